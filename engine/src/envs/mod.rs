@@ -1,0 +1,103 @@
+//! The environments: the trait that each fills, the registry of ids, and their reset parameters.
+
+pub mod mortar_mayhem;
+pub mod character;
+mod parameters;
+mod spec;
+mod vector;
+
+use std::sync::Arc;
+
+use thiserror::Error;
+
+use crate::random::Generator;
+pub use parameters::{Kind, Parameter, ParameterError, ResetParameters};
+pub use spec::{ActionSpace, Column, FRAME_BYTES, SCREEN, Spec};
+
+/// Rules and pictures of one family of environments.
+///
+/// [`step`](Environment::step) changes the state and [`draw`](Environment::draw) reads it: neither does the other's work. One
+/// object plays many episodes, and what an episode leaves behind matters, as in the original.
+pub trait Environment: Send {
+    /// What all environments with the same reset parameters share: the parameters and the pictures made from them.
+    type Assets: Send + Sync;
+
+    /// Makes the shared part for one set of reset parameters.
+    fn assets(spec: &Spec, parameters: &ResetParameters) -> Self::Assets;
+
+    /// An environment that has not played yet; [`reset`](Environment::reset) it before anything else.
+    fn new(assets: &Arc<Self::Assets>) -> Self;
+
+    /// Starts an episode.
+    fn reset(&mut self, assets: &Arc<Self::Assets>, random: &mut Generator);
+
+    /// Plays one step. `action` has one number for each branch of the action space, each within its range.
+    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition;
+
+    /// Draws the observation: `frame` holds [`FRAME_BYTES`] bytes, indexed \[x\]\[y\]\[channel\], of any content before.
+    fn draw(&self, frame: &mut [u8]);
+
+    /// Writes the vector observation; empty where the environment has none.
+    fn vector_observation(&self, _out: &mut [f32]) {}
+
+    /// Writes what the current frame shows as numbers, as the specification's `features` list them.
+    fn features(&self, out: &mut [f32]);
+
+    /// Writes the ground truth; empty where the environment has none.
+    fn ground_truth(&self, _out: &mut [f64]) {}
+
+    /// Writes the final info, as the specification's `info` lists it. Called in the step that ends the episode.
+    fn info(&self, out: &mut [f64]);
+}
+
+/// What one step yields beside the observation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Transition {
+    /// The original's Python float.
+    pub reward: f64,
+    /// Whether the episode ended. The original reports every end, also that by the step limit, as `terminated`.
+    pub terminated: bool,
+}
+
+/// Plays an environment from its feature and vector observations, and remembers what an agent would have to.
+pub trait Expert: Send {
+    /// Forgets the last episode.
+    fn reset(&mut self);
+
+    /// Chooses an action. Call it once for each observation, the first of an episode included.
+    fn act(&mut self, features: &[f32], vector_observation: &[f32], action: &mut [i32]);
+}
+
+/// The families of environments; each id belongs to one.
+#[derive(Clone, Copy, Debug)]
+pub enum Family {
+    MortarMayhem(mortar_mayhem::Variant),
+}
+
+/// Every environment id, in the order in which `endless list` shows them.
+pub fn specs() -> impl Iterator<Item = &'static Spec> {
+    mortar_mayhem::SPECS.iter()
+}
+
+/// The environment of that id.
+pub fn spec(id: &str) -> Result<&'static Spec, UnknownEnvironment> {
+    specs().find(|spec| spec.id == id).ok_or_else(|| UnknownEnvironment {
+        id: id.to_owned(),
+        known: specs().map(|spec| spec.id).collect::<Vec<_>>().join(", "),
+    })
+}
+
+/// A scripted expert for the environment.
+pub fn expert(spec: &Spec) -> Box<dyn Expert> {
+    match spec.family {
+        Family::MortarMayhem(variant) => Box::new(mortar_mayhem::expert::MortarExpert::new(variant)),
+    }
+}
+
+/// An id that no environment has.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("no environment `{id}`; there are {known}")]
+pub struct UnknownEnvironment {
+    pub id: String,
+    pub known: String,
+}

@@ -1,0 +1,63 @@
+//! Mortar Mayhem: memorise a sequence of commands, then execute it on an arena whose other tiles burn.
+
+mod commands;
+mod drawing;
+pub mod expert;
+mod features;
+mod parameters;
+mod rules;
+
+use std::sync::Arc;
+
+pub use commands::{Command, COMMANDS, MAX_VECTOR_COMMANDS};
+pub use drawing::Assets;
+pub use parameters::{Locomotion, Parameters, SPECS, Variant};
+pub use rules::MortarMayhem;
+
+use crate::envs::{Environment, Family, ResetParameters, Spec, Transition};
+use crate::random::Generator;
+
+impl Environment for MortarMayhem {
+    type Assets = Assets;
+
+    fn assets(spec: &Spec, parameters: &ResetParameters) -> Assets {
+        let Family::MortarMayhem(variant) = spec.family;
+        Assets::new(variant, Parameters::new(variant, parameters))
+    }
+
+    fn new(assets: &Arc<Assets>) -> Self {
+        MortarMayhem::unplayed(assets)
+    }
+
+    fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
+        self.start(assets, random);
+    }
+
+    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
+        self.play(action, random)
+    }
+
+    fn draw(&self, frame: &mut [u8]) {
+        self.draw_frame(frame);
+    }
+
+    fn vector_observation(&self, out: &mut [f32]) {
+        out.fill(0.0);
+        for (one_hot, command) in out.chunks_exact_mut(COMMANDS).zip(&self.commands) {
+            one_hot[command.one_hot()] = 1.0;
+        }
+    }
+
+    fn features(&self, out: &mut [f32]) {
+        self.write_features(out);
+    }
+
+    fn ground_truth(&self, out: &mut [f64]) {
+        let (x, y) = self.target;
+        out.copy_from_slice(&[f64::from(x) / 5.0, f64::from(y) / 5.0]);
+    }
+
+    fn info(&self, out: &mut [f64]) {
+        out.copy_from_slice(&if self.assets.variant.endless { self.endless_info() } else { self.finite_info() });
+    }
+}

@@ -1,0 +1,173 @@
+//! Reset parameters: the original's names and defaults, and the check of what a user gives.
+
+use serde::Serialize;
+use serde_json::{Map, Value as Json};
+use thiserror::Error;
+
+/// Longest list that a parameter takes.
+const MAX_LIST: usize = 4096;
+
+/// Type, default and limits of a reset parameter.
+#[derive(Clone, Copy, Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum Kind {
+    Bool { default: bool },
+    Int { default: i64, min: i64, max: i64 },
+    Float { default: f64, min: f64, max: f64 },
+    /// A list that the environment draws one value from in each episode. Not empty.
+    IntList { default: &'static [i64], min: i64, max: i64 },
+}
+
+/// One reset parameter of an environment.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Parameter {
+    pub name: &'static str,
+    #[serde(flatten)]
+    pub kind: Kind,
+    pub description: &'static str,
+}
+
+impl Parameter {
+    /// The default as JSON text.
+    pub fn default_text(&self) -> String {
+        match self.kind {
+            Kind::Bool { default } => default.to_string(),
+            Kind::Int { default, .. } => default.to_string(),
+            Kind::Float { default, .. } => format!("{default:?}"),
+            Kind::IntList { default, .. } => format!("{default:?}"),
+        }
+    }
+
+    /// Type and limits in words.
+    pub fn allowed(&self) -> String {
+        match self.kind {
+            Kind::Bool { .. } => "true or false".to_owned(),
+            Kind::Int { min, max, .. } => format!("an integer in {}", range(min, max, i64::MIN, i64::MAX)),
+            Kind::Float { min, max, .. } => format!("a number in {}", range(min, max, f64::MIN, f64::MAX)),
+            Kind::IntList { min, max, .. } => {
+                format!("a list of 1 to {MAX_LIST} integers in {}", range(min, max, i64::MIN, i64::MAX))
+            }
+        }
+    }
+
+    fn default_value(&self) -> Value {
+        match self.kind {
+            Kind::Bool { default } => Value::Bool(default),
+            Kind::Int { default, .. } => Value::Int(default),
+            Kind::Float { default, .. } => Value::Float(default),
+            Kind::IntList { default, .. } => Value::IntList(default.to_vec()),
+        }
+    }
+
+    fn parse(&self, given: &Json) -> Result<Value, ParameterError> {
+        let wrong_type = || ParameterError::WrongType {
+            name: self.name,
+            value: given.to_string(),
+            allowed: self.allowed(),
+        };
+        let out_of_range = || ParameterError::OutOfRange {
+            name: self.name,
+            value: given.to_string(),
+            allowed: self.allowed(),
+        };
+        match self.kind {
+            Kind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong_type),
+            Kind::Int { min, max, .. } => {
+                let value = integer(given).ok_or_else(wrong_type)?;
+                (min..=max).contains(&value).then_some(Value::Int(value)).ok_or_else(out_of_range)
+            }
+            Kind::Float { min, max, .. } => {
+                let value = given.as_f64().ok_or_else(wrong_type)?;
+                (min..=max).contains(&value).then_some(Value::Float(value)).ok_or_else(out_of_range)
+            }
+            Kind::IntList { min, max, .. } => {
+                let items = given.as_array().ok_or_else(wrong_type)?;
+                let values: Vec<i64> = items.iter().map(integer).collect::<Option<_>>().ok_or_else(wrong_type)?;
+                let fits = (1..=MAX_LIST).contains(&values.len()) && values.iter().all(|v| (min..=max).contains(v));
+                fits.then_some(Value::IntList(values)).ok_or_else(out_of_range)
+            }
+        }
+    }
+}
+
+/// An integer, also where it is written as `3.0`.
+fn integer(given: &Json) -> Option<i64> {
+    given.as_i64().or_else(|| given.as_f64().filter(|v| v.fract() == 0.0 && v.abs() < 1e15).map(|v| v as i64))
+}
+
+fn range<T: PartialOrd + std::fmt::Display>(min: T, max: T, lowest: T, highest: T) -> String {
+    match (min > lowest, max < highest) {
+        (true, true) => format!("{min} to {max}"),
+        (true, false) => format!("{min} or more"),
+        (false, true) => format!("{max} or less"),
+        (false, false) => "any size".to_owned(),
+    }
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Value {
+    Bool(bool),
+    Int(i64),
+    Float(f64),
+    IntList(Vec<i64>),
+}
+
+/// A complete and valid set of reset parameters: the defaults, with what was given in their place.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ResetParameters {
+    values: Vec<(&'static str, Value)>,
+}
+
+impl ResetParameters {
+    /// Checks `given` against `parameters` and fills in the defaults.
+    pub fn new(
+        id: &'static str,
+        parameters: &'static [Parameter],
+        given: &Map<String, Json>,
+    ) -> Result<Self, ParameterError> {
+        if let Some(name) = given.keys().find(|name| parameters.iter().all(|p| p.name != name.as_str())) {
+            let allowed = parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", ");
+            return Err(ParameterError::Unknown { id, name: name.clone(), allowed });
+        }
+        let values = parameters
+            .iter()
+            .map(|p| Ok((p.name, given.get(p.name).map_or_else(|| Ok(p.default_value()), |v| p.parse(v))?)))
+            .collect::<Result<_, _>>()?;
+        Ok(ResetParameters { values })
+    }
+
+    fn value(&self, name: &str) -> Option<&Value> {
+        self.values.iter().find(|(n, _)| *n == name).map(|(_, v)| v)
+    }
+
+    /// The flag of that name, or `absent` if the environment has none.
+    pub fn bool(&self, name: &str, absent: bool) -> bool {
+        if let Some(Value::Bool(value)) = self.value(name) { *value } else { absent }
+    }
+
+    /// The integer of that name, or `absent` if the environment has none.
+    pub fn int(&self, name: &str, absent: i64) -> i64 {
+        if let Some(Value::Int(value)) = self.value(name) { *value } else { absent }
+    }
+
+    /// The number of that name, or `absent` if the environment has none.
+    pub fn float(&self, name: &str, absent: f64) -> f64 {
+        if let Some(Value::Float(value)) = self.value(name) { *value } else { absent }
+    }
+
+    /// The list of that name, empty if the environment has none.
+    pub fn int_list(&self, name: &str) -> Vec<i64> {
+        if let Some(Value::IntList(value)) = self.value(name) { value.clone() } else { Vec::new() }
+    }
+}
+
+/// A reset parameter that cannot be used.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum ParameterError {
+    #[error("{id} has no reset parameter `{name}`; it has {allowed}")]
+    Unknown { id: &'static str, name: String, allowed: String },
+    #[error("reset parameter `{name}` is {value}, but must be {allowed}")]
+    WrongType { name: &'static str, value: String, allowed: String },
+    #[error("reset parameter `{name}` is {value}, which is out of range: it must be {allowed}")]
+    OutOfRange { name: &'static str, value: String, allowed: String },
+}

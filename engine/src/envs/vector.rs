@@ -1,0 +1,43 @@
+//! Vectors as pygame's `Vector2` computes them.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+/// How far an angle may be from a quarter turn to count as one.
+const EPSILON: f64 = 1e-6;
+
+/// `vector.rotate(degrees)`: quarter turns are exact, everything else goes through sine and cosine.
+pub fn rotate([x, y]: [f64; 2], degrees: f64) -> [f64; 2] {
+    let angle = (degrees * PI / 180.0).rem_euclid(TAU);
+    if (angle + EPSILON) % FRAC_PI_2 < 2.0 * EPSILON {
+        return match ((angle + EPSILON) / FRAC_PI_2) as i32 {
+            1 => [-y, x],
+            2 => [-x, -y],
+            3 => [y, -x],
+            _ => [x, y],
+        };
+    }
+    let (sin, cos) = angle.sin_cos();
+    [cos * x - sin * y, sin * x + cos * y]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::rotate;
+
+    /// Values that pygame 2.4 printed.
+    #[test]
+    fn rotations_equal_pygames() {
+        for (degrees, expected) in [
+            (45.0, [-4.440892098500626e-16, -5.65685424949238]),
+            (90.0, [4.0, -4.0]),
+            (135.0, [5.65685424949238, -4.440892098500626e-16]),
+            (180.0, [4.0, 4.0]),
+            (225.0, [8.881784197001252e-16, 5.656854249492381]),
+            (270.0, [-4.0, 4.0]),
+            (315.0, [-5.65685424949238, 1.3322676295501878e-15]),
+            (360.0, [-4.0, -4.0]),
+        ] {
+            assert_eq!(rotate([-4.0, -4.0], degrees), expected, "{degrees} degrees");
+        }
+    }
+}

@@ -1,0 +1,302 @@
+//! Many environments of one id, stepped in lockstep by worker threads.
+
+mod lanes;
+mod seeding;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use serde_json::{Map, Value as Json};
+use thiserror::Error;
+
+use crate::batch::{BatchMut, Block, Layout, batch_layout};
+use crate::envs::mortar_mayhem::MortarMayhem;
+use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
+use lanes::{FamilyLanes, Lanes};
+pub use seeding::Seeding;
+use seeding::Seeds;
+
+/// Most environments in one pool.
+pub const MAX_ENVS: usize = 1 << 20;
+
+/// When an episode that ended gives way to the next one. The names are Gymnasium's.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Autoreset {
+    /// In the step after: that step ignores its action, and returns the new episode's first observation with a reward of 0.
+    #[default]
+    NextStep,
+    /// In the same step: the observation is already the new episode's, reward, flags and info are the old one's.
+    SameStep,
+    /// Never: the trainer resets with [`Pool::reset`]. Until then the episode is played on, as the original allows.
+    Disabled,
+}
+
+/// Reset parameters of a pool's environments, by the original's names.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Options {
+    /// All environments have the same.
+    Shared(Map<String, Json>),
+    /// One set for each environment.
+    Each(Vec<Map<String, Json>>),
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Options::Shared(Map::new())
+    }
+}
+
+/// What a pool is made of.
+#[derive(Clone, Debug)]
+pub struct PoolConfig {
+    /// Environment id, such as `MortarMayhem-v0`.
+    pub id: String,
+    /// Environments in the pool, 1 to [`MAX_ENVS`].
+    pub num_envs: usize,
+    pub options: Options,
+    pub autoreset: Autoreset,
+    /// Whether same-step auto-reset keeps the last observation of an episode, in the `final_*` sections.
+    pub final_observation: bool,
+    pub seeding: Seeding,
+    /// Whether the batch has the feature observation.
+    pub features: bool,
+    /// Number of this pool's first environment, and of environments in all pools together, for seeding: an engine that serves
+    /// several groups counts its environments through.
+    pub first_env: usize,
+    pub total_envs: usize,
+}
+
+impl PoolConfig {
+    /// `num_envs` environments of that id with the defaults: default options, next-step auto-reset, seeds from entropy.
+    pub fn new(id: &str, num_envs: usize) -> Self {
+        PoolConfig {
+            id: id.to_owned(),
+            num_envs,
+            options: Options::default(),
+            autoreset: Autoreset::default(),
+            final_observation: false,
+            seeding: Seeding::Continue { seed: None },
+            features: false,
+            first_env: 0,
+            total_envs: num_envs,
+        }
+    }
+}
+
+/// Worker threads that step environments. Several pools may share them.
+#[derive(Clone, Debug)]
+pub struct Threads(Option<Arc<rayon::ThreadPool>>);
+
+impl Threads {
+    /// `count` threads; 0 stands for one for each core. One thread is the caller's own.
+    pub fn new(count: usize) -> Result<Self, PoolError> {
+        let count = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
+        if count == 1 {
+            return Ok(Threads(None));
+        }
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(count)
+            .thread_name(|i| format!("endless-worker-{i}"))
+            .build()
+            .map(|pool| Threads(Some(Arc::new(pool))))
+            .map_err(|source| PoolError::Threads { count, source })
+    }
+
+    /// Threads that step environments at the same time.
+    pub fn count(&self) -> usize {
+        self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
+    }
+
+    fn run(&self, work: impl FnOnce() + Send) {
+        match &self.0 {
+            Some(pool) => pool.install(work),
+            None => work(),
+        }
+    }
+}
+
+/// Which environments start an episode.
+#[derive(Clone, Copy, Debug)]
+pub enum ResetRequest<'a> {
+    /// All, each with the seed that the seeding policy gives it.
+    All,
+    /// All, environment `i` with `seed + i`.
+    Seed(u64),
+    /// Each as its number says: 0 leaves it alone, 1 starts an episode by the seeding policy, 2 one with its own `seed`.
+    Each { reset: &'a [u8], seed: &'a [u64] },
+}
+
+/// Environments of one id in lockstep.
+pub struct Pool {
+    spec: &'static Spec,
+    layout: Layout,
+    lanes: Box<dyn Lanes>,
+    autoreset: Autoreset,
+    threads: Threads,
+    was_reset: bool,
+}
+
+impl Pool {
+    /// Makes the environments. They want a [`reset`](Pool::reset) before the first step.
+    pub fn new(config: &PoolConfig, threads: &Threads) -> Result<Self, PoolError> {
+        let spec = envs::spec(&config.id)?;
+        if !(1..=MAX_ENVS).contains(&config.num_envs) {
+            return Err(PoolError::NumEnvs { given: config.num_envs });
+        }
+        match &config.seeding {
+            Seeding::List(seeds) if seeds.is_empty() => return Err(PoolError::NoSeeds),
+            Seeding::Range { start, end, .. } if start >= end || *end > i64::MAX as u64 => {
+                return Err(PoolError::SeedRange { start: *start, end: *end });
+            }
+            _ => {}
+        }
+        let lanes: Box<dyn Lanes> = match spec.family {
+            Family::MortarMayhem(_) => Box::new(family_lanes::<MortarMayhem>(spec, config)?),
+        };
+        Ok(Pool {
+            spec,
+            layout: batch_layout(
+                spec,
+                config.num_envs,
+                config.features,
+                config.final_observation && config.autoreset == Autoreset::SameStep,
+            ),
+            lanes,
+            autoreset: config.autoreset,
+            threads: threads.clone(),
+            was_reset: false,
+        })
+    }
+
+    /// What is fixed about the environment id.
+    pub fn spec(&self) -> &'static Spec {
+        self.spec
+    }
+
+    /// How a batch of this pool lies in memory.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Starts episodes and writes every environment's row: the current observation, a reward of 0, no flag.
+    pub fn reset(&mut self, request: ResetRequest<'_>, batch: &mut [Block]) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match request {
+            ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
+                return Err(PoolError::ResetCount { given: reset.len().min(seed.len()), num_envs });
+            }
+            ResetRequest::Each { reset, .. } if !self.was_reset && reset.contains(&0) => {
+                return Err(PoolError::NotReset);
+            }
+            _ => {}
+        }
+        let (out, slices) = (self.batch_mut(batch)?, self.slices());
+        let lanes = &mut self.lanes;
+        self.threads.run(|| lanes.reset(slices, request, out));
+        self.was_reset = true;
+        Ok(())
+    }
+
+    /// Plays one step of every environment. `actions` holds a row of int32 for each environment, one number for each branch of
+    /// the action space. On an error no environment has moved.
+    pub fn step(&mut self, actions: &[i32], batch: &mut [Block]) -> Result<(), PoolError> {
+        if !self.was_reset {
+            return Err(PoolError::NotReset);
+        }
+        check_actions(self.spec, self.layout.num_envs(), actions)?;
+        let (out, slices) = (self.batch_mut(batch)?, self.slices());
+        let (lanes, autoreset) = (&mut self.lanes, self.autoreset);
+        self.threads.run(|| lanes.step(slices, autoreset, actions, out));
+        Ok(())
+    }
+
+    fn slices(&self) -> usize {
+        self.threads.count().min(self.layout.num_envs())
+    }
+
+    fn batch_mut<'a>(&self, batch: &'a mut [Block]) -> Result<BatchMut<'a>, PoolError> {
+        let given = batch.len();
+        BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed: self.layout.blocks() })
+    }
+}
+
+/// Whether `actions` fit `num_envs` environments: the right count, each in its branch's range.
+pub fn check_actions(spec: &Spec, num_envs: usize, actions: &[i32]) -> Result<(), PoolError> {
+    let branches = spec.action_space.branches();
+    if actions.len() != num_envs * branches.len() {
+        return Err(PoolError::ActionCount { given: actions.len(), num_envs, branches: branches.len() });
+    }
+    let fits = |action: &[i32]| action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a));
+    match actions.chunks_exact(branches.len()).position(|action| !fits(action)) {
+        None => Ok(()),
+        Some(env) => Err(PoolError::ActionRange {
+            env,
+            given: actions[env * branches.len()..][..branches.len()].to_vec(),
+            space: spec.action_space.to_string(),
+        }),
+    }
+}
+
+/// Makes the environments of one family; those with the same options share their assets.
+fn family_lanes<E: Environment>(spec: &'static Spec, config: &PoolConfig) -> Result<FamilyLanes<E>, PoolError> {
+    let make = |given: &Map<String, Json>| -> Result<Arc<E::Assets>, ParameterError> {
+        Ok(Arc::new(E::assets(spec, &ResetParameters::new(spec.id, spec.parameters, given)?)))
+    };
+    let assets: Vec<Arc<E::Assets>> = match &config.options {
+        Options::Shared(given) => vec![make(given)?; config.num_envs],
+        Options::Each(each) if each.len() == config.num_envs => {
+            let mut made = HashMap::new();
+            each.iter()
+                .enumerate()
+                .map(|(env, given)| match made.entry(Json::from(given.clone()).to_string()) {
+                    std::collections::hash_map::Entry::Occupied(entry) => Ok(Arc::clone(entry.get())),
+                    std::collections::hash_map::Entry::Vacant(entry) => make(given)
+                        .map(|assets| Arc::clone(entry.insert(assets)))
+                        .map_err(|source| PoolError::ParametersOf { env, source }),
+                })
+                .collect::<Result<_, _>>()?
+        }
+        Options::Each(each) => {
+            return Err(PoolError::OptionsCount { given: each.len(), num_envs: config.num_envs });
+        }
+    };
+    let list: Arc<[u64]> = match &config.seeding {
+        Seeding::List(seeds) => seeds.as_slice().into(),
+        _ => [].into(),
+    };
+    let environments = assets.into_iter().enumerate().map(|(env, assets)| {
+        (assets, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs))
+    });
+    Ok(FamilyLanes::new(spec.action_space.branches().len(), environments))
+}
+
+/// A pool that cannot be made, or a call that it cannot carry out.
+#[derive(Debug, Error)]
+pub enum PoolError {
+    #[error(transparent)]
+    UnknownEnvironment(#[from] UnknownEnvironment),
+    #[error(transparent)]
+    Parameters(#[from] ParameterError),
+    #[error("options of environment {env}: {source}")]
+    ParametersOf { env: usize, source: ParameterError },
+    #[error("{given} sets of options for {num_envs} environments; give one for each, or one for all")]
+    OptionsCount { given: usize, num_envs: usize },
+    #[error("{given} environments asked for; a pool has 1 to {MAX_ENVS}")]
+    NumEnvs { given: usize },
+    #[error("the list of seeds is empty; give at least one")]
+    NoSeeds,
+    #[error("the range of seeds {start}..{end} is empty or ends above 2^63 - 1")]
+    SeedRange { start: u64, end: u64 },
+    #[error("cannot start {count} threads: {source}")]
+    Threads { count: usize, source: rayon::ThreadPoolBuildError },
+    #[error("step before the first reset; reset all environments once")]
+    NotReset,
+    #[error("{given} action numbers for {num_envs} environments of {branches} branches; give {}", num_envs * branches)]
+    ActionCount { given: usize, num_envs: usize, branches: usize },
+    #[error("action {given:?} of environment {env} is not in {space}")]
+    ActionRange { env: usize, given: Vec<i32>, space: String },
+    #[error("a reset of {given} environments asked of a pool of {num_envs}; give one flag and one seed for each")]
+    ResetCount { given: usize, num_envs: usize },
+    #[error("a batch of {given} blocks of 64 bytes given; the layout needs {needed}")]
+    BatchTooShort { given: usize, needed: usize },
+}

@@ -1,0 +1,55 @@
+//! Which seed each episode of each environment gets.
+
+use crate::random::{Generator, SeedSequence};
+
+/// How episodes are seeded. Environments are counted over all groups of an engine, so that results depend neither on the
+/// number of threads nor on how the environments are divided.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Seeding {
+    /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as the original's does
+    /// when it is reset without a seed. Without a seed, from the operating system's entropy.
+    Continue { seed: Option<u64> },
+    /// Each episode draws its seed uniformly from `start..end`. `seed` fixes the draws. The paper trains on `0..100000`.
+    Range { start: u64, end: u64, seed: Option<u64> },
+    /// Episode `e` of environment `i` of `n` gets the seed number `e * n + i` of the list, which starts over at its end.
+    List(Vec<u64>),
+}
+
+/// The seeds of one environment's episodes.
+#[derive(Debug)]
+pub(super) enum Seeds {
+    Continue { first: Option<u64> },
+    Range { start: i64, end: i64, draws: Generator },
+    List { seeds: std::sync::Arc<[u64]>, next: usize, stride: usize },
+}
+
+impl Seeds {
+    /// The seeds of environment number `env` of `total`.
+    pub(super) fn new(seeding: &Seeding, list: &std::sync::Arc<[u64]>, env: usize, total: usize) -> Self {
+        match seeding {
+            Seeding::Continue { seed } => Seeds::Continue { first: seed.map(|seed| seed.wrapping_add(env as u64)) },
+            Seeding::Range { start, end, seed } => Seeds::Range {
+                start: *start as i64,
+                end: *end as i64,
+                draws: match seed {
+                    Some(seed) => Generator::from_seed_sequence(&SeedSequence::new(*seed).with_spawn_key(&[env as u32])),
+                    None => Generator::from_entropy(),
+                },
+            },
+            Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env, stride: total },
+        }
+    }
+
+    /// The next episode's seed; `None` continues the environment's generator.
+    pub(super) fn next(&mut self) -> Option<u64> {
+        match self {
+            Seeds::Continue { first } => first.take(),
+            Seeds::Range { start, end, draws } => Some(draws.integers(*start, *end) as u64),
+            Seeds::List { seeds, next, stride } => {
+                let seed = seeds[*next % seeds.len()];
+                *next = (*next + *stride) % seeds.len();
+                Some(seed)
+            }
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! The draws of numpy's `Generator` that the environments use.
+
+use std::fmt;
+
+use rand::rngs::SysRng;
+use rand::{Rng, TryRng};
+use rand_pcg::Pcg64;
+use serde::{Deserialize, Serialize};
+
+use super::SeedSequence;
+
+/// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
+///
+/// Sources: `numpy/random/_generator.pyx`, `src/distributions/distributions.c` and
+/// `src/pcg64/pcg64.h` (numpy 1.26 and 2.x).
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Generator {
+    /// The bit generator, 64 bits a step.
+    bits: Pcg64,
+    /// The high half of a step whose low half went into a 32-bit draw; the next 32-bit draw takes
+    /// it, whatever 64-bit draws come in between. numpy's `has_uint32` and `uinteger`.
+    kept: Option<u32>,
+}
+
+impl Generator {
+    /// The generator that Gymnasium's `np_random(seed)` gives; every value is a valid seed.
+    pub fn from_seed(seed: u64) -> Self {
+        Self::from_seed_sequence(&SeedSequence::new(seed))
+    }
+
+    /// `Generator(PCG64(sequence))`.
+    pub fn from_seed_sequence(sequence: &SeedSequence) -> Self {
+        let [state_high, state_low, stream_high, stream_low] = sequence.generate_state_u64();
+        let join = |high: u64, low: u64| u128::from(high) << 64 | u128::from(low);
+        Self { bits: Pcg64::new(join(state_high, state_low), join(stream_high, stream_low)), kept: None }
+    }
+
+    /// An unseeded generator, `Generator(PCG64())`: from 128 bits of the operating system's
+    /// entropy, as Gymnasium takes where a reset brings no seed.
+    ///
+    /// # Panics
+    ///
+    /// If the operating system has no entropy to give, as `rand`'s own generators do.
+    // Straight from the system: a generator kept by the process would repeat itself in the
+    // children of a fork, which is how Python starts parallel environments.
+    pub fn from_entropy() -> Self {
+        let mut entropy = [0; size_of::<u128>()];
+        SysRng.try_fill_bytes(&mut entropy).expect("entropy from the operating system");
+        Self::from_seed_sequence(&SeedSequence::from_u128(u128::from_le_bytes(entropy)))
+    }
+
+    /// `integers(low, high)`: a uniform whole number of `low..high`, by numpy's `int64` path.
+    /// numpy counts float arguments as whole numbers cut towards zero.
+    ///
+    /// A range of one number is that number and draws nothing. Callers guarantee `low < high`,
+    /// which numpy insists on; an empty range gives `low` and draws nothing too.
+    #[inline]
+    pub fn integers(&mut self, low: i64, high: i64) -> i64 {
+        if low.saturating_add(1) >= high {
+            return low;
+        }
+        // How many numbers there are: 2 to 2⁶⁴ - 1, exact in spite of the wrapping.
+        let count = high.wrapping_sub(low) as u64;
+        low.wrapping_add_unsigned(self.below(count))
+    }
+
+    /// `integers(low, high, size)`: fills `values` with what as many calls of
+    /// [`integers`](Self::integers) would give, which is what numpy does for a size.
+    #[inline]
+    pub fn fill_integers(&mut self, low: i64, high: i64, values: &mut [i64]) {
+        values.fill_with(|| self.integers(low, high));
+    }
+
+    /// `choice(items)`: one of the items, each as likely as another. A single item draws nothing.
+    ///
+    /// # Panics
+    ///
+    /// If there are no items, where numpy raises an error.
+    #[inline]
+    pub fn choice<'a, T>(&mut self, items: &'a [T]) -> &'a T {
+        // A slice of items that have a size holds at most i64::MAX of them.
+        &items[self.integers(0, items.len() as i64) as usize]
+    }
+
+    /// `random()`: a multiple of 2⁻⁵³ in `[0, 1)`.
+    #[inline]
+    pub fn random(&mut self) -> f64 {
+        const STEP: f64 = 1.0 / (1_u64 << 53) as f64;
+        (self.bits.next_u64() >> 11) as f64 * STEP
+    }
+
+    /// `uniform(low, high)`: `low + (high - low) * random()`, rounded after each step as numpy does,
+    /// so in `[low, high)` but for rounding. Callers guarantee what numpy insists on: `high - low`
+    /// is finite and not negative.
+    #[inline]
+    pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * self.random()
+    }
+
+    /// A uniform number of `0..count`, for a count of 2 or more, from as few bits as numpy takes.
+    #[inline]
+    fn below(&mut self, count: u64) -> u64 {
+        const WORDS: u64 = 1 << 32;
+        if count < WORDS {
+            self.below_u32(count as u32).into()
+        } else if count == WORDS {
+            self.next_u32().into()
+        } else {
+            self.below_u64(count)
+        }
+    }
+
+    /// Lemire's method on 32-bit draws: the high half of `count * draw` is the result, and the low
+    /// half tells the few draws that would favour some results and are repeated.
+    ///
+    /// Daniel Lemire, "Fast Random Integer Generation in an Interval",
+    /// ACM Transactions on Modeling and Computer Simulation 29 (1), 2019.
+    #[inline]
+    fn below_u32(&mut self, count: u32) -> u32 {
+        let mut product = u64::from(count) * u64::from(self.next_u32());
+        // The threshold is below the count, so that most draws need no division.
+        if (product as u32) < count {
+            let threshold = count.wrapping_neg() % count;
+            while (product as u32) < threshold {
+                product = u64::from(count) * u64::from(self.next_u32());
+            }
+        }
+        (product >> 32) as u32
+    }
+
+    /// Lemire's method on 64-bit draws.
+    #[inline]
+    fn below_u64(&mut self, count: u64) -> u64 {
+        let mut product = u128::from(count) * u128::from(self.bits.next_u64());
+        if (product as u64) < count {
+            let threshold = count.wrapping_neg() % count;
+            while (product as u64) < threshold {
+                product = u128::from(count) * u128::from(self.bits.next_u64());
+            }
+        }
+        (product >> 64) as u64
+    }
+
+    /// A 32-bit draw: each step of the bit generator serves two, the low half first.
+    #[inline]
+    fn next_u32(&mut self) -> u32 {
+        self.kept.take().unwrap_or_else(|| {
+            let word = self.bits.next_u64();
+            self.kept = Some((word >> 32) as u32);
+            word as u32
+        })
+    }
+}
+
+/// Shows the whole state, which `rand_pcg` keeps out of its own `Debug`.
+impl fmt::Debug for Generator {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter
+            .debug_struct("Generator")
+            .field("state", &self.bits.state())
+            .field("stream", &self.bits.stream())
+            .field("kept", &self.kept)
+            .finish()
+    }
+}

@@ -1,0 +1,186 @@
+//! numpy's random numbers, bit for bit: [`SeedSequence`] and [`Generator`] over PCG64.
+//!
+//! The environments were written against `numpy.random.Generator(PCG64(SeedSequence(seed)))`, which
+//! is what Gymnasium's `np_random(seed)` hands out. The same seed has to give the same episodes
+//! here, so the draws follow numpy 1.26 and 2.x (which agree) exactly, down to how many bits each
+//! of them consumes.
+
+mod generator;
+mod seed_sequence;
+
+pub use generator::Generator;
+pub use seed_sequence::SeedSequence;
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use serde::Deserialize;
+
+    use super::{Generator, SeedSequence};
+
+    /// What numpy gave, recorded by `tests/random/record_random.py`.
+    #[derive(Deserialize)]
+    struct Cases {
+        seedings: Vec<Seeding>,
+        streams: Vec<Stream>,
+    }
+
+    #[derive(Deserialize)]
+    struct Seeding {
+        entropy: Vec<u32>,
+        spawn_key: Vec<u32>,
+        u32: [u32; 9],
+        u64: [u64; 5],
+    }
+
+    #[derive(Deserialize)]
+    struct Stream {
+        seed: u64,
+        spawn_key: Vec<u32>,
+        draws: Vec<Draw>,
+    }
+
+    /// Arguments, then what was drawn; floats as their bits.
+    #[derive(Deserialize)]
+    #[serde(rename_all = "lowercase")]
+    enum Draw {
+        Integers(i64, i64, Vec<i64>),
+        Choice(usize, usize),
+        Uniform(u64, u64, u64),
+        Random(u64),
+    }
+
+    fn cases() -> Cases {
+        serde_json::from_str(include_str!("../../../tests/random/cases.json")).unwrap()
+    }
+
+    #[test]
+    fn seed_sequences_equal_numpys() {
+        for case in cases().seedings {
+            let entropy = &case.entropy;
+            let check = |sequence: SeedSequence| {
+                let sequence = sequence.with_spawn_key(&case.spawn_key);
+                assert_eq!(sequence.generate_state_u32(), case.u32, "{entropy:?}");
+                assert_eq!(sequence.generate_state_u64(), case.u64, "{entropy:?}");
+            };
+            check(SeedSequence::from_words(entropy));
+            let value = |words: &[u32]| words.iter().rev().fold(0, |value, &word| value << 32 | u128::from(word));
+            if entropy.len() <= 4 {
+                check(SeedSequence::from_u128(value(entropy)));
+            }
+            if entropy.len() <= 2 {
+                check(SeedSequence::new(value(entropy) as u64));
+            }
+        }
+    }
+
+    #[test]
+    fn spawn_keys_can_be_given_in_steps() {
+        let seed = SeedSequence::new(3);
+        assert_eq!(seed.with_spawn_key(&[1]).with_spawn_key(&[2]), seed.with_spawn_key(&[1, 2]));
+        assert_ne!(seed, seed.with_spawn_key(&[0]));
+        assert_eq!(seed, seed.with_spawn_key(&[]));
+    }
+
+    #[test]
+    fn draws_equal_numpys() {
+        let indices: Vec<usize> = (0..1000).collect();
+        for case in cases().streams {
+            let sequence = SeedSequence::new(case.seed).with_spawn_key(&case.spawn_key);
+            let mut rng = Generator::from_seed_sequence(&sequence);
+            if case.spawn_key.is_empty() {
+                assert_eq!(rng, Generator::from_seed(case.seed));
+            }
+            for (at, draw) in case.draws.iter().enumerate() {
+                let place = format!("seed {}, draw {at}", case.seed);
+                match *draw {
+                    Draw::Integers(low, high, ref expected) => {
+                        let mut filler = rng.clone();
+                        let mut filled = vec![0; expected.len()];
+                        filler.fill_integers(low, high, &mut filled);
+                        assert_eq!(&filled, expected, "{place}");
+                        for &value in expected {
+                            assert_eq!(rng.integers(low, high), value, "{place}");
+                        }
+                        assert_eq!(rng, filler, "{place}");
+                    }
+                    Draw::Choice(length, expected) => {
+                        assert_eq!(*rng.choice(&indices[..length]), expected, "{place}");
+                    }
+                    Draw::Uniform(low, high, expected) => {
+                        let drawn = rng.uniform(f64::from_bits(low), f64::from_bits(high));
+                        assert_eq!(drawn.to_bits(), expected, "{place}");
+                    }
+                    Draw::Random(expected) => {
+                        assert_eq!(rng.random().to_bits(), expected, "{place}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_saved_generator_goes_on_where_it_was() {
+        let mut rng = Generator::from_seed(11);
+        // One 32-bit draw leaves the other half of its word waiting.
+        rng.integers(0, 10);
+        let saved = serde_json::to_string(&rng).unwrap();
+        let mut restored: Generator = serde_json::from_str(&saved).unwrap();
+        assert_eq!(restored, rng);
+        for _ in 0..9 {
+            assert_eq!(restored.integers(-45, 45), rng.integers(-45, 45));
+            assert_eq!(restored.random(), rng.random());
+        }
+        assert_eq!(format!("{restored:?}"), format!("{rng:?}"));
+    }
+
+    #[test]
+    fn unseeded_generators_differ() {
+        assert_ne!(Generator::from_entropy(), Generator::from_entropy());
+    }
+
+    #[test]
+    fn ranges_of_one_and_empty_ranges_draw_nothing() {
+        let untouched = Generator::from_seed(5);
+        let mut rng = untouched.clone();
+        assert_eq!(rng.integers(7, 8), 7);
+        assert_eq!(rng.integers(7, 7), 7);
+        assert_eq!(rng.integers(7, -7), 7);
+        assert_eq!(rng.integers(i64::MAX, i64::MIN), i64::MAX);
+        assert_eq!(rng.choice(&["only"]), &"only");
+        assert_eq!(rng, untouched);
+    }
+
+    #[test]
+    #[should_panic(expected = "index out of bounds")]
+    fn nothing_to_choose_from() {
+        Generator::from_seed(0).choice::<u8>(&[]);
+    }
+
+    proptest! {
+        #[test]
+        fn integers_stay_in_range(seed: u64, low: i64, high: i64, draws in 1..40_usize) {
+            let mut rng = Generator::from_seed(seed);
+            for _ in 0..draws {
+                let value = rng.integers(low, high);
+                prop_assert!(value == low || (low..high).contains(&value));
+            }
+        }
+
+        #[test]
+        fn integers_stay_in_short_ranges(seed: u64, low: i64, length in 1..1000_i64) {
+            let high = low.saturating_add(length);
+            let mut values = [0; 40];
+            Generator::from_seed(seed).fill_integers(low, high, &mut values);
+            prop_assert!(values.iter().all(|&value| value == low || (low..high).contains(&value)));
+        }
+
+        #[test]
+        fn floats_stay_in_range(seed: u64, low in -1e6..1e6_f64, length in 0.0..1e6_f64) {
+            let mut rng = Generator::from_seed(seed);
+            prop_assert!((0.0..1.0).contains(&rng.random()));
+            let value = rng.uniform(low, low + length);
+            prop_assert!((low..=low + length).contains(&value));
+        }
+    }
+}

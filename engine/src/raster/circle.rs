@@ -1,0 +1,225 @@
+//! Circles: filled, thin and with a border of some width.
+//!
+//! pygame's circles have an even diameter: about the centre `(x, y)`, the distance 1 is the column
+//! `x` to the right and the column `x - 1` to the left, and likewise for the rows.
+
+use std::ops::Range;
+
+use super::canvas::clip;
+use super::{Canvas, Rgb};
+
+/// Larger radii are drawn with this one, to bound the work.
+pub(super) const MAX_RADIUS: i64 = 1 << 20;
+
+/// Whether the midpoint that follows the point `(x, y)` of an outline lies outside of the circle,
+/// so that the outline has to come one pixel nearer.
+pub(super) fn falls(radius: i64, x: i64, y: i64) -> bool {
+    (x + 1) * (x + 1) + y * (y - 1) >= radius * radius
+}
+
+/// The points of an eighth of a circle by the midpoint rule: distances `(x, y)` from the centre, by
+/// growing `x`.
+#[derive(Clone, Debug)]
+pub(super) struct Octant {
+    radius: i64,
+    x: i64,
+    y: i64,
+}
+
+impl Octant {
+    pub(super) fn new(radius: i64) -> Self {
+        Self { radius, x: 0, y: radius }
+    }
+}
+
+impl Iterator for Octant {
+    type Item = (i64, i64);
+
+    fn next(&mut self) -> Option<(i64, i64)> {
+        if self.x >= self.y {
+            return None;
+        }
+        self.y -= i64::from(falls(self.radius, self.x, self.y));
+        self.x += 1;
+        Some((self.x, self.y))
+    }
+}
+
+/// A filled circle, made ready to be painted at any place, as one run per column.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Disc {
+    /// Per distance of a column from the centre, from 1: how far its run reaches up and down.
+    half_heights: Vec<i32>,
+}
+
+/// A column of a [`Disc`] on a canvas: the pixels `(x, y)` for all `y` in `rows`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DiscColumn {
+    pub x: usize,
+    pub rows: Range<usize>,
+}
+
+impl Disc {
+    /// The disc that `pygame.draw.circle` fills; empty for radii below 1.
+    pub fn new(radius: i32) -> Self {
+        let radius = i64::from(radius).clamp(0, MAX_RADIUS);
+        let mut half_heights = vec![0; radius as usize];
+        for (x, y) in Octant::new(radius) {
+            // pygame swaps the ends of a run that end before they start: none is empty.
+            half_heights[x as usize - 1] = y.max(1) as i32;
+            // Of the points with the same `y`, the last is the farthest out.
+            if y > 0 && falls(radius, x, y) {
+                let half_height = &mut half_heights[y as usize - 1];
+                *half_height = (*half_height).max(x as i32);
+            }
+        }
+        Self { half_heights }
+    }
+
+    /// The radius in pixels.
+    pub fn radius(&self) -> i32 {
+        self.half_heights.len() as i32
+    }
+
+    /// The runs of the disc about `center` that lie on a canvas of `width` by `height` pixels, from
+    /// left to right, without the empty ones.
+    pub fn columns(&self, center: (i32, i32), width: usize, height: usize) -> impl Iterator<Item = DiscColumn> + '_ {
+        let (center_x, center_y) = (i64::from(center.0), i64::from(center.1));
+        let radius = i64::from(self.radius());
+        let columns = clip(center_x - radius, center_x + radius - 1, width);
+        columns.filter_map(move |x| {
+            let right = x as i64 - center_x;
+            let index = if right < 0 { -right - 1 } else { right };
+            let half_height = i64::from(self.half_heights[index as usize]);
+            let rows = clip(center_y - half_height, center_y + half_height - 1, height);
+            (!rows.is_empty()).then_some(DiscColumn { x, rows })
+        })
+    }
+}
+
+/// The outline of a circle as the wide border follows it: one point per row, downwards from the
+/// top, by two midpoint rules that meet on the diagonal.
+struct Contour {
+    radius: i64,
+    x: i64,
+    y: i64,
+}
+
+impl Contour {
+    fn new(radius: i64) -> Self {
+        Self { radius, x: 0, y: radius }
+    }
+
+    /// Whether the contour is still in the part where a row is wider than one point.
+    fn is_flat(&self) -> bool {
+        self.x < self.y
+    }
+
+    /// Moves along the row to its farthest point; only for the flat part.
+    fn widen(&mut self) {
+        let outside = 4 * self.radius * self.radius;
+        while 4 * (self.x + 1).pow(2) + (2 * self.y - 1).pow(2) < outside {
+            self.x += 1;
+        }
+    }
+
+    /// Goes diagonally to the next row; only for the flat part.
+    fn descend_flat(&mut self) {
+        self.x += 1;
+        self.y -= 1;
+    }
+
+    /// Goes to the next row in the steep part.
+    fn descend_steep(&mut self) {
+        let outside = 4 * self.radius * self.radius;
+        if (2 * self.x + 1).pow(2) + 4 * (self.y - 1).pow(2) <= outside {
+            self.x += 1;
+        }
+        self.y -= 1;
+    }
+}
+
+impl Canvas<'_> {
+    /// Draws a circle as `pygame.draw.circle` does. Lengths are in pixels.
+    ///
+    /// With a `width` of 0, or one of the radius or more, the circle is filled; else `width` is
+    /// that of its border, which grows inwards. Nothing is drawn for a `radius` below 1 or a
+    /// negative `width`. Exact for radii up to 46340, beyond which pygame's own numbers overflow.
+    pub fn draw_circle(&mut self, color: Rgb, center: (i32, i32), radius: i32, width: i32) {
+        if radius < 1 || width < 0 {
+            return;
+        }
+        if width == 0 || width >= radius {
+            self.fill_disc(color, center, &Disc::new(radius));
+            return;
+        }
+        let x = i64::from(center.0);
+        let y = i64::from(center.1);
+        let radius = i64::from(radius).min(MAX_RADIUS);
+        if width == 1 {
+            self.draw_thin_circle(color, x, y, radius);
+        } else {
+            let width = i64::from(width).min(radius);
+            self.draw_ring(color, x, y, radius, width);
+        }
+    }
+
+    /// Fills a circle with a ready [`Disc`]: the same pixels as [`Canvas::draw_circle`]'s.
+    pub fn fill_disc(&mut self, color: Rgb, center: (i32, i32), disc: &Disc) {
+        let height = self.height();
+        for DiscColumn { x, rows } in disc.columns(center, self.width(), height) {
+            let column = x * height;
+            let run = &mut self.pixels_mut()[(column + rows.start) * 3..(column + rows.end) * 3];
+            run.as_chunks_mut().0.fill(color);
+        }
+    }
+
+    fn draw_thin_circle(&mut self, color: Rgb, center_x: i64, center_y: i64, radius: i64) {
+        for (near, far) in Octant::new(radius) {
+            for (x, y) in [(near, far), (far, near)] {
+                for column in [center_x - x, center_x + x - 1] {
+                    self.put(column, center_y - y, color);
+                    self.put(column, center_y + y - 1, color);
+                }
+            }
+        }
+    }
+
+    fn draw_ring(&mut self, color: Rgb, center_x: i64, center_y: i64, radius: i64, width: i64) {
+        let inner_radius = radius - width + 1;
+        let mut outer = Contour::new(radius);
+        let mut inner = Contour::new(inner_radius);
+        let mut is_hollow = false;
+        let mut is_flat = outer.is_flat();
+        while outer.y >= 0 {
+            if is_flat {
+                outer.widen();
+            }
+            let (left, right) = (center_x - outer.x, center_x + outer.x - 1);
+            for row in [center_y - outer.y, center_y + outer.y - 1] {
+                if is_hollow {
+                    self.fill_row(left, center_x - inner.x, row, color);
+                    self.fill_row(center_x + inner.x - 1, right, row, color);
+                } else {
+                    self.fill_row(left, right, row, color);
+                }
+            }
+            if is_flat {
+                outer.descend_flat();
+            } else {
+                outer.descend_steep();
+            }
+            is_hollow = is_hollow || outer.y < inner_radius;
+            if is_hollow {
+                // The inner contour keeps to the flat rule as long as the outer one is flat.
+                if is_flat || inner.is_flat() {
+                    inner.widen();
+                    inner.descend_flat();
+                } else {
+                    inner.descend_steep();
+                }
+            }
+            is_flat = is_flat && outer.is_flat();
+        }
+    }
+}

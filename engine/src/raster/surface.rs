@@ -1,0 +1,131 @@
+//! A picture of its own, with the colour key and the alpha that pygame's surfaces have.
+
+use super::{Canvas, CornerRadii, Rect, Rgb};
+
+/// An RGB picture, as a `pygame.Surface` of the display's format: 32 bits, no alpha per pixel.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Surface {
+    width: usize,
+    height: usize,
+    pixels: Vec<u8>,
+    color_key: Option<Rgb>,
+    alpha: u8,
+    /// Whether SDL holds the picture run-length encoded, because that changes how it blends it.
+    pub(super) run_length_encoded: bool,
+}
+
+impl Surface {
+    /// A black, opaque surface without a colour key.
+    pub fn new(width: usize, height: usize) -> Self {
+        Self {
+            width,
+            height,
+            pixels: vec![0; width * height * 3],
+            color_key: None,
+            alpha: 255,
+            run_length_encoded: false,
+        }
+    }
+
+    /// A black surface of another size that pygame's transformations make out of this one: with
+    /// its colour key and alpha, and run-length encoded where there is a colour key.
+    pub(super) fn transformed(&self, width: usize, height: usize) -> Self {
+        Self {
+            color_key: self.color_key,
+            alpha: self.alpha,
+            run_length_encoded: self.color_key.is_some(),
+            ..Self::new(width, height)
+        }
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// The bytes, column by column, 3 a pixel.
+    pub fn pixels(&self) -> &[u8] {
+        &self.pixels
+    }
+
+    /// The bytes, to be changed.
+    pub fn pixels_mut(&mut self) -> &mut [u8] {
+        &mut self.pixels
+    }
+
+    /// Gives the bytes away.
+    pub fn into_pixels(self) -> Vec<u8> {
+        self.pixels
+    }
+
+    /// The colour of a pixel, or `None` outside of the surface.
+    pub fn pixel(&self, x: usize, y: usize) -> Option<Rgb> {
+        if x >= self.width || y >= self.height {
+            return None;
+        }
+        self.pixels.as_chunks().0.get(x * self.height + y).copied()
+    }
+
+    /// The colour that is left out when the surface is blitted.
+    pub fn color_key(&self) -> Option<Rgb> {
+        self.color_key
+    }
+
+    /// Sets or removes the colour key.
+    pub fn set_color_key(&mut self, color_key: Option<Rgb>) {
+        self.color_key = color_key;
+        // pygame drops the encoding whenever it sets a key, but not when it takes one away.
+        self.run_length_encoded &= color_key.is_none();
+    }
+
+    /// How much the surface covers when it is blitted: 0 not at all, 255 fully.
+    pub fn alpha(&self) -> u8 {
+        self.alpha
+    }
+
+    /// Sets the alpha; values beyond 0 to 255 become the nearest of them.
+    pub fn set_alpha(&mut self, alpha: i32) {
+        self.alpha = alpha.clamp(0, 255) as u8;
+        self.run_length_encoded = false;
+    }
+
+    /// The surface as a canvas.
+    pub fn canvas(&mut self) -> Canvas<'_> {
+        Canvas::new(&mut self.pixels, self.width, self.height)
+    }
+
+    /// Paints every pixel.
+    pub fn fill(&mut self, color: Rgb) {
+        self.canvas().fill(color);
+    }
+
+    /// Draws a circle: see [`Canvas::draw_circle`].
+    pub fn draw_circle(&mut self, color: Rgb, center: (i32, i32), radius: i32, width: i32) {
+        self.canvas().draw_circle(color, center, radius, width);
+    }
+
+    /// Draws a line: see [`Canvas::draw_line`].
+    pub fn draw_line(&mut self, color: Rgb, start: (i32, i32), end: (i32, i32), width: i32) {
+        self.canvas().draw_line(color, start, end, width);
+    }
+
+    /// Draws a rectangle: see [`Canvas::draw_rect`].
+    pub fn draw_rect(&mut self, color: Rgb, rect: Rect, width: i32) {
+        self.canvas().draw_rect(color, rect, width);
+    }
+
+    /// Draws a rectangle with rounded corners: see [`Canvas::draw_rounded_rect`].
+    pub fn draw_rounded_rect(&mut self, color: Rgb, rect: Rect, width: i32, radii: CornerRadii) {
+        self.canvas().draw_rounded_rect(color, rect, width, radii);
+    }
+
+    /// Blits `source` with its top left corner at `(x, y)`: see [`Canvas::blit`].
+    pub fn blit(&mut self, source: &Surface, x: i32, y: i32) {
+        self.canvas().blit(source, x, y);
+    }
+}

@@ -1,0 +1,271 @@
+//! The drawings that pygame made, replayed; and drawing with arguments that pygame never sees.
+
+use proptest::prelude::*;
+use serde::Deserialize;
+
+use super::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface};
+
+/// What pygame painted, recorded by `tests/raster/record_raster.py`.
+#[derive(Deserialize)]
+struct Cases {
+    scenes: Vec<Vec<Operation>>,
+    alpha_sweeps: Vec<AlphaSweep>,
+}
+
+/// An operation on the surface whose number comes first. Colours are 0xRRGGBB.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Operation {
+    Surface(usize, usize, usize),
+    Fill(usize, u32),
+    ColorKey(usize, Option<u32>),
+    Alpha(usize, i32),
+    Noise(usize, u32),
+    Circle(usize, u32, i32, i32, i32, i32),
+    Line(usize, u32, i32, i32, i32, i32, i32),
+    Rect(usize, u32, i32, i32, i32, i32, i32),
+    RoundedRect(usize, u32, i32, i32, i32, i32, i32, u32, u32, u32, u32),
+    /// The new surface, the one it is made of, and the degrees.
+    Rotate(usize, usize, i32),
+    /// The new surface, the one it is made of, and the new size.
+    Scale(usize, usize, usize, usize),
+    /// The target, the source and the position.
+    Blit(usize, usize, i32, i32),
+    /// The expected size and check sum.
+    Check(usize, usize, usize, u32),
+}
+
+/// Check sums of the mixtures of every level (columns) into every level (rows), by the alpha.
+#[derive(Deserialize)]
+struct AlphaSweep {
+    mode: String,
+    sums: Vec<(i32, u32)>,
+}
+
+fn cases() -> Cases {
+    serde_json::from_str(include_str!("../../../tests/raster/cases.json")).unwrap()
+}
+
+fn rgb(color: u32) -> Rgb {
+    let [_, r, g, b] = color.to_be_bytes();
+    [r, g, b]
+}
+
+/// Colours of all kinds; about an eighth of the pixels is 0x010203.
+fn noise(surface: &mut Surface, seed: u32) {
+    for (index, pixel) in (0u32..).zip(surface.pixels_mut().as_chunks_mut().0) {
+        let mut value = index.wrapping_mul(2_654_435_761) ^ seed.wrapping_mul(2_246_822_519);
+        value ^= value >> 15;
+        value = value.wrapping_mul(2_246_822_519);
+        value ^= value >> 13;
+        *pixel = if value >> 29 == 0 { [1, 2, 3] } else { rgb(value) };
+    }
+}
+
+fn replay(scene: &[Operation], surfaces: &mut Vec<Surface>) -> Result<(), String> {
+    for (index, operation) in scene.iter().enumerate() {
+        match *operation {
+            Operation::Surface(_, width, height) => surfaces.push(Surface::new(width, height)),
+            Operation::Fill(id, color) => surfaces[id].fill(rgb(color)),
+            Operation::ColorKey(id, key) => surfaces[id].set_color_key(key.map(rgb)),
+            Operation::Alpha(id, alpha) => surfaces[id].set_alpha(alpha),
+            Operation::Noise(id, seed) => noise(&mut surfaces[id], seed),
+            Operation::Circle(id, color, x, y, radius, width) => {
+                surfaces[id].draw_circle(rgb(color), (x, y), radius, width);
+            }
+            Operation::Line(id, color, x0, y0, x1, y1, width) => {
+                surfaces[id].draw_line(rgb(color), (x0, y0), (x1, y1), width);
+            }
+            Operation::Rect(id, color, x, y, w, h, width) => {
+                surfaces[id].draw_rect(rgb(color), Rect::new(x, y, w, h), width);
+            }
+            Operation::RoundedRect(id, color, x, y, w, h, width, top_left, top_right, bottom_left, bottom_right) => {
+                let radii = CornerRadii { top_left, top_right, bottom_left, bottom_right };
+                surfaces[id].draw_rounded_rect(rgb(color), Rect::new(x, y, w, h), width, radii);
+            }
+            Operation::Rotate(_, source, degrees) => surfaces.push(surfaces[source].rotate(degrees)),
+            Operation::Scale(_, source, width, height) => {
+                surfaces.push(surfaces[source].scale_nearest(width, height));
+            }
+            Operation::Blit(id, source, x, y) => {
+                let source = surfaces[source].clone();
+                let mut painted = surfaces[id].clone();
+                surfaces[id].blit(&source, x, y);
+                if source.alpha() == 255 {
+                    Sprite::new(&source).blit(&mut painted.canvas(), x, y);
+                    if painted != surfaces[id] {
+                        return Err(format!("operation {index}: the sprite differs in {operation:?}"));
+                    }
+                }
+            }
+            Operation::Check(id, width, height, sum) => {
+                let surface = &surfaces[id];
+                let size = (surface.width(), surface.height());
+                if (size, crc32fast::hash(surface.pixels())) != ((width, height), sum) {
+                    let before = &scene[index.saturating_sub(1)];
+                    return Err(format!("operation {index}, {size:?}: {operation:?} after {before:?}"));
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn scenes_equal_pygames() {
+    let scenes = cases().scenes;
+    let failures: Vec<String> = scenes
+        .iter()
+        .enumerate()
+        .filter_map(|(number, scene)| Some(format!("scene {number}, {}", replay(scene, &mut Vec::new()).err()?)))
+        .collect();
+    assert!(failures.is_empty(), "{} of {}: {:#?}", failures.len(), scenes.len(), &failures[..failures.len().min(20)]);
+}
+
+#[test]
+fn translucent_blits_equal_pygames() {
+    let mut over = Surface::new(256, 256);
+    let mut below = Surface::new(256, 256);
+    for (index, pixel) in over.pixels_mut().as_chunks_mut().0.iter_mut().enumerate() {
+        *pixel = [(index / 256) as u8; 3];
+    }
+    for (index, pixel) in below.pixels_mut().as_chunks_mut().0.iter_mut().enumerate() {
+        *pixel = [index as u8; 3];
+    }
+    for AlphaSweep { mode, sums } in cases().alpha_sweeps {
+        for (alpha, sum) in sums {
+            let mut source = over.clone();
+            source.set_color_key((mode != "plain").then_some([1, 2, 3]));
+            source.set_alpha(alpha);
+            if mode == "encoded" {
+                source = source.rotate(0);
+            }
+            let mut target = below.clone();
+            target.blit(&source, 0, 0);
+            assert_eq!(crc32fast::hash(target.pixels()), sum, "{mode}, alpha {alpha}");
+        }
+    }
+}
+
+/// Ordinary, large and extreme numbers.
+fn any_number() -> impl Strategy<Value = i32> {
+    prop_oneof![-100..200i32, -100_000..100_000i32, any::<i32>(), Just(i32::MIN), Just(i32::MAX)]
+}
+
+fn any_position() -> impl Strategy<Value = (i32, i32)> {
+    (any_number(), any_number())
+}
+
+/// A small picture with a colour key, and with holes.
+fn any_picture() -> impl Strategy<Value = Surface> {
+    (0..20usize, 0..20usize, any::<u32>()).prop_map(|(width, height, seed)| {
+        let mut surface = Surface::new(width, height);
+        noise(&mut surface, seed);
+        surface.set_color_key(Some([1, 2, 3]));
+        surface
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(400))]
+
+    #[test]
+    fn shapes_of_any_numbers_are_drawn(
+        size in (0..60usize, 0..60usize),
+        a in any_position(),
+        b in any_position(),
+        width in any_number(),
+        radii in any::<[u32; 4]>(),
+    ) {
+        let mut surface = Surface::new(size.0, size.1);
+        let color = [1, 2, 3];
+        surface.draw_line(color, a, b, width);
+        surface.draw_circle(color, a, b.0, width);
+        surface.draw_circle(color, a, b.0, 1);
+        surface.draw_circle(color, a, b.0, 0);
+        let rect = Rect::new(a.0, a.1, b.0, b.1);
+        let [top_left, top_right, bottom_left, bottom_right] = radii;
+        surface.draw_rect(color, rect, width);
+        for radii in [
+            CornerRadii { top_left, top_right, bottom_left, bottom_right },
+            CornerRadii { top_left: top_left % 50, top_right: top_right % 50, ..CornerRadii::default() },
+        ] {
+            surface.draw_rounded_rect(color, rect, width, radii);
+            surface.draw_rounded_rect(color, rect, 0, radii);
+        }
+    }
+
+    #[test]
+    fn pictures_are_turned_scaled_and_blitted_anywhere(
+        picture in any_picture(),
+        degrees in any_number(),
+        size in (0..60usize, 0..60usize),
+        at in any_position(),
+        alpha in any_number(),
+    ) {
+        let mut target = Surface::new(size.0, size.1);
+        let mut picture = picture.rotate(degrees).scale_nearest(size.1, size.0);
+        target.blit(&picture, at.0, at.1);
+        picture.set_alpha(alpha);
+        target.blit(&picture, at.0, at.1);
+    }
+
+    #[test]
+    fn a_sprite_paints_what_its_surface_paints(
+        picture in any_picture(),
+        near in (-25..60i32, -25..60i32),
+        far in any_position(),
+    ) {
+        let sprite = Sprite::new(&picture);
+        let bounds = sprite.bounds();
+        for (x, y) in [near, far] {
+            let mut blitted = Surface::new(40, 30);
+            let mut painted = blitted.clone();
+            blitted.blit(&picture, x, y);
+            sprite.blit(&mut Canvas::new(painted.pixels_mut(), 40, 30), x, y);
+            prop_assert_eq!(&blitted, &painted);
+            // Outside of the bounds nothing may change.
+            let left = i64::from(x) + i64::from(bounds.x);
+            let top = i64::from(y) + i64::from(bounds.y);
+            for (index, pixel) in painted.pixels().as_chunks::<3>().0.iter().enumerate() {
+                let (column, row) = ((index / 30) as i64 - left, (index % 30) as i64 - top);
+                let is_within =
+                    (0..i64::from(bounds.width)).contains(&column) && (0..i64::from(bounds.height)).contains(&row);
+                prop_assert!(is_within || *pixel == [0; 3]);
+            }
+        }
+    }
+
+    #[test]
+    fn a_disc_is_the_filled_circle(radius in -2..80i32, center in (-90..120i32, -90..120i32), far in any_position()) {
+        let disc = Disc::new(radius);
+        for center in [center, far] {
+            let mut drawn = Surface::new(50, 40);
+            let mut filled = drawn.clone();
+            drawn.draw_circle([9, 8, 7], center, radius, 0);
+            filled.canvas().fill_disc([9, 8, 7], center, &disc);
+            prop_assert_eq!(&drawn, &filled);
+        }
+    }
+}
+
+#[test]
+fn the_bounds_of_a_sprite_are_tight() {
+    let mut surface = Surface::new(10, 8);
+    surface.set_color_key(Some([0; 3]));
+    assert_eq!(Sprite::new(&surface).bounds(), Rect::default());
+    surface.draw_rect([1; 3], Rect::new(3, 2, 4, 5), 0);
+    assert_eq!(Sprite::new(&surface).bounds(), Rect::new(3, 2, 4, 5));
+    surface.set_color_key(None);
+    assert_eq!(Sprite::new(&surface).bounds(), Rect::new(0, 0, 10, 8));
+}
+
+#[test]
+fn pixels_lie_column_by_column() {
+    let mut surface = Surface::new(4, 3);
+    surface.draw_rect([1, 2, 3], Rect::new(2, 1, 1, 1), 0);
+    assert_eq!(surface.pixel(2, 1), Some([1, 2, 3]));
+    assert_eq!(surface.pixel(4, 0), None);
+    assert_eq!(surface.pixel(0, 3), None);
+    assert_eq!(surface.into_pixels()[(2 * 3 + 1) * 3..][..3], [1, 2, 3]);
+}

@@ -1,0 +1,122 @@
+//! Plays a trace's actions again and compares everything that the original returned.
+
+use std::fmt;
+
+use serde_json::{Map, Value as Json};
+
+use super::{Trace, TraceError};
+use crate::batch::{Batch, Block, zeroed};
+use crate::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
+
+/// How a replay went.
+#[derive(Debug, Default)]
+pub struct Replay {
+    pub episodes: usize,
+    pub steps: usize,
+    /// Values that differ.
+    pub differences: usize,
+    /// The first of them.
+    pub first: Option<Difference>,
+    /// Checksums of ground-truth views in the trace, which are not compared.
+    pub unchecked_views: usize,
+}
+
+/// One value that differs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Difference {
+    /// Episode of the trace, from 0.
+    pub episode: usize,
+    /// Step of the episode, from 1; 0 is the reset.
+    pub step: usize,
+    pub what: String,
+    pub expected: String,
+    pub found: String,
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Difference { episode, step, what, expected, found } = self;
+        write!(f, "episode {episode}, step {step}: {what} expected {expected}, found {found}")
+    }
+}
+
+impl Replay {
+    fn compare<T: PartialEq + fmt::Debug>(&mut self, step: usize, what: &str, expected: T, found: T) {
+        if expected == found {
+            return;
+        }
+        self.differences += 1;
+        self.first.get_or_insert_with(|| Difference {
+            episode: self.episodes,
+            step,
+            what: what.to_owned(),
+            expected: format!("{expected:?}"),
+            found: format!("{found:?}"),
+        });
+    }
+}
+
+/// Replays `trace` and counts the values that differ.
+pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
+    let config = PoolConfig {
+        options: Options::Shared(trace.options.clone()),
+        autoreset: Autoreset::Disabled,
+        ..PoolConfig::new(&trace.env, 1)
+    };
+    let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+    let mut blocks = zeroed(pool.layout().blocks());
+    let mut replay = Replay::default();
+    for episode in &trace.episodes {
+        match episode.seed {
+            Some(seed) => pool.reset(ResetRequest::Each { reset: &[2], seed: &[seed] }, &mut blocks)?,
+            None => pool.reset(ResetRequest::All, &mut blocks)?,
+        }
+        let batch = Batch::new(pool.layout(), &blocks);
+        replay.compare(0, "observation checksum", episode.reset_crc, crc32fast::hash(batch.observation()));
+        replay.compare(0, "vector observation", &*episode.reset_vector, batch.section("vector_observation"));
+        compare_info(&mut replay, 0, &episode.reset_info, &info(&pool, &blocks, false));
+        for (step, expected) in (1..).zip(&episode.steps) {
+            pool.step(&expected.action, &mut blocks)?;
+            let batch = Batch::new(pool.layout(), &blocks);
+            replay.compare(step, "observation checksum", expected.crc, crc32fast::hash(batch.observation()));
+            replay.compare(step, "reward", expected.reward, batch.reward()[0]);
+            replay.compare(step, "done", expected.done, batch.terminated()[0] == 1);
+            compare_info(&mut replay, step, &expected.info, &info(&pool, &blocks, expected.done));
+            replay.unchecked_views += usize::from(expected.render_crc.is_some());
+            replay.steps += 1;
+        }
+        replay.episodes += 1;
+    }
+    Ok(replay)
+}
+
+/// The info dictionary as the original gives it.
+fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static str, Vec<f64>)> {
+    let batch = Batch::new(pool.layout(), blocks);
+    let mut info = Vec::new();
+    let ground_truth = batch.section::<f64>("ground_truth");
+    if !ground_truth.is_empty() {
+        info.push(("ground_truth", ground_truth.to_vec()));
+    }
+    if done {
+        info.push(("reward", batch.episode_return().to_vec()));
+        info.push(("length", vec![f64::from(batch.episode_length()[0])]));
+        let columns = pool.spec().info.iter().zip(batch.section::<f64>("info"));
+        info.extend(columns.map(|(column, value)| (column.name, vec![*value])));
+    }
+    info
+}
+
+fn compare_info(replay: &mut Replay, step: usize, expected: &Map<String, Json>, found: &[(&str, Vec<f64>)]) {
+    for (name, value) in expected {
+        let value: Option<Vec<f64>> = match value {
+            Json::Array(values) => values.iter().map(Json::as_f64).collect(),
+            value => value.as_f64().map(|value| vec![value]),
+        };
+        let found = found.iter().find(|(key, _)| key == name).map(|(_, value)| value.clone());
+        replay.compare(step, &format!("info `{name}`"), value, found);
+    }
+    for (name, value) in found.iter().filter(|(name, _)| !expected.contains_key(*name)) {
+        replay.compare(step, &format!("info `{name}`"), None, Some(value));
+    }
+}
