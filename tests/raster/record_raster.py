@@ -41,9 +41,9 @@ def begin():
 
 
 def register(surface):
+    """Gives a new surface the next number."""
     numbers[id(surface)] = len(kept)
     kept.append(surface)
-    return len(kept) - 1
 
 
 def number(surface):
@@ -74,7 +74,8 @@ class Surface(BaseSurface):
 
     def __init__(self, size, *arguments):
         super().__init__(size, *arguments)
-        note("surface", register(self), *self.get_size())
+        note("surface", *self.get_size())
+        register(self)
 
     def fill(self, color):
         note("fill", number(self), mapped(self, color))
@@ -111,14 +112,16 @@ def rect(surface, color, rect, width=0, radius=0, *corners):
 
 
 def rotate(surface, angle):
-    result = base_rotate(surface, angle)
-    note("rotate", register(result), number(surface), angle)
+    source, result = number(surface), base_rotate(surface, angle)
+    note("rotate", source, angle)
+    register(result)
     return result
 
 
 def scale(surface, size):
-    result = base_scale(surface, size)
-    note("scale", register(result), number(surface), *size)
+    source, result = number(surface), base_scale(surface, size)
+    note("scale", source, *size)
+    register(result)
     return result
 
 

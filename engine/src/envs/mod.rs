@@ -19,11 +19,14 @@ pub use spec::{ActionSpace, Column, FRAME_BYTES, SCREEN, Spec};
 /// [`step`](Environment::step) changes the state and [`draw`](Environment::draw) reads it: neither does the other's work. One
 /// object plays many episodes, and what an episode leaves behind matters, as in the original.
 pub trait Environment: Send {
+    /// What tells the family's ids apart.
+    type Variant: Copy;
+
     /// What all environments with the same reset parameters share: the parameters and the pictures made from them.
     type Assets: Send + Sync;
 
     /// Makes the shared part for one set of reset parameters.
-    fn assets(spec: &Spec, parameters: &ResetParameters) -> Self::Assets;
+    fn assets(variant: Self::Variant, parameters: &ResetParameters) -> Self::Assets;
 
     /// An environment that has not played yet; [`reset`](Environment::reset) it before anything else.
     fn new(assets: &Arc<Self::Assets>) -> Self;

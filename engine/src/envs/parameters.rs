@@ -27,7 +27,41 @@ pub struct Parameter {
     pub description: &'static str,
 }
 
+/// Largest reward that a reset parameter gives, and the smallest with the sign turned.
+const MAX_REWARD: f64 = 1e6;
+
 impl Parameter {
+    /// A flag.
+    pub const fn bool(name: &'static str, default: bool, description: &'static str) -> Self {
+        Parameter { name, kind: Kind::Bool { default }, description }
+    }
+
+    /// An integer in `min..=max`.
+    pub const fn int(name: &'static str, default: i64, min: i64, max: i64, description: &'static str) -> Self {
+        Parameter { name, kind: Kind::Int { default, min, max }, description }
+    }
+
+    /// A number in `min..=max`.
+    pub const fn float(name: &'static str, default: f64, min: f64, max: f64, description: &'static str) -> Self {
+        Parameter { name, kind: Kind::Float { default, min, max }, description }
+    }
+
+    /// A reward or, with a negative number, a punishment.
+    pub const fn reward(name: &'static str, default: f64, description: &'static str) -> Self {
+        Parameter::float(name, default, -MAX_REWARD, MAX_REWARD, description)
+    }
+
+    /// A list of integers in `min..=max` to draw from.
+    pub const fn list(
+        name: &'static str,
+        default: &'static [i64],
+        min: i64,
+        max: i64,
+        description: &'static str,
+    ) -> Self {
+        Parameter { name, kind: Kind::IntList { default, min, max }, description }
+    }
+
     /// The default as JSON text.
     pub fn default_text(&self) -> String {
         match self.kind {

@@ -151,7 +151,7 @@ impl Pool {
             _ => {}
         }
         let lanes: Box<dyn Lanes> = match spec.family {
-            Family::MortarMayhem(_) => Box::new(family_lanes::<MortarMayhem>(spec, config)?),
+            Family::MortarMayhem(variant) => Box::new(family_lanes::<MortarMayhem>(spec, variant, config)?),
         };
         Ok(Pool {
             spec,
@@ -238,9 +238,13 @@ pub fn check_actions(spec: &Spec, num_envs: usize, actions: &[i32]) -> Result<()
 }
 
 /// Makes the environments of one family; those with the same options share their assets.
-fn family_lanes<E: Environment>(spec: &'static Spec, config: &PoolConfig) -> Result<FamilyLanes<E>, PoolError> {
+fn family_lanes<E: Environment>(
+    spec: &'static Spec,
+    variant: E::Variant,
+    config: &PoolConfig,
+) -> Result<FamilyLanes<E>, PoolError> {
     let make = |given: &Map<String, Json>| -> Result<Arc<E::Assets>, ParameterError> {
-        Ok(Arc::new(E::assets(spec, &ResetParameters::new(spec.id, spec.parameters, given)?)))
+        Ok(Arc::new(E::assets(variant, &ResetParameters::new(spec.id, spec.parameters, given)?)))
     };
     let assets: Vec<Arc<E::Assets>> = match &config.options {
         Options::Shared(given) => vec![make(given)?; config.num_envs],

@@ -7,8 +7,10 @@ use super::{Canvas, Rgb, Surface};
 /// does: the change is `1/255` of the difference per unit of `alpha`, cut off towards zero.
 #[inline]
 pub const fn blend_keyed(source: u8, below: u8, alpha: u8) -> u8 {
-    let difference = source as i32 - below as i32;
-    (below as i32 + difference * alpha as i32 / 255) as u8
+    let weighted = source.abs_diff(below) as u16 * alpha as u16;
+    // The quotient by 255, exact for all products of two bytes.
+    let change = ((weighted + 1 + (weighted >> 8)) >> 8) as u8;
+    if source >= below { below + change } else { below - change }
 }
 
 /// Mixes a channel of a translucent surface without a colour key into the channel below it, as SDL
@@ -19,8 +21,44 @@ pub const fn blend_plain(source: u8, below: u8, alpha: u8) -> u8 {
     if alpha == 255 {
         return source;
     }
-    let difference = source as i32 - below as i32;
-    (below as i32 + ((difference * alpha as i32) >> 8)) as u8
+    ((source as u16 * alpha as u16 + below as u16 * (256 - alpha as u16)) >> 8) as u8
+}
+
+/// How the channels of a surface meet those below them.
+#[derive(Clone, Copy)]
+enum Mixing {
+    Copied,
+    Keyed,
+    Plain,
+}
+
+impl Mixing {
+    fn of(source: &Surface) -> Self {
+        if source.alpha() == 255 {
+            Self::Copied
+        } else if source.color_key().is_some() && !source.run_length_encoded {
+            Self::Keyed
+        } else {
+            // SDL blends run-length encoded surfaces by the rule of those without a key.
+            Self::Plain
+        }
+    }
+
+    fn paint(self, source: &[u8], below: &mut [u8], alpha: u8) {
+        match self {
+            Self::Copied => below.copy_from_slice(source),
+            Self::Keyed => {
+                for (source, below) in source.iter().zip(below) {
+                    *below = blend_keyed(*source, *below, alpha);
+                }
+            }
+            Self::Plain => {
+                for (source, below) in source.iter().zip(below) {
+                    *below = blend_plain(*source, *below, alpha);
+                }
+            }
+        }
+    }
 }
 
 impl Canvas<'_> {
@@ -33,44 +71,28 @@ impl Canvas<'_> {
         if columns.is_empty() || rows.is_empty() || source.alpha() == 0 {
             return;
         }
+        let mixing = Mixing::of(source);
         let height = self.height();
         let first_row = (rows.start as i64 - y) as usize;
         for column in columns {
             let source_start = (column as i64 - x) as usize * source.height() + first_row;
-            let run = &source.pixels().as_chunks().0[source_start..source_start + rows.len()];
+            let run = &source.pixels().as_chunks::<3>().0[source_start..][..rows.len()];
             let start = column * height + rows.start;
-            let below = &mut self.pixels_mut().as_chunks_mut().0[start..start + rows.len()];
-            blit_run(run, below, source);
-        }
-    }
-}
-
-/// Paints a run of pixels of the surface `source` over the ones `below`.
-fn blit_run(run: &[Rgb], below: &mut [Rgb], source: &Surface) {
-    let alpha = source.alpha();
-    match (source.color_key(), alpha) {
-        (None, 255) => below.copy_from_slice(run),
-        (None, _) => {
-            for (pixel, below) in run.iter().zip(below) {
-                *below = mixed(*pixel, *below, |source, below| blend_plain(source, below, alpha));
-            }
-        }
-        (Some(key), 255) => {
-            for (pixel, below) in run.iter().zip(below).filter(|(pixel, _)| **pixel != key) {
-                *below = *pixel;
-            }
-        }
-        (Some(key), _) => {
-            // SDL blends run-length encoded surfaces by the rule of those without a key.
-            let blend = if source.run_length_encoded { blend_plain } else { blend_keyed };
-            for (pixel, below) in run.iter().zip(below).filter(|(pixel, _)| **pixel != key) {
-                *below = mixed(*pixel, *below, |source, below| blend(source, below, alpha));
+            let below = &mut self.pixels_mut().as_chunks_mut::<3>().0[start..][..rows.len()];
+            for (first, opaque) in opaque_runs(run, source.color_key()) {
+                let below = below[first..][..opaque.len()].as_flattened_mut();
+                mixing.paint(opaque.as_flattened(), below, source.alpha());
             }
         }
     }
 }
 
-#[inline]
-fn mixed(pixel: Rgb, below: Rgb, blend: impl Fn(u8, u8) -> u8) -> Rgb {
-    std::array::from_fn(|channel| blend(pixel[channel], below[channel]))
+/// The parts of a run between the pixels of the colour key, each with the index of its first pixel.
+pub(super) fn opaque_runs(run: &[Rgb], key: Option<Rgb>) -> impl Iterator<Item = (usize, &[Rgb])> {
+    let mut next = 0;
+    run.chunk_by(move |a, b| (Some(*a) == key) == (Some(*b) == key)).filter_map(move |part| {
+        let first = next;
+        next += part.len();
+        (Some(part[0]) != key).then_some((first, part))
+    })
 }

@@ -51,7 +51,7 @@ impl<'a> Canvas<'a> {
 
     /// Paints every pixel.
     pub fn fill(&mut self, color: Rgb) {
-        self.pixels.as_chunks_mut().0.fill(color);
+        fill_run(self.pixels, color);
     }
 
     /// Paints one pixel.
@@ -75,10 +75,23 @@ impl<'a> Canvas<'a> {
         }
         for x in columns {
             let column = x * self.height;
-            let run = &mut self.pixels[(column + rows.start) * 3..(column + rows.end) * 3];
-            run.as_chunks_mut().0.fill(color);
+            fill_run(&mut self.pixels[(column + rows.start) * 3..(column + rows.end) * 3], color);
         }
     }
+}
+
+/// Paints all pixels of a run.
+pub(super) fn fill_run(mut run: &mut [u8], color: Rgb) {
+    // Sixteen pixels are a whole number of machine words, however long a word is. It takes a long
+    // run to make up for the making of the block.
+    if run.len() >= 8 * 48 {
+        let mut block = [0; 48];
+        block.as_chunks_mut().0.fill(color);
+        let (blocks, rest) = run.as_chunks_mut();
+        blocks.fill(block);
+        run = rest;
+    }
+    run.as_chunks_mut().0.fill(color);
 }
 
 /// The part of `first..=last` that lies in `0..size`.

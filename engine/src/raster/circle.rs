@@ -5,11 +5,11 @@
 
 use std::ops::Range;
 
-use super::canvas::clip;
+use super::canvas::{clip, fill_run};
 use super::{Canvas, Rgb};
 
 /// Larger radii are drawn with this one, to bound the work.
-pub(super) const MAX_RADIUS: i64 = 1 << 20;
+const MAX_RADIUS: i64 = 1 << 16;
 
 /// Whether the midpoint that follows the point `(x, y)` of an outline lies outside of the circle,
 /// so that the outline has to come one pixel nearer.
@@ -169,8 +169,7 @@ impl Canvas<'_> {
         let height = self.height();
         for DiscColumn { x, rows } in disc.columns(center, self.width(), height) {
             let column = x * height;
-            let run = &mut self.pixels_mut()[(column + rows.start) * 3..(column + rows.end) * 3];
-            run.as_chunks_mut().0.fill(color);
+            fill_run(&mut self.pixels_mut()[(column + rows.start) * 3..(column + rows.end) * 3], color);
         }
     }
 

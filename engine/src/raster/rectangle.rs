@@ -28,7 +28,7 @@ pub struct CornerRadii {
 }
 
 /// Farther out, coordinates of rounded rectangles are drawn as this one, to bound the work.
-const MAX_COORDINATE: i64 = 1 << 20;
+const MAX_COORDINATE: i64 = 1 << 16;
 
 /// The outermost columns and rows of a rectangle, all within it.
 #[derive(Clone, Copy)]
@@ -132,7 +132,7 @@ impl Canvas<'_> {
     /// `width` is as in [`Canvas::draw_rect`], which also draws the rectangles whose radii are all
     /// 0 and those that are less than 2 pixels wide or high. Radii that do not fit are scaled down.
     /// A negative width or height of `rect` counts to the left or upwards. Exact for coordinates of
-    /// up to 2^20 pixels.
+    /// up to 2^16 pixels.
     pub fn draw_rounded_rect(&mut self, color: Rgb, rect: Rect, width: i32, radii: CornerRadii) {
         if width < 0 {
             return;
@@ -194,14 +194,17 @@ impl Canvas<'_> {
             (left, bottom - corners.bottom_left),
         ];
         let sides = || points.iter().zip(points.iter().cycle().skip(1));
+        // A corner as high as the rectangle reaches one pixel beyond it.
+        let first = points.iter().fold(top, |first, point| first.min(point.1));
+        let last = points.iter().fold(bottom, |last, point| last.max(point.1));
 
-        for y in top.max(0)..=bottom.min(self.height() as i64 - 1) {
+        for y in first.max(0)..=last.min(self.height() as i64 - 1) {
             // Where the slanted and upright sides cross the row; their lower ends do not count,
             // except on the last row.
             let mut crossings: Vec<i64> = sides()
                 .filter_map(|(&a, &b)| {
                     let (upper, lower) = if a.1 < b.1 { (a, b) } else { (b, a) };
-                    let crosses = (upper.1 <= y && y < lower.1) || (y == bottom && lower.1 == bottom);
+                    let crosses = (upper.1 <= y && y < lower.1) || (y == last && lower.1 == last);
                     (upper.1 < lower.1 && crosses)
                         .then(|| (y - upper.1) * (lower.0 - upper.0) / (lower.1 - upper.1) + upper.0)
                 })
@@ -212,7 +215,7 @@ impl Canvas<'_> {
             }
         }
         // A level side below which the shape narrows is not covered by the crossings.
-        for (a, b) in sides().filter(|(a, b)| a.1 == b.1 && top < a.1 && a.1 < bottom) {
+        for (a, b) in sides().filter(|(a, b)| a.1 == b.1 && first < a.1 && a.1 < last) {
             self.fill_row(a.0, b.0, a.1, color);
         }
     }

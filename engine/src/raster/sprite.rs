@@ -1,5 +1,6 @@
 //! Pictures that are painted often: compiled to the runs of their opaque pixels.
 
+use super::blit::opaque_runs;
 use super::canvas::clip;
 use super::{Canvas, Rect, Surface};
 
@@ -33,14 +34,10 @@ impl Sprite {
         let key = surface.color_key();
         let columns = surface.pixels().as_chunks::<3>().0.chunks_exact(surface.height().max(1));
         for (x, column) in columns.enumerate() {
-            let mut y = 0;
-            for run in column.chunk_by(|a, b| (Some(*a) == key) == (Some(*b) == key)) {
-                if Some(run[0]) != key {
-                    let start = pixels.len() as u32;
-                    pixels.extend_from_slice(run.as_flattened());
-                    runs.push(Run { x: x as u32, y, length: run.len() as u32, start });
-                }
-                y += run.len() as u32;
+            for (y, run) in opaque_runs(column, key) {
+                let start = pixels.len() as u32;
+                pixels.extend_from_slice(run.as_flattened());
+                runs.push(Run { x: x as u32, y: y as u32, length: run.len() as u32, start });
             }
         }
         let bounds = bounds(&runs);
@@ -73,15 +70,15 @@ impl Sprite {
     #[inline]
     fn blit_whole(&self, canvas: &mut Canvas<'_>, x: i32, y: i32) {
         let height = canvas.height();
+        // Negative where the sprite's empty margin reaches beyond the canvas; the runs do not.
+        let corner = i64::from(x) * height as i64 + i64::from(y);
         let pixels = canvas.pixels_mut();
+        let mut remaining = self.pixels.as_slice();
         for run in &self.runs {
-            // Non-negative because the run lies on the canvas, although x or y may be negative.
-            let column = (i64::from(x) + i64::from(run.x)) as usize;
-            let row = (i64::from(y) + i64::from(run.y)) as usize;
-            let start = (column * height + row) * 3;
-            let length = run.length as usize * 3;
-            let source = &self.pixels[run.start as usize..][..length];
-            copy_run(source, &mut pixels[start..][..length]);
+            let start = (corner + i64::from(run.x) * height as i64 + i64::from(run.y)) as usize * 3;
+            let (source, rest) = remaining.split_at(run.length as usize * 3);
+            remaining = rest;
+            copy_run(source, &mut pixels[start..][..source.len()]);
         }
     }
 

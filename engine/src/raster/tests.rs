@@ -12,11 +12,13 @@ struct Cases {
     alpha_sweeps: Vec<AlphaSweep>,
 }
 
-/// An operation on the surface whose number comes first. Colours are 0xRRGGBB.
+/// An operation on the surface whose number comes first; new surfaces get the next number. Colours
+/// are 0xRRGGBB.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Operation {
-    Surface(usize, usize, usize),
+    /// A new surface's size.
+    Surface(usize, usize),
     Fill(usize, u32),
     ColorKey(usize, Option<u32>),
     Alpha(usize, i32),
@@ -25,10 +27,10 @@ enum Operation {
     Line(usize, u32, i32, i32, i32, i32, i32),
     Rect(usize, u32, i32, i32, i32, i32, i32),
     RoundedRect(usize, u32, i32, i32, i32, i32, i32, u32, u32, u32, u32),
-    /// The new surface, the one it is made of, and the degrees.
-    Rotate(usize, usize, i32),
-    /// The new surface, the one it is made of, and the new size.
-    Scale(usize, usize, usize, usize),
+    /// What the new surface is made of, and the degrees.
+    Rotate(usize, i32),
+    /// What the new surface is made of, and its size.
+    Scale(usize, usize, usize),
     /// The target, the source and the position.
     Blit(usize, usize, i32, i32),
     /// The expected size and check sum.
@@ -65,7 +67,7 @@ fn noise(surface: &mut Surface, seed: u32) {
 fn replay(scene: &[Operation], surfaces: &mut Vec<Surface>) -> Result<(), String> {
     for (index, operation) in scene.iter().enumerate() {
         match *operation {
-            Operation::Surface(_, width, height) => surfaces.push(Surface::new(width, height)),
+            Operation::Surface(width, height) => surfaces.push(Surface::new(width, height)),
             Operation::Fill(id, color) => surfaces[id].fill(rgb(color)),
             Operation::ColorKey(id, key) => surfaces[id].set_color_key(key.map(rgb)),
             Operation::Alpha(id, alpha) => surfaces[id].set_alpha(alpha),
@@ -83,8 +85,8 @@ fn replay(scene: &[Operation], surfaces: &mut Vec<Surface>) -> Result<(), String
                 let radii = CornerRadii { top_left, top_right, bottom_left, bottom_right };
                 surfaces[id].draw_rounded_rect(rgb(color), Rect::new(x, y, w, h), width, radii);
             }
-            Operation::Rotate(_, source, degrees) => surfaces.push(surfaces[source].rotate(degrees)),
-            Operation::Scale(_, source, width, height) => {
+            Operation::Rotate(source, degrees) => surfaces.push(surfaces[source].rotate(degrees)),
+            Operation::Scale(source, width, height) => {
                 surfaces.push(surfaces[source].scale_nearest(width, height));
             }
             Operation::Blit(id, source, x, y) => {

@@ -14,14 +14,14 @@ pub use drawing::Assets;
 pub use parameters::{Locomotion, Parameters, SPECS, Variant};
 pub use rules::MortarMayhem;
 
-use crate::envs::{Environment, Family, ResetParameters, Spec, Transition};
+use crate::envs::{Environment, ResetParameters, Transition};
 use crate::random::Generator;
 
 impl Environment for MortarMayhem {
+    type Variant = Variant;
     type Assets = Assets;
 
-    fn assets(spec: &Spec, parameters: &ResetParameters) -> Assets {
-        let Family::MortarMayhem(variant) = spec.family;
+    fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
         Assets::new(variant, Parameters::new(variant, parameters))
     }
 

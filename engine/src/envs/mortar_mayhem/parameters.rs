@@ -3,7 +3,7 @@
 //! Source: `default_reset_parameters` and `process_reset_params` of the original. Where the original checks nothing, the limits
 //! are ours: wide enough for every use, narrow enough that no value makes the rules meaningless or the memory large.
 
-use crate::envs::{ActionSpace, Column, Family, Kind, Parameter, ResetParameters, Spec};
+use crate::envs::{ActionSpace, Column, Family, Parameter, ResetParameters, Spec};
 
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 
@@ -82,62 +82,41 @@ impl Parameters {
     }
 }
 
-const MAX_REWARD: f64 = 1e6;
-
-const fn list(name: &'static str, default: &'static [i64], min: i64, max: i64, description: &'static str) -> Parameter {
-    Parameter { name, kind: Kind::IntList { default, min, max }, description }
-}
-
-const fn int(name: &'static str, default: i64, min: i64, max: i64, description: &'static str) -> Parameter {
-    Parameter { name, kind: Kind::Int { default, min, max }, description }
-}
-
-const fn float(name: &'static str, default: f64, min: f64, max: f64, description: &'static str) -> Parameter {
-    Parameter { name, kind: Kind::Float { default, min, max }, description }
-}
-
-const fn reward(name: &'static str, default: f64, description: &'static str) -> Parameter {
-    float(name, default, -MAX_REWARD, MAX_REWARD, description)
-}
-
 const AGENT_SCALE: Parameter =
-    float("agent_scale", 0.25, 0.0, 4.0, "Size of the agent; 0.25 is a radius of 6 pixels. Without effect on a grid.");
-const AGENT_SPEED: Parameter = float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
-const ARENA_SIZE: Parameter = int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
+    Parameter::float("agent_scale", 0.25, 0.0, 4.0, "Size of the agent; 0.25 is a radius of 6 pixels. Without effect on a grid.");
+const AGENT_SPEED: Parameter = Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
+const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
 const ALLOWED_COMMANDS: &str = "How many of the commands may occur, in the order right, down, left, up, stay, right down, \
                                 right up, left down, left up.";
 const COMMAND_COUNT: &str = "Number of commands to execute. A list to draw from.";
 const COMMAND_SHOW_DURATION: Parameter =
-    list("command_show_duration", &[3], 0, 1000, "Steps that one command is shown. A list to draw from.");
+    Parameter::list("command_show_duration", &[3], 0, 1000, "Steps that one command is shown. A list to draw from.");
 const COMMAND_SHOW_DELAY: Parameter =
-    list("command_show_delay", &[1], 0, 1000, "Steps between two shown commands. A list to draw from.");
+    Parameter::list("command_show_delay", &[1], 0, 1000, "Steps between two shown commands. A list to draw from.");
 const EXPLOSION_DURATION: &str = "Steps that the agent has to stay on the commanded tile. A list to draw from.";
 const EXPLOSION_DELAY: &str = "Steps that the agent has to execute one command. A list to draw from.";
-const VISUAL_FEEDBACK: Parameter = Parameter {
-    name: "visual_feedback",
-    kind: Kind::Bool { default: true },
-    description: "Whether the wrong tiles turn red when a command is checked.",
-};
+const VISUAL_FEEDBACK: Parameter =
+    Parameter::bool("visual_feedback", true, "Whether the wrong tiles turn red when a command is checked.");
 const REWARD_COMMAND_FAILURE: Parameter =
-    reward("reward_command_failure", 0.0, "Reward for failing at the current command.");
-const REWARD_COMMAND_SUCCESS: Parameter = reward("reward_command_success", 0.1, "Reward for executing one command.");
+    Parameter::reward("reward_command_failure", 0.0, "Reward for failing at the current command.");
+const REWARD_COMMAND_SUCCESS: Parameter = Parameter::reward("reward_command_success", 0.1, "Reward for executing one command.");
 const REWARD_EPISODE_SUCCESS: Parameter =
-    reward("reward_episode_success", 0.0, "Reward for executing the whole sequence.");
+    Parameter::reward("reward_episode_success", 0.0, "Reward for executing the whole sequence.");
 
 const fn finite_command_count(max: i64) -> Parameter {
-    list("command_count", &[10], 1, max, COMMAND_COUNT)
+    Parameter::list("command_count", &[10], 1, max, COMMAND_COUNT)
 }
 
 const MORTAR_MAYHEM: &[Parameter] = &[
     AGENT_SCALE,
     AGENT_SPEED,
     ARENA_SIZE,
-    int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
+    Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
     finite_command_count(1000),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
-    list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
-    list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -147,12 +126,12 @@ const MORTAR_MAYHEM: &[Parameter] = &[
 const MORTAR_MAYHEM_GRID: &[Parameter] = &[
     AGENT_SCALE,
     ARENA_SIZE,
-    int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
+    Parameter::int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
     finite_command_count(1000),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
-    list("explosion_duration", &[2], 1, 1000, EXPLOSION_DURATION),
-    list("explosion_delay", &[6], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[2], 1, 1000, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[6], 1, 1000, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -163,10 +142,10 @@ const MORTAR_MAYHEM_B: &[Parameter] = &[
     AGENT_SCALE,
     AGENT_SPEED,
     ARENA_SIZE,
-    int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
+    Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
     finite_command_count(MAX_VECTOR_COMMANDS as i64),
-    list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
-    list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -176,10 +155,10 @@ const MORTAR_MAYHEM_B: &[Parameter] = &[
 const MORTAR_MAYHEM_B_GRID: &[Parameter] = &[
     AGENT_SCALE,
     ARENA_SIZE,
-    int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
+    Parameter::int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
     finite_command_count(MAX_VECTOR_COMMANDS as i64),
-    list("explosion_duration", &[2], 1, 1000, EXPLOSION_DURATION),
-    list("explosion_delay", &[6], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[2], 1, 1000, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[6], 1, 1000, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -187,19 +166,19 @@ const MORTAR_MAYHEM_B_GRID: &[Parameter] = &[
 ];
 
 const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
-    int("max_steps", -1, i64::MIN, i64::MAX, "Steps that an episode may last; not limited if less than 1."),
+    Parameter::int("max_steps", -1, i64::MIN, i64::MAX, "Steps that an episode may last; not limited if less than 1."),
     AGENT_SCALE,
     AGENT_SPEED,
-    int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
-    int("initial_command_count", 1, 1, 1000, "Commands that are shown at first."),
+    Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
+    Parameter::int("initial_command_count", 1, 1, 1000, "Commands that are shown at first."),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
-    list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
-    list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
-    reward("reward_new_command_success", 0.0, "Reward for executing the whole sequence known so far."),
+    Parameter::reward("reward_new_command_success", 0.0, "Reward for executing the whole sequence known so far."),
 ];
 
 const FINITE_INFO: &[Column] = &[

@@ -1,0 +1,75 @@
+//! Options that several commands share.
+
+use clap::ValueEnum;
+use endless_gym::pool::{Autoreset, Options, PoolConfig, Seeding};
+use serde_json::{Map, Value as Json};
+
+use super::Failure;
+
+/// Auto-reset modes by Gymnasium's names.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum AutoresetMode {
+    /// Start the next episode in the step after one ended.
+    NextStep,
+    /// Start it in the same step.
+    SameStep,
+    /// Wait for the trainer to reset.
+    Disabled,
+}
+
+/// What the environments are like.
+#[derive(clap::Args, Clone, Debug)]
+pub struct EnvironmentArgs {
+    /// Reset parameter of all environments, such as `arena_size=6` or `command_count=[5,10]`; may be given several times.
+    #[arg(long = "option", value_name = "NAME=VALUE")]
+    options: Vec<String>,
+    /// Seed: environment i starts with SEED + i. From the system's entropy if left out.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Draw each episode's seed from START..END (END excluded), as the paper's training does from 0..100000.
+    #[arg(long, value_name = "START..END", value_parser = seed_range)]
+    seed_range: Option<(u64, u64)>,
+    /// Play these seeds in turn, and again from the start.
+    #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
+    seed_list: Vec<u64>,
+}
+
+fn seed_range(text: &str) -> Result<(u64, u64), String> {
+    let (start, end) = text.split_once("..").ok_or("expected START..END")?;
+    let number = |text: &str| text.parse::<u64>().map_err(|error| format!("`{text}`: {error}"));
+    Ok((number(start)?, number(end)?))
+}
+
+impl EnvironmentArgs {
+    /// No option set.
+    pub const DEFAULT: EnvironmentArgs =
+        EnvironmentArgs { options: Vec::new(), seed: None, seed_range: None, seed_list: Vec::new() };
+
+    /// A pool's configuration with these options.
+    pub fn configure(&self, id: &str, num_envs: usize) -> Result<PoolConfig, Failure> {
+        let mut options = Map::new();
+        for option in &self.options {
+            let (name, value) =
+                option.split_once('=').ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
+            // What is no JSON is passed on as text, so that the check of the parameter says what it should be.
+            let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
+            options.insert(name.to_owned(), value);
+        }
+        let seeding = match (self.seed_range, &self.seed_list[..]) {
+            (Some((start, end)), _) => Seeding::Range { start, end, seed: self.seed },
+            (None, []) => Seeding::Continue { seed: self.seed },
+            (None, list) => Seeding::List(list.to_vec()),
+        };
+        Ok(PoolConfig { options: Options::Shared(options), seeding, ..PoolConfig::new(id, num_envs) })
+    }
+}
+
+impl From<AutoresetMode> for Autoreset {
+    fn from(mode: AutoresetMode) -> Self {
+        match mode {
+            AutoresetMode::NextStep => Autoreset::NextStep,
+            AutoresetMode::SameStep => Autoreset::SameStep,
+            AutoresetMode::Disabled => Autoreset::Disabled,
+        }
+    }
+}

@@ -1,0 +1,87 @@
+//! `endless verify`.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use endless_gym::trace::{Trace, replay};
+use rayon::prelude::*;
+use serde_json::json;
+
+use super::Failure;
+use super::output::{print, print_json, progress};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Trace files (`.json.gz`).
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode, Failure> {
+    let bar = progress(args.files.len() as u64, "replaying {bar:40} {pos}/{len} traces");
+    let replays: Vec<_> = args
+        .files
+        .par_iter()
+        .map(|file| {
+            let replayed = Trace::open(file).and_then(|trace| replay(&trace));
+            bar.inc(1);
+            (file, replayed)
+        })
+        .collect();
+    bar.finish_and_clear();
+
+    let (mut episodes, mut steps, mut differences, mut failures) = (0, 0, 0, 0);
+    let mut records = Vec::new();
+    for (file, replayed) in &replays {
+        let name = file.display();
+        let text = match replayed {
+            Ok(replay) => {
+                episodes += replay.episodes;
+                steps += replay.steps;
+                differences += replay.differences;
+                let verdict = replay.first.as_ref().map_or("no difference".to_owned(), |first| {
+                    format!("{} differences, the first in {first}", replay.differences)
+                });
+                let views = match replay.unchecked_views {
+                    0 => String::new(),
+                    views => format!(" ({views} checksums of ground-truth views not compared)"),
+                };
+                format!("{} episodes, {} steps, {verdict}{views}", replay.episodes, replay.steps)
+            }
+            Err(error) => {
+                failures += 1;
+                format!("not replayed: {error}")
+            }
+        };
+        if args.json {
+            records.push(json!({
+                "file": file,
+                "episodes": replayed.as_ref().ok().map(|replay| replay.episodes),
+                "steps": replayed.as_ref().ok().map(|replay| replay.steps),
+                "differences": replayed.as_ref().ok().map(|replay| replay.differences),
+                "verdict": text,
+            }));
+        } else {
+            print(format_args!("{name}: {text}"));
+        }
+    }
+    if args.json {
+        print_json(&json!({
+            "traces": records,
+            "episodes": episodes,
+            "steps": steps,
+            "differences": differences,
+            "not_replayed": failures,
+        }))?;
+    } else {
+        if failures > 0 {
+            print(format_args!("{failures} traces not replayed"));
+        }
+        let verified = replays.len() - failures;
+        print(format_args!("verified {verified} traces: {episodes} episodes, {steps} steps, {differences} differences"));
+    }
+    Ok(if differences + failures == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}

@@ -1,0 +1,35 @@
+//! Values whose destructor belongs to the process that made them.
+
+use std::ops::Deref;
+
+/// Owns a port or a sample. In a process that was forked off the one that made it, dropping it does nothing: the destructor
+/// would remove files and segments that the parent still uses.
+pub(super) struct Here<T> {
+    value: Option<T>,
+    process: u32,
+}
+
+impl<T> Here<T> {
+    pub(super) fn new(value: T) -> Self {
+        Here { value: Some(value), process: std::process::id() }
+    }
+}
+
+impl<T> Deref for Here<T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        match &self.value {
+            Some(value) => value,
+            None => unreachable!("the value is there until the drop"),
+        }
+    }
+}
+
+impl<T> Drop for Here<T> {
+    fn drop(&mut self) {
+        if self.process != std::process::id() {
+            std::mem::forget(self.value.take());
+        }
+    }
+}

@@ -1,0 +1,141 @@
+//! The headers of the messages between trainer and engine. Their payload is a batch: `[Block]`.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+use super::error::Rejection;
+use crate::batch::{Block, LAYOUT_VERSION};
+
+// SAFETY: a block is 64 plain bytes in `repr(C)`, without pointers or handles, alike in every process.
+unsafe impl ZeroCopySend for Block {
+    unsafe fn type_name() -> &'static str {
+        "endless_gym::Block"
+    }
+}
+
+/// What a trainer asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// A step with the payload's `action`.
+    Step,
+    /// An episode for every environment, seeded by the engine's policy.
+    ResetAll,
+    /// An episode for every environment, seeded from the header's `seed` on.
+    ResetSeed,
+    /// Episodes as the payload's `reset` and `seed` say.
+    ResetEach,
+}
+
+impl Kind {
+    const ALL: [Kind; 4] = [Kind::Step, Kind::ResetAll, Kind::ResetSeed, Kind::ResetEach];
+
+    /// The number in the header; 0 is none of them.
+    pub(super) fn code(self) -> u32 {
+        self as u32 + 1
+    }
+
+    pub(super) fn from_code(code: u32) -> Option<Self> {
+        Kind::ALL.into_iter().find(|kind| kind.code() == code)
+    }
+}
+
+/// Header of a message from the trainer.
+#[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
+#[type_name("endless_gym::ActionHeader")]
+#[repr(C)]
+pub(super) struct ActionHeader {
+    pub layout_version: u32,
+    /// A [`Kind`].
+    pub kind: u32,
+    /// The engine's epoch that the trainer knows; the engine drops messages of any other.
+    pub epoch: u64,
+    /// Number of the trainer, drawn when it connects.
+    pub trainer: u64,
+    /// Number of the message; the answer repeats it.
+    pub request: u64,
+    /// First seed of a [`Kind::ResetSeed`].
+    pub seed: u64,
+}
+
+impl ActionHeader {
+    pub(super) fn new(kind: Kind, epoch: u64, trainer: u64, request: u64, seed: u64) -> Self {
+        ActionHeader { layout_version: LAYOUT_VERSION, kind: kind.code(), epoch, trainer, request, seed }
+    }
+}
+
+/// Bytes of the text in an [`ObservationHeader`].
+const TEXT_BYTES: usize = 192;
+
+/// Header of a batch from the engine, or of a rejection.
+#[derive(Clone, Copy, Debug, ZeroCopySend)]
+#[type_name("endless_gym::ObservationHeader")]
+#[repr(C)]
+pub(super) struct ObservationHeader {
+    pub layout_version: u32,
+    pub group: u32,
+    pub epoch: u64,
+    /// Batches that the group has yielded since the engine started, this one included.
+    pub step: u64,
+    /// Trainer and number of the message that this answers.
+    pub trainer: u64,
+    pub request: u64,
+    /// 0 for a batch, else a [`Rejection`]; the payload of a rejection means nothing.
+    pub status: u32,
+    text_length: u32,
+    text: [u8; TEXT_BYTES],
+}
+
+impl Default for ObservationHeader {
+    fn default() -> Self {
+        ObservationHeader {
+            layout_version: LAYOUT_VERSION,
+            group: 0,
+            epoch: 0,
+            step: 0,
+            trainer: 0,
+            request: 0,
+            status: 0,
+            text_length: 0,
+            text: [0; TEXT_BYTES],
+        }
+    }
+}
+
+impl ObservationHeader {
+    /// Turns the answer into a rejection.
+    pub(super) fn reject(&mut self, reason: Rejection, message: &str) {
+        let end = message.floor_char_boundary(TEXT_BYTES);
+        self.status = reason.status();
+        self.text_length = end as u32;
+        self.text[..end].copy_from_slice(&message.as_bytes()[..end]);
+    }
+
+    /// Why the engine rejected the message, if it did.
+    pub(super) fn rejection(&self) -> Option<(Rejection, String)> {
+        let text = self.text.get(..self.text_length as usize).unwrap_or_default();
+        let message = String::from_utf8_lossy(text).into_owned();
+        (self.status != 0).then(|| (Rejection::from_status(self.status).unwrap_or(Rejection::Kind), message))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kinds_survive_the_header() {
+        for kind in Kind::ALL {
+            assert_eq!(Kind::from_code(kind.code()), Some(kind));
+        }
+        assert_eq!(Kind::from_code(0), None);
+    }
+
+    #[test]
+    fn a_rejection_keeps_what_fits_of_its_text() {
+        let mut header = ObservationHeader::default();
+        assert_eq!(header.rejection(), None);
+        header.reject(Rejection::Pool, &"ä".repeat(200));
+        assert_eq!(header.rejection(), Some((Rejection::Pool, "ä".repeat(TEXT_BYTES / 2))));
+        header.text_length = u32::MAX;
+        assert_eq!(header.rejection(), Some((Rejection::Pool, String::new())));
+    }
+}

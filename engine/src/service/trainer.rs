@@ -1,0 +1,354 @@
+//! The trainer's side: sends actions and receives batches, which it reads where the engine wrote them.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use iceoryx2::identifiers::UniqueNodeId;
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+
+use super::config::Namespace;
+use super::error::ServiceError;
+use super::here::Here;
+use super::message::{ActionHeader, Kind};
+use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Ipc, Names, Open, PortError, Services};
+use super::received::{ObservationPort, Received};
+use super::specification::{self, Specification};
+use super::wait::wait;
+use crate::batch::Block;
+use crate::pool::ResetRequest;
+
+/// How long a trainer hears nothing before it looks whether the engine still lives.
+const QUIET: Duration = Duration::from_millis(200);
+
+/// How often a trainer looks for an engine that is not there yet.
+const RETRY: Duration = Duration::from_millis(20);
+
+/// Chunks of an action publisher: one that the engine reads, one on its way, one being written.
+const ACTION_CHUNKS: usize = 3;
+
+/// Where a trainer or an observer finds its engine.
+#[derive(Clone, Debug)]
+pub struct ConnectConfig {
+    /// The engine's name.
+    pub service: String,
+    pub namespace: Namespace,
+    /// How long to wait for an engine of that name to appear. Zero: it must be there.
+    pub timeout: Duration,
+}
+
+impl ConnectConfig {
+    /// The engine of that name in the default namespace, which must be there.
+    pub fn new(service: &str) -> Self {
+        ConnectConfig { service: service.to_owned(), namespace: Namespace::default(), timeout: Duration::ZERO }
+    }
+}
+
+/// The one process that acts in an engine's environments.
+///
+/// Each [`reset`](Trainer::reset) or [`send`](Trainer::send) to a group is answered by one batch, which
+/// [`receive`](Trainer::receive) returns; several groups may owe an answer at a time.
+///
+/// A trainer outlives its engine: after [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] it goes on with an
+/// engine of the same name once [`reconnect`](Trainer::reconnect) succeeds. Batches that it still holds stay readable.
+pub struct Trainer {
+    config: ConnectConfig,
+    specification: Arc<Specification>,
+    link: Here<Link>,
+    trainer: u64,
+    request: u64,
+    /// The message that each group has not answered yet.
+    pending: Vec<Option<u64>>,
+}
+
+/// Ports to one engine, for the time that it runs.
+struct Link {
+    actions: Vec<ActionPublisher>,
+    observations: Vec<Arc<ObservationPort>>,
+    to_engine: Notifier<Ipc>,
+    to_trainer: Listener<Ipc>,
+    engine: UniqueNodeId,
+    node: Node<Ipc>,
+}
+
+impl Trainer {
+    /// Connects to an engine by its name. Waits for it as long as `config` says.
+    pub fn connect(config: &ConnectConfig) -> Result<Self, ServiceError> {
+        let (link, specification) = Link::new(config)?;
+        let pending = vec![None; specification.groups];
+        let specification = Arc::new(specification);
+        let trainer = rand::random();
+        Ok(Trainer { config: config.clone(), specification, link: Here::new(link), trainer, request: 0, pending })
+    }
+
+    /// Connects to an engine of the same name that was started in place of the one that is lost, waiting for it up to
+    /// `timeout`. It must serve the same environments in the same layout. All groups want a reset afterwards; answers that were
+    /// still due are forgotten.
+    pub fn reconnect(&mut self, timeout: Duration) -> Result<(), ServiceError> {
+        let (link, specification) = Link::new_unless(
+            &ConnectConfig { timeout, ..self.config.clone() },
+            ports::is_alive(self.link.node.config(), self.link.engine).then_some(self.specification.epoch),
+        )?;
+        if let Some(what) = self.specification.difference(&specification) {
+            return Err(ServiceError::SpecificationChanged { service: self.config.service.clone(), what });
+        }
+        self.pending.fill(None);
+        self.specification = Arc::new(specification);
+        self.link = Here::new(link);
+        Ok(())
+    }
+
+    /// What the engine serves.
+    pub fn specification(&self) -> &Specification {
+        &self.specification
+    }
+
+    /// Asks a group to start episodes; [`receive`](Trainer::receive) returns their first observations.
+    pub fn reset(&mut self, group: usize, request: ResetRequest<'_>) -> Result<(), ServiceError> {
+        let (specification, num_envs) = (Arc::clone(&self.specification), self.specification.num_envs);
+        match request {
+            ResetRequest::All => self.post(group, Kind::ResetAll, 0, |_| Ok(())),
+            ResetRequest::Seed(first) => self.post(group, Kind::ResetSeed, first, |_| Ok(())),
+            ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
+                let given = if reset.len() == num_envs { seed.len() } else { reset.len() };
+                Err(ServiceError::ResetCount { given, num_envs })
+            }
+            ResetRequest::Each { reset, seed } => self.post(group, Kind::ResetEach, 0, |message| {
+                specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
+                specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
+                Ok(())
+            }),
+        }
+    }
+
+    /// Steps a group; [`receive`](Trainer::receive) returns what came of it. `actions` holds a row for each environment, one
+    /// number for each branch of the action space.
+    pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
+        let expected = self.specification.num_envs * self.specification.action_space.branches().len();
+        if actions.len() != expected {
+            return Err(ServiceError::ActionCount {
+                given: actions.len(),
+                num_envs: self.specification.num_envs,
+                branches: self.specification.action_space.branches().len(),
+            });
+        }
+        self.send_with(group, |message| message.copy_from_slice(actions))
+    }
+
+    /// As [`Trainer::send`], for actions that `fill` writes where the engine reads them. Until then the slice holds an earlier
+    /// step's actions or zeros.
+    pub fn send_with(&mut self, group: usize, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
+        let specification = Arc::clone(&self.specification);
+        self.post(group, Kind::Step, 0, |message| {
+            let actions = specification.action.write::<i32>(message, "action");
+            fill(actions);
+            check_actions(&specification, actions)
+        })
+    }
+
+    /// The answer to the last message to `group`.
+    ///
+    /// After [`ServiceError::TimedOut`] it is still due and may be received later. An engine that is slow is waited for; one
+    /// that is dead is noticed within half a second.
+    pub fn receive(&mut self, group: usize, timeout: Duration) -> Result<Received, ServiceError> {
+        self.check_group(group)?;
+        if self.pending[group].is_none() {
+            return Err(ServiceError::NothingSent { group });
+        }
+        self.receive_from(group..group + 1, timeout)
+    }
+
+    /// The answer of whichever group has it first. [`Received::group`] tells which.
+    pub fn receive_any(&mut self, timeout: Duration) -> Result<Received, ServiceError> {
+        if self.pending.iter().all(Option::is_none) {
+            return Err(ServiceError::NothingSent { group: 0 });
+        }
+        self.receive_from(0..self.pending.len(), timeout)
+    }
+
+    fn receive_from(&mut self, groups: std::ops::Range<usize>, timeout: Duration) -> Result<Received, ServiceError> {
+        let start = Instant::now();
+        loop {
+            let left = timeout.saturating_sub(start.elapsed());
+            let (link, pending) = (&*self.link, &self.pending);
+            let answer = wait(&link.to_trainer, left.min(QUIET), || {
+                for group in groups.clone() {
+                    let Some(request) = pending[group] else { continue };
+                    // What is in the buffer may be the answer to an earlier trainer.
+                    while let Some(received) = link.observations[group].receive(&self.specification)? {
+                        if received.answers(self.trainer, request) {
+                            return Ok(Some(received));
+                        }
+                    }
+                }
+                Ok(None)
+            })?;
+            if let Some(received) = answer {
+                self.pending[received.group()] = None;
+                return received.or_rejection();
+            }
+            if !ports::is_alive(link.node.config(), link.engine) {
+                return Err(self.lost());
+            }
+            if start.elapsed() >= timeout {
+                return Err(ServiceError::TimedOut { service: self.config.service.clone(), waited: timeout });
+            }
+        }
+    }
+
+    fn check_group(&self, group: usize) -> Result<(), ServiceError> {
+        if group < self.pending.len() {
+            return Ok(());
+        }
+        let (service, groups) = (self.config.service.clone(), self.pending.len());
+        Err(ServiceError::NoSuchGroup { service, given: group, groups })
+    }
+
+    /// Writes a message in shared memory and sends it.
+    fn post(
+        &mut self,
+        group: usize,
+        kind: Kind,
+        seed: u64,
+        write: impl FnOnce(&mut [Block]) -> Result<(), ServiceError>,
+    ) -> Result<(), ServiceError> {
+        self.check_group(group)?;
+        if self.pending[group].is_some() {
+            return Err(ServiceError::AnswerPending { group });
+        }
+        let failed = ServiceError::middleware("cannot send a message");
+        let message = self.link.actions[group]
+            .loan_slice_uninit(self.specification.action.blocks())
+            .map_err(|e| failed(e.to_string()))?;
+        // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
+        // fresh shared memory, and what a recycled chunk held before is a message.
+        let mut message = unsafe { message.assume_init() };
+        write(message.payload_mut())?;
+        self.request += 1;
+        *message.user_header_mut() =
+            ActionHeader::new(kind, self.specification.epoch, self.trainer, self.request, seed);
+        let receivers = message.send().map_err(|e| failed(e.to_string()))?;
+        if receivers == 0 && !ports::is_alive(self.link.node.config(), self.link.engine) {
+            return Err(self.lost());
+        }
+        ports::notify(&self.link.to_engine, group);
+        self.pending[group] = Some(self.request);
+        Ok(())
+    }
+
+    /// The error for an engine that does not live any more: whether another one has taken its place.
+    fn lost(&self) -> ServiceError {
+        let service = self.config.service.clone();
+        match specification::read(&self.link.node, &service) {
+            Ok(Some(other)) if other.epoch != self.specification.epoch => ServiceError::EngineRestarted { service },
+            _ => ServiceError::EngineLost { service, pid: self.specification.engine_pid },
+        }
+    }
+}
+
+impl Link {
+    fn new(config: &ConnectConfig) -> Result<(Self, Specification), ServiceError> {
+        Link::new_unless(config, None)
+    }
+
+    /// Connects to the engine of that name, unless its epoch is `except`.
+    fn new_unless(config: &ConnectConfig, except: Option<u64>) -> Result<(Self, Specification), ServiceError> {
+        let _ = except;
+        find(config, |node, specification| {
+            let names = Names::new(&specification.service, specification.epoch);
+            let services = Services { node: &node, names, open: Open::Existing };
+            let groups = 0..specification.groups;
+            // The publishers first: whoever has the first of them is the trainer.
+            let actions = groups
+                .clone()
+                .map(|group| action_publisher(&services, group, specification))
+                .collect::<Result<_, _>>()?;
+            let ports: Vec<_> = groups
+                .map(|group| ObservationPort::open(&services, group, specification))
+                .collect::<Result<_, _>>()?;
+            let to_engine = ports::notifier(&services.events("to_engine", specification.groups)?)?;
+            let to_trainer = ports::listener(&services.events("to_trainer", specification.groups)?)?;
+            let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+            let engine = ports[0].engine().ok_or_else(restarted)?;
+            let observations = ports.into_iter().map(Arc::new).collect();
+            Ok(Link { actions, observations, to_engine, to_trainer, engine, node: node.clone() })
+        })
+    }
+}
+
+/// Looks for the engine until `connect` succeeds with what its specification says or time is up.
+pub(super) fn find<T>(
+    config: &ConnectConfig,
+    connect: impl Fn(&Node<Ipc>, &Specification) -> Result<T, ServiceError>,
+) -> Result<(T, Specification), ServiceError> {
+    let start = Instant::now();
+    let node = ports::node(&config.namespace)?;
+    loop {
+        let result = match specification::read(&node, &config.service)? {
+            None => Err(ServiceError::UnknownEngine {
+                service: config.service.clone(),
+                root: config.namespace.root().to_owned(),
+                known: known(&specification::list(&node)?),
+            }),
+            Some(specification) => connect(&node, &specification).map(|link| (link, specification)),
+        };
+        match result {
+            // The engine is not there yet, or was replaced while we connected.
+            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
+                if start.elapsed() < config.timeout =>
+            {
+                node.try_cleanup_dead_nodes();
+                std::thread::sleep(RETRY);
+            }
+            result => return result,
+        }
+    }
+}
+
+fn known(engines: &[String]) -> String {
+    match engines {
+        [] => "is none".to_owned(),
+        [one] => format!("is {one}"),
+        many => format!("are {}", many.join(", ")),
+    }
+}
+
+/// The port that makes a process the trainer of a group.
+fn action_publisher(
+    services: &Services<'_>,
+    group: usize,
+    specification: &Specification,
+) -> Result<ActionPublisher, ServiceError> {
+    let service = services.actions(group)?;
+    let start = Instant::now();
+    loop {
+        match ports::publisher(&service, specification.action.blocks(), ACTION_CHUNKS) {
+            Ok((publisher, _)) => return Ok(publisher),
+            Err(PortError::Other(e)) => return Err(e),
+            Err(PortError::Taken) => {}
+        }
+        // A dead trainer's port is there until someone has removed it; a living one's stays.
+        let owner = ports::publishing_node(&service);
+        let alive = owner.is_some_and(|owner| ports::is_alive(services.node.config(), owner));
+        if alive || start.elapsed() >= CLEANUP_TIMEOUT {
+            let pid = owner.and_then(|owner| ports::process_of(services.node.config(), owner));
+            return Err(ServiceError::TrainerExists { service: specification.service.clone(), pid });
+        }
+        services.node.try_cleanup_dead_nodes();
+        std::thread::sleep(RETRY);
+    }
+}
+
+fn check_actions(specification: &Specification, actions: &[i32]) -> Result<(), ServiceError> {
+    let branches = specification.action_space.branches();
+    let fits = |action: &[i32]| action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a));
+    match actions.chunks_exact(branches.len().max(1)).enumerate().find(|(_, action)| !fits(action)) {
+        None => Ok(()),
+        Some((env, action)) => Err(ServiceError::ActionRange {
+            env,
+            given: action.to_vec(),
+            space: specification.action_space.to_string(),
+        }),
+    }
+}

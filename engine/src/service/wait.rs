@@ -1,0 +1,48 @@
+//! Waiting for the other side: spin, yield, then sleep until an event or a time-out.
+//!
+//! The order is measured. A message that comes within a few microseconds is met by spinning. Spinning longer hurts where both
+//! processes share a core, so the processor is offered to others next. Only then does the waiter go to sleep, which costs the
+//! other side a system call to wake it.
+//!
+//! A waiter that found its message while awake leaves the event pending. The sender's next notification then finds it set and
+//! returns without a system call: a busy pair of processes never enters the kernel.
+
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
+
+use super::error::ServiceError;
+use super::ports::Ipc;
+
+const SPIN: Duration = Duration::from_micros(3);
+const YIELD: Duration = Duration::from_micros(50);
+
+/// Calls `poll` until it yields something or `timeout` has passed; sleeps on `listener` in between. An interrupting signal
+/// counts as a time-out.
+pub(super) fn wait<T>(
+    listener: &Listener<Ipc>,
+    timeout: Duration,
+    mut poll: impl FnMut() -> Result<Option<T>, ServiceError>,
+) -> Result<Option<T>, ServiceError> {
+    let start = Instant::now();
+    loop {
+        if let Some(found) = poll()? {
+            return Ok(Some(found));
+        }
+        let waited = start.elapsed();
+        if waited >= timeout {
+            return Ok(None);
+        }
+        if waited < SPIN {
+            std::hint::spin_loop();
+        } else if waited < YIELD {
+            std::thread::yield_now();
+        } else {
+            match listener.timed_wait(|_| {}, timeout - waited) {
+                Ok(_) => {}
+                Err(ListenerWaitError::InterruptSignal) => return poll(),
+                Err(e) => return Err(ServiceError::middleware("cannot wait for the other side")(e.to_string())),
+            }
+        }
+    }
+}
