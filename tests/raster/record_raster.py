@@ -190,6 +190,31 @@ def random_scene(rng, draws):
         check(surface)
 
 
+def edge_scene():
+    """Shapes that random ones seldom hit: corners as high as their rectangle, lines that end just
+    off the surface, circles beyond an edge, borders about as wide as what is visible."""
+    surface = Surface((60, 50))
+    for height in (2, 3, 11, 41):
+        for corners in [(0, 0, 45, 0), (45, 0, 0, 0), (0, 26, 0, 22), (0, 0, 3, 3), (9, 9, 9, 9)]:
+            for width in (0, 1, 3):
+                rect(surface, 0xFF8000 + height, (6, 4, 46, height), width, 0, *corners)
+                check(surface)
+    for offset in (-2, -1, 0, 1):
+        for width in (1, 2, 5):
+            for end in [(60 + offset, 17), (23, 50 + offset), (60 + offset, 50 + offset)]:
+                line(surface, 0x0080FF + width, (-offset, -3), end, width)
+                line(surface, 0x40C020 + width, end, (-7, -7), width)
+                check(surface)
+        for radius in (1, 2, 3, 20):
+            for width in (0, 1, 2, 19):
+                circle(surface, 0x800040 + radius, (offset - radius, 25), radius, width)
+                circle(surface, 0x402040 + radius, (30, 50 + radius + offset), radius, width)
+                check(surface)
+        for width in (4, 5, 6):
+            rect(surface, 0x123456 + width, (50 + offset, -20, 40, 90), width)
+            check(surface)
+
+
 def random_transformation(rng):
     """Surfaces with colour keys and alphas, turned, scaled and blitted."""
     most = rng.choice([3, 12, 40, 90])
@@ -210,10 +235,16 @@ def random_transformation(rng):
     elif kind == 2:
         source = scale(rotate(source, angle), (rng.randint(0, 90), rng.randint(0, 90)))
     check(source)
-    if kind != 3 and rng.random() < 0.2:
-        alpha = rng.randint(0, 255)
-        note("alpha", number(source), alpha)
-        source.set_alpha(alpha)
+    if kind != 3 and rng.random() < 0.3:
+        # What was transformed is no surface that notes what is done to it.
+        if rng.random() < 0.5:
+            alpha = rng.randint(0, 255)
+            note("alpha", number(source), alpha)
+            BaseSurface.set_alpha(source, alpha)
+        else:
+            key = rng.choice([0x010203, 0x010203, None])
+            note("color_key", number(source), key)
+            BaseSurface.set_colorkey(source, key)
     target = Surface((rng.randint(1, 90), rng.randint(1, 90)))
     noise(target, rng.getrandbits(31))
     for _ in range(3):
@@ -359,7 +390,7 @@ def option_sets(rng):
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", type=int, default=90, help="random scenes of each kind")
+    parser.add_argument("--scenes", type=int, default=70, help="random scenes of each kind")
     parser.add_argument("--draws", type=int, default=12, help="shapes per random scene")
     parser.add_argument("--episodes", type=int, default=1, help="episodes per environment")
     parser.add_argument("--steps", type=int, default=8, help="steps per episode")
@@ -391,6 +422,7 @@ def main():
         for name, options in option_sets(rng):
             seed = rng.getrandbits(20)
             record(episode, name, options, seed, arguments.steps, 2)
+    record(edge_scene)
     for _ in range(arguments.scenes):
         record(random_scene, rng, arguments.draws)
         record(random_transformation, rng)

@@ -155,6 +155,11 @@ impl<'a> Batch<'a> {
         self.layout
     }
 
+    /// The whole batch, sections and the padding between them.
+    pub fn bytes(&self) -> &'a [u8] {
+        bytemuck::cast_slice(self.blocks)
+    }
+
     /// All numbers of a section; empty if the batch has none of that name and type.
     pub fn section<T: Element>(&self, name: &str) -> &'a [T] {
         self.layout.read(self.blocks, name)

@@ -61,15 +61,11 @@ fn show(spec: &Spec) {
     print("");
     let mut rows = table(["reset parameter", "default", "allowed", "meaning"]);
     for parameter in spec.parameters {
-        rows.add_row([
-            parameter.name,
-            &parameter.default_text(),
-            &parameter.allowed(),
-            parameter.description,
-        ]);
+        rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
     }
     print(rows);
-    for (title, columns) in [("info at an episode's end", spec.info), ("feature (option `--features`)", spec.features)] {
+    for (title, columns) in [("info at an episode's end", spec.info), ("feature (option `--features`)", spec.features)]
+    {
         let mut rows = table([title, "meaning"]);
         for column in columns {
             rows.add_row([column.name, column.description]);

@@ -2,12 +2,13 @@
 
 mod bench;
 mod demo;
+mod engine_process;
 mod list;
 mod options;
 mod output;
+mod play;
 mod serve;
 mod stop;
-mod trainer;
 mod verify;
 
 use std::process::ExitCode;
@@ -37,6 +38,9 @@ enum Command {
     /// Replay recorded traces of the original and compare every observation, reward, flag and info.
     Verify(verify::Args),
 }
+
+/// The environment that commands take where none is named.
+const DEFAULT_ENVIRONMENT: &str = "Endless-MortarMayhem-v0";
 
 /// What any command may fail with: it is shown as one line.
 type Failure = Box<dyn std::error::Error>;

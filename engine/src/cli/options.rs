@@ -41,16 +41,26 @@ fn seed_range(text: &str) -> Result<(u64, u64), String> {
 }
 
 impl EnvironmentArgs {
-    /// No option set.
-    pub const DEFAULT: EnvironmentArgs =
-        EnvironmentArgs { options: Vec::new(), seed: None, seed_range: None, seed_list: Vec::new() };
+    /// The arguments that say the same to another `endless`.
+    pub fn arguments(&self) -> Vec<String> {
+        let mut arguments: Vec<String> =
+            self.options.iter().flat_map(|option| ["--option".to_owned(), option.clone()]).collect();
+        arguments.extend(self.seed.map(|seed| format!("--seed={seed}")));
+        arguments.extend(self.seed_range.map(|(start, end)| format!("--seed-range={start}..{end}")));
+        if !self.seed_list.is_empty() {
+            let seeds: Vec<String> = self.seed_list.iter().map(u64::to_string).collect();
+            arguments.push(format!("--seed-list={}", seeds.join(",")));
+        }
+        arguments
+    }
 
     /// A pool's configuration with these options.
     pub fn configure(&self, id: &str, num_envs: usize) -> Result<PoolConfig, Failure> {
         let mut options = Map::new();
         for option in &self.options {
-            let (name, value) =
-                option.split_once('=').ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
+            let (name, value) = option
+                .split_once('=')
+                .ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
             // What is no JSON is passed on as text, so that the check of the parameter says what it should be.
             let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
             options.insert(name.to_owned(), value);

@@ -81,7 +81,9 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
             print(format_args!("{failures} traces not replayed"));
         }
         let verified = replays.len() - failures;
-        print(format_args!("verified {verified} traces: {episodes} episodes, {steps} steps, {differences} differences"));
+        print(format_args!(
+            "verified {verified} traces: {episodes} episodes, {steps} steps, {differences} differences"
+        ));
     }
     Ok(if differences + failures == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

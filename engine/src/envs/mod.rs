@@ -1,7 +1,7 @@
 //! The environments: the trait that each fills, the registry of ids, and their reset parameters.
 
-pub mod mortar_mayhem;
 pub mod character;
+pub mod mortar_mayhem;
 mod parameters;
 mod spec;
 mod vector;

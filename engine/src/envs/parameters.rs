@@ -11,11 +11,25 @@ const MAX_LIST: usize = 4096;
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Kind {
-    Bool { default: bool },
-    Int { default: i64, min: i64, max: i64 },
-    Float { default: f64, min: f64, max: f64 },
+    Bool {
+        default: bool,
+    },
+    Int {
+        default: i64,
+        min: i64,
+        max: i64,
+    },
+    Float {
+        default: f64,
+        min: f64,
+        max: f64,
+    },
     /// A list that the environment draws one value from in each episode. Not empty.
-    IntList { default: &'static [i64], min: i64, max: i64 },
+    IntList {
+        default: &'static [i64],
+        min: i64,
+        max: i64,
+    },
 }
 
 /// One reset parameter of an environment.
@@ -76,11 +90,10 @@ impl Parameter {
     pub fn allowed(&self) -> String {
         match self.kind {
             Kind::Bool { .. } => "true or false".to_owned(),
-            Kind::Int { min, max, .. } => format!("an integer in {}", range(min, max, i64::MIN, i64::MAX)),
-            Kind::Float { min, max, .. } => format!("a number in {}", range(min, max, f64::MIN, f64::MAX)),
-            Kind::IntList { min, max, .. } => {
-                format!("a list of 1 to {MAX_LIST} integers in {}", range(min, max, i64::MIN, i64::MAX))
-            }
+            Kind::Int { min: i64::MIN, max: i64::MAX, .. } => "integer".to_owned(),
+            Kind::Int { min, max, .. } => format!("integer, {min} to {max}"),
+            Kind::Float { min, max, .. } => format!("number, {min} to {max}"),
+            Kind::IntList { min, max, .. } => format!("list of 1 to {MAX_LIST} integers, {min} to {max}"),
         }
     }
 
@@ -94,16 +107,10 @@ impl Parameter {
     }
 
     fn parse(&self, given: &Json) -> Result<Value, ParameterError> {
-        let wrong_type = || ParameterError::WrongType {
-            name: self.name,
-            value: given.to_string(),
-            allowed: self.allowed(),
-        };
-        let out_of_range = || ParameterError::OutOfRange {
-            name: self.name,
-            value: given.to_string(),
-            allowed: self.allowed(),
-        };
+        let wrong_type =
+            || ParameterError::WrongType { name: self.name, value: given.to_string(), allowed: self.allowed() };
+        let out_of_range =
+            || ParameterError::OutOfRange { name: self.name, value: given.to_string(), allowed: self.allowed() };
         match self.kind {
             Kind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong_type),
             Kind::Int { min, max, .. } => {
@@ -127,15 +134,6 @@ impl Parameter {
 /// An integer, also where it is written as `3.0`.
 fn integer(given: &Json) -> Option<i64> {
     given.as_i64().or_else(|| given.as_f64().filter(|v| v.fract() == 0.0 && v.abs() < 1e15).map(|v| v as i64))
-}
-
-fn range<T: PartialOrd + std::fmt::Display>(min: T, max: T, lowest: T, highest: T) -> String {
-    match (min > lowest, max < highest) {
-        (true, true) => format!("{min} to {max}"),
-        (true, false) => format!("{min} or more"),
-        (false, true) => format!("{max} or less"),
-        (false, false) => "any size".to_owned(),
-    }
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -200,8 +198,8 @@ impl ResetParameters {
 pub enum ParameterError {
     #[error("{id} has no reset parameter `{name}`; it has {allowed}")]
     Unknown { id: &'static str, name: String, allowed: String },
-    #[error("reset parameter `{name}` is {value}, but must be {allowed}")]
+    #[error("reset parameter `{name}` is {value}, but has to be: {allowed}")]
     WrongType { name: &'static str, value: String, allowed: String },
-    #[error("reset parameter `{name}` is {value}, which is out of range: it must be {allowed}")]
+    #[error("reset parameter `{name}` is {value}, which is out of range; it has to be: {allowed}")]
     OutOfRange { name: &'static str, value: String, allowed: String },
 }

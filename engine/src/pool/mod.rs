@@ -268,9 +268,10 @@ fn family_lanes<E: Environment>(
         Seeding::List(seeds) => seeds.as_slice().into(),
         _ => [].into(),
     };
-    let environments = assets.into_iter().enumerate().map(|(env, assets)| {
-        (assets, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs))
-    });
+    let environments = assets
+        .into_iter()
+        .enumerate()
+        .map(|(env, assets)| (assets, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs)));
     Ok(FamilyLanes::new(spec.action_space.branches().len(), environments))
 }
 

@@ -32,7 +32,9 @@ impl Seeds {
                 start: *start as i64,
                 end: *end as i64,
                 draws: match seed {
-                    Some(seed) => Generator::from_seed_sequence(&SeedSequence::new(*seed).with_spawn_key(&[env as u32])),
+                    Some(seed) => {
+                        Generator::from_seed_sequence(&SeedSequence::new(*seed).with_spawn_key(&[env as u32]))
+                    }
                     None => Generator::from_entropy(),
                 },
             },

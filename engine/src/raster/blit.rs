@@ -71,14 +71,16 @@ impl Canvas<'_> {
         if columns.is_empty() || rows.is_empty() || source.alpha() == 0 {
             return;
         }
-        let mixing = Mixing::of(source);
         let height = self.height();
-        let first_row = (rows.start as i64 - y) as usize;
-        for column in columns {
-            let source_start = (column as i64 - x) as usize * source.height() + first_row;
-            let run = &source.pixels().as_chunks::<3>().0[source_start..][..rows.len()];
-            let start = column * height + rows.start;
-            let below = &mut self.pixels_mut().as_chunks_mut::<3>().0[start..][..rows.len()];
+        let start = columns.start * height + rows.start;
+        let source_start = (columns.start as i64 - x) as usize * source.height() + (rows.start as i64 - y) as usize;
+        // Columns that are complete on both sides lie one after the other, as one long run.
+        let is_complete = rows.len() == height && source.height() == height;
+        let (count, length) = if is_complete { (1, columns.len() * height) } else { (columns.len(), rows.len()) };
+        let mixing = Mixing::of(source);
+        for column in 0..count {
+            let run = &source.pixels().as_chunks::<3>().0[source_start + column * source.height()..][..length];
+            let below = &mut self.pixels_mut().as_chunks_mut::<3>().0[start + column * height..][..length];
             for (first, opaque) in opaque_runs(run, source.color_key()) {
                 let below = below[first..][..opaque.len()].as_flattened_mut();
                 mixing.paint(opaque.as_flattened(), below, source.alpha());
@@ -90,7 +92,9 @@ impl Canvas<'_> {
 /// The parts of a run between the pixels of the colour key, each with the index of its first pixel.
 pub(super) fn opaque_runs(run: &[Rgb], key: Option<Rgb>) -> impl Iterator<Item = (usize, &[Rgb])> {
     let mut next = 0;
-    run.chunk_by(move |a, b| (Some(*a) == key) == (Some(*b) == key)).filter_map(move |part| {
+    // Without a key, nothing has to be compared.
+    let is_same = move |a: &Rgb, b: &Rgb| key.is_none_or(|key| (*a == key) == (*b == key));
+    run.chunk_by(is_same).filter_map(move |part| {
         let first = next;
         next += part.len();
         (Some(part[0]) != key).then_some((first, part))

@@ -81,17 +81,15 @@ impl<'a> Canvas<'a> {
 }
 
 /// Paints all pixels of a run.
-pub(super) fn fill_run(mut run: &mut [u8], color: Rgb) {
-    // Sixteen pixels are a whole number of machine words, however long a word is. It takes a long
-    // run to make up for the making of the block.
-    if run.len() >= 8 * 48 {
-        let mut block = [0; 48];
-        block.as_chunks_mut().0.fill(color);
-        let (blocks, rest) = run.as_chunks_mut();
-        blocks.fill(block);
-        run = rest;
+pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
+    // Up to this length, pixels are painted one by one; the rest is copied, twice as much each time.
+    let mut painted = run.len().min(96 * 3);
+    run[..painted].as_chunks_mut().0.fill(color);
+    while painted < run.len() {
+        let length = painted.min(run.len() - painted);
+        run.copy_within(..length, painted);
+        painted += length;
     }
-    run.as_chunks_mut().0.fill(color);
 }
 
 /// The part of `first..=last` that lies in `0..size`.

@@ -55,7 +55,9 @@ pub struct Disc {
 /// A column of a [`Disc`] on a canvas: the pixels `(x, y)` for all `y` in `rows`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DiscColumn {
+    /// The column, from the canvas' left edge.
     pub x: usize,
+    /// The rows, from the canvas' top edge.
     pub rows: Range<usize>,
 }
 
@@ -189,8 +191,9 @@ impl Canvas<'_> {
         let mut outer = Contour::new(radius);
         let mut inner = Contour::new(inner_radius);
         let mut is_hollow = false;
-        let mut is_flat = outer.is_flat();
         while outer.y >= 0 {
+            // Decided before the row is widened, which may end the flat part.
+            let is_flat = outer.is_flat();
             if is_flat {
                 outer.widen();
             }
@@ -210,15 +213,13 @@ impl Canvas<'_> {
             }
             is_hollow = is_hollow || outer.y < inner_radius;
             if is_hollow {
-                // The inner contour keeps to the flat rule as long as the outer one is flat.
-                if is_flat || inner.is_flat() {
+                if inner.is_flat() {
                     inner.widen();
                     inner.descend_flat();
                 } else {
                     inner.descend_steep();
                 }
             }
-            is_flat = is_flat && outer.is_flat();
         }
     }
 }

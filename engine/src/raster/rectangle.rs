@@ -6,13 +6,18 @@ use super::{Canvas, Rgb};
 /// A rectangle in pixels: its top left corner and its size.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Rect {
+    /// The leftmost column.
     pub x: i32,
+    /// The topmost row.
     pub y: i32,
+    /// Number of columns.
     pub width: i32,
+    /// Number of rows.
     pub height: i32,
 }
 
 impl Rect {
+    /// A rectangle with its top left corner at `(x, y)`.
     pub const fn new(x: i32, y: i32, width: i32, height: i32) -> Self {
         Self { x, y, width, height }
     }
@@ -21,6 +26,7 @@ impl Rect {
 /// The radii of a rectangle's corners in pixels; 0 is a square corner.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CornerRadii {
+    /// As pygame's `border_top_left_radius`; the others likewise.
     pub top_left: u32,
     pub top_right: u32,
     pub bottom_left: u32,

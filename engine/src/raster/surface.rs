@@ -16,11 +16,16 @@ pub struct Surface {
 
 impl Surface {
     /// A black, opaque surface without a colour key.
+    ///
+    /// # Panics
+    ///
+    /// When the pixels are too many for the memory.
     pub fn new(width: usize, height: usize) -> Self {
+        let size = width.checked_mul(height).and_then(|pixels| pixels.checked_mul(3));
         Self {
             width,
             height,
-            pixels: vec![0; width * height * 3],
+            pixels: vec![0; size.expect("the size of a surface in bytes")],
             color_key: None,
             alpha: 255,
             run_length_encoded: false,

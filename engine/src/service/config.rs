@@ -93,7 +93,9 @@ impl Namespace {
             return Err(unusable(format!("it belongs to user {owner}, and this process to user {user}")));
         }
         if metadata.permissions().mode() & 0o022 != 0 {
-            return Err(unusable("other users may write to it; take their permission away with `chmod 700`".to_owned()));
+            return Err(unusable(
+                "other users may write to it; take their permission away with `chmod 700`".to_owned(),
+            ));
         }
         let mut config = Config::default();
         let root = IceoryxPath::new(self.root.as_os_str().as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;

@@ -3,7 +3,6 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::sample::Sample;
@@ -11,9 +10,8 @@ use iceoryx2::sample::Sample;
 use super::config::{Namespace, check_name};
 use super::error::{PACKAGE_VERSION, Rejection, ServiceError};
 use super::message::{ActionHeader, Kind, ObservationHeader};
-use super::ports::{
-    self, ActionSubscriber, Ipc, Limits, Names, ObservationPublisher, Open, PortError, Services,
-};
+use super::node::{Ipc, Member};
+use super::ports::{self, ActionSubscriber, Limits, Names, ObservationPublisher, Open, PortError, Services};
 use super::preflight::Resident;
 use super::specification::{self, Published, Specification};
 use super::wait::wait;
@@ -72,10 +70,8 @@ impl EngineConfig {
         if !(1..=MAX_GROUPS).contains(&self.groups) {
             return Err(ServiceError::Groups { given: self.groups, limit: MAX_GROUPS });
         }
-        let limits = [
-            ("batches to hold", self.batches_held, 1, MAX_HELD),
-            ("observers", self.observers, 0, MAX_OBSERVERS),
-        ];
+        let limits =
+            [("batches to hold", self.batches_held, 1, MAX_HELD), ("observers", self.observers, 0, MAX_OBSERVERS)];
         for (what, given, lowest, highest) in limits {
             if !(lowest..=highest).contains(&given) {
                 return Err(ServiceError::Limit { what, given, lowest, highest });
@@ -130,7 +126,7 @@ pub struct Engine {
     specification: Specification,
     summary: Summary,
     _published: Published,
-    node: Node<Ipc>,
+    node: Member,
 }
 
 struct Group {
@@ -151,7 +147,7 @@ impl Engine {
     /// Makes the environments and takes the name. Trainers can connect once [`run`](Engine::run) is called.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
-        let node = ports::node(&config.namespace)?;
+        let node = Member::join(&config.namespace)?;
         specification::refuse_second_engine(&node, &config.service)?;
         let pools: Vec<Pool> =
             config.pools()?.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<_, _>>()?;
@@ -233,19 +229,11 @@ impl Engine {
         let outcome = taken.and_then(|kind| group.carry_out(kind, &request, batch.payload_mut()));
         let step = group.step + u64::from(outcome.is_ok());
         let header = batch.user_header_mut();
-        *header = ObservationHeader {
-            group: number as u32,
-            epoch: self.specification.epoch,
-            step,
-            trainer: request.trainer,
-            request: request.request,
-            ..ObservationHeader::default()
-        };
+        *header = ObservationHeader::answering(&request, number, self.specification.epoch, step);
         if let Err((reason, message)) = &outcome {
             header.reject(*reason, message);
         }
-        let receivers =
-            batch.send().map_err(|e| ServiceError::middleware("cannot send a batch")(e.to_string()))?;
+        let receivers = batch.send().map_err(|e| ServiceError::middleware("cannot send a batch")(e.to_string()))?;
         ports::notify(&self.to_trainer, number);
         group.step = step;
         self.summary.undelivered += u64::from(receivers == 0);
@@ -325,9 +313,7 @@ impl Group {
             Kind::Step => self.pool.step(&self.action, batch),
             Kind::ResetAll => self.pool.reset(ResetRequest::All, batch),
             Kind::ResetSeed => self.pool.reset(ResetRequest::Seed(header.seed), batch),
-            Kind::ResetEach => {
-                self.pool.reset(ResetRequest::Each { reset: &self.reset, seed: &self.seed }, batch)
-            }
+            Kind::ResetEach => self.pool.reset(ResetRequest::Each { reset: &self.reset, seed: &self.seed }, batch),
         };
         done.map_err(|e| (Rejection::Pool, e.to_string()))?;
         self.trainer = Some(header.trainer);

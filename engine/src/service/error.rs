@@ -33,7 +33,9 @@ pub enum ServiceError {
         of_process(*pid)
     )]
     TrainerExists { service: String, pid: Option<u32> },
-    #[error("engine `{service}` has no room for another observer; stop one, or start the engine with more than {limit}")]
+    #[error(
+        "engine `{service}` has no room for another observer; stop one, or start the engine with more than {limit}"
+    )]
     TooManyObservers { service: String, limit: usize },
     #[error(
         "engine `{service}` speaks layout version {layout} (endless-gym {package}), this process layout version \
@@ -66,7 +68,9 @@ pub enum ServiceError {
     AnswerPending { group: usize },
     #[error("nothing was sent to group {group}; reset or step it before receiving")]
     NothingSent { group: usize },
-    #[error("{limit} batches of group {group} are held and no more can be lent; drop one, or copy what you want to keep")]
+    #[error(
+        "{limit} batches of group {group} are held and no more can be lent; drop one, or copy what you want to keep"
+    )]
     TooManyBatchesHeld { group: usize, limit: usize },
     #[error("no answer of engine `{service}` within {waited:?}; it is alive, so wait longer for large batches")]
     TimedOut { service: String, waited: Duration },
@@ -145,7 +149,8 @@ mod tests {
 
     #[test]
     fn messages_say_both_versions() {
-        let text = ServiceError::Version { service: "a".into(), layout: "7".into(), package: "9.9.9".into() }.to_string();
+        let text =
+            ServiceError::Version { service: "a".into(), layout: "7".into(), package: "9.9.9".into() }.to_string();
         for part in ["layout version 7", "9.9.9", &format!("layout version {LAYOUT_VERSION}"), PACKAGE_VERSION] {
             assert!(text.contains(part), "{text}");
         }

@@ -13,6 +13,15 @@ impl<T> Here<T> {
     pub(super) fn new(value: T) -> Self {
         Here { value: Some(value), process: std::process::id() }
     }
+
+    /// Drops the value before its time, after which it must not be used. Says whether this process may do that at all.
+    pub(super) fn leave(&mut self) -> bool {
+        let here = self.process == std::process::id();
+        if here {
+            self.value = None;
+        }
+        here
+    }
 }
 
 impl<T> Deref for Here<T> {

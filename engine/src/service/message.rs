@@ -101,6 +101,12 @@ impl Default for ObservationHeader {
 }
 
 impl ObservationHeader {
+    /// The header of the batch that answers `request`.
+    pub(super) fn answering(request: &ActionHeader, group: usize, epoch: u64, step: u64) -> Self {
+        let (trainer, request) = (request.trainer, request.request);
+        ObservationHeader { group: group as u32, epoch, step, trainer, request, ..ObservationHeader::default() }
+    }
+
     /// Turns the answer into a rejection.
     pub(super) fn reject(&mut self, reason: Rejection, message: &str) {
         let end = message.floor_char_boundary(TEXT_BYTES);

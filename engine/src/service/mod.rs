@@ -43,6 +43,7 @@ mod engine;
 mod error;
 mod here;
 mod message;
+mod node;
 mod observer;
 mod ports;
 mod preflight;

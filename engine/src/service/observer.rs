@@ -3,11 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use iceoryx2::node::Node;
-
 use super::error::ServiceError;
-use super::here::Here;
-use super::ports::{self, Ipc, Names, Open, Services};
+use super::node::Member;
+use super::ports::{Names, Open, Services};
 use super::received::{ObservationPort, Received};
 use super::specification::Specification;
 use super::trainer::{ConnectConfig, find};
@@ -20,26 +18,22 @@ const POLL: Duration = Duration::from_millis(1);
 pub struct Observer {
     port: Arc<ObservationPort>,
     specification: Arc<Specification>,
-    node: Here<Node<Ipc>>,
+    node: Arc<Member>,
 }
 
 impl Observer {
     /// Watches a group of the engine that `config` names.
     pub fn connect(config: &ConnectConfig, group: usize) -> Result<Self, ServiceError> {
-        let ((port, node), specification) = find(config, |node, specification| {
+        let (node, port, specification) = find(config, |node, specification| {
             let (service, groups) = (specification.service.clone(), specification.groups);
             if group >= groups {
                 return Err(ServiceError::NoSuchGroup { service, given: group, groups });
             }
             let names = Names::new(&service, specification.epoch);
             let services = Services { node, names, open: Open::Existing };
-            let port = ObservationPort::open(&services, group, specification)?;
-            if port.engine().is_none() {
-                return Err(ServiceError::EngineRestarted { service });
-            }
-            Ok((port, node.clone()))
+            ObservationPort::open(&services, node, group, specification)
         })?;
-        Ok(Observer { port: Arc::new(port), specification: Arc::new(specification), node: Here::new(node) })
+        Ok(Observer { port: Arc::new(port), specification: Arc::new(specification), node })
     }
 
     /// What the engine serves.
@@ -72,6 +66,6 @@ impl Observer {
     }
 
     fn is_engine_alive(&self) -> bool {
-        self.port.engine().is_some_and(|engine| ports::is_alive(self.node.config(), engine))
+        self.node.is_alive(self.port.engine())
     }
 }

@@ -3,28 +3,22 @@
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::node::NodeView;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{
-    AllocationStrategy, BackpressureStrategy, CallbackProgression, Config, EventId, LogLevel, Node, NodeBuilder,
-    NodeState, ServiceName, SignalHandlingMode, ipc_threadsafe, set_log_level_from_env_or,
+    AllocationStrategy, BackpressureStrategy, CallbackProgression, EventId, PortFactory, ServiceName, ZeroCopySend,
 };
 use iceoryx2::service::builder::event::EventOpenError;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
-use super::config::Namespace;
 use super::error::ServiceError;
 use super::message::{ActionHeader, ObservationHeader};
+use super::node::{Ipc, Member};
 use super::preflight::Resident;
 use crate::batch::Block;
-
-/// The kind of services. Its ports and samples may be moved to and dropped in any thread, which a binding to a garbage
-/// collected language needs.
-pub(super) type Ipc = ipc_threadsafe::Service;
 
 pub(super) type ActionService = publish_subscribe::PortFactory<Ipc, [Block], ActionHeader>;
 pub(super) type ActionPublisher = Publisher<Ipc, [Block], ActionHeader>;
@@ -35,32 +29,6 @@ pub(super) type ObservationSubscriber = Subscriber<Ipc, [Block], ObservationHead
 
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and those about to be refused.
 const MAX_NODES: usize = 64;
-
-/// A node in the namespace. Making one also removes what dead processes left there.
-pub(super) fn node(namespace: &Namespace) -> Result<Node<Ipc>, ServiceError> {
-    set_log_level_from_env_or(LogLevel::Error);
-    let config = namespace.prepare()?;
-    NodeBuilder::new()
-        .config(&config)
-        .signal_handling_mode(SignalHandlingMode::Disabled)
-        .create()
-        .map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))
-}
-
-/// Whether the process that owns a node still runs. `false` is certain; where the state cannot be read, it counts as running.
-pub(super) fn is_alive(config: &Config, node: UniqueNodeId) -> bool {
-    !matches!(Node::<Ipc>::state_of(config, node), Ok(None | Some(NodeState::Dead(_))))
-}
-
-/// The process that owns a running node.
-pub(super) fn process_of(config: &Config, node: UniqueNodeId) -> Option<u32> {
-    match Node::<Ipc>::state_of(config, node) {
-        Ok(Some(NodeState::Alive(view))) => {
-            view.details().as_ref().and_then(|details| u32::try_from(details.process_id().value()).ok())
-        }
-        _ => None,
-    }
-}
 
 /// Names of one engine's services. All but the specification's carry the epoch, so that an engine that starts anew shares
 /// nothing with what a dead one left.
@@ -114,7 +82,7 @@ pub(super) enum Open {
 
 /// Makes or opens the services of one engine.
 pub(super) struct Services<'a> {
-    pub node: &'a Node<Ipc>,
+    pub node: &'a Member,
     pub names: Names,
     pub open: Open,
 }
@@ -122,9 +90,9 @@ pub(super) struct Services<'a> {
 macro_rules! create_or_open {
     ($self:ident, $builder:expr, $error:ident) => {
         match $self.open {
-            Open::Create => $builder
-                .create()
-                .map_err(|e| ServiceError::middleware("cannot create a service")(e.to_string())),
+            Open::Create => {
+                $builder.create().map_err(|e| ServiceError::middleware("cannot create a service")(e.to_string()))
+            }
             Open::Existing => $builder.open().map_err(|e| match e {
                 $error::DoesNotExist | $error::IsMarkedForDestruction => {
                     ServiceError::EngineRestarted { service: $self.names.service.clone() }
@@ -199,7 +167,7 @@ impl Services<'_> {
 
 /// A publisher of messages of `blocks` blocks. `resident` chunks are brought into memory right away, so that too little of it
 /// is an error here and not a signal later.
-pub(super) fn publisher<H: Default + std::fmt::Debug + iceoryx2::prelude::ZeroCopySend>(
+pub(super) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
     service: &publish_subscribe::PortFactory<Ipc, [Block], H>,
     blocks: usize,
     resident: usize,
@@ -280,10 +248,9 @@ pub(super) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Opt
 }
 
 /// The node that publishes on a service.
-pub(super) fn publishing_node<H: std::fmt::Debug + iceoryx2::prelude::ZeroCopySend>(
+pub(super) fn publishing_node<H: std::fmt::Debug + ZeroCopySend>(
     service: &publish_subscribe::PortFactory<Ipc, [Block], H>,
 ) -> Option<UniqueNodeId> {
-    use iceoryx2::prelude::PortFactory;
     first_node(|found| {
         service.dynamic_config().list_publishers(|details| {
             found(details.node_id);

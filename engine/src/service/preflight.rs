@@ -55,11 +55,7 @@ fn needed(blocks: usize, chunks: usize) -> u64 {
 }
 
 fn check(needed: u64, available: u64) -> Result<(), ServiceError> {
-    if needed <= available {
-        Ok(())
-    } else {
-        Err(ServiceError::SharedMemoryTooSmall { needed, available, path: PATH })
-    }
+    if needed <= available { Ok(()) } else { Err(ServiceError::SharedMemoryTooSmall { needed, available, path: PATH }) }
 }
 
 /// Bytes that are left; `None` where the file system does not say, or has no limit.
@@ -68,18 +64,25 @@ fn available() -> Option<u64> {
     (file_system.f_blocks > 0).then(|| file_system.f_bavail.saturating_mul(file_system.f_frsize))
 }
 
+/// Sizes that the pages of the operating system may have.
+const PAGES: [usize; 3] = [4 << 10, 16 << 10, 64 << 10];
+
 /// Allocates the pages under `chunk` without changing what is in them.
 fn populate(chunk: &mut [MaybeUninit<Block>]) -> rustix::io::Result<()> {
-    let page = rustix::param::page_size();
     let start = chunk.as_mut_ptr();
-    let above = start.addr() % page;
-    let length = above + size_of_val(chunk);
-    let first_page = start.wrapping_byte_sub(above);
+    let mut pages = PAGES.into_iter();
+    let mut page = pages.next().unwrap_or(1);
     loop {
-        // SAFETY: the range covers whole pages that hold a part of `chunk`, which is mapped for writing. The advice allocates
-        // pages; it changes neither their content nor the mapping.
-        match unsafe { rustix::mm::madvise(first_page.cast(), length, Advice::LinuxPopulateWrite) } {
+        let above = start.addr() % page;
+        let (first, length) = (start.wrapping_byte_sub(above), above + size_of_val(chunk));
+        // SAFETY: the range covers whole pages that hold a part of `chunk`, which is mapped for writing; if it is not one of
+        // whole pages, the call does nothing. The advice allocates pages and changes neither their content nor the mapping.
+        match unsafe { rustix::mm::madvise(first.cast(), length, Advice::LinuxPopulateWrite) } {
             Err(Errno::INTR | Errno::AGAIN) => {}
+            Err(Errno::INVAL) => match pages.next() {
+                Some(next) => page = next,
+                None => return Err(Errno::INVAL),
+            },
             result => return result,
         }
     }
@@ -104,7 +107,7 @@ mod tests {
     #[test]
     fn pages_that_cannot_be_had_are_an_error_and_not_a_signal() {
         // The second page of the mapping lies behind the end of the file: touching it raises SIGBUS, as a full /dev/shm does.
-        let page = rustix::param::page_size();
+        let page = PAGES[2];
         let path = std::env::temp_dir().join(format!("endless-preflight-{}", std::process::id()));
         let file = File::options().read(true).write(true).create(true).truncate(true).open(&path).unwrap();
         std::fs::remove_file(&path).unwrap();

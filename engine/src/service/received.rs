@@ -10,7 +10,8 @@ use iceoryx2::sample::Sample;
 use super::error::ServiceError;
 use super::here::Here;
 use super::message::ObservationHeader;
-use super::ports::{self, Ipc, ObservationSubscriber, Services};
+use super::node::{Ipc, Member};
+use super::ports::{self, ObservationSubscriber, Services};
 use super::specification::Specification;
 use crate::batch::{Batch, Block};
 
@@ -85,16 +86,20 @@ impl std::fmt::Debug for Received {
 pub(super) struct ObservationPort {
     subscriber: Here<ObservationSubscriber>,
     group: usize,
-    engine: Option<UniqueNodeId>,
+    engine: UniqueNodeId,
+    _node: Arc<Member>,
 }
 
 impl ObservationPort {
     pub(super) fn open(
         services: &Services<'_>,
+        node: &Arc<Member>,
         group: usize,
         specification: &Specification,
     ) -> Result<Self, ServiceError> {
         let service = services.observations(group, specification.limits())?;
+        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+        let engine = ports::publishing_node(&service).ok_or_else(restarted)?;
         let subscriber = service.subscriber_builder().create().map_err(|e| match e {
             SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
                 service: specification.service.clone(),
@@ -102,11 +107,11 @@ impl ObservationPort {
             },
             e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
         })?;
-        Ok(ObservationPort { subscriber: Here::new(subscriber), group, engine: ports::publishing_node(&service) })
+        Ok(ObservationPort { subscriber: Here::new(subscriber), group, engine, _node: Arc::clone(node) })
     }
 
     /// The node of the engine on the other side.
-    pub(super) fn engine(&self) -> Option<UniqueNodeId> {
+    pub(super) fn engine(&self) -> UniqueNodeId {
         self.engine
     }
 
@@ -119,10 +124,7 @@ impl ObservationPort {
             Ok(None) => return Ok(None),
             Ok(Some(sample)) => sample,
             Err(ReceiveError::ExceedsMaxBorrows) => {
-                return Err(ServiceError::TooManyBatchesHeld {
-                    group: self.group,
-                    limit: specification.batches_held,
-                });
+                return Err(ServiceError::TooManyBatchesHeld { group: self.group, limit: specification.batches_held });
             }
             Err(e) => return Err(ServiceError::middleware("cannot receive a batch")(e.to_string())),
         };

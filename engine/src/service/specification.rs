@@ -6,17 +6,18 @@
 
 use std::time::{Duration, Instant};
 
-use iceoryx2::node::Node;
 use iceoryx2::port::writer::Writer;
-use iceoryx2::prelude::{CallbackProgression, MessagingPattern, PortFactory, Service, ZeroCopySend};
+use iceoryx2::prelude::{CallbackProgression, PortFactory, Service, ZeroCopySend};
 use iceoryx2::service::builder::blackboard::{BlackboardCreateError, BlackboardOpenError};
 use iceoryx2::service::port_factory::blackboard;
+use iceoryx2::service::static_config::messaging_pattern::MessagingPattern;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 
 use super::config::{Namespace, check_name};
 use super::error::{PACKAGE_VERSION, ServiceError};
-use super::ports::{self, CLEANUP_TIMEOUT, Ipc, Limits, Names, SPECIFICATION_PREFIX};
+use super::node::{Ipc, Member};
+use super::ports::{self, CLEANUP_TIMEOUT, Limits, Names, SPECIFICATION_PREFIX};
 use crate::batch::{LAYOUT_VERSION, Layout};
 use crate::envs::ActionSpace;
 use crate::pool::Autoreset;
@@ -155,7 +156,7 @@ pub(super) struct Published {
 }
 
 /// Publishes the specification, and with it takes the name.
-pub(super) fn publish(node: &Node<Ipc>, specification: &Specification) -> Result<Published, ServiceError> {
+pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Published, ServiceError> {
     let failed = ServiceError::middleware("cannot publish the specification");
     let text = serde_json::to_vec(specification).map_err(|e| failed(e.to_string()))?;
     let mut package = [0; 32];
@@ -192,7 +193,7 @@ pub(super) fn publish(node: &Node<Ipc>, specification: &Specification) -> Result
 }
 
 /// Fails if an engine of that name runs.
-pub(super) fn refuse_second_engine(node: &Node<Ipc>, service: &str) -> Result<(), ServiceError> {
+pub(super) fn refuse_second_engine(node: &Member, service: &str) -> Result<(), ServiceError> {
     let name = Names::specification(service)?;
     let Ok(board) = node.service_builder(&name).blackboard_opener::<u32>().open() else { return Ok(()) };
     let owner = ports::first_node(|found| {
@@ -202,8 +203,8 @@ pub(super) fn refuse_second_engine(node: &Node<Ipc>, service: &str) -> Result<()
         });
     });
     match owner {
-        Some(owner) if ports::is_alive(node.config(), owner) => {
-            let pid = ports::process_of(node.config(), owner);
+        Some(owner) if node.is_alive(owner) => {
+            let pid = node.process_of(owner);
             Err(ServiceError::EngineExists { service: service.to_owned(), pid })
         }
         _ => Ok(()),
@@ -211,7 +212,7 @@ pub(super) fn refuse_second_engine(node: &Node<Ipc>, service: &str) -> Result<()
 }
 
 /// Reads the specification of the engine of that name; `None` if there is none.
-pub(super) fn read(node: &Node<Ipc>, service: &str) -> Result<Option<Specification>, ServiceError> {
+pub(super) fn read(node: &Member, service: &str) -> Result<Option<Specification>, ServiceError> {
     check_name(service)?;
     let failed = ServiceError::middleware("cannot read the specification");
     let unreadable = |reason: String| ServiceError::Specification { service: service.to_owned(), reason };
@@ -251,11 +252,11 @@ pub(super) fn read(node: &Node<Ipc>, service: &str) -> Result<Option<Specificati
 
 /// Names of the engines in a namespace, in alphabetical order.
 pub fn engines(namespace: &Namespace) -> Result<Vec<String>, ServiceError> {
-    // Making a node removes what dead engines left, which would be listed too.
-    list(&ports::node(namespace)?)
+    // Joining removes what dead engines left, which would be listed too.
+    list(&Member::join(namespace)?)
 }
 
-pub(super) fn list(node: &Node<Ipc>) -> Result<Vec<String>, ServiceError> {
+pub(super) fn list(node: &Member) -> Result<Vec<String>, ServiceError> {
     let mut names = Vec::new();
     let listed = Ipc::list(node.config(), |service| {
         let name = service.static_details.name().as_str();

@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
@@ -12,7 +11,8 @@ use super::config::Namespace;
 use super::error::ServiceError;
 use super::here::Here;
 use super::message::{ActionHeader, Kind};
-use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Ipc, Names, Open, PortError, Services};
+use super::node::{Ipc, Member};
+use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Names, Open, PortError, Services};
 use super::received::{ObservationPort, Received};
 use super::specification::{self, Specification};
 use super::wait::wait;
@@ -69,7 +69,7 @@ struct Link {
     to_engine: Notifier<Ipc>,
     to_trainer: Listener<Ipc>,
     engine: UniqueNodeId,
-    node: Node<Ipc>,
+    node: Arc<Member>,
 }
 
 impl Trainer {
@@ -83,19 +83,18 @@ impl Trainer {
     }
 
     /// Connects to an engine of the same name that was started in place of the one that is lost, waiting for it up to
-    /// `timeout`. It must serve the same environments in the same layout. All groups want a reset afterwards; answers that were
-    /// still due are forgotten.
+    /// `timeout`. It must serve the same environments in the same layout, and wants a reset of each group. Where the engine is
+    /// not lost, the connection stays. In both cases answers that are still due are forgotten.
     pub fn reconnect(&mut self, timeout: Duration) -> Result<(), ServiceError> {
-        let (link, specification) = Link::new_unless(
-            &ConnectConfig { timeout, ..self.config.clone() },
-            ports::is_alive(self.link.node.config(), self.link.engine).then_some(self.specification.epoch),
-        )?;
-        if let Some(what) = self.specification.difference(&specification) {
-            return Err(ServiceError::SpecificationChanged { service: self.config.service.clone(), what });
+        if !self.link.node.is_alive(self.link.engine) {
+            let (link, specification) = Link::new(&ConnectConfig { timeout, ..self.config.clone() })?;
+            if let Some(what) = self.specification.difference(&specification) {
+                return Err(ServiceError::SpecificationChanged { service: self.config.service.clone(), what });
+            }
+            self.specification = Arc::new(specification);
+            self.link = Here::new(link);
         }
         self.pending.fill(None);
-        self.specification = Arc::new(specification);
-        self.link = Here::new(link);
         Ok(())
     }
 
@@ -188,7 +187,7 @@ impl Trainer {
                 self.pending[received.group()] = None;
                 return received.or_rejection();
             }
-            if !ports::is_alive(link.node.config(), link.engine) {
+            if !link.node.is_alive(link.engine) {
                 return Err(self.lost());
             }
             if start.elapsed() >= timeout {
@@ -229,7 +228,7 @@ impl Trainer {
         *message.user_header_mut() =
             ActionHeader::new(kind, self.specification.epoch, self.trainer, self.request, seed);
         let receivers = message.send().map_err(|e| failed(e.to_string()))?;
-        if receivers == 0 && !ports::is_alive(self.link.node.config(), self.link.engine) {
+        if receivers == 0 && !self.link.node.is_alive(self.link.engine) {
             return Err(self.lost());
         }
         ports::notify(&self.link.to_engine, group);
@@ -249,41 +248,35 @@ impl Trainer {
 
 impl Link {
     fn new(config: &ConnectConfig) -> Result<(Self, Specification), ServiceError> {
-        Link::new_unless(config, None)
-    }
-
-    /// Connects to the engine of that name, unless its epoch is `except`.
-    fn new_unless(config: &ConnectConfig, except: Option<u64>) -> Result<(Self, Specification), ServiceError> {
-        let _ = except;
-        find(config, |node, specification| {
+        let (node, ports, specification) = find(config, |node, specification| {
             let names = Names::new(&specification.service, specification.epoch);
-            let services = Services { node: &node, names, open: Open::Existing };
+            let services = Services { node, names, open: Open::Existing };
             let groups = 0..specification.groups;
             // The publishers first: whoever has the first of them is the trainer.
-            let actions = groups
+            let actions: Vec<_> = groups
                 .clone()
                 .map(|group| action_publisher(&services, group, specification))
                 .collect::<Result<_, _>>()?;
-            let ports: Vec<_> = groups
-                .map(|group| ObservationPort::open(&services, group, specification))
+            let observations: Vec<_> = groups
+                .map(|group| ObservationPort::open(&services, node, group, specification).map(Arc::new))
                 .collect::<Result<_, _>>()?;
             let to_engine = ports::notifier(&services.events("to_engine", specification.groups)?)?;
             let to_trainer = ports::listener(&services.events("to_trainer", specification.groups)?)?;
-            let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
-            let engine = ports[0].engine().ok_or_else(restarted)?;
-            let observations = ports.into_iter().map(Arc::new).collect();
-            Ok(Link { actions, observations, to_engine, to_trainer, engine, node: node.clone() })
-        })
+            Ok((actions, observations, to_engine, to_trainer))
+        })?;
+        let (actions, observations, to_engine, to_trainer) = ports;
+        let engine = observations[0].engine();
+        Ok((Link { actions, observations, to_engine, to_trainer, engine, node }, specification))
     }
 }
 
 /// Looks for the engine until `connect` succeeds with what its specification says or time is up.
 pub(super) fn find<T>(
     config: &ConnectConfig,
-    connect: impl Fn(&Node<Ipc>, &Specification) -> Result<T, ServiceError>,
-) -> Result<(T, Specification), ServiceError> {
+    connect: impl Fn(&Arc<Member>, &Specification) -> Result<T, ServiceError>,
+) -> Result<(Arc<Member>, T, Specification), ServiceError> {
     let start = Instant::now();
-    let node = ports::node(&config.namespace)?;
+    let node = Arc::new(Member::join(&config.namespace)?);
     loop {
         let result = match specification::read(&node, &config.service)? {
             None => Err(ServiceError::UnknownEngine {
@@ -291,9 +284,10 @@ pub(super) fn find<T>(
                 root: config.namespace.root().to_owned(),
                 known: known(&specification::list(&node)?),
             }),
-            Some(specification) => connect(&node, &specification).map(|link| (link, specification)),
+            Some(specification) => connect(&node, &specification).map(|ports| (ports, specification)),
         };
         match result {
+            Ok((ports, specification)) => return Ok((node, ports, specification)),
             // The engine is not there yet, or was replaced while we connected.
             Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
                 if start.elapsed() < config.timeout =>
@@ -301,7 +295,7 @@ pub(super) fn find<T>(
                 node.try_cleanup_dead_nodes();
                 std::thread::sleep(RETRY);
             }
-            result => return result,
+            Err(e) => return Err(e),
         }
     }
 }
@@ -330,9 +324,9 @@ fn action_publisher(
         }
         // A dead trainer's port is there until someone has removed it; a living one's stays.
         let owner = ports::publishing_node(&service);
-        let alive = owner.is_some_and(|owner| ports::is_alive(services.node.config(), owner));
+        let alive = owner.is_some_and(|owner| services.node.is_alive(owner));
         if alive || start.elapsed() >= CLEANUP_TIMEOUT {
-            let pid = owner.and_then(|owner| ports::process_of(services.node.config(), owner));
+            let pid = owner.and_then(|owner| services.node.process_of(owner));
             return Err(ServiceError::TrainerExists { service: specification.service.clone(), pid });
         }
         services.node.try_cleanup_dead_nodes();

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 
 use super::error::ServiceError;
-use super::ports::Ipc;
+use super::node::Ipc;
 
 const SPIN: Duration = Duration::from_micros(3);
 const YIELD: Duration = Duration::from_micros(50);

@@ -39,7 +39,9 @@ impl MortarExpert {
     fn remember(&mut self, features: &[f32], vector_observation: &[f32]) {
         if self.commands.is_empty() {
             let given = vector_observation.chunks_exact(COMMANDS);
-            self.commands.extend(given.filter_map(|one_hot| one_hot.iter().position(|v| *v == 1.0)).filter_map(Command::from_one_hot));
+            self.commands.extend(
+                given.filter_map(|one_hot| one_hot.iter().position(|v| *v == 1.0)).filter_map(Command::from_one_hot),
+            );
         }
         let shown = features[COMMAND..COMMAND + COMMANDS].iter().position(|v| *v == 1.0).map(Command::from_index);
         if shown != self.last_shown

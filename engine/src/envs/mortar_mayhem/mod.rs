@@ -9,7 +9,7 @@ mod rules;
 
 use std::sync::Arc;
 
-pub use commands::{Command, COMMANDS, MAX_VECTOR_COMMANDS};
+pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
 pub use drawing::Assets;
 pub use parameters::{Locomotion, Parameters, SPECS, Variant};
 pub use rules::MortarMayhem;

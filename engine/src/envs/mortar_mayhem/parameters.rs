@@ -82,9 +82,15 @@ impl Parameters {
     }
 }
 
-const AGENT_SCALE: Parameter =
-    Parameter::float("agent_scale", 0.25, 0.0, 4.0, "Size of the agent; 0.25 is a radius of 6 pixels. Without effect on a grid.");
-const AGENT_SPEED: Parameter = Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
+const AGENT_SCALE: Parameter = Parameter::float(
+    "agent_scale",
+    0.25,
+    0.0,
+    4.0,
+    "Size of the agent; 0.25 is a radius of 6 pixels. Without effect on a grid.",
+);
+const AGENT_SPEED: Parameter =
+    Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
 const ALLOWED_COMMANDS: &str = "How many of the commands may occur, in the order right, down, left, up, stay, right down, \
                                 right up, left down, left up.";
@@ -99,7 +105,8 @@ const VISUAL_FEEDBACK: Parameter =
     Parameter::bool("visual_feedback", true, "Whether the wrong tiles turn red when a command is checked.");
 const REWARD_COMMAND_FAILURE: Parameter =
     Parameter::reward("reward_command_failure", 0.0, "Reward for failing at the current command.");
-const REWARD_COMMAND_SUCCESS: Parameter = Parameter::reward("reward_command_success", 0.1, "Reward for executing one command.");
+const REWARD_COMMAND_SUCCESS: Parameter =
+    Parameter::reward("reward_command_success", 0.1, "Reward for executing one command.");
 const REWARD_EPISODE_SUCCESS: Parameter =
     Parameter::reward("reward_episode_success", 0.0, "Reward for executing the whole sequence.");
 

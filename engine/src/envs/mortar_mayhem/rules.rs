@@ -141,7 +141,8 @@ impl MortarMayhem {
     /// Commands that keep within the arena, each drawn from those that can be executed where the last one leads.
     fn add_valid_commands(&mut self, count: i64, random: &mut Generator) {
         let parameters = &self.assets.parameters;
-        let inside = |(x, y): (i32, i32)| (0..parameters.arena_size).contains(&x) && (0..parameters.arena_size).contains(&y);
+        let inside =
+            |(x, y): (i32, i32)| (0..parameters.arena_size).contains(&x) && (0..parameters.arena_size).contains(&y);
         let mut at = self.agent_tile;
         for _ in 0..count {
             let valid = || Command::first(parameters.allowed_commands).filter(|command| inside(command.apply(at)));

@@ -1,0 +1,379 @@
+//! The service between real processes: engines and trainers that are started, killed and restarted.
+//!
+//! The test binary starts itself again for them: the test `role` does nothing unless the environment tells it what to be.
+
+mod service_support;
+
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use endless_gym::pool::ResetRequest;
+use endless_gym::service::{ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, Trainer, engines};
+use rustix::process::{Pid, Signal, kill_process};
+use service_support::foreign::{ActionHeader, Foreign};
+use service_support::{Place, engine_config, play_role};
+
+const SECONDS: Duration = Duration::from_secs(5);
+
+#[test]
+fn role() {
+    play_role();
+}
+
+/// Resets a group and plays some steps.
+fn play(trainer: &mut Trainer, group: usize, steps: u64) {
+    trainer.reset(group, ResetRequest::Seed(3)).unwrap();
+    let first = trainer.receive(group, SECONDS).unwrap().step();
+    for step in 1..=steps {
+        trainer.send_with(group, |actions| actions.fill(1)).unwrap();
+        let received = trainer.receive(group, SECONDS).unwrap();
+        assert_eq!(received.step(), first + step);
+        assert_eq!(received.batch().reward().len(), trainer.specification().num_envs);
+    }
+}
+
+#[test]
+fn groups_are_reset_and_stepped_independently() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 4, 2);
+    let mut trainer = place.trainer("gym").unwrap();
+    let specification = trainer.specification().clone();
+    assert_eq!((specification.groups, specification.num_envs), (2, 4));
+    assert_eq!(specification.service, "gym");
+
+    trainer.reset(0, ResetRequest::Seed(7)).unwrap();
+    trainer.reset(1, ResetRequest::Seed(7)).unwrap();
+    let second = trainer.receive(1, SECONDS).unwrap();
+    let first = trainer.receive(0, SECONDS).unwrap();
+    assert_eq!((first.group(), second.group()), (0, 1));
+    assert_eq!(first.batch().observation(), second.batch().observation());
+    assert!(first.batch().observation().iter().any(|byte| *byte != 0));
+    assert_eq!(first.batch().episode_length(), [0; 4]);
+
+    let actions = vec![1; 4 * specification.action_space.branches().len()];
+    trainer.send(0, &actions).unwrap();
+    let stepped = trainer.receive_any(SECONDS).unwrap();
+    assert_eq!((stepped.group(), stepped.step()), (0, 2));
+    assert_eq!(stepped.batch().episode_length(), [1; 4]);
+    assert_eq!(first.batch().episode_length(), [0; 4], "a held batch stays as it was");
+
+    trainer.reset(0, ResetRequest::Each { reset: &[0, 2, 0, 1], seed: &[0, 7, 0, 0] }).unwrap();
+    let again = trainer.receive(0, SECONDS).unwrap();
+    assert_eq!(again.batch().episode_length(), [1, 0, 1, 0]);
+}
+
+#[test]
+fn mistakes_of_a_trainer_are_typed_errors() {
+    let place = Place::new();
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let mut engine = Engine::new(&engine_config(place.namespace(), "gym", 2, 1)).unwrap();
+        let stop = &stop;
+        let running = scope.spawn(move || engine.run(stop).unwrap());
+        let mut trainer = place.trainer("gym").unwrap();
+        let width = trainer.specification().action_space.branches().len();
+
+        assert!(matches!(trainer.reset(1, ResetRequest::All), Err(ServiceError::NoSuchGroup { given: 1, .. })));
+        assert!(matches!(trainer.receive(0, SECONDS), Err(ServiceError::NothingSent { group: 0 })));
+        assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingSent { .. })));
+        assert!(matches!(
+            trainer.reset(0, ResetRequest::Each { reset: &[1, 1], seed: &[1] }),
+            Err(ServiceError::ResetCount { given: 1, num_envs: 2 })
+        ));
+        assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::ActionCount { given: 1, num_envs: 2, .. })));
+
+        // Nothing can be stepped before the first reset.
+        trainer.send(0, &vec![0; 2 * width]).unwrap();
+        let rejected = trainer.receive(0, SECONDS).unwrap_err();
+        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+
+        trainer.reset(0, ResetRequest::All).unwrap();
+        assert!(matches!(trainer.reset(0, ResetRequest::All), Err(ServiceError::AnswerPending { group: 0 })));
+        trainer.receive(0, SECONDS).unwrap();
+
+        let mut actions = vec![0; 2 * width];
+        actions[width] = 99;
+        let error = trainer.send(0, &actions).unwrap_err();
+        assert!(matches!(&error, ServiceError::ActionRange { env: 1, given, .. } if given[0] == 99), "{error}");
+
+        let mut held = Vec::new();
+        for _ in 0..trainer.specification().batches_held {
+            trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+            held.push(trainer.receive(0, SECONDS).unwrap());
+        }
+        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+        let error = trainer.receive(0, SECONDS).unwrap_err();
+        assert!(matches!(error, ServiceError::TooManyBatchesHeld { group: 0, limit: 3 }), "{error}");
+        held.remove(0);
+        held.push(trainer.receive(0, SECONDS).unwrap());
+        assert!(held.windows(2).all(|pair| pair[0].step() + 1 == pair[1].step()));
+
+        stop.store(true, Ordering::Relaxed);
+        let summary = running.join().unwrap();
+        assert_eq!((summary.batches, summary.env_steps, summary.rejected), (5, 8, 1));
+    });
+}
+
+#[test]
+fn a_second_trainer_and_a_second_engine_are_refused() {
+    let place = Place::new();
+    let engine = place.engine("gym", 1, 1);
+    let _trainer = place.trainer("gym").unwrap();
+    let refused = place.trainer("gym").map(drop).unwrap_err();
+    let own = std::process::id();
+    assert!(matches!(refused, ServiceError::TrainerExists { pid: Some(pid), .. } if pid == own), "{refused}");
+    let refused = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).map(drop).unwrap_err();
+    assert!(matches!(refused, ServiceError::EngineExists { pid: Some(pid), .. } if pid == engine.id()), "{refused}");
+    assert!(refused.to_string().contains("gym"));
+}
+
+#[test]
+fn an_unknown_engine_is_named_among_those_that_exist() {
+    let place = Place::new();
+    let alone = place.trainer_now("gym").map(drop).unwrap_err();
+    assert!(alone.to_string().contains("there is none"), "{alone}");
+    let _engine = place.engine("other", 1, 1);
+    place.trainer("other").unwrap();
+    let error = place.trainer_now("gym").map(drop).unwrap_err();
+    assert!(matches!(&error, ServiceError::UnknownEngine { service, .. } if service == "gym"), "{error}");
+    assert!(error.to_string().contains("there is other"), "{error}");
+    assert_eq!(engines(place.namespace()).unwrap(), ["other"]);
+    let config = ConnectConfig { namespace: place.namespace().clone(), ..ConnectConfig::new("a/b") };
+    assert!(matches!(Trainer::connect(&config), Err(ServiceError::InvalidName { .. })));
+}
+
+#[test]
+fn observers_see_the_newest_batch_and_hold_nobody_up() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    let config = place.connect_config("gym");
+    let mut observer = Observer::connect(&config, 0).unwrap();
+    assert!(observer.newest().unwrap().is_none());
+    play(&mut trainer, 0, 10);
+    let seen = observer.newest().unwrap().unwrap();
+    assert_eq!(seen.step(), 11);
+    // One that hoards what it gets runs out by itself; the trainer does not notice.
+    let mut hoard = vec![seen];
+    while hoard.len() < 3 {
+        play(&mut trainer, 0, 1);
+        hoard.push(observer.next(SECONDS).unwrap());
+    }
+    play(&mut trainer, 0, 10);
+    assert!(matches!(observer.newest(), Err(ServiceError::TooManyBatchesHeld { .. })));
+    assert!(matches!(Observer::connect(&config, 1), Err(ServiceError::NoSuchGroup { .. })));
+    let others: Vec<_> = (0..2).map(|_| Observer::connect(&config, 0).unwrap()).collect();
+    let error = Observer::connect(&config, 0).map(drop).unwrap_err();
+    assert!(matches!(error, ServiceError::TooManyObservers { limit: 3, .. }), "{error}");
+    drop(others);
+    play(&mut trainer, 0, 1);
+}
+
+#[test]
+fn after_a_killed_trainer_the_next_one_plays_on() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 2);
+    for _ in 0..2 {
+        let mut killed = place.role("trainer", "gym", &[]);
+        // It plays for as long as it lives; the observer shows that it does.
+        let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
+        observer.next(SECONDS).unwrap();
+        killed.kill();
+        let mut trainer = place.trainer("gym").unwrap();
+        // The environments are in the dead one's episodes.
+        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+        let rejected = trainer.receive(0, SECONDS).unwrap_err();
+        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+        play(&mut trainer, 0, 5);
+        play(&mut trainer, 1, 5);
+    }
+}
+
+#[test]
+fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 2, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 3);
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    let held = trainer.receive(0, SECONDS).unwrap();
+    let frame = held.batch().observation().to_vec();
+
+    engine.kill();
+    let start = Instant::now();
+    let error = trainer
+        .send_with(0, |actions| actions.fill(0))
+        .and_then(|()| trainer.receive(0, Duration::from_secs(60)).map(drop))
+        .unwrap_err();
+    assert!(matches!(error, ServiceError::EngineLost { pid, .. } if pid == engine.id()), "{error}");
+    assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
+    let error = trainer.reconnect(Duration::ZERO).unwrap_err();
+    assert!(matches!(error, ServiceError::UnknownEngine { .. }), "{error}");
+
+    let mut engine = place.engine("gym", 2, 1);
+    trainer.reconnect(SECONDS).unwrap();
+    play(&mut trainer, 0, 3);
+    assert_eq!(held.batch().observation(), frame, "what a dead engine lent stays");
+
+    // The next one is replaced before the trainer notices anything.
+    engine.kill();
+    let mut engine = place.engine("gym", 2, 1);
+    Observer::connect(&place.connect_config("gym"), 0).unwrap();
+    let error = trainer
+        .send_with(0, |actions| actions.fill(0))
+        .and_then(|()| trainer.receive(0, SECONDS).map(drop))
+        .unwrap_err();
+    assert!(matches!(error, ServiceError::EngineRestarted { .. }), "{error}");
+    trainer.reconnect(SECONDS).unwrap();
+    play(&mut trainer, 0, 3);
+
+    // One that serves something else is no successor.
+    engine.kill();
+    let _engine = place.engine("gym", 3, 1);
+    let error = trainer.reconnect(SECONDS).unwrap_err();
+    assert!(matches!(error, ServiceError::SpecificationChanged { what: "number of environments", .. }), "{error}");
+    drop(trainer);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
+}
+
+#[test]
+fn an_engine_that_ends_is_noticed_too() {
+    let place = Place::new();
+    let engine = place.engine("gym", 1, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 1);
+    engine.end();
+    let error = trainer
+        .send_with(0, |actions| actions.fill(0))
+        .and_then(|()| trainer.receive(0, SECONDS).map(drop))
+        .unwrap_err();
+    assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+}
+
+#[test]
+fn a_slow_engine_is_waited_for() {
+    let place = Place::new();
+    let engine = place.engine("gym", 1, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 1);
+    let pid = Pid::from_raw(engine.id() as i32).unwrap();
+    kill_process(pid, Signal::STOP).unwrap();
+    std::thread::sleep(Duration::from_millis(50));
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    let error = trainer.receive(0, Duration::from_millis(700)).unwrap_err();
+    assert!(matches!(error, ServiceError::TimedOut { .. }), "{error}");
+    assert!(matches!(trainer.receive(0, Duration::ZERO), Err(ServiceError::TimedOut { .. })));
+    kill_process(pid, Signal::CONT).unwrap();
+    assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), 3);
+}
+
+#[test]
+fn nothing_is_left_behind() {
+    let place = Place::new();
+    let engine = place.engine("gym", 2, 2);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 1, 2);
+    assert!(!place.leftovers().is_empty());
+    trainer.reset(0, ResetRequest::All).unwrap();
+    let held = trainer.receive(0, SECONDS).unwrap();
+    engine.end();
+    drop(trainer);
+    drop(held);
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+
+    // Nor after a crash, once anyone has come by.
+    let mut engine = place.engine("gym", 2, 2);
+    place.trainer("gym").unwrap();
+    engine.kill();
+    assert!(!place.leftovers().is_empty());
+    assert_eq!(engines(place.namespace()).unwrap(), [] as [String; 0]);
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
+#[test]
+fn bad_messages_are_answered_with_rejections() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 1);
+    let specification = place.trainer("gym").unwrap().specification().clone();
+    let foreign = Foreign::new(place.namespace(), &specification);
+    let good = ActionHeader::reset_all(&specification);
+    assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
+
+    let version = ActionHeader { layout_version: 77, ..good };
+    let (status, text) = foreign.ask(version, foreign.blocks(), |_| {}).unwrap();
+    assert!(status != 0 && text.contains("77"), "{text}");
+    let (status, text) = foreign.ask(ActionHeader { kind: 55, ..good }, foreign.blocks(), |_| {}).unwrap();
+    assert!(status != 0 && text.contains("55"), "{text}");
+    let step = ActionHeader { kind: 1, ..good };
+    let (status, text) = foreign.ask(step, 1, |_| {}).unwrap();
+    assert!(status != 0 && text.contains("1 blocks"), "{text}");
+    let out_of_range = |blocks: &mut [endless_gym::batch::Block]| {
+        specification.action.write::<i32>(blocks, "action").fill(-1);
+    };
+    let (status, text) = foreign.ask(step, foreign.blocks(), out_of_range).unwrap();
+    assert!(status != 0 && text.contains("-1"), "{text}");
+    let earlier = ActionHeader { epoch: specification.epoch.wrapping_sub(1), ..good };
+    assert_eq!(foreign.ask(earlier, foreign.blocks(), |_| {}), None, "a message of another epoch is dropped");
+
+    // Nothing of that has harmed the engine.
+    let fine = |blocks: &mut [endless_gym::batch::Block]| {
+        specification.action.write::<i32>(blocks, "action").fill(0);
+    };
+    assert_eq!(foreign.ask(step, foreign.blocks(), fine).unwrap().0, 0);
+    drop(foreign);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
+}
+
+#[test]
+fn another_version_is_refused_with_both_numbers() {
+    let place = Place::new();
+    let _old = service_support::foreign::engine_of_version(place.namespace(), "old", 999);
+    let error = place.trainer_now("old").map(drop).unwrap_err();
+    assert!(matches!(&error, ServiceError::Version { layout, .. } if layout == "999"), "{error}");
+    assert!(error.to_string().contains("install the same version"), "{error}");
+}
+
+#[test]
+fn messages_of_another_type_are_refused() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 1, 1);
+    let specification = place.trainer("gym").unwrap().specification().clone();
+    let _other = service_support::foreign::engine_of_other_type(place.namespace(), "other", &specification);
+    let error = place.trainer_now("other").map(drop).unwrap_err();
+    assert!(matches!(error, ServiceError::IncompatibleTypes { .. }), "{error}");
+}
+
+#[test]
+fn too_little_shared_memory_is_an_error_and_not_a_signal() {
+    let place = Place::new();
+    let exe = std::env::current_exe().unwrap();
+    let script = "mount -t tmpfs -o size=4M tmpfs /dev/shm && exec \"$0\" role --exact --nocapture";
+    let output = Command::new("unshare")
+        .args(["--mount", "--map-root-user", "sh", "-c", script])
+        .arg(exe)
+        .envs(place.role_environment("engine", "gym", &["64", "1"]))
+        .stdin(std::process::Stdio::null())
+        .output();
+    let text = match &output {
+        Ok(output) => String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr),
+        Err(e) => e.to_string().into(),
+    };
+    if !text.contains("running 1 test") {
+        println!("skipped: a mount namespace of our own is not permitted here ({})", text.trim());
+        return;
+    }
+    assert!(text.contains("SharedMemoryTooSmall") && text.contains("/dev/shm"), "{text}");
+    assert!(text.contains("fewer environments"), "{text}");
+}
+
+#[test]
+fn trainers_and_batches_may_move_between_threads() {
+    fn check<T: Send + Sync>() {}
+    check::<Trainer>();
+    check::<endless_gym::service::Received>();
+    check::<Observer>();
+    fn movable<T: Send>() {}
+    movable::<Engine>();
+    check::<Namespace>();
+}
