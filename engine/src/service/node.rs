@@ -15,7 +15,7 @@ use super::error::ServiceError;
 use super::here::Here;
 
 /// The kind of services. Its ports and samples may be moved to and dropped in any thread, which a binding to a garbage
-/// collected language needs. It costs 0.1 microseconds a step against the kind for one thread.
+/// collected language needs. It costs half a microsecond a step against the kind for one thread.
 pub(super) type Ipc = ipc_threadsafe::Service;
 
 /// This process as a member of a namespace. Goes after all ports that were made with it.

@@ -1,0 +1,263 @@
+//! The `endless` program, as a user runs it: real processes, their output, exit status and what they leave behind.
+
+mod common;
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use endless_gym::service::{ConnectConfig, Namespace, Trainer};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value as Json;
+
+/// A directory of sockets for one test alone, and what is left of its segments.
+struct Room {
+    root: PathBuf,
+}
+
+impl Room {
+    fn new(name: &str) -> Self {
+        let root = std::env::temp_dir().join(format!("eg-{name}-{}", std::process::id()));
+        std::fs::create_dir_all(&root).unwrap();
+        std::fs::set_permissions(&root, std::fs::Permissions::from_mode(0o700)).unwrap();
+        Room { root }
+    }
+
+    fn endless(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_endless"));
+        command.args(arguments).env("ENDLESS_GYM_ROOT", &self.root);
+        command
+    }
+
+    fn run(&self, arguments: &[&str]) -> Output {
+        self.endless(arguments).output().unwrap()
+    }
+
+    fn segments(&self) -> Vec<String> {
+        let prefix = Namespace::at(&self.root).prefix().to_owned();
+        let names = std::fs::read_dir("/dev/shm").unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
+        names.filter(|name| name.contains(&prefix)).collect()
+    }
+
+    fn wait_for_engine(&self) {
+        let start = Instant::now();
+        while endless_gym::service::engines(&Namespace::at(&self.root)).unwrap().is_empty() {
+            assert!(start.elapsed() < Duration::from_secs(20), "no engine starts");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    fn connect(&self, service: &str) -> Trainer {
+        let config = ConnectConfig {
+            namespace: Namespace::at(&self.root),
+            timeout: Duration::from_secs(10),
+            ..ConnectConfig::new(service)
+        };
+        Trainer::connect(&config).unwrap()
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.root);
+    }
+}
+
+fn text(bytes: &[u8]) -> &str {
+    std::str::from_utf8(bytes).unwrap()
+}
+
+fn signal(child: &Child, signal: Signal) {
+    kill_process(Pid::from_child(child), signal).unwrap();
+}
+
+fn wait(child: &mut Child) -> std::process::ExitStatus {
+    let start = Instant::now();
+    loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            return status;
+        }
+        assert!(start.elapsed() < Duration::from_secs(20), "the program does not end");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn list_shows_environments_and_parameters() {
+    let room = Room::new("list");
+    let all = room.run(&["list"]);
+    assert!(all.status.success());
+    assert!(text(&all.stdout).contains("Endless-MortarMayhem-v0"));
+    let one = room.run(&["list", "MortarMayhem-v0"]);
+    for part in ["command_show_duration", "[3]", "integer, 2 to 6", "commands_completed"] {
+        assert!(text(&one.stdout).contains(part), "{part}");
+    }
+    let json: Json = serde_json::from_slice(&room.run(&["list", "--json"]).stdout).unwrap();
+    assert_eq!(json[0]["id"], "MortarMayhem-v0");
+    assert_eq!(json[0]["parameters"][2]["name"], "arena_size");
+    assert_eq!(json[0]["parameters"][2]["max"], 6);
+    let unknown = room.run(&["list", "MortarMayhem-v1"]);
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; there are MortarMayhem-v0"));
+    assert_eq!(text(&unknown.stderr).lines().count(), 1);
+}
+
+#[test]
+fn verify_counts_and_exits_by_differences() {
+    let room = Room::new("verify");
+    let files = common::traces("MortarMayhem-Grid");
+    let verify = |files: &[&Path]| {
+        let files: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
+        room.run(&[&["verify"], &files[..]].concat())
+    };
+    let same = verify(&[&files[0], &files[1]]);
+    assert_eq!(same.status.code(), Some(0));
+    let lines: Vec<&str> = text(&same.stdout).lines().collect();
+    assert_eq!(lines.len(), 3);
+    assert!(lines[0].ends_with("6 episodes, 276 steps, no difference"), "{}", lines[0]);
+    assert_eq!(lines[2], "verified 2 traces: 12 episodes, 552 steps, 0 differences");
+
+    let mut recorded = String::new();
+    std::io::Read::read_to_string(
+        &mut flate2::read::GzDecoder::new(std::fs::File::open(&files[0]).unwrap()),
+        &mut recorded,
+    )
+    .unwrap();
+    let write = |name: &str, trace: &Json| {
+        let path = room.root.join(name);
+        let mut file = flate2::write::GzEncoder::new(std::fs::File::create(&path).unwrap(), Default::default());
+        std::io::Write::write_all(&mut file, trace.to_string().as_bytes()).unwrap();
+        path
+    };
+    let mut trace: Json = serde_json::from_str(&recorded).unwrap();
+    trace["episodes"][2]["steps"][4][1] = 0.5.into();
+    let other = verify(&[&write("other.json.gz", &trace)]);
+    assert_eq!(other.status.code(), Some(1));
+    assert!(
+        text(&other.stdout).contains("1 differences, the first in episode 2, step 5: reward expected 0.5, found 0.0"),
+        "{}",
+        text(&other.stdout)
+    );
+    trace["env"] = "Chess-v0".into();
+    let unknown = verify(&[&files[0], &write("unknown.json.gz", &trace)]);
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(text(&unknown.stdout).contains("not replayed: no environment `Chess-v0`"));
+    assert!(text(&unknown.stdout).ends_with("verified 1 traces: 6 episodes, 276 steps, 0 differences\n"));
+    assert_eq!(verify(&[Path::new("/nowhere.json.gz")]).status.code(), Some(1));
+}
+
+#[test]
+fn the_demo_plays_through_shared_memory_and_leaves_nothing() {
+    let room = Room::new("demo");
+    let demo = room.run(&["demo", "--env", "MortarMayhem-Grid-v0", "--num-envs", "8", "--seconds", "2", "--json"]);
+    assert!(demo.status.success(), "{}", text(&demo.stderr));
+    let json: Json = serde_json::from_slice(&demo.stdout).unwrap();
+    assert!(json["episodes"].as_u64().unwrap() >= 16, "{json}");
+    assert_eq!(json["mean_length"], 118.0);
+    assert_eq!(json["mean_info"]["commands_completed"], 1.0);
+    let random = room.run(&["demo", "--policy", "random", "--num-envs", "8", "--seconds", "0.5"]);
+    assert!(text(&random.stdout).contains("steps per second"), "{}", text(&random.stderr));
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn ctrl_c_ends_the_demo_with_its_summary() {
+    let room = Room::new("ctrlc");
+    let mut demo =
+        room.endless(&["demo", "--num-envs", "8", "--seconds", "60"]).stdout(Stdio::piped()).spawn().unwrap();
+    room.wait_for_engine();
+    signal(&demo, Signal::INT);
+    assert!(wait(&mut demo).success());
+    assert!(text(&demo.wait_with_output().unwrap().stdout).contains("steps per second"));
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn an_engine_does_not_outlive_a_killed_demo() {
+    let room = Room::new("orphan");
+    let mut demo = room.endless(&["demo", "--num-envs", "8"]).stdout(Stdio::null()).spawn().unwrap();
+    room.wait_for_engine();
+    signal(&demo, Signal::KILL);
+    wait(&mut demo);
+    let start = Instant::now();
+    // The engine goes by itself and takes its own segments along; the next process clears up after the killed trainer.
+    while start.elapsed() < Duration::from_secs(10) && !room.segments().is_empty() {
+        std::thread::sleep(Duration::from_millis(500));
+        room.run(&["demo", "--num-envs", "1", "--seconds", "0.1"]);
+    }
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn serve_serves_until_a_signal_and_leaves_nothing() {
+    let room = Room::new("serve");
+    for end in [Signal::INT, Signal::TERM] {
+        let arguments = ["serve", "--num-envs", "4", "--groups", "2", "--service", "one", "--option", "max_steps=50"];
+        let mut engine = room.endless(&arguments).stdout(Stdio::piped()).spawn().unwrap();
+        let mut trainer = room.connect("one");
+        assert_eq!(trainer.specification().groups, 2);
+        assert_eq!(trainer.specification().options[0]["max_steps"], 50);
+        trainer.reset(1, endless_gym::pool::ResetRequest::All).unwrap();
+        trainer.receive(1, Duration::from_secs(5)).unwrap();
+        drop(trainer);
+        signal(&engine, end);
+        assert!(wait(&mut engine).success());
+        assert!(
+            text(&engine.wait_with_output().unwrap().stdout).starts_with("serving Endless-MortarMayhem-v0 as `one`")
+        );
+        assert_eq!(room.segments(), [""; 0]);
+    }
+}
+
+#[test]
+fn wrong_arguments_are_one_clear_line() {
+    let room = Room::new("wrong");
+    for (arguments, part) in [
+        (vec!["serve", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (vec!["serve", "--option", "arena_sise=3"], "no reset parameter `arena_sise`"),
+        (vec!["serve", "--option", "max_steps"], "expected NAME=VALUE"),
+        (vec!["serve", "--option", "agent_speed=fast"], "`agent_speed` is \"fast\", but has to be: number"),
+        (vec!["serve", "--num-envs", "0"], "0 environments"),
+        (vec!["serve", "--groups", "0"], "0 groups"),
+        (vec!["serve", "--service", "a/b"], "`a/b` cannot name an engine"),
+        (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (vec!["demo", "--num-envs", "0"], "0 environments"),
+        (vec!["demo", "--option", "arena_size=7"], "`arena_size` is 7, which is out of range"),
+        (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "/no/python: "),
+    ] {
+        let output = room.run(&arguments);
+        let stderr = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
+        assert!(stderr.starts_with("endless: ") && stderr.contains(part), "{arguments:?}: {stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
+    }
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn bench_measures_every_way() {
+    let room = Room::new("bench");
+    let output = room.run(&["bench", "--num-envs", "16", "--seconds", "0.05", "--rounds", "1", "--json"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let json: Json = serde_json::from_slice(&output.stdout).unwrap();
+    let measurements = json[0]["measurements"].as_array().unwrap();
+    let ways: Vec<&str> = measurements.iter().map(|m| m["way"].as_str().unwrap()).collect();
+    for way in ["in process, 1 thread", "service, only receives", "service, reads every byte"] {
+        assert!(ways.contains(&way), "{ways:?}");
+    }
+    assert!(measurements.iter().all(|m| m["steps_per_second"].as_f64().unwrap() > 0.0));
+}
+
+#[test]
+fn every_command_explains_itself() {
+    let room = Room::new("help");
+    for (command, part) in
+        [("list", "--json"), ("demo", "--seconds"), ("serve", "--service"), ("bench", "--rounds"), ("verify", "FILES")]
+    {
+        let help = room.run(&[command, "--help"]);
+        assert!(help.status.success() && text(&help.stdout).contains(part), "{command}");
+    }
+    assert!(text(&room.run(&["demo", "--help"]).stdout).contains("[default: 10]"), "defaults are shown");
+}
