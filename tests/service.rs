@@ -237,6 +237,29 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
+/// Longer than the others, for `cargo test -- --ignored`: deaths come at any moment, also while connecting.
+#[test]
+#[ignore = "takes a minute"]
+fn deaths_at_any_moment_are_survived() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 3, 2);
+    for round in 0..300_u64 {
+        let mut killed = place.role("trainer", "gym", &[]);
+        // Start, connection and play of a process take some 30 milliseconds.
+        std::thread::sleep(Duration::from_micros(round * 7919 % 60_000));
+        if round % 3 == 0 {
+            engine.kill();
+            engine = place.engine("gym", 3, 2);
+        }
+        killed.kill();
+        let mut trainer = place.trainer("gym").unwrap_or_else(|e| panic!("round {round}: {e}"));
+        play(&mut trainer, 0, 3);
+        play(&mut trainer, 1, 3);
+    }
+    engine.end();
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
 #[test]
 fn an_engine_that_ends_is_noticed_too() {
     let place = Place::new();

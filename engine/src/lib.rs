@@ -11,3 +11,8 @@ pub mod random;
 pub mod raster;
 pub mod service;
 pub mod trace;
+
+/// The examples of the README, as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;

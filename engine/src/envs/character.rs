@@ -2,6 +2,8 @@
 //!
 //! Source: the original's `character_controller.py`.
 
+use serde::{Deserialize, Serialize};
+
 use super::vector::rotate;
 use crate::raster::{Canvas, Rgb, Sprite, Surface};
 
@@ -62,7 +64,7 @@ impl CharacterSprites {
 }
 
 /// Where the character is and where it faces.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Character {
     /// Centre in pixels of the screen.
     pub position: (i32, i32),

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use thiserror::Error;
 
 use crate::random::Generator;
+use crate::raster::Canvas;
 pub use parameters::{Kind, Parameter, ParameterError, ResetParameters};
 pub use spec::{ActionSpace, Column, FRAME_BYTES, SCREEN, Spec};
 
@@ -39,6 +40,10 @@ pub trait Environment: Send {
 
     /// Draws the observation: `frame` holds [`FRAME_BYTES`] bytes, indexed \[x\]\[y\]\[channel\], of any content before.
     fn draw(&self, frame: &mut [u8]);
+
+    /// Draws the original's ground-truth view on a canvas of the observation's size, before the original scales it up. The
+    /// state changes where an original counts its views.
+    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
     /// Writes the vector observation; empty where the environment has none.
     fn vector_observation(&self, _out: &mut [f32]) {}

@@ -1,5 +1,7 @@
 //! The commands of Mortar Mayhem: where they lead, what they look like, and when each is shown.
 
+use serde::{Deserialize, Serialize};
+
 use crate::raster::{Rgb, Sprite, Surface};
 
 /// Number of commands that there are.
@@ -14,7 +16,7 @@ const WHITE: Rgb = [255, 255, 255];
 const BLACK: Rgb = [0, 0, 0];
 
 /// A command, by its number in the original's order; `allowed_commands` counts from the start.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Command(u8);
 
 /// What is fixed about a command.
@@ -108,7 +110,7 @@ pub fn pictures() -> [Sprite; COMMANDS] {
 }
 
 /// The schedule by which commands are shown: each for `duration` frames, and nothing for `delay` frames after it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Clue {
     /// Number in the sequence of the first command to show.
     first: usize,

@@ -24,7 +24,7 @@ impl MortarMayhem {
         out[AGENT] = share(character.position.0);
         out[AGENT + 1] = share(character.position.1);
         out[HEADING..HEADING + 2].copy_from_slice(&character.heading());
-        if let Some(command) = self.shown_command {
+        if let Some(command) = self.state.shown_command {
             out[COMMAND + command.index()] = 1.0;
         }
         if let Some((x, y)) = self.visible_fire() {

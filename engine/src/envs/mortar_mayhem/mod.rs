@@ -16,6 +16,7 @@ pub use rules::MortarMayhem;
 
 use crate::envs::{Environment, ResetParameters, Transition};
 use crate::random::Generator;
+use crate::raster::Canvas;
 
 impl Environment for MortarMayhem {
     type Variant = Variant;
@@ -41,9 +42,13 @@ impl Environment for MortarMayhem {
         self.draw_frame(frame);
     }
 
+    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
+        self.draw_debug_frame(canvas);
+    }
+
     fn vector_observation(&self, out: &mut [f32]) {
         out.fill(0.0);
-        for (one_hot, command) in out.chunks_exact_mut(COMMANDS).zip(&self.commands) {
+        for (one_hot, command) in out.chunks_exact_mut(COMMANDS).zip(&self.state.commands) {
             one_hot[command.one_hot()] = 1.0;
         }
     }
@@ -53,7 +58,7 @@ impl Environment for MortarMayhem {
     }
 
     fn ground_truth(&self, out: &mut [f64]) {
-        let (x, y) = self.target;
+        let (x, y) = self.state.target;
         out.copy_from_slice(&[f64::from(x) / 5.0, f64::from(y) / 5.0]);
     }
 

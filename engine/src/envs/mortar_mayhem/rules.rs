@@ -5,28 +5,42 @@
 
 use std::sync::Arc;
 
+use serde::{Deserialize, Serialize};
+
 use super::commands::{Clue, Command};
 use super::drawing::{Assets, TILE};
 use super::parameters::Locomotion;
 use crate::envs::Transition;
-use crate::envs::character::Character;
+use crate::envs::character::{Character, CharacterSprites};
 use crate::random::Generator;
 
 /// Which character a frame shows, other than the first frame of an episode.
 ///
 /// The endless original goes on showing the last episode's character until the agent may move in the new one.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) enum Shown {
     /// No episode has played a step yet.
     Nobody,
     Current,
-    Former(Arc<Assets>, Character),
+    /// The last episode's, with the scale that it was drawn at.
+    Former {
+        character: Character,
+        scale: f64,
+    },
 }
 
-/// State of one environment.
+/// One environment: its state, and the pictures that it is shown with.
 #[derive(Clone, Debug)]
 pub struct MortarMayhem {
     pub(super) assets: Arc<Assets>,
+    /// Pictures of [`Shown::Former`].
+    pub(super) former_sprites: Arc<CharacterSprites>,
+    pub(super) state: State,
+}
+
+/// All that changes while an environment is played.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct State {
     pub(super) agent: Character,
     pub(super) shown: Shown,
     /// The frame is the first of its episode.
@@ -40,7 +54,9 @@ pub struct MortarMayhem {
     pub(super) target: (i32, i32),
     /// All tiles but the target burn.
     tiles_on: bool,
-    clue: Clue,
+    pub(super) clue: Clue,
+    /// The clue as the ground-truth view goes through it, at its own pace.
+    pub(super) viewed_clue: Clue,
     show_duration: usize,
     show_delay: usize,
     explosion_duration: u32,
@@ -58,8 +74,7 @@ pub struct MortarMayhem {
 
 impl MortarMayhem {
     pub(super) fn unplayed(assets: &Arc<Assets>) -> Self {
-        MortarMayhem {
-            assets: Arc::clone(assets),
+        let state = State {
             agent: Character::default(),
             shown: Shown::Nobody,
             first_frame: true,
@@ -69,6 +84,7 @@ impl MortarMayhem {
             target: (0, 0),
             tiles_on: false,
             clue: Clue::default(),
+            viewed_clue: Clue::default(),
             show_duration: 0,
             show_delay: 0,
             explosion_duration: 1,
@@ -79,12 +95,15 @@ impl MortarMayhem {
             steps: 0,
             total_completed: 0,
             success: false,
-        }
+        };
+        MortarMayhem { assets: Arc::clone(assets), former_sprites: Arc::clone(&assets.character), state }
     }
 
     pub(super) fn start(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
-        if let Shown::Current = self.shown {
-            self.shown = Shown::Former(Arc::clone(&self.assets), self.agent);
+        if let Shown::Current = self.state.shown {
+            let scale = self.assets.parameters.agent_scale;
+            self.state.shown = Shown::Former { character: self.state.agent, scale };
+            self.former_sprites = Arc::clone(&self.assets.character);
         }
         if !Arc::ptr_eq(&self.assets, assets) {
             self.assets = Arc::clone(assets);
@@ -94,21 +113,21 @@ impl MortarMayhem {
 
         let size = i64::from(parameters.arena_size);
         let tile = random.integers(0, size * size);
-        self.agent_tile = ((tile / size) as i32, (tile % size) as i32);
+        self.state.agent_tile = ((tile / size) as i32, (tile % size) as i32);
         let mut offset = (0, 0);
         if variant.start_offset {
             offset = (random.integers(-2, 2) as i32, random.integers(-2, 2) as i32);
         }
         let centre = |corner: i32, tile: i32| corner + tile * TILE + TILE / 2;
-        self.agent = Character {
+        self.state.agent = Character {
             position: (
-                centre(assets.arena.0, self.agent_tile.0) + offset.0,
-                centre(assets.arena.1, self.agent_tile.1) + offset.1,
+                centre(assets.arena.0, self.state.agent_tile.0) + offset.0,
+                centre(assets.arena.1, self.state.agent_tile.1) + offset.1,
             ),
             rotation: 0,
         };
 
-        self.commands.clear();
+        self.state.commands.clear();
         if variant.endless {
             for _ in 0..parameters.initial_command_count {
                 self.add_any_command(random);
@@ -117,25 +136,26 @@ impl MortarMayhem {
             let count = *random.choice(&parameters.command_count);
             self.add_valid_commands(count, random);
         }
-        self.clue = Clue::default();
+        self.state.clue = Clue::default();
+        self.state.viewed_clue = Clue::default();
         if !variant.commands_given {
-            self.show_duration = *random.choice(&parameters.command_show_duration) as usize;
-            self.show_delay = *random.choice(&parameters.command_show_delay) as usize;
-            self.clue = Clue::new(0, self.commands.len(), self.show_duration, self.show_delay);
+            self.state.show_duration = *random.choice(&parameters.command_show_duration) as usize;
+            self.state.show_delay = *random.choice(&parameters.command_show_delay) as usize;
+            self.begin_clue(0);
         }
         self.show_next();
 
-        self.target = self.tile_after(self.agent_tile, 0);
-        self.tiles_on = false;
-        self.current_command = 0;
-        self.command_steps = 0;
-        self.verify_steps = 0;
-        self.steps = 0;
-        self.total_completed = 0;
-        self.success = false;
-        self.first_frame = true;
-        self.explosion_duration = *random.choice(&parameters.explosion_duration) as u32;
-        self.explosion_delay = *random.choice(&parameters.explosion_delay) as u32;
+        self.state.target = self.tile_after(self.state.agent_tile, 0);
+        self.state.tiles_on = false;
+        self.state.current_command = 0;
+        self.state.command_steps = 0;
+        self.state.verify_steps = 0;
+        self.state.steps = 0;
+        self.state.total_completed = 0;
+        self.state.success = false;
+        self.state.first_frame = true;
+        self.state.explosion_duration = *random.choice(&parameters.explosion_duration) as u32;
+        self.state.explosion_delay = *random.choice(&parameters.explosion_delay) as u32;
     }
 
     /// Commands that keep within the arena, each drawn from those that can be executed where the last one leads.
@@ -143,26 +163,26 @@ impl MortarMayhem {
         let parameters = &self.assets.parameters;
         let inside =
             |(x, y): (i32, i32)| (0..parameters.arena_size).contains(&x) && (0..parameters.arena_size).contains(&y);
-        let mut at = self.agent_tile;
+        let mut at = self.state.agent_tile;
         for _ in 0..count {
             let valid = || Command::first(parameters.allowed_commands).filter(|command| inside(command.apply(at)));
             let drawn = random.integers(0, valid().count() as i64) as usize;
             // At least two of the first four commands lead from any tile to another.
             if let Some(command) = valid().nth(drawn) {
                 at = command.apply(at);
-                self.commands.push(command);
+                self.state.commands.push(command);
             }
         }
     }
 
     fn add_any_command(&mut self, random: &mut Generator) {
         let drawn = random.integers(0, self.assets.parameters.allowed_commands as i64);
-        self.commands.push(Command::from_index(drawn as usize));
+        self.state.commands.push(Command::from_index(drawn as usize));
     }
 
     /// Where command number `number` leads; the endless arena is a torus.
     fn tile_after(&self, tile: (i32, i32), number: usize) -> (i32, i32) {
-        let (x, y) = self.commands.get(number).map_or(tile, |command| command.apply(tile));
+        let (x, y) = self.state.commands.get(number).map_or(tile, |command| command.apply(tile));
         if self.assets.variant.endless {
             let size = self.assets.parameters.arena_size;
             (x.rem_euclid(size), y.rem_euclid(size))
@@ -171,30 +191,36 @@ impl MortarMayhem {
         }
     }
 
+    /// Begins to show the commands from number `first` on.
+    fn begin_clue(&mut self, first: usize) {
+        let state = &mut self.state;
+        state.clue = Clue::new(first, state.commands.len() - first, state.show_duration, state.show_delay);
+        state.viewed_clue = state.clue;
+    }
+
     fn show_next(&mut self) {
-        self.shown_command = self.clue.next_frame().and_then(|number| self.commands.get(number).copied());
+        self.state.shown_command =
+            self.state.clue.next_frame().and_then(|number| self.state.commands.get(number).copied());
     }
 
     pub(super) fn play(&mut self, action: &[i32], random: &mut Generator) -> Transition {
         let mut transition = Transition { reward: 0.0, terminated: false };
-        self.first_frame = false;
-        self.success = false;
-        if self.clue.is_over() {
-            self.shown_command = None;
-            self.shown = Shown::Current;
+        self.state.first_frame = false;
+        self.state.success = false;
+        if self.state.clue.is_over() {
+            self.state.shown_command = None;
+            self.state.shown = Shown::Current;
             self.move_agent(action);
             self.verify(&mut transition, random);
             self.burn(&mut transition);
         } else {
             self.show_next();
-            if let Shown::Nobody = self.shown {
-                self.shown = Shown::Current;
-            } else if !self.assets.variant.endless {
-                self.shown = Shown::Current;
+            if !self.assets.variant.endless || self.state.shown == Shown::Nobody {
+                self.state.shown = Shown::Current;
             }
         }
-        self.steps += 1;
-        transition.terminated |= self.steps == self.assets.parameters.max_steps;
+        self.state.steps += 1;
+        transition.terminated |= self.state.steps == self.assets.parameters.max_steps;
         transition
     }
 
@@ -202,33 +228,34 @@ impl MortarMayhem {
         let assets = &*self.assets;
         let (speed, radius) = (assets.parameters.agent_speed, assets.character.radius());
         match assets.variant.locomotion {
-            Locomotion::Free => self.agent.step_within(action, speed, radius, assets.arena),
-            Locomotion::Wrapping => self.agent.step_wrapping(action, speed, radius, assets.arena),
+            Locomotion::Free => self.state.agent.step_within(action, speed, radius, assets.arena),
+            Locomotion::Wrapping => self.state.agent.step_wrapping(action, speed, radius, assets.arena),
             Locomotion::Grid => {
-                let (x, y) = self.agent.step_on_grid(action[0], self.agent_tile, assets.parameters.arena_size);
+                let (x, y) =
+                    self.state.agent.step_on_grid(action[0], self.state.agent_tile, assets.parameters.arena_size);
                 let centre = |corner: i32, tile: i32| corner + tile * TILE + TILE / 2;
-                self.agent.position = (centre(assets.arena.0, x), centre(assets.arena.1, y));
+                self.state.agent.position = (centre(assets.arena.0, x), centre(assets.arena.1, y));
             }
         }
-        let (x, y) = self.agent.position;
-        self.agent_tile = ((x - assets.arena.0).div_euclid(TILE), (y - assets.arena.1).div_euclid(TILE));
+        let (x, y) = self.state.agent.position;
+        self.state.agent_tile = ((x - assets.arena.0).div_euclid(TILE), (y - assets.arena.1).div_euclid(TILE));
     }
 
     /// When the current command is due: checks it, and sets the tiles on fire.
     fn verify(&mut self, transition: &mut Transition, random: &mut Generator) {
-        let due = self.command_steps > 0 && self.command_steps.is_multiple_of(self.explosion_delay);
-        if !due || self.tiles_on {
+        let due = self.state.command_steps > 0 && self.state.command_steps.is_multiple_of(self.state.explosion_delay);
+        if !due || self.state.tiles_on {
             return;
         }
         let parameters = &self.assets.parameters;
         let endless = self.assets.variant.endless;
-        if self.current_command < self.commands.len() {
-            self.current_command += 1;
-            self.tiles_on = true;
-            if self.agent_tile == self.target {
+        if self.state.current_command < self.state.commands.len() {
+            self.state.current_command += 1;
+            self.state.tiles_on = true;
+            if self.state.agent_tile == self.state.target {
                 transition.reward += parameters.reward_command_success;
-                self.total_completed += 1;
-                if endless && self.current_command == self.commands.len() {
+                self.state.total_completed += 1;
+                if endless && self.state.current_command == self.state.commands.len() {
                     transition.reward += parameters.reward_sequence_success;
                 }
             } else {
@@ -236,61 +263,66 @@ impl MortarMayhem {
                 transition.reward += parameters.reward_command_failure;
             }
         }
-        if self.current_command >= self.commands.len() {
+        if self.state.current_command >= self.state.commands.len() {
             if endless {
                 self.add_any_command(random);
-                self.current_command = 0;
-                self.verify_steps = 0;
-                self.clue = Clue::new(self.commands.len() - 1, 1, self.show_duration, self.show_delay);
+                self.state.current_command = 0;
+                self.state.verify_steps = 0;
+                self.begin_clue(self.state.commands.len() - 1);
             } else {
                 transition.terminated = true;
-                self.success = true;
+                self.state.success = true;
                 transition.reward += parameters.reward_sequence_success;
             }
         }
-        self.command_steps = 1;
+        self.state.command_steps = 1;
     }
 
     /// While tiles burn: ends the episode where the agent stands on one, and puts them out when their time is over.
     fn burn(&mut self, transition: &mut Transition) {
-        if !self.tiles_on {
-            self.command_steps += 1;
-        } else if self.verify_steps > 0 && self.verify_steps.is_multiple_of(self.explosion_duration) {
-            self.tiles_on = false;
-            self.verify_steps = 0;
-            if self.current_command < self.commands.len() {
-                self.target = self.tile_after(self.target, self.current_command);
+        if !self.state.tiles_on {
+            self.state.command_steps += 1;
+        } else if self.state.verify_steps > 0 && self.state.verify_steps.is_multiple_of(self.state.explosion_duration) {
+            self.state.tiles_on = false;
+            self.state.verify_steps = 0;
+            if self.state.current_command < self.state.commands.len() {
+                self.state.target = self.tile_after(self.state.target, self.state.current_command);
             }
         } else {
-            if self.agent_tile != self.target {
+            if self.state.agent_tile != self.state.target {
                 transition.terminated = true;
                 transition.reward = self.assets.parameters.reward_command_failure;
             }
-            self.verify_steps += 1;
+            self.state.verify_steps += 1;
         }
     }
 
     /// The tile that is spared, while others are seen burning.
     pub(super) fn visible_fire(&self) -> Option<(i32, i32)> {
-        (self.tiles_on && self.assets.parameters.visual_feedback).then_some(self.target)
+        (self.state.tiles_on && self.assets.parameters.visual_feedback).then_some(self.state.target)
     }
 
-    /// The character that the frame shows, and the pictures that it was given.
-    pub(super) fn shown_character(&self) -> (&Assets, &Character) {
-        match &self.shown {
-            Shown::Former(assets, character) if !self.first_frame => (assets, character),
-            _ => (&self.assets, &self.agent),
+    /// The character that the frame shows, and its pictures.
+    pub(super) fn shown_character(&self) -> (&CharacterSprites, &Character) {
+        if self.state.first_frame { (&self.assets.character, &self.state.agent) } else { self.last_moved() }
+    }
+
+    /// The character that moved last, in this episode or an earlier one, and its pictures.
+    pub(super) fn last_moved(&self) -> (&CharacterSprites, &Character) {
+        match &self.state.shown {
+            Shown::Former { character, .. } => (&self.former_sprites, character),
+            Shown::Nobody | Shown::Current => (&self.assets.character, &self.state.agent),
         }
     }
 
     /// The final info of finite ids: success, and the share of commands that were executed.
     pub(super) fn finite_info(&self) -> [f64; 2] {
-        let success = f64::from(u8::from(self.success));
-        [success, (self.current_command as f64 - 1.0 + success) / self.commands.len() as f64]
+        let success = f64::from(u8::from(self.state.success));
+        [success, (self.state.current_command as f64 - 1.0 + success) / self.state.commands.len() as f64]
     }
 
     /// The final info of the endless id: commands executed, and the longest sequence.
     pub(super) fn endless_info(&self) -> [f64; 2] {
-        [self.total_completed as f64, self.commands.len().saturating_sub(1) as f64]
+        [self.state.total_completed as f64, self.state.commands.len().saturating_sub(1) as f64]
     }
 }
