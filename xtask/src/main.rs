@@ -1,10 +1,13 @@
 //! The project's chores: `cargo xtask test` passes all tests.
 
+mod original;
+
 use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 const HELP: &str = "\
-cargo xtask test    check the format, lint, and run all tests";
+cargo xtask test                 check the format, lint, and run all tests
+cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)";
 
 /// What `cargo xtask test` runs, in this order; the first that fails ends it.
 const TEST: &[&[&str]] = &[
@@ -14,40 +17,53 @@ const TEST: &[&[&str]] = &[
     &["doc", "--workspace", "--no-deps", "--locked"],
 ];
 
+/// The live comparison alone, optimised, since it is long.
+const LIVE: &[&str] = &["test", "--release", "--locked", "--test", "live", "--", "--nocapture"];
+const LIVE_STEPS: &str = "100000";
+
 fn main() -> ExitCode {
-    match std::env::args().nth(1).as_deref() {
-        Some("test") => test(),
-        None | Some("help" | "--help" | "-h") => {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let done = match arguments[..] {
+        ["test"] => run(TEST, &[]),
+        ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
+        ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
+        [] | ["help" | "--help" | "-h"] => {
             println!("{HELP}");
-            ExitCode::SUCCESS
+            Ok(())
         }
-        Some(other) => {
-            eprintln!("xtask: there is no `{other}`; there is\n{HELP}");
+        _ => Err(format!("there is no `{}`; there is\n{HELP}", arguments.join(" "))),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(message) => {
+            eprintln!("xtask: {message}");
             ExitCode::FAILURE
         }
     }
 }
 
-fn test() -> ExitCode {
-    for arguments in TEST {
+/// Runs cargo with each of the argument lists, beside a Python that has the original.
+fn run(commands: &[&[&str]], variables: &[(&str, &str)]) -> Result<(), String> {
+    let python = original::python()?;
+    for arguments in commands {
         let line = format!("cargo {}", arguments.join(" "));
         println!("==> {line}");
         let start = Instant::now();
-        // The path of the cargo that runs this, so that toolchain and settings are the same.
+        // The cargo that runs this, so that toolchain and settings are the same.
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let status = Command::new(cargo).args(*arguments).env("RUSTDOCFLAGS", "--deny warnings").status();
-        match status {
-            Ok(status) if status.success() => println!("    {:.1} s", start.elapsed().as_secs_f64()),
-            Ok(status) => {
-                eprintln!("xtask: `{line}` failed: {status}");
-                return ExitCode::FAILURE;
-            }
-            Err(error) => {
-                eprintln!("xtask: `{line}` cannot be run: {error}");
-                return ExitCode::FAILURE;
-            }
+        let status = Command::new(cargo)
+            .args(*arguments)
+            .env("RUSTDOCFLAGS", "--deny warnings")
+            .env("ENDLESS_ORIGINAL_PYTHON", &python)
+            .envs(variables.iter().copied())
+            .status()
+            .map_err(|error| format!("`{line}` cannot be run: {error}"))?;
+        if !status.success() {
+            return Err(format!("`{line}` failed: {status}"));
         }
+        println!("    {:.1} s", start.elapsed().as_secs_f64());
     }
-    println!("all checks passed");
-    ExitCode::SUCCESS
+    println!("all passed");
+    Ok(())
 }

@@ -1,0 +1,210 @@
+//! The original, live: fresh seeds, options and actions, of which nothing may differ.
+//!
+//! The engine plays first, with experts that err now and then, so that episodes get far; the original plays the same actions; the
+//! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original, which `cargo xtask test` sets up, and
+//! `ENDLESS_LIVE_STEPS` the steps to compare for each id.
+
+use std::io::{BufRead, BufReader, Write};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::envs::{self, Kind, Parameter, Spec};
+use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::trace::{Trace, replay};
+use proptest::prelude::*;
+use proptest::test_runner::{Config, TestRunner};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::{Map, Value as Json, json};
+
+/// Steps that an episode is played at most.
+const MAX_STEPS: usize = 400;
+
+/// The original in a process of its own.
+struct Original {
+    child: Child,
+    requests: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+impl Original {
+    fn start() -> Self {
+        let python = std::env::var("ENDLESS_ORIGINAL_PYTHON").expect(
+            "run `cargo xtask test`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
+        );
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/live/original.py");
+        let mut child = Command::new(python)
+            .arg(script)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("the original's Python starts");
+        let (requests, answers) = (child.stdin.take().unwrap(), child.stdout.take().unwrap());
+        Original { child, requests, answers: BufReader::new(answers) }
+    }
+
+    fn play(&mut self, request: &Json) -> Json {
+        writeln!(self.requests, "{request}").unwrap();
+        let mut line = String::new();
+        self.answers.read_line(&mut line).unwrap();
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("the original answers `{line}`: {error}"))
+    }
+}
+
+impl Drop for Original {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// One environment object that plays a few episodes.
+#[derive(Clone, Debug)]
+struct Case {
+    options: Map<String, Json>,
+    /// The first episode needs a seed: an unseeded one differs by nature.
+    first_seed: u64,
+    seeds: Vec<Option<u64>>,
+    /// How often an action is random instead of the expert's.
+    error_rate: f64,
+    action_seed: u64,
+}
+
+/// Any value within the parameter's limits, more often one that is not far from the default.
+fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
+    match parameter.kind {
+        Kind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
+        Kind::Int { default, min, max } => {
+            let near = (2 * default.abs() + 200).clamp(min, max);
+            (min.max(-1)..=near).prop_map(Json::from).boxed()
+        }
+        Kind::Float { default, min, max } => {
+            let reach = 2.0 * default.abs() + 0.1;
+            let near = (default - reach).max(min)..=(default + reach).min(max);
+            prop_oneof![8 => near, 1 => min..=max, 1 => Just(min)].prop_map(Json::from).boxed()
+        }
+        Kind::IntList { default, min, max } => {
+            let near = (2 * default.iter().max().unwrap_or(&min) + 1).clamp(min, max);
+            prop::collection::vec(min..=near, 1..4).prop_map(Json::from).boxed()
+        }
+    }
+}
+
+fn case(spec: &'static Spec) -> impl Strategy<Value = Case> {
+    let options: Vec<_> = spec
+        .parameters
+        .iter()
+        .filter(|parameter| !NEWER.contains(&parameter.name))
+        .map(|parameter| {
+            let name = parameter.name;
+            prop::option::weighted(0.3, value(parameter)).prop_map(move |value| value.map(|value| (name, value)))
+        })
+        .collect();
+    let seeds = prop::collection::vec(prop::option::of(any::<u64>()), 1..4);
+    let error_rate = prop_oneof![Just(0.0), Just(0.03), Just(0.3), Just(1.0)];
+    (options, any::<u64>(), seeds, error_rate, any::<u64>()).prop_map(
+        |(options, first_seed, seeds, error_rate, action_seed)| {
+            let options = options.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect();
+            Case { options, first_seed, seeds, error_rate, action_seed }
+        },
+    )
+}
+
+/// Plays a case in the engine: the request that makes the original play the same.
+fn play(spec: &'static Spec, case: &Case) -> Json {
+    let config = PoolConfig {
+        options: Options::Shared(case.options.clone()),
+        autoreset: Autoreset::Disabled,
+        features: true,
+        ..PoolConfig::new(spec.id, 1)
+    };
+    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks: Vec<Block> = zeroed(pool.layout().blocks());
+    let mut random = SmallRng::seed_from_u64(case.action_seed);
+    let branches = spec.action_space.branches();
+    let mut episodes = Vec::new();
+    for seed in std::iter::once(Some(case.first_seed)).chain(case.seeds.iter().copied()) {
+        match seed {
+            Some(seed) => pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap(),
+            None => pool.reset(ResetRequest::All, &mut blocks).unwrap(),
+        }
+        let mut expert = envs::expert(spec);
+        let mut actions = Vec::new();
+        for _ in 0..MAX_STEPS {
+            let batch = Batch::new(pool.layout(), &blocks);
+            let mut action = vec![0; branches.len()];
+            expert.act(batch.section("features"), batch.section("vector_observation"), &mut action);
+            if random.random::<f64>() < case.error_rate {
+                action.iter_mut().zip(branches).for_each(|(number, n)| *number = random.random_range(0..*n));
+            }
+            pool.step(&action, &mut blocks).unwrap();
+            actions.push(action);
+            if Batch::new(pool.layout(), &blocks).terminated()[0] == 1 {
+                break;
+            }
+        }
+        episodes.push(json!({"seed": seed, "actions": actions}));
+    }
+    json!({"env": spec.id, "options": case.options, "render": true, "episodes": episodes})
+}
+
+/// Reset parameters of version 1.0.3 that the original from PyPI, 1.0.2, does not know; the traces cover them.
+const NEWER: [&str; 3] = ["reward_new_command_success", "reward_path_progress_dense", "coin_enabled"];
+
+fn compare(id: &str) {
+    let spec = envs::spec(id).unwrap();
+    let wanted: usize = std::env::var("ENDLESS_LIVE_STEPS").map_or(1500, |text| text.parse().unwrap());
+    let original = std::cell::RefCell::new(Original::start());
+    let (steps, raised) = (std::cell::Cell::new(0), std::cell::Cell::new(0));
+    while steps.get() < wanted {
+        let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
+        TestRunner::new(config)
+            .run(&case(spec), |case| {
+                let answer = original.borrow_mut().play(&play(spec, &case));
+                if answer.get("error").is_some() {
+                    raised.set(raised.get() + 1);
+                    return Ok(());
+                }
+                let trace: Trace = serde_json::from_value(answer).unwrap();
+                let replay = replay(&trace).unwrap();
+                prop_assert_eq!(replay.first, None);
+                steps.set(steps.get() + replay.steps);
+                Ok(())
+            })
+            .unwrap();
+        assert!(raised.get() < 20 + steps.get() / 50, "{id}: the original raises too often to compare with");
+    }
+    println!(
+        "{id}: {} steps without a difference, {} option sets at which the original raises",
+        steps.get(),
+        raised.get()
+    );
+}
+
+macro_rules! live {
+    ($($name:ident: $id:literal,)*) => {
+        $(
+            #[test]
+            fn $name() {
+                compare($id);
+            }
+        )*
+
+        #[test]
+        fn no_id_is_forgotten() {
+            let mut compared = vec![$($id),*];
+            let mut all: Vec<&str> = envs::specs().map(|spec| spec.id).collect();
+            compared.sort_unstable();
+            all.sort_unstable();
+            assert_eq!(compared, all);
+        }
+    };
+}
+
+live! {
+    mortar_mayhem: "MortarMayhem-v0",
+    mortar_mayhem_grid: "MortarMayhem-Grid-v0",
+    mortar_mayhem_b: "MortarMayhemB-v0",
+    mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
+    endless_mortar_mayhem: "Endless-MortarMayhem-v0",
+}
