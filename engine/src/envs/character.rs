@@ -76,6 +76,13 @@ pub struct Character {
 pub type Bounds = (i32, i32, i32, i32);
 
 impl Character {
+    /// Whether the character can be at such a place and face in such a direction.
+    pub fn is_valid(&self) -> bool {
+        const FAR: i32 = 1 << 16;
+        let near = |at: i32| (-FAR..=FAR).contains(&at);
+        (0..360).contains(&self.rotation) && self.rotation % 45 == 0 && near(self.position.0) && near(self.position.1)
+    }
+
     /// Turns to where the action points, and returns the unit vector of the movement.
     fn turn(&mut self, action: &[i32]) -> [f64; 2] {
         let towards = |branch: i32| [0.0, -1.0, 1.0][branch as usize];

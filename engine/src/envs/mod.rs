@@ -8,6 +8,7 @@ mod vector;
 
 use std::sync::Arc;
 
+use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 
 use crate::random::Generator;
@@ -21,10 +22,13 @@ pub use spec::{ActionSpace, Column, FRAME_BYTES, SCREEN, Spec};
 /// object plays many episodes, and what an episode leaves behind matters, as in the original.
 pub trait Environment: Send {
     /// What tells the family's ids apart.
-    type Variant: Copy;
+    type Variant: Copy + Send + Sync;
 
     /// What all environments with the same reset parameters share: the parameters and the pictures made from them.
     type Assets: Send + Sync;
+
+    /// All that changes while an environment is played; what a snapshot keeps.
+    type State: Serialize + DeserializeOwned;
 
     /// Makes the shared part for one set of reset parameters.
     fn assets(variant: Self::Variant, parameters: &ResetParameters) -> Self::Assets;
@@ -54,6 +58,13 @@ pub trait Environment: Send {
     /// Writes the ground truth; empty where the environment has none.
     fn ground_truth(&self, _out: &mut [f64]) {}
 
+    /// The state, for a snapshot.
+    fn state(&self) -> &Self::State;
+
+    /// Goes on from a state that an environment with these assets was in. One that no such environment can be in is refused,
+    /// and changes nothing.
+    fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
+
     /// Writes the final info, as the specification's `info` lists it. Called in the step that ends the episode.
     fn info(&self, out: &mut [f64]);
 }
@@ -66,6 +77,11 @@ pub struct Transition {
     /// Whether the episode ended. The original reports every end, also that by the step limit, as `terminated`.
     pub terminated: bool,
 }
+
+/// A state that no environment with these reset parameters can be in.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+#[error("the state is none that the environment can be in")]
+pub struct InvalidState;
 
 /// Plays an environment from its feature and vector observations, and remembers what an agent would have to.
 pub trait Expert: Send {

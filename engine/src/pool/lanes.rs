@@ -2,10 +2,13 @@
 
 use std::sync::Arc;
 
+use serde_json::{Map, Value as Json};
+
 use super::seeding::Seeds;
+use super::snapshot::{Saved, SnapshotError};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
-use crate::envs::Environment;
+use crate::envs::{Environment, ResetParameters, Spec};
 use crate::random::Generator;
 
 /// One environment with all that belongs to it alone.
@@ -18,7 +21,12 @@ struct Lane<E: Environment> {
     episode_length: i32,
     /// The last step ended the episode, and the next one is to start a new one (next-step auto-reset).
     ended: bool,
+    /// The reset parameters that were given.
+    options: Arc<Options>,
 }
+
+/// Reset parameters by name, as they were given.
+pub(super) type Options = Map<String, Json>;
 
 impl<E: Environment> Lane<E> {
     fn start_episode(&mut self, seed: Option<u64>) {
@@ -96,19 +104,30 @@ pub(super) trait Lanes: Send {
 
     /// Resets environments as `request` says and writes every environment's row.
     fn reset(&mut self, slices: usize, request: ResetRequest<'_>, out: BatchMut<'_>);
+
+    /// The whole state of one environment.
+    fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError>;
+
+    /// Goes on from a snapshot in the place of one environment.
+    fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError>;
 }
 
 /// The environments of one pool.
 pub(super) struct FamilyLanes<E: Environment> {
     lanes: Vec<Lane<E>>,
-    branches: usize,
+    spec: &'static Spec,
+    variant: E::Variant,
 }
 
 impl<E: Environment> FamilyLanes<E> {
     /// Environments with the given assets and seeds, none of them reset yet.
-    pub(super) fn new(branches: usize, environments: impl Iterator<Item = (Arc<E::Assets>, Seeds)>) -> Self {
+    pub(super) fn new(
+        spec: &'static Spec,
+        variant: E::Variant,
+        environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds)>,
+    ) -> Self {
         let lanes = environments
-            .map(|(assets, seeds)| Lane {
+            .map(|(assets, options, seeds)| Lane {
                 env: E::new(&assets),
                 assets,
                 random: Generator::from_entropy(),
@@ -116,15 +135,16 @@ impl<E: Environment> FamilyLanes<E> {
                 episode_return: 0.0,
                 episode_length: 0,
                 ended: false,
+                options,
             })
             .collect();
-        FamilyLanes { lanes, branches }
+        FamilyLanes { lanes, spec, variant }
     }
 }
 
 impl<E: Environment> Lanes for FamilyLanes<E> {
     fn step(&mut self, slices: usize, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) {
-        let branches = self.branches;
+        let branches = self.spec.action_space.branches().len();
         in_slices(slices, 0, &mut self.lanes, out, &|first, lanes, mut out| {
             let actions = actions[first * branches..].chunks_exact(branches);
             for (row, (lane, action)) in lanes.iter_mut().zip(actions).enumerate() {
@@ -148,6 +168,47 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
                 lane.write_start(&mut out, row);
             }
         });
+    }
+
+    fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
+        let lane = &self.lanes[env];
+        // The state is borrowed when it is saved and owned when it is restored; its encoding is the same.
+        Saved {
+            id: self.spec.id.to_owned(),
+            options: Json::from(Options::clone(&lane.options)).to_string(),
+            random: lane.random.clone(),
+            seeds: lane.seeds.save(),
+            episode_return: lane.episode_return,
+            episode_length: lane.episode_length,
+            ended: lane.ended,
+            state: lane.env.state(),
+        }
+        .to_bytes()
+    }
+
+    fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
+        let saved = Saved::<E::State>::from_bytes(snapshot)?;
+        if saved.id != self.spec.id {
+            return Err(SnapshotError::OtherEnvironment { given: saved.id, expected: self.spec.id });
+        }
+        let lane = &mut self.lanes[env];
+        let options: Options =
+            serde_json::from_str(&saved.options).map_err(|error| SnapshotError::Content(error.to_string()))?;
+        let (assets, options) = if options == *lane.options {
+            (Arc::clone(&lane.assets), Arc::clone(&lane.options))
+        } else {
+            let parameters = ResetParameters::new(self.spec.id, self.spec.parameters, &options)?;
+            (Arc::new(E::assets(self.variant, &parameters)), Arc::new(options))
+        };
+        lane.env.restore(&assets, saved.state)?;
+        lane.assets = assets;
+        lane.options = options;
+        lane.random = saved.random;
+        lane.seeds.restore(saved.seeds);
+        lane.episode_return = saved.episode_return;
+        lane.episode_length = saved.episode_length;
+        lane.ended = saved.ended;
+        Ok(())
     }
 }
 

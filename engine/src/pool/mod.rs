@@ -2,8 +2,10 @@
 
 mod lanes;
 mod seeding;
+mod snapshot;
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::Arc;
 
 use serde_json::{Map, Value as Json};
@@ -15,6 +17,7 @@ use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Sp
 use lanes::{FamilyLanes, Lanes};
 pub use seeding::Seeding;
 use seeding::Seeds;
+pub use snapshot::{SNAPSHOT_VERSION, SnapshotError};
 
 /// Most environments in one pool.
 pub const MAX_ENVS: usize = 1 << 20;
@@ -210,6 +213,32 @@ impl Pool {
         Ok(())
     }
 
+    /// Writes every environment's row as a reset of none does: the current observation, a reward of 0, no flag.
+    pub fn observe(&mut self, batch: &mut [Block]) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        self.reset(ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] }, batch)
+    }
+
+    /// The whole state of one environment, its generator included, for [`restore`](Pool::restore).
+    pub fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
+        self.check_env(env)?;
+        if self.was_reset { self.lanes.snapshot(env) } else { Err(SnapshotError::NotReset) }
+    }
+
+    /// Puts an environment of the same id into the state that a snapshot was taken in, also one of another pool, with other
+    /// reset parameters: it goes on identically. [`observe`](Pool::observe) shows what it looks like.
+    ///
+    /// The seeds of later episodes are the snapshot's too where both pools have the same kind of [`Seeding`].
+    pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
+        self.check_env(env)?;
+        self.lanes.restore(env, snapshot)
+    }
+
+    fn check_env(&self, env: usize) -> Result<(), SnapshotError> {
+        let num_envs = self.layout.num_envs();
+        if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnvironment { given: env, num_envs }) }
+    }
+
     fn slices(&self) -> usize {
         self.threads.count().min(self.layout.num_envs())
     }
@@ -243,19 +272,21 @@ fn family_lanes<E: Environment>(
     variant: E::Variant,
     config: &PoolConfig,
 ) -> Result<FamilyLanes<E>, PoolError> {
-    let make = |given: &Map<String, Json>| -> Result<Arc<E::Assets>, ParameterError> {
-        Ok(Arc::new(E::assets(variant, &ResetParameters::new(spec.id, spec.parameters, given)?)))
+    // The options of an environment, and what is made from them.
+    let make = |given: &Map<String, Json>| -> Result<(Arc<lanes::Options>, Arc<E::Assets>), ParameterError> {
+        let parameters = ResetParameters::new(spec.id, spec.parameters, given)?;
+        Ok((Arc::new(given.clone()), Arc::new(E::assets(variant, &parameters))))
     };
-    let assets: Vec<Arc<E::Assets>> = match &config.options {
+    let made: Vec<_> = match &config.options {
         Options::Shared(given) => vec![make(given)?; config.num_envs],
         Options::Each(each) if each.len() == config.num_envs => {
-            let mut made = HashMap::new();
+            let mut known = HashMap::new();
             each.iter()
                 .enumerate()
-                .map(|(env, given)| match made.entry(Json::from(given.clone()).to_string()) {
-                    std::collections::hash_map::Entry::Occupied(entry) => Ok(Arc::clone(entry.get())),
-                    std::collections::hash_map::Entry::Vacant(entry) => make(given)
-                        .map(|assets| Arc::clone(entry.insert(assets)))
+                .map(|(env, given)| match known.entry(Json::from(given.clone()).to_string()) {
+                    Entry::Occupied(entry) => Ok(Clone::clone(entry.get())),
+                    Entry::Vacant(entry) => make(given)
+                        .map(|made| Clone::clone(entry.insert(made)))
                         .map_err(|source| PoolError::ParametersOf { env, source }),
                 })
                 .collect::<Result<_, _>>()?
@@ -268,11 +299,10 @@ fn family_lanes<E: Environment>(
         Seeding::List(seeds) => seeds.as_slice().into(),
         _ => [].into(),
     };
-    let environments = assets
-        .into_iter()
-        .enumerate()
-        .map(|(env, assets)| (assets, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs)));
-    Ok(FamilyLanes::new(spec.action_space.branches().len(), environments))
+    let environments = made.into_iter().enumerate().map(|(env, (options, assets))| {
+        (assets, options, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs))
+    });
+    Ok(FamilyLanes::new(spec, variant, environments))
 }
 
 /// A pool that cannot be made, or a call that it cannot carry out.

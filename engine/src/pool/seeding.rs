@@ -1,5 +1,7 @@
 //! Which seed each episode of each environment gets.
 
+use serde::{Deserialize, Serialize};
+
 use crate::random::{Generator, SeedSequence};
 
 /// How episodes are seeded. Environments are counted over all groups of an engine, so that results depend neither on the
@@ -54,4 +56,31 @@ impl Seeds {
             }
         }
     }
+
+    /// What a snapshot keeps of the seeds to come.
+    pub(super) fn save(&self) -> SavedSeeds {
+        match self {
+            Seeds::Continue { first } => SavedSeeds::Continue { first: *first },
+            Seeds::Range { draws, .. } => SavedSeeds::Range { draws: draws.clone() },
+            Seeds::List { next, .. } => SavedSeeds::List { next: *next },
+        }
+    }
+
+    /// Goes on where a snapshot was taken. Under another policy than the snapshot's, this one's seeds stay.
+    pub(super) fn restore(&mut self, saved: SavedSeeds) {
+        match (self, saved) {
+            (Seeds::Continue { first }, SavedSeeds::Continue { first: saved }) => *first = saved,
+            (Seeds::Range { draws, .. }, SavedSeeds::Range { draws: saved }) => *draws = saved,
+            (Seeds::List { seeds, next, .. }, SavedSeeds::List { next: saved }) => *next = saved % seeds.len(),
+            _ => {}
+        }
+    }
+}
+
+/// Where an environment is in its sequence of seeds.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) enum SavedSeeds {
+    Continue { first: Option<u64> },
+    Range { draws: Generator },
+    List { next: usize },
 }

@@ -57,6 +57,11 @@ impl Command {
         Command((index % COMMANDS) as u8)
     }
 
+    /// Whether there is such a command; a broken snapshot may hold any number.
+    pub fn is_valid(self) -> bool {
+        self.index() < COMMANDS
+    }
+
     /// Its number in the original's order.
     pub fn index(self) -> usize {
         usize::from(self.0)
@@ -124,6 +129,13 @@ impl Clue {
     /// Shows `count` commands of the sequence, from number `first` on.
     pub fn new(first: usize, count: usize, duration: usize, delay: usize) -> Self {
         Clue { first, duration, delay, frame: 0, frames: count * (duration + delay) }
+    }
+
+    /// Whether its numbers are such that it can be gone through.
+    pub fn is_valid(&self) -> bool {
+        const MANY: usize = 1 << 32;
+        [self.first, self.duration, self.delay, self.frame, self.frames].iter().all(|number| *number < MANY)
+            && (self.frames == 0 || self.duration + self.delay > 0)
     }
 
     /// Whether everything has been shown.

@@ -12,15 +12,16 @@ use std::sync::Arc;
 pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
 pub use drawing::Assets;
 pub use parameters::{Locomotion, Parameters, SPECS, Variant};
-pub use rules::MortarMayhem;
+pub use rules::{MortarMayhem, State};
 
-use crate::envs::{Environment, ResetParameters, Transition};
+use crate::envs::{Environment, InvalidState, ResetParameters, Transition};
 use crate::random::Generator;
 use crate::raster::Canvas;
 
 impl Environment for MortarMayhem {
     type Variant = Variant;
     type Assets = Assets;
+    type State = State;
 
     fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
         Assets::new(variant, Parameters::new(variant, parameters))
@@ -60,6 +61,14 @@ impl Environment for MortarMayhem {
     fn ground_truth(&self, out: &mut [f64]) {
         let (x, y) = self.state.target;
         out.copy_from_slice(&[f64::from(x) / 5.0, f64::from(y) / 5.0]);
+    }
+
+    fn state(&self) -> &State {
+        &self.state
+    }
+
+    fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
+        self.resume(assets, state)
     }
 
     fn info(&self, out: &mut [f64]) {

@@ -82,6 +82,11 @@ impl Parameters {
     }
 }
 
+/// Largest scale of the agent: a radius of 100 pixels.
+pub const MAX_AGENT_SCALE: f64 = 4.0;
+/// Most steps that anything takes.
+pub const MAX_DURATION: i64 = 1000;
+
 const AGENT_SCALE: Parameter = Parameter::float(
     "agent_scale",
     0.25,
@@ -95,10 +100,20 @@ const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along
 const ALLOWED_COMMANDS: &str = "How many of the commands may occur, in the order right, down, left, up, stay, right down, \
                                 right up, left down, left up.";
 const COMMAND_COUNT: &str = "Number of commands to execute. A list to draw from.";
-const COMMAND_SHOW_DURATION: Parameter =
-    Parameter::list("command_show_duration", &[3], 0, 1000, "Steps that one command is shown. A list to draw from.");
-const COMMAND_SHOW_DELAY: Parameter =
-    Parameter::list("command_show_delay", &[1], 0, 1000, "Steps between two shown commands. A list to draw from.");
+const COMMAND_SHOW_DURATION: Parameter = Parameter::list(
+    "command_show_duration",
+    &[3],
+    0,
+    MAX_DURATION,
+    "Steps that one command is shown. A list to draw from.",
+);
+const COMMAND_SHOW_DELAY: Parameter = Parameter::list(
+    "command_show_delay",
+    &[1],
+    0,
+    MAX_DURATION,
+    "Steps between two shown commands. A list to draw from.",
+);
 const EXPLOSION_DURATION: &str = "Steps that the agent has to stay on the commanded tile. A list to draw from.";
 const EXPLOSION_DELAY: &str = "Steps that the agent has to execute one command. A list to draw from.";
 const VISUAL_FEEDBACK: Parameter =
@@ -122,8 +137,8 @@ const MORTAR_MAYHEM: &[Parameter] = &[
     finite_command_count(1000),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
-    Parameter::list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[18], 1, MAX_DURATION, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -137,8 +152,8 @@ const MORTAR_MAYHEM_GRID: &[Parameter] = &[
     finite_command_count(1000),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
-    Parameter::list("explosion_duration", &[2], 1, 1000, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[6], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[2], 1, MAX_DURATION, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[6], 1, MAX_DURATION, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -151,8 +166,8 @@ const MORTAR_MAYHEM_B: &[Parameter] = &[
     ARENA_SIZE,
     Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
     finite_command_count(MAX_VECTOR_COMMANDS as i64),
-    Parameter::list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[18], 1, MAX_DURATION, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -164,8 +179,8 @@ const MORTAR_MAYHEM_B_GRID: &[Parameter] = &[
     ARENA_SIZE,
     Parameter::int("allowed_commands", 5, 4, 9, ALLOWED_COMMANDS),
     finite_command_count(MAX_VECTOR_COMMANDS as i64),
-    Parameter::list("explosion_duration", &[2], 1, 1000, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[6], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[2], 1, MAX_DURATION, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[6], 1, MAX_DURATION, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,
@@ -180,8 +195,8 @@ const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
     Parameter::int("initial_command_count", 1, 1, 1000, "Commands that are shown at first."),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
-    Parameter::list("explosion_duration", &[6], 1, 1000, EXPLOSION_DURATION),
-    Parameter::list("explosion_delay", &[18], 1, 1000, EXPLOSION_DELAY),
+    Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),
+    Parameter::list("explosion_delay", &[18], 1, MAX_DURATION, EXPLOSION_DELAY),
     VISUAL_FEEDBACK,
     REWARD_COMMAND_FAILURE,
     REWARD_COMMAND_SUCCESS,

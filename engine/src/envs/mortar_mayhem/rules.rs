@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use super::commands::{Clue, Command};
 use super::drawing::{Assets, TILE};
-use super::parameters::Locomotion;
-use crate::envs::Transition;
+use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_DURATION};
 use crate::envs::character::{Character, CharacterSprites};
+use crate::envs::{InvalidState, Transition};
 use crate::random::Generator;
 
 /// Which character a frame shows, other than the first frame of an episode.
@@ -72,6 +72,31 @@ pub struct State {
     success: bool,
 }
 
+impl State {
+    /// Whether playing on from the state stays within the rules: every number in its range.
+    fn is_valid(&self, assets: &Assets) -> bool {
+        let size = assets.parameters.arena_size;
+        let on_arena = |(x, y): (i32, i32)| (0..size).contains(&x) && (0..size).contains(&y);
+        let former_is_valid = match &self.shown {
+            Shown::Former { character, scale } => character.is_valid() && (0.0..=MAX_AGENT_SCALE).contains(scale),
+            Shown::Nobody | Shown::Current => true,
+        };
+        self.agent.is_valid()
+            && former_is_valid
+            && on_arena(self.target)
+            && (on_arena(self.agent_tile) || assets.variant.locomotion != Locomotion::Grid)
+            && self.commands.iter().chain(&self.shown_command).all(|command| command.is_valid())
+            && self.current_command <= self.commands.len()
+            && self.clue.is_valid()
+            && self.viewed_clue.is_valid()
+            && [self.show_duration, self.show_delay].iter().all(|steps| *steps <= MAX_DURATION as usize)
+            && [self.explosion_duration, self.explosion_delay].iter().all(|s| (1..=MAX_DURATION as u32).contains(s))
+            && [self.command_steps, self.verify_steps].iter().all(|steps| *steps < u32::MAX / 2)
+            && (0..i64::MAX / 2).contains(&self.steps)
+            && self.total_completed < usize::MAX / 2
+    }
+}
+
 impl MortarMayhem {
     pub(super) fn unplayed(assets: &Arc<Assets>) -> Self {
         let state = State {
@@ -97,6 +122,22 @@ impl MortarMayhem {
             success: false,
         };
         MortarMayhem { assets: Arc::clone(assets), former_sprites: Arc::clone(&assets.character), state }
+    }
+
+    /// Goes on from a state, if an environment with these assets can be in it.
+    pub(super) fn resume(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
+        if !state.is_valid(assets) {
+            return Err(InvalidState);
+        }
+        self.assets = Arc::clone(assets);
+        self.former_sprites = match state.shown {
+            Shown::Former { scale, .. } if scale != assets.parameters.agent_scale => {
+                Arc::new(CharacterSprites::new(scale))
+            }
+            _ => Arc::clone(&assets.character),
+        };
+        self.state = state;
+        Ok(())
     }
 
     pub(super) fn start(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
