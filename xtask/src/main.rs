@@ -7,7 +7,8 @@ use std::time::Instant;
 
 const HELP: &str = "\
 cargo xtask test                 check the format, lint, and run all tests
-cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)";
+cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)
+cargo xtask original             set up the original in a virtual environment and print the path of its Python";
 
 /// What `cargo xtask test` runs, in this order; the first that fails ends it.
 const TEST: &[&[&str]] = &[
@@ -28,6 +29,7 @@ fn main() -> ExitCode {
         ["test"] => run(TEST, &[]),
         ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
         ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
+        ["original"] => original::python().map(|python| println!("{}", python.display())),
         [] | ["help" | "--help" | "-h"] => {
             println!("{HELP}");
             Ok(())

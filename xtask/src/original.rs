@@ -9,15 +9,15 @@ const PYTHONS: [&str; 2] = ["python3.11", "python3"];
 
 /// The path of that Python, which is made if it is not there yet.
 pub fn python() -> Result<PathBuf, String> {
-    let target = std::env::var_os("CARGO_TARGET_DIR")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../target"), PathBuf::from);
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."));
+    let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace.join("target"), PathBuf::from);
     let folder = std::path::absolute(target.join("venvs/original")).map_err(|error| error.to_string())?;
     let python = folder.join("bin/python");
     let complete = folder.join("complete");
     if complete.exists() {
         return Ok(python);
     }
-    println!("==> {} in {}", PACKAGES.join(" and "), folder.display());
+    eprintln!("==> {} in {}", PACKAGES.join(" and "), folder.display());
     let base = PYTHONS.into_iter().find(|python| version(python).is_some_and(|text| text.starts_with("Python 3.11."))).ok_or(
         "the original needs Python 3.11, and neither `python3.11` nor `python3` is one; install it, for example with pyenv",
     )?;
