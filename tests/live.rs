@@ -4,11 +4,13 @@
 //! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original, which `cargo xtask test` sets up, and
 //! `ENDLESS_LIVE_STEPS` the steps to compare for each id.
 
+mod common;
+
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use endless_gym::batch::{Batch, Block, zeroed};
-use endless_gym::envs::{self, Kind, Parameter, Spec};
+use endless_gym::envs::{self, Spec};
 use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::trace::{Trace, replay};
 use proptest::prelude::*;
@@ -70,42 +72,20 @@ struct Case {
     action_seed: u64,
 }
 
-/// Any value within the parameter's limits, more often one that is not far from the default.
-fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
-    match parameter.kind {
-        Kind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
-        Kind::Int { default, min, max } => {
-            let near = (2 * default.abs() + 200).clamp(min, max);
-            (min.max(-1)..=near).prop_map(Json::from).boxed()
-        }
-        Kind::Float { default, min, max } => {
-            let reach = 2.0 * default.abs() + 0.1;
-            let near = (default - reach).max(min)..=(default + reach).min(max);
-            prop_oneof![8 => near, 1 => min..=max, 1 => Just(min)].prop_map(Json::from).boxed()
-        }
-        Kind::IntList { default, min, max } => {
-            let near = (2 * default.iter().max().unwrap_or(&min) + 1).clamp(min, max);
-            prop::collection::vec(min..=near, 1..4).prop_map(Json::from).boxed()
-        }
-    }
-}
-
 fn case(spec: &'static Spec) -> impl Strategy<Value = Case> {
-    let options: Vec<_> = spec
-        .parameters
-        .iter()
-        .filter(|parameter| !NEWER.contains(&parameter.name))
-        .map(|parameter| {
-            let name = parameter.name;
-            prop::option::weighted(0.3, value(parameter)).prop_map(move |value| value.map(|value| (name, value)))
-        })
-        .collect();
     let seeds = prop::collection::vec(prop::option::of(any::<u64>()), 1..4);
     let error_rate = prop_oneof![Just(0.0), Just(0.03), Just(0.3), Just(1.0)];
+    let options = common::options(spec).prop_map(|mut options| {
+        NEWER.iter().for_each(|name| drop(options.remove(*name)));
+        options
+    });
     (options, any::<u64>(), seeds, error_rate, any::<u64>()).prop_map(
-        |(options, first_seed, seeds, error_rate, action_seed)| {
-            let options = options.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect();
-            Case { options, first_seed, seeds, error_rate, action_seed }
+        |(options, first_seed, seeds, error_rate, action_seed)| Case {
+            options,
+            first_seed,
+            seeds,
+            error_rate,
+            action_seed,
         },
     )
 }

@@ -1,5 +1,7 @@
 //! Many environments in lockstep: auto-reset, seeding, options, threads, and what is refused.
 
+mod common;
+
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs;
 use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads};
@@ -255,27 +257,10 @@ proptest! {
     /// Any options within the limits, any seed, any actions: nothing panics, and two pools agree.
     #[test]
     fn any_options_within_the_limits_can_be_played(
-        id in 0_usize..5,
+        (spec, given) in prop::sample::select(envs::specs().collect::<Vec<_>>())
+            .prop_flat_map(|spec| (Just(spec), common::options(spec))),
         seed: u64,
-        scale in 0.0..=4.0_f64,
-        speed in 0.0..=84.0_f64,
-        arena_size in 2..=6_i64,
-        allowed_commands in 4..=9_i64,
-        counts in prop::collection::vec(1..=20_i64, 1..4),
-        durations in prop::collection::vec(0..=4_i64, 1..4),
-        delays in prop::collection::vec(0..=3_i64, 1..4),
-        explosions in prop::collection::vec(1..=5_i64, 1..4),
-        visual_feedback: bool,
     ) {
-        let spec = envs::specs().nth(id).unwrap();
-        let wanted = json!({
-            "agent_scale": scale, "agent_speed": speed, "arena_size": arena_size, "allowed_commands": allowed_commands,
-            "command_count": counts, "initial_command_count": counts[0], "command_show_duration": durations,
-            "command_show_delay": delays, "explosion_duration": explosions, "explosion_delay": explosions,
-            "visual_feedback": visual_feedback,
-        });
-        let mut given = options(wanted);
-        given.retain(|name, _| spec.parameters.iter().any(|parameter| parameter.name == name));
         let config = PoolConfig {
             options: Options::Shared(given),
             seeding: Seeding::Continue { seed: Some(seed) },

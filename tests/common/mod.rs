@@ -3,6 +3,10 @@
 
 use std::path::PathBuf;
 
+use endless_gym::envs::{Kind, Parameter, Spec};
+use proptest::prelude::*;
+use serde_json::{Map, Value as Json};
+
 /// The recorded traces of the ids that start with `prefix` and go on with `-v0`. There is no test without them: they are
 /// expected in `../shared/reference`, or where `ENDLESS_REFERENCE` says.
 pub fn traces(prefix: &str) -> Vec<PathBuf> {
@@ -25,3 +29,36 @@ pub fn traces(prefix: &str) -> Vec<PathBuf> {
 /// The Mortar Mayhem ids without their version.
 pub const MORTAR_MAYHEM: [&str; 5] =
     ["MortarMayhem", "MortarMayhem-Grid", "MortarMayhemB", "MortarMayhemB-Grid", "Endless-MortarMayhem"];
+
+/// Any value within the parameter's limits, more often one that is not far from the default.
+fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
+    match parameter.kind {
+        Kind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
+        Kind::Int { default, min, max } => {
+            let near = (2 * default.abs() + 200).clamp(min, max);
+            (min.max(-1)..=near).prop_map(Json::from).boxed()
+        }
+        Kind::Float { default, min, max } => {
+            let reach = 2.0 * default.abs() + 0.1;
+            let near = (default - reach).max(min)..=(default + reach).min(max);
+            prop_oneof![8 => near, 1 => min..=max, 1 => Just(min)].prop_map(Json::from).boxed()
+        }
+        Kind::IntList { default, min, max } => {
+            let near = (2 * default.iter().max().unwrap_or(&min) + 1).clamp(min, max);
+            prop::collection::vec(min..=near, 1..4).prop_map(Json::from).boxed()
+        }
+    }
+}
+
+/// Any set of options within the limits: some of the parameters, each with any value.
+pub fn options(spec: &'static Spec) -> impl Strategy<Value = Map<String, Json>> {
+    let options: Vec<_> = spec
+        .parameters
+        .iter()
+        .map(|parameter| {
+            let name = parameter.name;
+            prop::option::weighted(0.3, value(parameter)).prop_map(move |value| value.map(|value| (name, value)))
+        })
+        .collect();
+    options.prop_map(|options| options.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect())
+}
