@@ -60,3 +60,24 @@ fn endless_mortar_mayhem_goes_on() {
     let ended = play("Endless-MortarMayhem-v0", 8, 10_000);
     assert!(ended.iter().all(Option::is_none), "{ended:?}");
 }
+
+/// How many of the first episodes with these seeds end with success, each within its step limit.
+fn solved(id: &str, num_envs: usize, steps: usize) -> usize {
+    let success = envs::spec(id).unwrap().info.iter().position(|column| column.name == "success").unwrap();
+    play(id, num_envs, steps).iter().flatten().filter(|info| info[success] == 1.0).count()
+}
+
+#[test]
+fn finite_mystery_path_is_solved() {
+    for (id, limit) in [("MysteryPath-v0", 512), ("MysteryPath-Grid-v0", 128)] {
+        let solved = solved(id, 100, limit);
+        assert!(solved >= 99, "{id}: {solved} of 100 solved");
+    }
+}
+
+/// Where the way turns left, nobody can go on: the agent of this id cannot walk there.
+#[test]
+fn endless_mystery_path_goes_on() {
+    let ended = play("Endless-MysteryPath-v0", 30, 10_000).iter().flatten().count();
+    assert!(ended <= 1, "{ended} of 30 ended");
+}

@@ -187,4 +187,7 @@ live! {
     mortar_mayhem_b: "MortarMayhemB-v0",
     mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
     endless_mortar_mayhem: "Endless-MortarMayhem-v0",
+    mystery_path: "MysteryPath-v0",
+    mystery_path_grid: "MysteryPath-Grid-v0",
+    endless_mystery_path: "Endless-MysteryPath-v0",
 }

@@ -106,7 +106,7 @@ fn list_shows_environments_and_parameters() {
 #[test]
 fn verify_counts_and_exits_by_differences() {
     let room = Room::new("verify");
-    let files = common::traces("MortarMayhem-Grid");
+    let files = common::traces("MortarMayhem-Grid-v0");
     let verify = |files: &[&Path]| {
         let files: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
         room.run(&[&["verify"], &files[..]].concat())

@@ -4,57 +4,62 @@ mod common;
 
 use endless_gym::trace::{Trace, TraceError, replay};
 
-fn replay_all(prefix: &str) {
-    for file in common::traces(prefix) {
+/// Replays all traces of an id, those with ground-truth views last.
+fn replay_all(id: &str) {
+    let mut views = 0;
+    for file in common::traces(id).into_iter().chain(common::traces_with_views(id)) {
         let trace = Trace::open(&file).unwrap();
         let replay = replay(&trace).unwrap();
         assert_eq!(replay.first, None, "{}", file.display());
         assert_eq!(replay.differences, 0, "{}", file.display());
         assert_eq!(replay.episodes, trace.episodes.len());
         assert_eq!(replay.steps, trace.episodes.iter().map(|episode| episode.steps.len()).sum::<usize>());
+        views += replay.views;
     }
+    assert!(views > 0, "no ground-truth view of {id} was compared");
 }
 
-#[test]
-fn mortar_mayhem() {
-    replay_all("MortarMayhem");
+macro_rules! traces {
+    ($($name:ident: $id:literal,)*) => { $(
+        #[test]
+        fn $name() {
+            replay_all($id);
+        }
+    )* };
 }
 
-#[test]
-fn mortar_mayhem_grid() {
-    replay_all("MortarMayhem-Grid");
-}
-
-#[test]
-fn mortar_mayhem_b() {
-    replay_all("MortarMayhemB");
-}
-
-#[test]
-fn mortar_mayhem_b_grid() {
-    replay_all("MortarMayhemB-Grid");
-}
-
-#[test]
-fn endless_mortar_mayhem() {
-    replay_all("Endless-MortarMayhem");
+traces! {
+    mortar_mayhem: "MortarMayhem-v0",
+    mortar_mayhem_grid: "MortarMayhem-Grid-v0",
+    mortar_mayhem_b: "MortarMayhemB-v0",
+    mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
+    endless_mortar_mayhem: "Endless-MortarMayhem-v0",
+    mystery_path: "MysteryPath-v0",
+    mystery_path_grid: "MysteryPath-Grid-v0",
+    endless_mystery_path: "Endless-MysteryPath-v0",
 }
 
 /// A replay that finds nothing wrong with a wrong trace would prove nothing.
 #[test]
 fn every_kind_of_difference_is_found() {
-    let open = |id: &str, file: usize| Trace::open(&common::traces(id)[file]).unwrap();
+    let open = |id: &str, file: usize| {
+        let files = [common::traces(id), common::traces_with_views(id)].concat();
+        Trace::open(&files[file.min(files.len() - 1)]).unwrap()
+    };
     type Change = fn(&mut Trace);
-    let changes: [(&str, &str, usize, Change); 7] = [
-        ("observation checksum", "MortarMayhem", 0, |trace| trace.episodes[1].reset_crc ^= 1),
-        ("observation checksum", "MortarMayhem", 3, |trace| trace.episodes[1].steps[3].crc ^= 1),
-        ("reward", "MortarMayhem", 3, |trace| trace.episodes[1].steps[3].reward += 1e-16),
-        ("done", "MortarMayhem", 3, |trace| trace.episodes[1].steps[3].done = true),
-        ("vector observation", "MortarMayhemB", 0, |trace| trace.episodes[1].reset_vector[0] += 1.0),
-        ("info `success`", "MortarMayhem", 0, |trace| {
+    let changes: [(&str, &str, usize, Change); 8] = [
+        ("observation checksum", "MortarMayhem-v0", 0, |trace| trace.episodes[1].reset_crc ^= 1),
+        ("observation checksum", "MortarMayhem-v0", 3, |trace| trace.episodes[1].steps[3].crc ^= 1),
+        ("reward", "MortarMayhem-v0", 3, |trace| trace.episodes[1].steps[3].reward += 1e-16),
+        ("done", "MortarMayhem-v0", 3, |trace| trace.episodes[1].steps[3].done = true),
+        ("vector observation", "MortarMayhemB-v0", 0, |trace| trace.episodes[1].reset_vector[0] += 1.0),
+        ("ground-truth view checksum", "MortarMayhem-v0", usize::MAX, |trace| {
+            *trace.episodes[1].steps[3].render_crc.as_mut().unwrap() ^= 1;
+        }),
+        ("info `success`", "MortarMayhem-v0", 0, |trace| {
             trace.episodes[1].steps.last_mut().unwrap().info["success"] = 0.5.into();
         }),
-        ("info `ground_truth`", "Endless-MortarMayhem", 0, |trace| {
+        ("info `ground_truth`", "Endless-MortarMayhem-v0", 0, |trace| {
             trace.episodes[1].steps[3].info.remove("ground_truth");
         }),
     ];
@@ -68,7 +73,7 @@ fn every_kind_of_difference_is_found() {
 
 #[test]
 fn a_trace_of_an_unknown_environment_is_an_error() {
-    let mut trace = Trace::open(&common::traces("MortarMayhem")[0]).unwrap();
+    let mut trace = Trace::open(&common::traces("MortarMayhem-v0")[0]).unwrap();
     trace.env = "NoSuchThing-v0".to_owned();
     assert!(matches!(replay(&trace), Err(TraceError::Pool(_))));
 }

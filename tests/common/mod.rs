@@ -7,28 +7,33 @@ use endless_gym::envs::{Kind, Parameter, Spec};
 use proptest::prelude::*;
 use serde_json::{Map, Value as Json};
 
-/// The recorded traces of the ids that start with `prefix` and go on with `-v0`. There is no test without them: they are
-/// expected in `../shared/reference`, or where `ENDLESS_REFERENCE` says.
-pub fn traces(prefix: &str) -> Vec<PathBuf> {
+/// The recorded traces of an id. There is no test without them: they are expected in `../shared/reference`, or where
+/// `ENDLESS_REFERENCE` says.
+pub fn traces(id: &str) -> Vec<PathBuf> {
+    traces_in("traces", id)
+}
+
+/// Those that have the checksums of ground-truth views.
+pub fn traces_with_views(id: &str) -> Vec<PathBuf> {
+    traces_in("traces/render", id)
+}
+
+fn traces_in(folder: &str, id: &str) -> Vec<PathBuf> {
     let reference = std::env::var_os("ENDLESS_REFERENCE")
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/reference"), PathBuf::from);
-    let folder = reference.join("traces");
+    let folder = reference.join(folder);
     let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
     let mut files: Vec<_> = entries
         .map(|entry| entry.unwrap().path())
         .filter(|path| {
             let name = path.file_name().unwrap().to_string_lossy().into_owned();
-            name.starts_with(&format!("{prefix}-v0.")) && name.ends_with(".json.gz")
+            name.starts_with(&format!("{id}.")) && name.ends_with(".json.gz")
         })
         .collect();
     files.sort();
-    assert!(!files.is_empty(), "no traces of {prefix} in {}", folder.display());
+    assert!(!files.is_empty(), "no traces of {id} in {}", folder.display());
     files
 }
-
-/// The Mortar Mayhem ids without their version.
-pub const MORTAR_MAYHEM: [&str; 5] =
-    ["MortarMayhem", "MortarMayhem-Grid", "MortarMayhemB", "MortarMayhemB-Grid", "Endless-MortarMayhem"];
 
 /// Any value within the parameter's limits, more often one that is not far from the default.
 fn value(parameter: &Parameter) -> BoxedStrategy<Json> {

@@ -45,11 +45,11 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
                 let verdict = replay.first.as_ref().map_or("no difference".to_owned(), |first| {
                     format!("{} differences, the first in {first}", replay.differences)
                 });
-                let views = match replay.unchecked_views {
+                let views = match replay.views {
                     0 => String::new(),
-                    views => format!(" ({views} checksums of ground-truth views not compared)"),
+                    views => format!(", {views} ground-truth views"),
                 };
-                format!("{} episodes, {} steps, {verdict}{views}", replay.episodes, replay.steps)
+                format!("{} episodes, {} steps{views}, {verdict}", replay.episodes, replay.steps)
             }
             Err(error) => {
                 failures += 1;

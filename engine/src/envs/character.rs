@@ -55,11 +55,15 @@ impl CharacterSprites {
         self.radius
     }
 
+    /// Pixels from a picture's left and top edges to the character's centre.
+    pub fn centre(&self) -> i32 {
+        self.size / 2
+    }
+
     /// Draws the character.
     pub fn draw(&self, character: &Character, canvas: &mut Canvas<'_>) {
         let (x, y) = character.position;
-        let corner = self.size / 2;
-        self.sprites[character.rotation as usize / 45].blit(canvas, x - corner, y - corner);
+        self.sprites[character.rotation as usize / 45].blit(canvas, x - self.centre(), y - self.centre());
     }
 }
 
@@ -78,7 +82,7 @@ pub type Bounds = (i32, i32, i32, i32);
 impl Character {
     /// Whether the character can be at such a place and face in such a direction.
     pub fn is_valid(&self) -> bool {
-        const FAR: i32 = 1 << 16;
+        const FAR: i32 = 1 << 28;
         let near = |at: i32| (-FAR..=FAR).contains(&at);
         (0..360).contains(&self.rotation) && self.rotation % 45 == 0 && near(self.position.0) && near(self.position.1)
     }
@@ -102,16 +106,20 @@ impl Character {
         [x / length, y / length]
     }
 
+    /// Moves by `speed` pixels, cut to whole pixels for each axis, and returns by how much.
+    pub fn step(&mut self, action: &[i32], speed: f64) -> (i32, i32) {
+        let [x, y] = self.turn(action).map(|part| (part * speed) as i32);
+        self.position = (self.position.0 + x, self.position.1 + y);
+        (x, y)
+    }
+
     /// Moves by `speed` pixels, cut to whole pixels for each axis, and stays within `bounds` by its radius.
     pub fn step_within(&mut self, action: &[i32], speed: f64, radius: i32, bounds: Bounds) {
-        let [x, y] = self.turn(action);
+        self.step(action, speed);
         let (left, top, right, bottom) = bounds;
         // The far side first, so that the near side wins where the character does not fit.
         let hold = |at: i32, low: i32, high: i32| at.min(high - radius).max(low + radius);
-        self.position = (
-            hold(self.position.0 + (x * speed) as i32, left, right),
-            hold(self.position.1 + (y * speed) as i32, top, bottom),
-        );
+        self.position = (hold(self.position.0, left, right), hold(self.position.1, top, bottom));
     }
 
     /// Moves by `speed` pixels, rounded to whole pixels after the sum, and comes back on the other side when more than half of

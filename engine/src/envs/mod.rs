@@ -2,9 +2,12 @@
 
 pub mod character;
 pub mod mortar_mayhem;
+pub mod mystery_path;
 mod parameters;
 mod spec;
+mod steering;
 mod vector;
+pub mod view;
 
 use std::sync::Arc;
 
@@ -96,11 +99,12 @@ pub trait Expert: Send {
 #[derive(Clone, Copy, Debug)]
 pub enum Family {
     MortarMayhem(mortar_mayhem::Variant),
+    MysteryPath(mystery_path::Variant),
 }
 
 /// Every environment id, in the order in which `endless list` shows them.
 pub fn specs() -> impl Iterator<Item = &'static Spec> {
-    mortar_mayhem::SPECS.iter()
+    mortar_mayhem::SPECS.iter().chain(mystery_path::SPECS)
 }
 
 /// The environment of that id.
@@ -115,6 +119,7 @@ pub fn spec(id: &str) -> Result<&'static Spec, UnknownEnvironment> {
 pub fn expert(spec: &Spec) -> Box<dyn Expert> {
     match spec.family {
         Family::MortarMayhem(variant) => Box::new(mortar_mayhem::expert::MortarExpert::new(variant)),
+        Family::MysteryPath(variant) => Box::new(mystery_path::expert::PathExpert::new(variant)),
     }
 }
 

@@ -8,7 +8,7 @@ use super::seeding::Seeds;
 use super::snapshot::{Saved, SnapshotError};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
-use crate::envs::{Environment, ResetParameters, Spec};
+use crate::envs::{Environment, ResetParameters, Spec, view};
 use crate::random::Generator;
 
 /// One environment with all that belongs to it alone.
@@ -110,6 +110,9 @@ pub(super) trait Lanes: Send {
 
     /// Goes on from a snapshot in the place of one environment.
     fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError>;
+
+    /// Draws one environment's ground-truth view.
+    fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
 }
 
 /// The environments of one pool.
@@ -209,6 +212,10 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
         lane.episode_length = saved.episode_length;
         lane.ended = saved.ended;
         Ok(())
+    }
+
+    fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
+        view::ground_truth_view(&mut self.lanes[env].env, out);
     }
 }
 

@@ -13,6 +13,8 @@ use thiserror::Error;
 
 use crate::batch::{BatchMut, Block, Layout, batch_layout};
 use crate::envs::mortar_mayhem::MortarMayhem;
+use crate::envs::mystery_path::MysteryPath;
+use crate::envs::view::VIEW_BYTES;
 use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
 use lanes::{FamilyLanes, Lanes};
 pub use seeding::Seeding;
@@ -155,6 +157,7 @@ impl Pool {
         }
         let lanes: Box<dyn Lanes> = match spec.family {
             Family::MortarMayhem(variant) => Box::new(family_lanes::<MortarMayhem>(spec, variant, config)?),
+            Family::MysteryPath(variant) => Box::new(family_lanes::<MysteryPath>(spec, variant, config)?),
         };
         Ok(Pool {
             spec,
@@ -237,6 +240,19 @@ impl Pool {
     fn check_env(&self, env: usize) -> Result<(), SnapshotError> {
         let num_envs = self.layout.num_envs();
         if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnvironment { given: env, num_envs }) }
+    }
+
+    /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,
+    /// indexed \[row\]\[column\]\[channel\]. `out` holds [`VIEW_BYTES`] bytes.
+    pub fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => return Err(PoolError::NotReset),
+            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { env, num_envs }),
+            _ if out.len() != VIEW_BYTES => return Err(PoolError::ViewSize { given: out.len() }),
+            _ => self.lanes.ground_truth_view(env, out),
+        }
+        Ok(())
     }
 
     fn slices(&self) -> usize {
@@ -332,6 +348,10 @@ pub enum PoolError {
     ActionRange { env: usize, given: Vec<i32>, space: String },
     #[error("a reset of {given} environments asked of a pool of {num_envs}; give one flag and one seed for each")]
     ResetCount { given: usize, num_envs: usize },
+    #[error("no environment {env} in a pool of {num_envs}")]
+    NoSuchEnv { env: usize, num_envs: usize },
+    #[error("{given} bytes given for a ground-truth view; it has {VIEW_BYTES}")]
+    ViewSize { given: usize },
     #[error("a batch of {given} blocks of 64 bytes given; the layout needs {needed}")]
     BatchTooShort { given: usize, needed: usize },
 }

@@ -6,6 +6,7 @@ use serde_json::{Map, Value as Json};
 
 use super::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
+use crate::envs::view::VIEW_BYTES;
 use crate::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
 
 /// How a replay went.
@@ -17,8 +18,8 @@ pub struct Replay {
     pub differences: usize,
     /// The first of them.
     pub first: Option<Difference>,
-    /// Checksums of ground-truth views in the trace, which are not compared.
-    pub unchecked_views: usize,
+    /// Ground-truth views compared.
+    pub views: usize,
 }
 
 /// One value that differs.
@@ -65,6 +66,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
     };
     let mut pool = Pool::new(&config, &Threads::new(1)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
+    let mut view = vec![0; VIEW_BYTES];
     let mut replay = Replay::default();
     for episode in &trace.episodes {
         match episode.seed {
@@ -82,7 +84,11 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
             replay.compare(step, "reward", expected.reward, batch.reward()[0]);
             replay.compare(step, "done", expected.done, batch.terminated()[0] == 1);
             compare_info(&mut replay, step, &expected.info, &info(&pool, &blocks, expected.done));
-            replay.unchecked_views += usize::from(expected.render_crc.is_some());
+            if let Some(crc) = expected.render_crc {
+                pool.ground_truth_view(0, &mut view)?;
+                replay.compare(step, "ground-truth view checksum", crc, crc32fast::hash(&view));
+                replay.views += 1;
+            }
             replay.steps += 1;
         }
         replay.episodes += 1;

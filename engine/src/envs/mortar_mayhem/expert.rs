@@ -4,6 +4,7 @@ use super::commands::{COMMANDS, Command};
 use super::drawing::TILE;
 use super::features::{AGENT, ARENA_SIZE, BURNING, COMMAND, HEADING, LARGEST_ARENA};
 use super::parameters::{Locomotion, Variant};
+use crate::envs::steering::turn_or_walk;
 use crate::envs::{Expert, SCREEN};
 
 /// Pixels that the agent may be off a tile's centre before it walks on.
@@ -92,7 +93,8 @@ impl Expert for MortarExpert {
         let Some((target_x, target_y)) = self.target.filter(|_| !burning) else { return };
 
         if self.variant.locomotion == Locomotion::Grid {
-            action[0] = turn_or_walk(features[HEADING], features[HEADING + 1], (target_x - tile.0, target_y - tile.1));
+            action[0] =
+                turn_or_walk([features[HEADING], features[HEADING + 1]], (target_x - tile.0, target_y - tile.1));
             return;
         }
         let towards = |target: i32, at: i32| {
@@ -108,27 +110,5 @@ impl Expert for MortarExpert {
         };
         action[0] = towards(target_x, x);
         action[1] = towards(target_y, y);
-    }
-}
-
-/// Actions on a grid.
-const NOTHING: i32 = 0;
-const LEFT: i32 = 1;
-const RIGHT: i32 = 2;
-const AHEAD: i32 = 3;
-
-/// The grid action that leads over `(x, y)` cells for an agent that faces along the heading.
-fn turn_or_walk(heading_x: f32, heading_y: f32, (x, y): (i32, i32)) -> i32 {
-    let (wanted_x, wanted_y) = match (x, y) {
-        (0, 0) => return NOTHING,
-        (0, y) => (0.0, y.signum() as f32),
-        (x, _) => (x.signum() as f32, 0.0),
-    };
-    let ahead = heading_x * wanted_x + heading_y * wanted_y;
-    let clockwise = heading_x * wanted_y - heading_y * wanted_x;
-    match () {
-        _ if ahead > 0.5 => AHEAD,
-        _ if clockwise > 0.5 => RIGHT,
-        _ => LEFT,
     }
 }

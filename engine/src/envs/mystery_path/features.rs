@@ -1,0 +1,136 @@
+//! What a frame of Mystery Path shows, in numbers. The path itself is not among them: it is to be remembered.
+
+use super::drawing::{Assets, TILE};
+use super::parameters::Variant;
+use super::path::GRID;
+use super::rules::State;
+use crate::envs::{Column, SCREEN};
+
+/// Places of the columns that all ids have.
+pub(super) const AGENT: usize = 0;
+pub(super) const HEADING: usize = 2;
+pub(super) const FALLEN: usize = 4;
+const SHARED: usize = FALLEN + 1;
+/// Places in [`FINITE_FEATURES`].
+const ORIGIN: usize = SHARED;
+const GOAL: usize = ORIGIN + 3;
+/// Places in [`ENDLESS_FEATURES`].
+pub(super) const STAMINA: usize = SHARED;
+pub(super) const BACKGROUND: usize = STAMINA + 2;
+pub(super) const PAST_SHIFT: usize = BACKGROUND + 1;
+pub(super) const PAST_PATH: usize = PAST_SHIFT + 1;
+
+/// Columns of tiles that the screen shows, whole or in part.
+const SCREEN_COLUMNS: usize = GRID as usize + 1;
+const SCREEN_TILES: usize = SCREEN_COLUMNS * GRID as usize;
+
+/// By how much the numbers of a tile are divided.
+const LAST_TILE: f32 = GRID as f32 - 1.0;
+
+const fn column(name: &'static str, description: &'static str) -> Column {
+    Column { name, description }
+}
+
+const SHARED_COLUMNS: [Column; SHARED] = [
+    column("agent_x", "horizontal centre of the agent on the screen, divided by 84"),
+    column("agent_y", "vertical centre of the agent on the screen, divided by 84"),
+    column("heading_x", "where the agent faces: horizontal part of a unit vector"),
+    column("heading_y", "where the agent faces: vertical part of a unit vector, down is positive"),
+    column("fallen", "1 while the red cross is seen: the agent fell off the path"),
+];
+
+/// What the frames of the finite ids show.
+pub const FINITE_FEATURES: &[Column] = &FINITE;
+
+/// What the frames of the endless id show.
+pub const ENDLESS_FEATURES: &[Column] = &ENDLESS;
+
+const FINITE: [Column; GOAL + 3] = with_shared([
+    column("origin_shown", "1 if the path's first tile is seen"),
+    column("origin_x", "column of the path's first tile, divided by 6; 0 if it is not seen"),
+    column("origin_y", "row of the path's first tile, divided by 6; 0 if it is not seen"),
+    column("goal_shown", "1 if the goal is seen"),
+    column("goal_x", "column of the goal, divided by 6; 0 if it is not seen"),
+    column("goal_y", "row of the goal, divided by 6; 0 if it is not seen"),
+]);
+
+/// The shared columns, then an id's own, then room for more.
+const fn with_shared<const OWN: usize, const ALL: usize>(own: [Column; OWN]) -> [Column; ALL] {
+    let mut all = [column("", ""); ALL];
+    let mut place = 0;
+    while place < SHARED + OWN {
+        all[place] = if place < SHARED { SHARED_COLUMNS[place] } else { own[place - SHARED] };
+        place += 1;
+    }
+    all
+}
+
+const ENDLESS: [Column; PAST_PATH + SCREEN_TILES] = {
+    let mut columns = with_shared([
+        column("stamina_shown", "1 if the stamina bar is seen"),
+        column("stamina", "green share of the stamina bar; 0 if it is not seen"),
+        column("background_shift", "tiles that the background has scrolled to the left; 0 if it is not seen"),
+        column("past_shift", "tiles that column 0 of the past path lies to the left of the screen; 0 if none is seen"),
+    ]);
+    let mut tile = 0;
+    while tile < SCREEN_TILES {
+        let name = PAST_NAMES[tile / GRID as usize][tile % GRID as usize];
+        columns[PAST_PATH + tile] =
+            column(name, "1 if the past path's tile in this column and row of the screen is seen");
+        tile += 1;
+    }
+    columns
+};
+
+macro_rules! past_names {
+    ($($column:literal)*) => {
+        [$([
+            concat!("past_", $column, "_0"), concat!("past_", $column, "_1"), concat!("past_", $column, "_2"),
+            concat!("past_", $column, "_3"), concat!("past_", $column, "_4"), concat!("past_", $column, "_5"),
+            concat!("past_", $column, "_6"),
+        ]),*]
+    };
+}
+
+/// Names of the past path's columns by column and row on the screen.
+const PAST_NAMES: [[&str; GRID as usize]; SCREEN_COLUMNS] = past_names!(0 1 2 3 4 5 6 7);
+
+impl State {
+    pub(super) fn write_features(&self, assets: &Assets, out: &mut [f32]) {
+        out.fill(0.0);
+        let character = self.shown_agent(assets);
+        out[AGENT] = character.position.0 as f32 / SCREEN as f32;
+        out[AGENT + 1] = character.position.1 as f32 / SCREEN as f32;
+        out[HEADING..HEADING + 2].copy_from_slice(&character.heading());
+        out[FALLEN] = f32::from(u8::from(self.cross.is_some()));
+        if assets.variant == Variant::Endless {
+            self.write_endless(assets, out);
+            return;
+        }
+        let parameters = &assets.parameters;
+        let tiles =
+            [(ORIGIN, parameters.show_origin, self.route.start()), (GOAL, parameters.show_goal, self.route.end())];
+        for (place, _, (x, y)) in tiles.into_iter().filter(|(_, shown, _)| *shown) {
+            out[place..place + 3].copy_from_slice(&[1.0, x as f32 / LAST_TILE, y as f32 / LAST_TILE]);
+        }
+    }
+
+    fn write_endless(&self, assets: &Assets, out: &mut [f32]) {
+        let parameters = &assets.parameters;
+        if parameters.show_stamina {
+            out[STAMINA] = 1.0;
+            out[STAMINA + 1] = self.journey.stamina_share(parameters.stamina_level).max(0.0) as f32;
+        }
+        if parameters.show_background {
+            out[BACKGROUND] = self.journey.background() as f32 / TILE as f32;
+        }
+        if parameters.show_past_path {
+            let camera = self.journey.camera() / f64::from(TILE);
+            for (_, (x, row)) in self.past_tiles(assets) {
+                let column = (x - camera.floor() as i32).clamp(0, GRID);
+                out[PAST_SHIFT] = (camera - camera.floor()) as f32;
+                out[PAST_PATH + (column * GRID + row) as usize] = 1.0;
+            }
+        }
+    }
+}

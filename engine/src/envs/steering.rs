@@ -1,0 +1,23 @@
+//! What scripted experts of several families know about steering.
+
+/// Actions on a grid.
+const NOTHING: i32 = 0;
+const LEFT: i32 = 1;
+const RIGHT: i32 = 2;
+const AHEAD: i32 = 3;
+
+/// The grid action that leads over `(x, y)` cells for an agent that faces along the heading, a unit vector.
+pub fn turn_or_walk([heading_x, heading_y]: [f32; 2], (x, y): (i32, i32)) -> i32 {
+    let (wanted_x, wanted_y) = match (x, y) {
+        (0, 0) => return NOTHING,
+        (0, y) => (0.0, y.signum() as f32),
+        (x, _) => (x.signum() as f32, 0.0),
+    };
+    let ahead = heading_x * wanted_x + heading_y * wanted_y;
+    let clockwise = heading_x * wanted_y - heading_y * wanted_x;
+    match () {
+        _ if ahead > 0.5 => AHEAD,
+        _ if clockwise > 0.5 => RIGHT,
+        _ => LEFT,
+    }
+}
