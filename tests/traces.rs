@@ -37,6 +37,8 @@ traces! {
     mystery_path: "MysteryPath-v0",
     mystery_path_grid: "MysteryPath-Grid-v0",
     endless_mystery_path: "Endless-MysteryPath-v0",
+    searing_spotlights: "SearingSpotlights-v0",
+    endless_searing_spotlights: "Endless-SearingSpotlights-v0",
 }
 
 /// A replay that finds nothing wrong with a wrong trace would prove nothing.

@@ -60,10 +60,17 @@ impl CharacterSprites {
         self.size / 2
     }
 
+    /// The character's picture, and the place of its top left corner on the screen.
+    pub fn picture(&self, character: &Character) -> (&Sprite, (i32, i32)) {
+        let (x, y) = character.position;
+        let corner = self.centre();
+        (&self.sprites[character.rotation as usize / 45 % self.sprites.len()], (x - corner, y - corner))
+    }
+
     /// Draws the character.
     pub fn draw(&self, character: &Character, canvas: &mut Canvas<'_>) {
-        let (x, y) = character.position;
-        self.sprites[character.rotation as usize / 45].blit(canvas, x - self.centre(), y - self.centre());
+        let (sprite, (x, y)) = self.picture(character);
+        sprite.blit(canvas, x, y);
     }
 }
 

@@ -1,9 +1,11 @@
 //! The environments: the trait that each fills, the registry of ids, and their reset parameters.
 
+pub mod background;
 pub mod character;
 pub mod mortar_mayhem;
 pub mod mystery_path;
 mod parameters;
+pub mod searing_spotlights;
 mod spec;
 mod steering;
 mod vector;
@@ -100,11 +102,12 @@ pub trait Expert: Send {
 pub enum Family {
     MortarMayhem(mortar_mayhem::Variant),
     MysteryPath(mystery_path::Variant),
+    SearingSpotlights(searing_spotlights::Variant),
 }
 
 /// Every environment id, in the order in which `endless list` shows them.
 pub fn specs() -> impl Iterator<Item = &'static Spec> {
-    mortar_mayhem::SPECS.iter().chain(mystery_path::SPECS)
+    mortar_mayhem::SPECS.iter().chain(mystery_path::SPECS).chain(searing_spotlights::SPECS)
 }
 
 /// The environment of that id.
@@ -120,6 +123,7 @@ pub fn expert(spec: &Spec) -> Box<dyn Expert> {
     match spec.family {
         Family::MortarMayhem(variant) => Box::new(mortar_mayhem::expert::MortarExpert::new(variant)),
         Family::MysteryPath(variant) => Box::new(mystery_path::expert::PathExpert::new(variant)),
+        Family::SearingSpotlights(variant) => Box::new(searing_spotlights::expert::SpotlightsExpert::new(variant)),
     }
 }
 

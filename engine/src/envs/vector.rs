@@ -20,9 +20,27 @@ pub fn rotate([x, y]: [f64; 2], degrees: f64) -> [f64; 2] {
     [cos * x - sin * y, sin * x + cos * y]
 }
 
+/// `from.lerp(to, share)`: the point that lies that share (0 to 1) of the way from the one to the other.
+pub fn lerp(from: [f64; 2], to: [f64; 2], share: f64) -> [f64; 2] {
+    std::array::from_fn(|axis| from[axis] * (1.0 - share) + to[axis] * share)
+}
+
+/// `a.distance_to(b)`.
+pub fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
+    let [x, y] = [b[0] - a[0], b[1] - a[1]];
+    (x * x + y * y).sqrt()
+}
+
 #[cfg(test)]
 mod tests {
-    use super::rotate;
+    use super::{distance, lerp, rotate};
+
+    #[test]
+    fn interpolation_and_distance() {
+        assert_eq!(lerp([2.0, -4.0], [10.0, 4.0], 0.25), [4.0, -2.0]);
+        assert_eq!(lerp([0.1, 0.2], [0.7, 0.3], 0.0), [0.1, 0.2]);
+        assert_eq!(distance([1.0, 2.0], [4.0, -2.0]), 5.0);
+    }
 
     /// Values that pygame 2.4 printed.
     #[test]

@@ -14,6 +14,7 @@ use thiserror::Error;
 use crate::batch::{BatchMut, Block, Layout, batch_layout};
 use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
+use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
 use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
 use lanes::{FamilyLanes, Lanes};
@@ -158,6 +159,7 @@ impl Pool {
         let lanes: Box<dyn Lanes> = match spec.family {
             Family::MortarMayhem(variant) => Box::new(family_lanes::<MortarMayhem>(spec, variant, config)?),
             Family::MysteryPath(variant) => Box::new(family_lanes::<MysteryPath>(spec, variant, config)?),
+            Family::SearingSpotlights(variant) => Box::new(family_lanes::<SearingSpotlights>(spec, variant, config)?),
         };
         Ok(Pool {
             spec,

@@ -86,16 +86,25 @@ impl Disc {
     /// The runs of the disc about `center` that lie on a canvas of `width` by `height` pixels, from
     /// left to right, without the empty ones.
     pub fn columns(&self, center: (i32, i32), width: usize, height: usize) -> impl Iterator<Item = DiscColumn> + '_ {
-        let (center_x, center_y) = (i64::from(center.0), i64::from(center.1));
+        let center_x = i64::from(center.0);
         let radius = i64::from(self.radius());
         let columns = clip(center_x - radius, center_x + radius - 1, width);
         columns.filter_map(move |x| {
-            let right = x as i64 - center_x;
-            let index = if right < 0 { -right - 1 } else { right };
-            let half_height = i64::from(self.half_heights[index as usize]);
-            let rows = clip(center_y - half_height, center_y + half_height - 1, height);
+            let rows = self.rows(center, x, height);
             (!rows.is_empty()).then_some(DiscColumn { x, rows })
         })
+    }
+
+    /// The rows of the column `x` that the disc about `center` covers on a canvas of `height` pixels.
+    #[inline]
+    pub fn rows(&self, center: (i32, i32), x: usize, height: usize) -> Range<usize> {
+        let right = x as i64 - i64::from(center.0);
+        let index = if right < 0 { -right - 1 } else { right };
+        let center_y = i64::from(center.1);
+        match self.half_heights.get(index as usize) {
+            Some(&half) => clip(center_y - i64::from(half), center_y + i64::from(half) - 1, height),
+            None => 0..0,
+        }
     }
 }
 

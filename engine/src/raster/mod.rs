@@ -31,7 +31,7 @@ pub use blit::{blend_keyed, blend_plain};
 pub use canvas::Canvas;
 pub use circle::{Disc, DiscColumn};
 pub use rectangle::{CornerRadii, Rect};
-pub use sprite::Sprite;
+pub use sprite::{Sprite, copy_run};
 pub use surface::Surface;
 
 /// A colour: red, green, blue.

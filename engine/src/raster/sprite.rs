@@ -1,8 +1,10 @@
 //! Pictures that are painted often: compiled to the runs of their opaque pixels.
 
+use std::ops::Range;
+
 use super::blit::opaque_runs;
 use super::canvas::clip;
-use super::{Canvas, Rect, Surface};
+use super::{Canvas, Disc, Rect, Surface, blend_keyed};
 
 /// A picture whose opaque pixels are stored as vertical runs, which are contiguous on a canvas.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -87,18 +89,63 @@ impl Sprite {
     fn blit_clipped(&self, canvas: &mut Canvas<'_>, x: i64, y: i64) {
         let (width, height) = (canvas.width(), canvas.height());
         let pixels = canvas.pixels_mut();
-        for run in &self.runs {
+        for (column, rows, source) in self.runs_on(width, height, x, y) {
+            pixels[(column * height + rows.start) * 3..][..source.len()].copy_from_slice(source);
+        }
+    }
+
+    /// Paints the part of the sprite that lies on the canvas within the disc about `center`.
+    pub fn blit_within(&self, canvas: &mut Canvas<'_>, x: i32, y: i32, disc: &Disc, center: (i32, i32)) {
+        let overlaps = |at: i32, length: i32, center: i32| {
+            let (start, center, radius) = (i64::from(at), i64::from(center), i64::from(disc.radius()));
+            start < center + radius && center - radius < start + i64::from(length)
+        };
+        let bounds = self.bounds;
+        if !overlaps(x.saturating_add(bounds.x), bounds.width, center.0)
+            || !overlaps(y.saturating_add(bounds.y), bounds.height, center.1)
+        {
+            return;
+        }
+        let (width, height) = (canvas.width(), canvas.height());
+        let pixels = canvas.pixels_mut();
+        for (column, rows, source) in self.runs_on(width, height, i64::from(x), i64::from(y)) {
+            let lit = disc.rows(center, column, height);
+            let (start, end) = (rows.start.max(lit.start), rows.end.min(lit.end));
+            if start < end {
+                let source = &source[(start - rows.start) * 3..(end - rows.start) * 3];
+                pixels[(column * height + start) * 3..][..source.len()].copy_from_slice(source);
+            }
+        }
+    }
+
+    /// Paints the sprite as it looks under a black surface of some `alpha` that has a colour key: 0 as it is, 255 black.
+    pub fn blit_shaded(&self, canvas: &mut Canvas<'_>, x: i32, y: i32, alpha: u8) {
+        let (width, height) = (canvas.width(), canvas.height());
+        let pixels = canvas.pixels_mut();
+        for (column, rows, source) in self.runs_on(width, height, i64::from(x), i64::from(y)) {
+            let target = &mut pixels[(column * height + rows.start) * 3..][..source.len()];
+            target.iter_mut().zip(source).for_each(|(target, source)| *target = blend_keyed(0, *source, alpha));
+        }
+    }
+
+    /// The parts of the runs that lie on a canvas, for a sprite with its top left corner at `(x, y)`: column, rows, pixels.
+    fn runs_on(
+        &self,
+        width: usize,
+        height: usize,
+        x: i64,
+        y: i64,
+    ) -> impl Iterator<Item = (usize, Range<usize>, &[u8])> {
+        self.runs.iter().filter_map(move |run| {
             let column = x + i64::from(run.x);
             let row = y + i64::from(run.y);
             let rows = clip(row, row + i64::from(run.length) - 1, height);
             if rows.is_empty() || !(0..width as i64).contains(&column) {
-                continue;
+                return None;
             }
-            let start = (column as usize * height + rows.start) * 3;
-            let source_start = run.start as usize + (rows.start as i64 - row) as usize * 3;
-            let length = rows.len() * 3;
-            pixels[start..][..length].copy_from_slice(&self.pixels[source_start..][..length]);
-        }
+            let start = run.start as usize + (rows.start as i64 - row) as usize * 3;
+            Some((column as usize, rows.clone(), &self.pixels[start..start + rows.len() * 3]))
+        })
     }
 }
 
@@ -111,10 +158,10 @@ fn bounds(runs: &[Run]) -> Rect {
     Rect::new(left as i32, top as i32, (right - left) as i32, (bottom - top) as i32)
 }
 
-/// Copies a short run. Blocks of fixed sizes are moved in registers, where a copy of any length
-/// would be a call; the last block overlaps the one before it.
+/// Copies a short run between slices of the same length. Blocks of fixed sizes are moved in registers,
+/// where a copy of any length would be a call; the last block overlaps the one before it.
 #[inline]
-fn copy_run(source: &[u8], target: &mut [u8]) {
+pub fn copy_run(source: &[u8], target: &mut [u8]) {
     if source.len() >= 32 {
         copy_blocks::<32>(source, target);
     } else if source.len() >= 16 {

@@ -1,0 +1,176 @@
+//! A scripted player that remembers where it is and where coins and exit were, and plans around the spotlights.
+
+mod forecast;
+mod plan;
+
+use std::collections::VecDeque;
+
+use super::features::{AGENT, COIN, EXIT, SPOTLIGHT};
+use super::parameters::Variant;
+use crate::envs::{Expert, SCREEN};
+use forecast::Forecast;
+use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, Plan, after, choose, dash};
+
+/// Pixels from the agent's centre to that of a coin or exit at which it reaches them, a little on the safe side.
+const COIN_REACH: i32 = 9;
+const EXIT_REACH: i32 = 11;
+
+/// Steps in which a target should be reached.
+const PATIENCE: u32 = 150;
+/// With more steps left than this it only follows its most cautious plan.
+const CALM: u32 = 130;
+/// With fewer steps left than this it accepts hits, one for each so many steps.
+const URGENT: u32 = 70;
+const STEPS_PER_HIT: u32 = 8;
+
+/// Shares of the margin for what the forecasts do not know, and whether to keep away from the border: the most cautious first.
+const CAUTIONS: [(f64, bool); 6] = [(1.0, true), (0.5, true), (1.0, false), (0.5, false), (0.2, false), (0.0, false)];
+
+/// Radius of the agent in pixels.
+const AGENT_RADIUS: f64 = 6.0;
+
+/// Plays Searing Spotlights from what a frame shows. It knows how the agent moves and how large things are by default, so it
+/// wants `agent_speed`, `agent_scale`, `coin_scale` and `exit_scale` as they are, and a lit first frame.
+#[derive(Debug)]
+pub struct SpotlightsExpert {
+    variant: Variant,
+    /// Where the agent is, seen or reckoned from its moves.
+    agent: Option<Place>,
+    coins: VecDeque<Place>,
+    exit: Option<Place>,
+    spotlights: Vec<Forecast>,
+    target: Option<Place>,
+    /// Steps until it dares more to get to the target.
+    patience: u32,
+}
+
+impl SpotlightsExpert {
+    /// An expert for one id of the family.
+    pub fn new(variant: Variant) -> Self {
+        SpotlightsExpert {
+            variant,
+            agent: None,
+            coins: VecDeque::new(),
+            exit: None,
+            spotlights: Vec::new(),
+            target: None,
+            patience: PATIENCE,
+        }
+    }
+
+    /// Takes in what the frame shows.
+    fn look(&mut self, features: &[f32]) {
+        let place = |at: usize| [features[at], features[at + 1]].map(|share| (share * SCREEN as f32).round() as i32);
+        if features[AGENT] == 1.0 {
+            self.agent = Some(place(AGENT + 1));
+        }
+        if features[EXIT] == 1.0 {
+            self.exit = Some(place(EXIT + 1));
+        }
+        let agent = self.agent;
+        let reached = |coin: &Place| agent.is_some_and(|agent| is_within(agent, *coin, COIN_REACH));
+        let seen = features[COIN..SPOTLIGHT].chunks_exact(3).enumerate().filter(|(_, coin)| coin[0] == 1.0);
+        let seen: Vec<Place> = seen.map(|(number, _)| place(COIN + 3 * number + 1)).collect();
+        self.coins.retain(|coin| !reached(coin));
+        for coin in seen {
+            if self.variant.endless {
+                self.coins.clear();
+            }
+            if !self.coins.contains(&coin) {
+                self.coins.push_back(coin);
+            }
+        }
+        self.watch(features);
+    }
+
+    /// Follows the lit circles from frame to frame.
+    fn watch(&mut self, features: &[f32]) {
+        let pixels = |share: f32| (share * SCREEN as f32).round() as i32;
+        let mut unmatched: Vec<(i32, Place)> = features[SPOTLIGHT..]
+            .chunks_exact(3)
+            .filter(|circle| circle[0] > 0.0)
+            .map(|circle| (pixels(circle[0]), [pixels(circle[1]), pixels(circle[2])]))
+            .collect();
+        for forecast in &mut self.spotlights {
+            let nearest = (0..unmatched.len())
+                .filter(|&index| unmatched[index].0 == forecast.radius)
+                .map(|index| (forecast.surprise(unmatched[index].1), index))
+                .min_by(|a, b| a.0.total_cmp(&b.0));
+            match nearest {
+                Some((surprise, index)) if surprise < 4.0 => forecast.observe(unmatched.swap_remove(index).1),
+                _ => forecast.miss(),
+            }
+        }
+        self.spotlights.retain(Forecast::is_fresh);
+        self.spotlights.extend(unmatched.into_iter().map(|(radius, place)| Forecast::new(radius, place)));
+    }
+
+    /// The most cautious plan that arrives; without one, the most cautious that keeps unseen; and when time runs out, the one
+    /// that arrives with the fewest hits.
+    fn plan(&self, agent: Place, goal: Goal) -> Plan {
+        let mut waiting: Option<Plan> = None;
+        for (caution, avoid_border) in CAUTIONS {
+            let plan = choose(agent, goal, &self.dangers(caution, avoid_border));
+            if plan.hits == 0 {
+                if plan.arrives {
+                    return plan;
+                }
+                waiting.get_or_insert(plan);
+                if self.patience > CALM {
+                    break;
+                }
+            }
+        }
+        let bearable_hits = (URGENT.saturating_sub(self.patience) / STEPS_PER_HIT) as usize;
+        let dash = if bearable_hits > 0 { dash(agent, goal, &self.dangers(0.1, false), bearable_hits) } else { None };
+        dash.or(waiting).unwrap_or_else(|| choose(agent, goal, &self.dangers(0.2, false)))
+    }
+
+    /// The danger of each coming step, with this share of the margin for what the forecasts do not know.
+    fn dangers(&self, caution: f64, avoid_border: bool) -> Vec<Danger> {
+        let mut dangers = vec![Danger::none(); HORIZON + 1];
+        for (step, danger) in dangers.iter_mut().enumerate().skip(1) {
+            for spotlight in &self.spotlights {
+                let (centre, deviation) = spotlight.at(step);
+                let margin = (caution * (1.0 + 2.0 * deviation)).min(8.0);
+                danger.add(centre, f64::from(spotlight.radius) + AGENT_RADIUS + 0.5 + margin);
+            }
+            // Near the border, a spotlight that comes in leaves no time to flee. Time to get away from it comes first.
+            if avoid_border && step > 4 {
+                danger.add_border();
+            }
+        }
+        dangers
+    }
+}
+
+fn is_within(a: Place, b: Place, reach: i32) -> bool {
+    let [x, y] = [a[0] - b[0], a[1] - b[1]];
+    x * x + y * y <= reach * reach
+}
+
+impl Expert for SpotlightsExpert {
+    fn reset(&mut self) {
+        *self = SpotlightsExpert::new(self.variant);
+    }
+
+    fn act(&mut self, features: &[f32], _vector_observation: &[f32], action: &mut [i32]) {
+        action.fill(0);
+        self.look(features);
+        let Some(agent) = self.agent else { return };
+        let nearest = self.coins.iter().min_by_key(|coin| {
+            let [x, y] = [coin[0] - agent[0], coin[1] - agent[1]];
+            x * x + y * y
+        });
+        let goal = match (nearest, self.exit) {
+            (Some(coin), _) => Goal { place: *coin, reach: COIN_REACH },
+            (None, Some(exit)) => Goal { place: exit, reach: EXIT_REACH },
+            (None, None) => Goal { place: NEUTRAL, reach: 1 },
+        };
+        self.patience = if self.target == Some(goal.place) { self.patience.saturating_sub(1) } else { PATIENCE };
+        self.target = Some(goal.place);
+        let best = self.plan(agent, goal);
+        action.copy_from_slice(&best.action);
+        self.agent = Some(after(agent, best.action));
+    }
+}

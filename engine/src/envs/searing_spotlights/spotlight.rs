@@ -1,0 +1,128 @@
+//! The spotlights: where they come from, how they move.
+//!
+//! Source: `Spotlight` of the original's `pygame_assets.py`.
+
+use serde::{Deserialize, Serialize};
+
+use super::parameters::{MAX_SPOT_RADIUS, Parameters};
+use super::rules::{BAR_HEIGHT, FAR};
+use crate::envs::SCREEN;
+use crate::envs::vector::{lerp, rotate};
+use crate::random::Generator;
+
+/// A spotlight on its way across the screen, along a parabola from one place off the screen to another.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Spotlight {
+    /// In pixels.
+    pub radius: i32,
+    /// Centre in pixels, as of the last step that it moved in.
+    pub location: [f64; 2],
+    /// Share of the way that one step goes.
+    speed: f64,
+    /// Share of the way behind it.
+    progress: f64,
+    /// It has arrived.
+    pub done: bool,
+    start: [f64; 2],
+    /// It sets out towards the target, but ends at the bend.
+    target: [f64; 2],
+    bend: [f64; 2],
+}
+
+impl Spotlight {
+    /// Draws a spotlight that waits just off the screen.
+    pub fn spawn(parameters: &Parameters, random: &mut Generator) -> Self {
+        // numpy cuts the fractions of both ends off.
+        let (low, high) = (parameters.spot_min_radius, parameters.spot_max_radius + 1.0);
+        let radius = random.integers(low as i64, high as i64) as i32;
+        let speed = random.uniform(parameters.spot_min_speed, parameters.spot_max_speed);
+        let start = random.integers(0, 360);
+        let target = start + 180 + random.integers(-45, 45);
+        let bend = target + random.integers(-135, 135);
+
+        let size = SCREEN as f64;
+        let distance = (size * size + size * size).sqrt() / 2.0 + f64::from(radius);
+        let centre = (SCREEN / 2) as f64;
+        let at = |degrees: i64| rotate([distance, 0.0], degrees as f64).map(|coordinate| centre + coordinate);
+        let start = at(start);
+        Spotlight {
+            radius,
+            location: start,
+            speed,
+            progress: 0.0,
+            done: false,
+            start,
+            target: at(target),
+            bend: at(bend),
+        }
+    }
+
+    /// Whether every number is in its range.
+    pub fn is_valid(&self) -> bool {
+        let near = |place: &[f64; 2]| place.iter().all(|coordinate| coordinate.abs() < f64::from(FAR) / 4.0);
+        (0..=MAX_SPOT_RADIUS).contains(&self.radius)
+            && [self.location, self.start, self.target, self.bend].iter().all(near)
+            && (0.0..=1.0).contains(&self.progress)
+            && self.speed >= 0.0
+    }
+
+    /// Goes on to the place for this step, where it shines and burns, and gets ready for the next.
+    pub fn advance(&mut self) {
+        let towards = lerp(self.target, self.bend, self.progress);
+        self.location = lerp(self.start, towards, self.progress);
+        self.progress += self.speed;
+        if self.progress >= 1.0 {
+            self.progress = 1.0;
+            self.done = true;
+        }
+    }
+
+    /// The circle that it lights up.
+    pub fn circle(&self) -> Circle {
+        let [x, y] = self.location;
+        Circle { x: x as i32, y: y as i32, radius: self.radius }
+    }
+}
+
+/// A lit circle, in pixels of the screen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Circle {
+    pub x: i32,
+    pub y: i32,
+    pub radius: i32,
+}
+
+impl Circle {
+    /// Whether a part of it may be seen: on the screen, and not only behind the bar at the top.
+    pub fn is_on_screen(&self) -> bool {
+        let columns = self.x - self.radius..self.x + self.radius;
+        let rows = self.y - self.radius..self.y + self.radius;
+        let size = SCREEN as i32;
+        columns.start < size && columns.end > 0 && rows.start < size && rows.end > BAR_HEIGHT as i32 && self.radius > 0
+    }
+
+    /// Whether it covers a place.
+    pub fn contains(&self, (x, y): (i32, i32)) -> bool {
+        let (x, y) = (x - self.x, y - self.y);
+        x * x + y * y < self.radius * self.radius
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Circle;
+
+    #[test]
+    fn circles_are_seen_up_to_the_last_pixel() {
+        let circle = |x, y| Circle { x, y, radius: 10 };
+        for (x, y) in [(-9, 40), (93, 40), (40, 93), (40, -5), (42, 42)] {
+            assert!(circle(x, y).is_on_screen(), "{x}, {y}");
+        }
+        for (x, y) in [(-10, 40), (94, 40), (40, 94), (40, -6)] {
+            assert!(!circle(x, y).is_on_screen(), "{x}, {y}");
+        }
+        assert!(!Circle { x: 40, y: 40, radius: 0 }.is_on_screen());
+        assert!(circle(40, 40).contains((49, 40)));
+        assert!(!circle(40, 40).contains((50, 40)));
+    }
+}
