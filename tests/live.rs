@@ -49,7 +49,7 @@ impl Original {
         writeln!(self.requests, "{request}").unwrap();
         let mut line = String::new();
         self.answers.read_line(&mut line).unwrap();
-        serde_json::from_str(&line).unwrap_or_else(|error| panic!("the original answers `{line}`: {error}"))
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("the original answers `{line:.300}`: {error}"))
     }
 }
 

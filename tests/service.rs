@@ -237,26 +237,30 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
-/// Longer than the others, for `cargo test -- --ignored`: deaths come at any moment, also while connecting.
+/// Longer than the others, for `cargo test -- --ignored`: deaths come at any moment, also while starting and connecting.
 #[test]
 #[ignore = "takes a minute"]
 fn deaths_at_any_moment_are_survived() {
     let place = Place::new();
-    let mut engine = place.engine("gym", 3, 2);
-    for round in 0..300_u64 {
-        let mut killed = place.role("trainer", "gym", &[]);
+    for round in 0..200_u64 {
         // Start, connection and play of a process take some 30 milliseconds.
-        std::thread::sleep(Duration::from_micros(round * 7919 % 60_000));
-        if round % 3 == 0 {
+        let moment = |step: u64| Duration::from_micros(round * step % 40_000);
+        let mut engine = place.engine("gym", 3, 2);
+        std::thread::sleep(moment(7919));
+        if round % 2 == 0 {
             engine.kill();
             engine = place.engine("gym", 3, 2);
         }
+        let mut killed = place.role("trainer", "gym", &[]);
+        std::thread::sleep(moment(6007));
         killed.kill();
         let mut trainer = place.trainer("gym").unwrap_or_else(|e| panic!("round {round}: {e}"));
         play(&mut trainer, 0, 3);
         play(&mut trainer, 1, 3);
     }
-    engine.end();
+    // What died too early to be recognised at once is recognised by its age.
+    std::thread::sleep(Duration::from_secs(11));
+    assert_eq!(engines(place.namespace()).unwrap(), [] as [String; 0]);
     assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
 }
 

@@ -35,7 +35,8 @@ def plain(value):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, numpy.ndarray)):
         return [plain(item) for item in value]
-    return value.item() if isinstance(value, numpy.generic) else value
+    value = value.item() if isinstance(value, numpy.generic) else value
+    return None if value != value else value  # what is not a number is null in JSON
 
 
 def checksum(array):

@@ -117,12 +117,22 @@ fn compare_info(replay: &mut Replay, step: usize, expected: &Map<String, Json>, 
     for (name, value) in expected {
         let value: Option<Vec<f64>> = match value {
             Json::Array(values) => values.iter().map(Json::as_f64).collect(),
+            // JSON knows no other way to write what is not a number.
+            Json::Null => Some(vec![f64::NAN]),
             value => value.as_f64().map(|value| vec![value]),
         };
         let found = found.iter().find(|(key, _)| key == name).map(|(_, value)| value.clone());
-        replay.compare(step, &format!("info `{name}`"), value, found);
+        if !both_are_nan(&value, &found) {
+            replay.compare(step, &format!("info `{name}`"), value, found);
+        }
     }
     for (name, value) in found.iter().filter(|(name, _)| !expected.contains_key(*name)) {
         replay.compare(step, &format!("info `{name}`"), None, Some(value));
     }
+}
+
+fn both_are_nan(one: &Option<Vec<f64>>, other: &Option<Vec<f64>>) -> bool {
+    let is_nan =
+        |value: &Option<Vec<f64>>| value.as_deref().is_some_and(|numbers| matches!(numbers, [n] if n.is_nan()));
+    is_nan(one) && is_nan(other)
 }

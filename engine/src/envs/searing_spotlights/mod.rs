@@ -8,13 +8,13 @@
 //! - An episode's first frame shows the circles that the last episode lit, and turns the agent upwards.
 //! - A background once painted over by `hide_chessboard` or `black_background` stays so in later episodes of the environment.
 //! - The endless id without `coin_enabled` has a black background, and hides even the spotlights for `coin_show_duration` steps.
+//! - With `num_coins: [0]` the exit is open from the first step, and the share of coins in the info is not a number.
 //! - What is visible in the dark is drawn above the bar at the top, or below it, depending on what else is visible.
 //!
 //! Where the original raises an error, the options do what their documentation promises:
 //!
 //! - `use_exit: false`: there is no exit, not even one that an earlier episode left behind, and an episode is won with the last
 //!   coin. Without coins as well, it goes on until the agent dies or `max_steps` are over.
-//! - `num_coins: [0]`: the exit is open from the first step, and the info reports a share of 0.
 //! - More coins than the screen has room for are placed regardless of each other.
 //! - The endless id's `show_last_action: false`: the bar does not show the action.
 //! - `spot_min_radius` above `spot_max_radius`: all spotlights have the former.

@@ -331,8 +331,8 @@ impl State {
 
     /// The final info of the finite id: health, share of coins, success.
     pub(super) fn finite_info(&self, parameters: &Parameters) -> [f64; 3] {
-        // Where there are no coins, the original divides by zero and raises an error.
-        let coins = f64::from(self.coins_collected) / self.num_coins.max(1) as f64;
+        // Not a number where there are no coins, as in the original.
+        let coins = f64::from(self.coins_collected) / self.num_coins as f64;
         [self.health_share(parameters), coins, f64::from(u8::from(self.success))]
     }
 
