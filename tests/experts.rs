@@ -81,3 +81,15 @@ fn endless_mystery_path_goes_on() {
     let ended = play("Endless-MysteryPath-v0", 30, 10_000).iter().flatten().count();
     assert!(ended <= 1, "{ended} of 30 ended");
 }
+
+#[test]
+fn finite_searing_spotlights_is_solved() {
+    let solved = solved("SearingSpotlights-v0", 100, 1024);
+    assert!(solved >= 99, "{solved} of 100 solved");
+}
+
+#[test]
+fn endless_searing_spotlights_lasts() {
+    let ended = play("Endless-SearingSpotlights-v0", 4, 1000);
+    assert!(ended.iter().all(Option::is_none), "{ended:?}");
+}

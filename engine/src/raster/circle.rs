@@ -108,6 +108,19 @@ impl Disc {
     }
 }
 
+/// The pixels of a circle whose border is one pixel wide, from its centre, each of them once; empty for radii below 1. All of
+/// them lie on the [`Disc`] of the same radius.
+pub fn circle_outline(radius: i32) -> Vec<(i32, i32)> {
+    let mut pixels: Vec<(i32, i32)> = Octant::new(i64::from(radius).clamp(0, MAX_RADIUS))
+        .map(|(near, far)| (near as i32, far as i32))
+        .flat_map(|(near, far)| [(near, far), (far, near)])
+        .flat_map(|(x, y)| [(-x, -y), (x - 1, -y), (-x, y - 1), (x - 1, y - 1)])
+        .collect();
+    pixels.sort_unstable();
+    pixels.dedup();
+    pixels
+}
+
 /// The outline of a circle as the wide border follows it: one point per row, downwards from the
 /// top, by two midpoint rules that meet on the diagonal.
 struct Contour {

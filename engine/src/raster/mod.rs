@@ -29,7 +29,7 @@ mod tests;
 
 pub use blit::{blend_keyed, blend_plain};
 pub use canvas::Canvas;
-pub use circle::{Disc, DiscColumn};
+pub use circle::{Disc, DiscColumn, circle_outline};
 pub use rectangle::{CornerRadii, Rect};
 pub use sprite::{Sprite, copy_run};
 pub use surface::Surface;

@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 use serde::Deserialize;
 
-use super::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface};
+use super::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface, circle_outline};
 
 /// What pygame painted, recorded by `tests/raster/record_raster.py`.
 #[derive(Deserialize)]
@@ -248,6 +248,63 @@ proptest! {
             filled.canvas().fill_disc([9, 8, 7], center, &disc);
             prop_assert_eq!(&drawn, &filled);
         }
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_sprite_within_a_disc_is_cut_to_it(
+        picture in any_picture(),
+        at in (-30..60i32, -30..60i32),
+        radius in -2..40i32,
+        center in (-30..60i32, -30..60i32),
+    ) {
+        let (sprite, disc) = (Sprite::new(&picture), Disc::new(radius));
+        let mut whole = Surface::new(33, 27);
+        sprite.blit(&mut whole.canvas(), at.0, at.1);
+        let mut lit = Surface::new(33, 27);
+        lit.canvas().fill_disc([255; 3], center, &disc);
+        let mut found = Surface::new(33, 27);
+        sprite.blit_within(&mut found.canvas(), at.0, at.1, &disc, center);
+        for (x, y) in (0..33).flat_map(|x| (0..27).map(move |y| (x, y))) {
+            let expected = if lit.pixel(x, y) == Some([255; 3]) { whole.pixel(x, y) } else { Some([0; 3]) };
+            prop_assert_eq!(found.pixel(x, y), expected, "{}, {}", x, y);
+        }
+    }
+
+    #[test]
+    fn a_shaded_sprite_looks_as_if_covered(picture in any_picture(), at in (-30..60i32, -30..60i32), alpha: u8) {
+        let sprite = Sprite::new(&picture);
+        let mut expected = Surface::new(33, 27);
+        sprite.blit(&mut expected.canvas(), at.0, at.1);
+        let mut cover = Surface::new(33, 27);
+        cover.set_color_key(Some([255, 0, 0]));
+        cover.set_alpha(alpha.into());
+        expected.blit(&cover, 0, 0);
+        let mut found = Surface::new(33, 27);
+        sprite.blit_shaded(&mut found.canvas(), at.0, at.1, alpha);
+        prop_assert_eq!(found.pixels(), expected.pixels());
+    }
+}
+
+#[test]
+fn an_outline_is_the_thin_circle_and_lies_on_the_disc() {
+    let size = 2 * 70 + 2;
+    for radius in -1..70 {
+        let center = (size / 2, size / 2);
+        let mut expected = Surface::new(size as usize, size as usize);
+        expected.draw_circle([9; 3], center, radius, 1);
+        let mut disc = Surface::new(size as usize, size as usize);
+        disc.draw_circle([9; 3], center, radius, 0);
+        let mut found = Surface::new(size as usize, size as usize);
+        let outline = circle_outline(radius);
+        for (x, y) in &outline {
+            let (x, y) = ((center.0 + x) as usize, (center.1 + y) as usize);
+            assert_eq!(found.pixel(x, y), Some([0; 3]), "radius {radius}: twice");
+            assert_eq!(disc.pixel(x, y), Some([9; 3]), "radius {radius}: off the disc");
+            found.canvas().put(x as i64, y as i64, [9; 3]);
+        }
+        assert_eq!(found, expected, "radius {radius}");
     }
 }
 

@@ -3,16 +3,14 @@
 //! The original paints a black surface with transparent circles over the scene. Here nothing that stays dark is painted: the
 //! frame is filled with the darkened background, and the circles bring the scene back, column by column.
 
-use std::sync::LazyLock;
-
 use serde::{Deserialize, Serialize};
 
-use super::parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters, Variant};
+use super::parameters::{MAX_SPOTLIGHTS, Parameters, Variant};
 use super::rules::{SearingSpotlights, State};
 use crate::envs::background::{BACKGROUND_TILE, tiled_background};
 use crate::envs::character::{Character, CharacterSprites};
 use crate::envs::{FRAME_BYTES, SCREEN};
-use crate::raster::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface, blend_keyed, copy_run};
+use crate::raster::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface, blend_keyed, circle_outline, copy_run};
 
 const BLACK: Rgb = [0, 0, 0];
 const WHITE: Rgb = [255, 255, 255];
@@ -24,7 +22,7 @@ const EXIT_OPEN: Rgb = [48, 141, 70];
 const EXIT_CLOSED: Rgb = [55, 55, 55];
 
 /// Bytes of a column of pixels.
-const COLUMN: usize = SCREEN * 3;
+pub(super) const COLUMN: usize = SCREEN * 3;
 
 /// What covers the screen behind everything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -58,8 +56,31 @@ impl Columns {
     }
 }
 
-/// The discs of all radii that spotlights may have.
-static DISCS: LazyLock<Vec<Disc>> = LazyLock::new(|| (0..=MAX_SPOT_RADIUS).map(Disc::new).collect());
+/// A spotlight's circle of some radius.
+#[derive(Debug)]
+struct Shape {
+    disc: Disc,
+    outline: Vec<(i32, i32)>,
+}
+
+impl Shape {
+    fn new(radius: i32) -> Self {
+        Shape { disc: Disc::new(radius), outline: circle_outline(radius) }
+    }
+
+    /// Draws the white outline of a half transparent surface over what the circle has brought back.
+    fn draw_outline(&self, canvas: &mut Canvas<'_>, centre: (i32, i32), alpha: u8) {
+        let pixels = canvas.pixels_mut().as_chunks_mut::<3>().0;
+        for (x, y) in &self.outline {
+            let (x, y) = (centre.0 + x, centre.1 + y);
+            let on_screen = |coordinate: i32| (0..SCREEN as i32).contains(&coordinate);
+            if on_screen(x) && on_screen(y) {
+                let pixel = &mut pixels[x as usize * SCREEN + y as usize];
+                *pixel = pixel.map(|channel| blend_keyed(255, channel, alpha));
+            }
+        }
+    }
+}
 
 /// What all environments with the same reset parameters share.
 #[derive(Debug)]
@@ -74,6 +95,9 @@ pub struct Assets {
     pub most_spotlights: usize,
     /// By [`Ground`].
     grounds: [Columns; 4],
+    /// The circles of all radii that these parameters allow, and the first of the radii.
+    shapes: Vec<Shape>,
+    first_radius: i32,
     coin: Sprite,
     exit_side: i32,
     exit_closed: Sprite,
@@ -91,6 +115,8 @@ impl Assets {
         let grounds = [tiled_background(BLUE), tiled_background(RED), plain(WHITE), plain(BLACK)];
         let coin_radius = (10.0 * parameters.coin_scale) as i32;
         let exit_side = (20.0 * parameters.exit_scale) as i32;
+        let first_radius = parameters.spot_min_radius as i32;
+        let last_radius = first_radius.max(parameters.spot_max_radius as i32);
         let [exit_closed, exit_open] = exit_pictures(exit_side, parameters.exit_scale);
         Assets {
             variant,
@@ -99,11 +125,24 @@ impl Assets {
             exit_radius: 20.0 / 2.0 * parameters.exit_scale,
             most_spotlights: most_spotlights(&parameters),
             grounds: grounds.each_ref().map(Columns::of),
+            shapes: (first_radius..=last_radius).map(Shape::new).collect(),
+            first_radius,
             coin: coin_picture(coin_radius, parameters.coin_scale),
             exit_side,
             exit_closed,
             exit_open,
             parameters,
+        }
+    }
+}
+
+impl Assets {
+    /// Hands out the circle of some radius. An episode's first frame may show one of other reset parameters.
+    #[inline]
+    fn with_shape(&self, radius: i32, draw: impl FnOnce(&Shape)) {
+        match self.shapes.get((radius - self.first_radius) as usize) {
+            Some(shape) => draw(shape),
+            None => draw(&Shape::new(radius)),
         }
     }
 }
@@ -225,49 +264,30 @@ impl SearingSpotlights {
         let state = &self.state;
         let ground = &self.assets.grounds[ground as usize];
         let darkness = state.darkness;
-        if darkness == 255 {
-            canvas.fill(BLACK);
-        } else if darkness == 0 || state.outlined {
+        if darkness == 0 {
             fill_columns(canvas, ground);
             self.each(hidden, agent, |sprite, (x, y)| sprite.blit(canvas, x, y));
-            if darkness > 0 {
-                self.shade_outlined(canvas);
-            }
             return;
+        }
+        if darkness == 255 {
+            canvas.pixels_mut().fill(0);
         } else {
             fill_columns(canvas, &ground.shaded(darkness));
             self.each(hidden, agent, |sprite, (x, y)| sprite.blit_shaded(canvas, x, y, darkness));
         }
-        for circle in &state.lit {
-            let Some(disc) = DISCS.get(circle.radius as usize) else { continue };
-            let centre = (circle.x, circle.y);
-            let pixels = canvas.pixels_mut();
-            for column in disc.columns(centre, SCREEN, SCREEN) {
-                let bytes = column.rows.start * 3..column.rows.end * 3;
-                copy_run(&ground.column(column.x)[bytes.clone()], &mut pixels[column.x * COLUMN..][bytes]);
-            }
-            self.each(hidden, agent, |sprite, (x, y)| sprite.blit_within(canvas, x, y, disc, centre));
-            if state.outlined {
-                canvas.draw_circle(WHITE, centre, circle.radius, 1);
-            }
-        }
-    }
-
-    /// Covers a bright scene by a half transparent black surface with outlined holes. Outlines take their colour from what
-    /// is below them and may cross, so this paints the surface as the original does.
-    fn shade_outlined(&self, canvas: &mut Canvas<'_>) {
-        let mut surface = [0; FRAME_BYTES];
-        let mut cover = Canvas::new(&mut surface, SCREEN, SCREEN);
-        for circle in &self.state.lit {
-            let centre = (circle.x, circle.y);
-            cover.draw_circle(RED, centre, circle.radius, 0);
-            cover.draw_circle(WHITE, centre, circle.radius, 1);
-        }
-        let covers = surface.as_chunks::<3>().0;
-        for (pixel, cover) in canvas.pixels_mut().as_chunks_mut::<3>().0.iter_mut().zip(covers) {
-            if *cover != RED {
-                *pixel = pixel.map(|channel| blend_keyed(cover[0], channel, self.state.darkness));
-            }
+        for circle in state.lit.iter().filter(|circle| circle.is_on_screen()) {
+            self.assets.with_shape(circle.radius, |shape| {
+                let centre = (circle.x, circle.y);
+                let pixels = canvas.pixels_mut();
+                for column in shape.disc.columns(centre, SCREEN, SCREEN) {
+                    let bytes = column.rows.start * 3..column.rows.end * 3;
+                    copy_run(&ground.column(column.x)[bytes.clone()], &mut pixels[column.x * COLUMN..][bytes]);
+                }
+                self.each(hidden, agent, |sprite, (x, y)| sprite.blit_within(canvas, x, y, &shape.disc, centre));
+                if state.outlined {
+                    shape.draw_outline(canvas, centre, darkness);
+                }
+            });
         }
     }
 }
@@ -284,7 +304,8 @@ impl State {
         if self.first_frame { Character { rotation: 0, ..self.agent } } else { self.agent }
     }
 
-    /// The agent as the ground-truth view shows it, which follows only when the agent has moved.
+    /// The agent as the ground-truth view shows it: that of the last episode until the agent of this one has moved, as in the
+    /// original, but in this one's size.
     fn true_agent(&self) -> Character {
         match self.former_agent {
             Some(former) if self.first_frame => former,

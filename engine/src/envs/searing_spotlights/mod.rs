@@ -28,6 +28,8 @@ pub mod parameters;
 mod rules;
 mod spawning;
 mod spotlight;
+#[cfg(test)]
+mod tests;
 mod top_bar;
 
 use std::sync::Arc;

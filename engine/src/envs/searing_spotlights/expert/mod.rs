@@ -3,9 +3,7 @@
 mod forecast;
 mod plan;
 
-use std::collections::VecDeque;
-
-use super::features::{AGENT, COIN, EXIT, SPOTLIGHT};
+use super::features::{AGENT, COIN, EXIT, HEALTH, SPOTLIGHT};
 use super::parameters::Variant;
 use crate::envs::{Expert, SCREEN};
 use forecast::Forecast;
@@ -19,9 +17,20 @@ const EXIT_REACH: i32 = 11;
 const PATIENCE: u32 = 150;
 /// With more steps left than this it only follows its most cautious plan.
 const CALM: u32 = 130;
-/// With fewer steps left than this it accepts hits, one for each so many steps.
-const URGENT: u32 = 70;
-const STEPS_PER_HIT: u32 = 8;
+/// With fewer steps left than this it accepts hits, one for each so many steps, but keeps a health point.
+const URGENT: u32 = 90;
+const STEPS_PER_HIT: u32 = 10;
+
+/// Health points at first, by default.
+const FINITE_HEALTH: f32 = 5.0;
+const ENDLESS_HEALTH: f32 = 10.0;
+
+/// Most pixels that it keeps away from where a spotlight is expected, beside the least distance.
+const MOST_MARGIN: f64 = 6.0;
+
+/// The share of the margin with which it looks for the way with the fewest hits, and for a way out of the light.
+const HURRY: f64 = 0.1;
+const ESCAPE: f64 = 0.2;
 
 /// Shares of the margin for what the forecasts do not know, and whether to keep away from the border: the most cautious first.
 const CAUTIONS: [(f64, bool); 6] = [(1.0, true), (0.5, true), (1.0, false), (0.5, false), (0.2, false), (0.0, false)];
@@ -36,9 +45,11 @@ pub struct SpotlightsExpert {
     variant: Variant,
     /// Where the agent is, seen or reckoned from its moves.
     agent: Option<Place>,
-    coins: VecDeque<Place>,
+    coins: Vec<Place>,
     exit: Option<Place>,
     spotlights: Vec<Forecast>,
+    /// Health points left.
+    health: u32,
     target: Option<Place>,
     /// Steps until it dares more to get to the target.
     patience: u32,
@@ -50,9 +61,10 @@ impl SpotlightsExpert {
         SpotlightsExpert {
             variant,
             agent: None,
-            coins: VecDeque::new(),
+            coins: Vec::new(),
             exit: None,
             spotlights: Vec::new(),
+            health: 0,
             target: None,
             patience: PATIENCE,
         }
@@ -60,6 +72,8 @@ impl SpotlightsExpert {
 
     /// Takes in what the frame shows.
     fn look(&mut self, features: &[f32]) {
+        let full_health = if self.variant.endless { ENDLESS_HEALTH } else { FINITE_HEALTH };
+        self.health = (features[HEALTH] * full_health).round() as u32;
         let place = |at: usize| [features[at], features[at + 1]].map(|share| (share * SCREEN as f32).round() as i32);
         if features[AGENT] == 1.0 {
             self.agent = Some(place(AGENT + 1));
@@ -77,7 +91,7 @@ impl SpotlightsExpert {
                 self.coins.clear();
             }
             if !self.coins.contains(&coin) {
-                self.coins.push_back(coin);
+                self.coins.push(coin);
             }
         }
         self.watch(features);
@@ -121,9 +135,9 @@ impl SpotlightsExpert {
                 }
             }
         }
-        let bearable_hits = (URGENT.saturating_sub(self.patience) / STEPS_PER_HIT) as usize;
-        let dash = if bearable_hits > 0 { dash(agent, goal, &self.dangers(0.1, false), bearable_hits) } else { None };
-        dash.or(waiting).unwrap_or_else(|| choose(agent, goal, &self.dangers(0.2, false)))
+        let hits = (URGENT.saturating_sub(self.patience) / STEPS_PER_HIT).min(self.health.saturating_sub(1)) as usize;
+        let dash = if hits > 0 { dash(agent, goal, &self.dangers(HURRY, false), hits) } else { None };
+        dash.or(waiting).unwrap_or_else(|| choose(agent, goal, &self.dangers(ESCAPE, false)))
     }
 
     /// The danger of each coming step, with this share of the margin for what the forecasts do not know.
@@ -132,7 +146,7 @@ impl SpotlightsExpert {
         for (step, danger) in dangers.iter_mut().enumerate().skip(1) {
             for spotlight in &self.spotlights {
                 let (centre, deviation) = spotlight.at(step);
-                let margin = (caution * (1.0 + 2.0 * deviation)).min(8.0);
+                let margin = (caution * (1.0 + deviation)).min(MOST_MARGIN);
                 danger.add(centre, f64::from(spotlight.radius) + AGENT_RADIUS + 0.5 + margin);
             }
             // Near the border, a spotlight that comes in leaves no time to flee. Time to get away from it comes first.

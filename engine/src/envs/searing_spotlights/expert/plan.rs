@@ -33,9 +33,6 @@ const MOVES: [([i32; 2], Place); 9] = [
     ([2, 2], [2, 2]),
 ];
 
-/// Most hits that a plan takes into account.
-const MAX_HITS: usize = 3;
-
 /// Where the agent is after an action.
 pub(super) fn after(place: Place, action: [i32; 2]) -> Place {
     let pixels = MOVES.iter().find(|(candidate, _)| *candidate == action).map_or([0, 0], |(_, pixels)| *pixels);
@@ -200,45 +197,41 @@ pub(super) struct Plan {
 /// The first action of the way that meets the least danger until the horizon and, among those, is the soonest at the goal or
 /// comes nearest to it. `dangers` has an entry for now, which does not count, and one for each step to come.
 pub(super) fn choose(start: Place, goal: Goal, dangers: &[Danger]) -> Plan {
-    let bearable = bearable(dangers);
     let start = moved(start, [0, 0]);
     let next = MOVES.map(|(action, pixels)| (action, moved(start, pixels)));
-    for hits in 0..=MAX_HITS {
-        // The first steps that allow for no more hits than these.
-        let allowed = &bearable[hits][1];
-        let firsts = next.iter().filter(|(_, place)| allowed.contains(*place));
-        if hits == 0 {
-            if firsts.count() > 0 {
-                let (action, arrives) = lead(start, goal, &bearable[0]);
-                return Plan { action, hits, arrives };
-            }
-        } else if let Some((action, _)) = firsts.min_by_key(|(_, place)| goal.distance(*place)) {
+    let safe = bearable(dangers, None);
+    if next.iter().any(|(_, place)| safe[1].contains(*place)) {
+        let (action, arrives) = lead(start, goal, &safe);
+        return Plan { action, hits: 0, arrives };
+    }
+    // With as many hits as there are steps, every way can be gone.
+    let mut allowed = safe;
+    for hits in 1..dangers.len() {
+        allowed = bearable(dangers, Some(&allowed));
+        let firsts = next.iter().filter(|(_, place)| allowed[1].contains(*place));
+        if let Some((action, _)) = firsts.min_by_key(|(_, place)| goal.distance(*place)) {
             return Plan { action: *action, hits, arrives: false };
         }
     }
-    Plan {
-        action: next.iter().min_by_key(|(_, place)| goal.distance(*place)).map_or([0, 0], |(action, _)| *action),
-        hits: MAX_HITS + 1,
-        arrives: false,
-    }
+    Plan { action: [0, 0], hits: dangers.len(), arrives: false }
 }
 
-/// For each number of hits, and each step: the places from which the rest of the way can be gone with no more than that.
-fn bearable(dangers: &[Danger]) -> [Vec<Places>; MAX_HITS + 1] {
+/// For each step: the places from which the rest of the way can be gone without danger, or with one dangerous step more than
+/// `easier` places allow.
+fn bearable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
     let everywhere = Places([u128::MAX; SCREEN]);
-    let mut sets: [Vec<Places>; MAX_HITS + 1] = std::array::from_fn(|_| vec![everywhere.clone(); dangers.len() + 1]);
+    let mut sets = vec![everywhere.clone(); dangers.len() + 1];
     for step in (1..dangers.len()).rev() {
-        let safe = dangers[step].safe();
-        let mut fewer = Places::NONE;
-        for levels in &mut sets {
-            let before = if step + 1 < dangers.len() { levels[step + 1].before() } else { everywhere.clone() };
-            let mut set = before.clone().and(&safe);
-            for (row, (fewer, safe)) in set.0.iter_mut().zip(fewer.0.iter().zip(&safe.0)) {
-                *row |= fewer & !safe;
-            }
-            levels[step] = set;
-            fewer = before;
+        let before = |sets: &[Places]| {
+            let is_last = step + 1 == dangers.len();
+            if is_last { everywhere.clone() } else { sets[step + 1].before() }
+        };
+        let mut set = before(&sets).and(&dangers[step].safe());
+        if let Some(easier) = easier {
+            let hurt = before(easier).and(&dangers[step].0);
+            set.0.iter_mut().zip(&hurt.0).for_each(|(row, hurt)| *row |= hurt);
         }
+        sets[step] = set;
     }
     sets
 }
@@ -363,6 +356,6 @@ mod tests {
         let plan = choose([30, 40], goal, &dangers);
         assert_eq!(plan.hits, 0);
         let surrounded = vec![Danger(Places([u128::MAX; SCREEN])); HORIZON + 1];
-        assert_eq!(choose([30, 40], goal, &surrounded).hits, MAX_HITS + 1);
+        assert_eq!(choose([30, 40], goal, &surrounded).hits, HORIZON);
     }
 }
