@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use endless_gym::envs::{self, Spec};
+use endless_gym::envs::{self, Family, Spec};
 use endless_gym::pool::ResetRequest;
 use serde_json::{Map, Value as Json, json};
 
@@ -23,9 +23,9 @@ pub struct Args {
     /// Who plays.
     #[arg(long, value_enum, default_value = "expert")]
     policy: Policy,
-    /// Environments in each group.
-    #[arg(long, default_value_t = 512)]
-    num_envs: usize,
+    /// Environments in each group [default: 512, or 16 for the expert of Searing Spotlights, which thinks long].
+    #[arg(long)]
+    num_envs: Option<usize>,
     /// Groups: the engine steps one while the trainer works on the other.
     #[arg(long, default_value_t = 2)]
     groups: usize,
@@ -65,9 +65,13 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     let spec = envs::spec(&args.id)?;
     let seconds = Duration::try_from_secs_f64(args.seconds).map_err(|error| format!("--seconds: {error}"))?;
     let stop = stop::on_signal()?;
+    let num_envs = args.num_envs.unwrap_or(match (spec.family, args.policy) {
+        (Family::SearingSpotlights(_), Policy::Expert) => 16,
+        _ => 512,
+    });
     let mut arguments: Vec<String> = [
         ("--env", args.id.clone()),
-        ("--num-envs", args.num_envs.to_string()),
+        ("--num-envs", num_envs.to_string()),
         ("--groups", args.groups.to_string()),
         ("--threads", args.threads.to_string()),
     ]
@@ -80,7 +84,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     let mut trainer = engine.connect()?;
 
     let mut random = RandomPlayer::new(spec);
-    let mut experts: Vec<_> = (0..args.groups).map(|_| ExpertPlayer::new(spec, args.num_envs)).collect();
+    let mut experts: Vec<_> = (0..args.groups).map(|_| ExpertPlayer::new(spec, num_envs)).collect();
     let mut tally = Tally::new(spec);
     for group in 0..args.groups {
         trainer.reset(group, ResetRequest::All)?;
@@ -105,7 +109,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
         }
     }
     bar.finish_and_clear();
-    summarise(args, spec, &tally, start.elapsed())?;
+    summarise(args, spec, num_envs, &tally, start.elapsed())?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -133,7 +137,7 @@ fn live(spec: &Spec, tally: &Tally, elapsed: Duration) -> String {
     text
 }
 
-fn summarise(args: &Args, spec: &Spec, tally: &Tally, elapsed: Duration) -> Result<(), Failure> {
+fn summarise(args: &Args, spec: &Spec, num_envs: usize, tally: &Tally, elapsed: Duration) -> Result<(), Failure> {
     let policy = match args.policy {
         Policy::Expert => "expert",
         Policy::Random => "random",
@@ -148,7 +152,7 @@ fn summarise(args: &Args, spec: &Spec, tally: &Tally, elapsed: Duration) -> Resu
         return print_json(&json!({
             "environment": spec.id,
             "policy": policy,
-            "num_envs": args.num_envs,
+            "num_envs": num_envs,
             "groups": args.groups,
             "seconds": elapsed.as_secs_f64(),
             "steps": tally.steps,
@@ -161,7 +165,7 @@ fn summarise(args: &Args, spec: &Spec, tally: &Tally, elapsed: Duration) -> Resu
         }));
     }
     let mut rows = table([spec.id, ""]);
-    let environments = format!("{} in {} groups, another process", args.num_envs * args.groups, args.groups);
+    let environments = format!("{} in {} groups, another process", num_envs * args.groups, args.groups);
     rows.add_row(["environments", &environments]);
     rows.add_row(["policy", policy]);
     rows.add_row(["seconds", &format!("{:.1}", elapsed.as_secs_f64())]);
