@@ -102,6 +102,10 @@ impl Namespace {
         config.global.set_root_path(&root);
         config.global.prefix = FileName::new(self.prefix.as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;
         config.global.creation_timeout = Duration::from_millis(500);
+        // We clean up ourselves, and more carefully.
+        config.global.node.cleanup_dead_nodes_on_creation = false;
+        config.global.node.cleanup_dead_nodes_on_destruction = false;
+        config.global.service.cleanup_dead_nodes_on_open = false;
         Ok(config)
     }
 }

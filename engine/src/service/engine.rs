@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::sample::Sample;
@@ -198,7 +199,7 @@ impl Engine {
                     self.answer(group, sample)?;
                 }
                 None if cleaned.elapsed() >= CLEANUP_EVERY => {
-                    self.node.try_cleanup_dead_nodes();
+                    self.node.clean();
                     cleaned = Instant::now();
                 }
                 None => {}
@@ -233,7 +234,11 @@ impl Engine {
         if let Err((reason, message)) = &outcome {
             header.reject(*reason, message);
         }
-        let receivers = batch.send().map_err(|e| ServiceError::middleware("cannot send a batch")(e.to_string()))?;
+        // A trainer that dies just now must not take the engine with it.
+        let receivers = batch.send().unwrap_or_else(|e| {
+            tracing::warn!(error = %e, group = number, "a batch reaches nobody");
+            0
+        });
         ports::notify(&self.to_trainer, number);
         group.step = step;
         self.summary.undelivered += u64::from(receivers == 0);
@@ -266,7 +271,14 @@ impl Group {
     }
 
     fn poll(&self) -> Result<Option<Sample<Ipc, [Block], ActionHeader>>, ServiceError> {
-        self.actions.receive().map_err(|e| ServiceError::middleware("cannot receive actions")(e.to_string()))
+        match self.actions.receive() {
+            // A trainer that died while it connected.
+            Err(ReceiveError::ConnectionFailure(e)) => {
+                tracing::warn!(error = %e, "a trainer cannot be heard");
+                Ok(None)
+            }
+            received => received.map_err(|e| ServiceError::middleware("cannot receive actions")(e.to_string())),
+        }
     }
 
     /// Checks a message and copies what it holds.

@@ -109,7 +109,8 @@ impl ObservationHeader {
 
     /// Turns the answer into a rejection.
     pub(super) fn reject(&mut self, reason: Rejection, message: &str) {
-        let end = message.floor_char_boundary(TEXT_BYTES);
+        let longest = message.len().min(TEXT_BYTES);
+        let end = (0..=longest).rev().find(|end| message.is_char_boundary(*end)).unwrap_or(0);
         self.status = reason.status();
         self.text_length = end as u32;
         self.text[..end].copy_from_slice(&message.as_bytes()[..end]);

@@ -49,6 +49,7 @@ mod ports;
 mod preflight;
 mod received;
 mod specification;
+mod sweep;
 mod trainer;
 mod wait;
 

@@ -1,18 +1,18 @@
 //! This process among those of its namespace, and whether others live.
 
-use std::fs;
 use std::ops::Deref;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{
-    CallbackProgression, Config, LogLevel, Node, NodeBuilder, NodeState, SignalHandlingMode, ipc_threadsafe,
+    CallbackProgression, LogLevel, Node, NodeBuilder, NodeState, SignalHandlingMode, ipc_threadsafe,
     set_log_level_from_env_or,
 };
 
 use super::config::Namespace;
 use super::error::ServiceError;
 use super::here::Here;
+use super::sweep;
 
 /// The kind of services. Its ports and samples may be moved to and dropped in any thread, which a binding to a garbage
 /// collected language needs. It costs half a microsecond a step against the kind for one thread.
@@ -21,7 +21,6 @@ pub(super) type Ipc = ipc_threadsafe::Service;
 /// This process as a member of a namespace. Goes after all ports that were made with it.
 pub(super) struct Member {
     node: Here<Node<Ipc>>,
-    prefix: String,
 }
 
 impl Member {
@@ -29,12 +28,41 @@ impl Member {
     pub(super) fn join(namespace: &Namespace) -> Result<Self, ServiceError> {
         set_log_level_from_env_or(LogLevel::Error);
         let config = namespace.prepare()?;
+        sweep::unsized_segments(&config);
         let node = NodeBuilder::new()
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create()
             .map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))?;
-        Ok(Member { node: Here::new(node), prefix: namespace.prefix().to_owned() })
+        let member = Member { node: Here::new(node) };
+        member.clean();
+        sweep::stubs(&config);
+        Ok(member)
+    }
+
+    /// Removes what processes left that have died.
+    pub(super) fn clean(&self) {
+        let mut dead = Vec::new();
+        let listed = Node::<Ipc>::list(self.config(), |state| {
+            if let NodeState::Dead(node) = state {
+                dead.push(node);
+            }
+            CallbackProgression::Continue
+        });
+        if let Err(e) = listed {
+            tracing::debug!(error = %e, "cannot look for dead processes");
+        }
+        if dead.is_empty() {
+            return;
+        }
+        // After their death and before the middleware looks at what they left: it would wait for a size for ever.
+        sweep::unsized_segments(self.config());
+        for node in dead.into_iter().filter(|node| node.details().is_some()) {
+            // That another process is at it is no error.
+            if let Err(e) = node.try_remove_stale_resources() {
+                tracing::debug!(error = %e, "a dead process is not removed");
+            }
+        }
     }
 
     /// Whether the process that owns a node still runs. `false` is certain; where the state cannot be read, it counts as
@@ -65,30 +93,8 @@ impl Deref for Member {
 impl Drop for Member {
     fn drop(&mut self) {
         let config = self.config().clone();
-        if self.node.leave() && is_deserted(&config) {
-            remove_node_counter(&self.prefix);
-        }
-    }
-}
-
-/// Whether a namespace has no members, dead ones included.
-fn is_deserted(config: &Config) -> bool {
-    let mut deserted = true;
-    let listed = Node::<Ipc>::list(config, |_| {
-        deserted = false;
-        CallbackProgression::Stop
-    });
-    listed.is_ok() && deserted
-}
-
-/// Removes the counter that numbers the members, which the middleware leaves in shared memory for ever. The number is one part
-/// of a member's identity beside process and time, so nothing is confused when it starts over.
-fn remove_node_counter(prefix: &str) {
-    for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        let name = entry.file_name();
-        let name = name.to_string_lossy();
-        if name.starts_with(prefix) && name.ends_with(".global_mgmt") {
-            let _ = fs::remove_file(entry.path());
+        if self.node.leave() {
+            sweep::deserted(&config);
         }
     }
 }

@@ -21,10 +21,11 @@ use super::preflight::Resident;
 use crate::batch::Block;
 
 pub(super) type ActionService = publish_subscribe::PortFactory<Ipc, [Block], ActionHeader>;
-pub(super) type ActionPublisher = Publisher<Ipc, [Block], ActionHeader>;
+pub(super) type BlockPublisher<H> = Publisher<Ipc, [Block], H>;
+pub(super) type ActionPublisher = BlockPublisher<ActionHeader>;
 pub(super) type ActionSubscriber = Subscriber<Ipc, [Block], ActionHeader>;
 pub(super) type ObservationService = publish_subscribe::PortFactory<Ipc, [Block], ObservationHeader>;
-pub(super) type ObservationPublisher = Publisher<Ipc, [Block], ObservationHeader>;
+pub(super) type ObservationPublisher = BlockPublisher<ObservationHeader>;
 pub(super) type ObservationSubscriber = Subscriber<Ipc, [Block], ObservationHeader>;
 
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and those about to be refused.
@@ -94,7 +95,10 @@ macro_rules! create_or_open {
                 $builder.create().map_err(|e| ServiceError::middleware("cannot create a service")(e.to_string()))
             }
             Open::Existing => $builder.open().map_err(|e| match e {
-                $error::DoesNotExist | $error::IsMarkedForDestruction => {
+                $error::DoesNotExist
+                | $error::IsMarkedForDestruction
+                | $error::HangsInCreation
+                | $error::ServiceInCorruptedState => {
                     ServiceError::EngineRestarted { service: $self.names.service.clone() }
                 }
                 e => $self.open_error(&format!("{e:?}")),
@@ -171,7 +175,7 @@ pub(super) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
     service: &publish_subscribe::PortFactory<Ipc, [Block], H>,
     blocks: usize,
     resident: usize,
-) -> Result<(Publisher<Ipc, [Block], H>, Resident), PortError> {
+) -> Result<(BlockPublisher<H>, Resident), PortError> {
     Resident::check_available(blocks, resident)?;
     let publisher = service
         .publisher_builder()

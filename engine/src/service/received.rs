@@ -126,7 +126,11 @@ impl ObservationPort {
             Err(ReceiveError::ExceedsMaxBorrows) => {
                 return Err(ServiceError::TooManyBatchesHeld { group: self.group, limit: specification.batches_held });
             }
-            Err(e) => return Err(ServiceError::middleware("cannot receive a batch")(e.to_string())),
+            // An engine that is gone; the trainer finds that out when it hears nothing.
+            Err(ReceiveError::ConnectionFailure(e)) => {
+                tracing::debug!(error = %e, "the engine cannot be heard");
+                return Ok(None);
+            }
         };
         let header = sample.user_header();
         // Whoever gets past the engine's lock on its services and publishes something else is no engine of ours.

@@ -7,7 +7,9 @@
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::writer::Writer;
-use iceoryx2::prelude::{CallbackProgression, PortFactory, Service, ZeroCopySend};
+use iceoryx2::prelude::{
+    CallbackProgression, MessagingPattern as MessagingPatternKind, NodeState, PortFactory, Service, ZeroCopySend,
+};
 use iceoryx2::service::builder::blackboard::{BlackboardCreateError, BlackboardOpenError};
 use iceoryx2::service::port_factory::blackboard;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern;
@@ -163,9 +165,10 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
     package.iter_mut().zip(PACKAGE_VERSION.bytes()).for_each(|(to, from)| *to = from);
     let length = u32::try_from(text.len()).map_err(|e| failed(e.to_string()))?;
     let head = Head { layout_version: LAYOUT_VERSION, length, package };
-    let deadline = Instant::now() + CLEANUP_TIMEOUT;
+    let name = Names::specification(&specification.service)?;
+    let start = Instant::now();
+    let mut forced = false;
     loop {
-        let name = Names::specification(&specification.service)?;
         let mut creator = node.service_builder(&name).blackboard_creator::<u32>().add(HEAD, head);
         for (key, bytes) in (HEAD + 1..).zip(text.chunks(PIECE_BYTES)) {
             let mut piece = Piece([0; PIECE_BYTES]);
@@ -177,18 +180,27 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
                 let writer = board.writer_builder().create().map_err(|e| failed(e.to_string()))?;
                 return Ok(Published { _writer: writer, _board: board });
             }
-            // Another engine has the name. Or a dead one had it, and someone is removing its leftovers or still reads them.
-            Err(BlackboardCreateError::AlreadyExists | BlackboardCreateError::IsBeingCreatedByAnotherInstance) => {
-                refuse_second_engine(node, &specification.service)?;
-            }
-            Err(BlackboardCreateError::HangsInCreation | BlackboardCreateError::ServiceInCorruptedState) => {}
+            // Another engine has the name. Or a dead one had it, and someone is removing what it left or still reads it.
+            Err(
+                BlackboardCreateError::AlreadyExists
+                | BlackboardCreateError::IsBeingCreatedByAnotherInstance
+                | BlackboardCreateError::HangsInCreation
+                | BlackboardCreateError::ServiceInCorruptedState,
+            ) => refuse_second_engine(node, &specification.service)?,
             Err(e) => return Err(failed(e.to_string())),
         }
-        if Instant::now() >= deadline {
-            return Err(ServiceError::EngineExists { service: specification.service.clone(), pid: None });
+        node.clean();
+        match start.elapsed() {
+            waited if waited < CLEANUP_TIMEOUT => std::thread::sleep(Duration::from_millis(5)),
+            _ if !forced => {
+                // SAFETY: for a second the name has had no living engine, and nobody managed to remove what a dead one left.
+                // Its readers look at it for less than a millisecond.
+                let removed = unsafe { node.force_remove_service(&name, MessagingPatternKind::Blackboard) };
+                removed.map_err(|e| failed(e.to_string()))?;
+                forced = true;
+            }
+            _ => return Err(ServiceError::EngineExists { service: specification.service.clone(), pid: None }),
         }
-        node.try_cleanup_dead_nodes();
-        std::thread::sleep(Duration::from_millis(5));
     }
 }
 
@@ -219,10 +231,12 @@ pub(super) fn read(node: &Member, service: &str) -> Result<Option<Specification>
     let name = Names::specification(service)?;
     let board = match node.service_builder(&name).blackboard_opener::<u32>().open() {
         Ok(board) => board,
+        // There is none, or one is starting, or a dead one's is being removed.
         Err(
             BlackboardOpenError::DoesNotExist
             | BlackboardOpenError::IsMarkedForDestruction
-            | BlackboardOpenError::HangsInCreation,
+            | BlackboardOpenError::HangsInCreation
+            | BlackboardOpenError::ServiceInCorruptedState,
         ) => return Ok(None),
         Err(BlackboardOpenError::VersionMismatch) => {
             let (layout, package) = ("unknown".to_owned(), "with another version of iceoryx2".to_owned());
@@ -260,8 +274,10 @@ pub(super) fn list(node: &Member) -> Result<Vec<String>, ServiceError> {
     let mut names = Vec::new();
     let listed = Ipc::list(node.config(), |service| {
         let name = service.static_details.name().as_str();
+        let is_alive = |node: &NodeState<Ipc>| matches!(node, NodeState::Alive(_));
         if let (MessagingPattern::Blackboard(_), Some(name)) =
             (service.static_details.messaging_pattern(), name.strip_prefix(SPECIFICATION_PREFIX))
+            && service.dynamic_details.is_some_and(|details| details.nodes.iter().any(is_alive))
         {
             names.push(name.to_owned());
         }

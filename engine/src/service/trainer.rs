@@ -292,7 +292,7 @@ pub(super) fn find<T>(
             Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
                 if start.elapsed() < config.timeout =>
             {
-                node.try_cleanup_dead_nodes();
+                node.clean();
                 std::thread::sleep(RETRY);
             }
             Err(e) => return Err(e),
@@ -329,7 +329,7 @@ fn action_publisher(
             let pid = owner.and_then(|owner| services.node.process_of(owner));
             return Err(ServiceError::TrainerExists { service: specification.service.clone(), pid });
         }
-        services.node.try_cleanup_dead_nodes();
+        services.node.clean();
         std::thread::sleep(RETRY);
     }
 }

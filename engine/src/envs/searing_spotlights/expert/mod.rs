@@ -40,6 +40,9 @@ const AGENT_RADIUS: f64 = 6.0;
 
 /// Plays Searing Spotlights from what a frame shows. It knows how the agent moves and how large things are by default, so it
 /// wants `agent_speed`, `agent_scale`, `coin_scale` and `exit_scale` as they are, and a lit first frame.
+///
+/// It wins the finite id practically always. In the endless id most episodes outlast 10,000 steps; the others end because slow
+/// spotlights cover the surroundings of a coin for most of its 160 steps, so that it comes too late or pays with its health.
 #[derive(Debug)]
 pub struct SpotlightsExpert {
     variant: Variant,
