@@ -239,7 +239,6 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
 
 /// Longer than the others, for `cargo test -- --ignored`: deaths come at any moment, also while starting and connecting.
 #[test]
-#[ignore = "takes a minute"]
 fn deaths_at_any_moment_are_survived() {
     let place = Place::new();
     for round in 0..200_u64 {
