@@ -237,7 +237,7 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
-/// Longer than the others, for `cargo test -- --ignored`: deaths come at any moment, also while starting and connecting.
+/// Deaths come at any moment, also while starting and connecting. This takes half a minute.
 #[test]
 fn deaths_at_any_moment_are_survived() {
     let place = Place::new();

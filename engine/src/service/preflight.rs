@@ -51,7 +51,7 @@ impl Resident {
 }
 
 fn needed(blocks: usize, chunks: usize) -> u64 {
-    (blocks as u64 * BLOCK_BYTES as u64).saturating_mul(chunks as u64).saturating_add(MARGIN)
+    (blocks as u64).saturating_mul(BLOCK_BYTES as u64).saturating_mul(chunks as u64).saturating_add(MARGIN)
 }
 
 fn check(needed: u64, available: u64) -> Result<(), ServiceError> {

@@ -175,7 +175,20 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
             piece.0[..bytes.len()].copy_from_slice(bytes);
             creator = creator.add(key, piece);
         }
-        match creator.max_readers(64).max_nodes(64).create() {
+        let created = creator.max_readers(64).max_nodes(64).create();
+        if start.elapsed() > Duration::from_millis(900) {
+            eprintln!("DEBUG {:?} {forced} {:?}", created.as_ref().err(), start.elapsed());
+            let _ = std::process::Command::new("sh")
+                .arg("-c")
+                .arg(format!(
+                    "ls -la {}/services {}/nodes; ls -la /dev/shm; for f in {}/services/*; do head -c 120 $f; done",
+                    node.config().global.root_path(),
+                    node.config().global.root_path(),
+                    node.config().global.root_path()
+                ))
+                .status();
+        }
+        match created {
             Ok(board) => {
                 let writer = board.writer_builder().create().map_err(|e| failed(e.to_string()))?;
                 return Ok(Published { _writer: writer, _board: board });
