@@ -36,7 +36,8 @@ impl Member {
             .map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))?;
         let member = Member { node: Here::new(node) };
         member.clean();
-        sweep::stubs(&config);
+        sweep::services(&config);
+        sweep::members(&config);
         Ok(member)
     }
 

@@ -20,6 +20,7 @@ use super::config::{Namespace, check_name};
 use super::error::{PACKAGE_VERSION, ServiceError};
 use super::node::{Ipc, Member};
 use super::ports::{self, CLEANUP_TIMEOUT, Limits, Names, SPECIFICATION_PREFIX};
+use super::sweep;
 use crate::batch::{LAYOUT_VERSION, Layout};
 use crate::envs::ActionSpace;
 use crate::pool::Autoreset;
@@ -167,7 +168,6 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
     let head = Head { layout_version: LAYOUT_VERSION, length, package };
     let name = Names::specification(&specification.service)?;
     let start = Instant::now();
-    let mut forced = false;
     loop {
         let mut creator = node.service_builder(&name).blackboard_creator::<u32>().add(HEAD, head);
         for (key, bytes) in (HEAD + 1..).zip(text.chunks(PIECE_BYTES)) {
@@ -175,20 +175,7 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
             piece.0[..bytes.len()].copy_from_slice(bytes);
             creator = creator.add(key, piece);
         }
-        let created = creator.max_readers(64).max_nodes(64).create();
-        if start.elapsed() > Duration::from_millis(900) {
-            eprintln!("DEBUG {:?} {forced} {:?}", created.as_ref().err(), start.elapsed());
-            let _ = std::process::Command::new("sh")
-                .arg("-c")
-                .arg(format!(
-                    "ls -la {}/services {}/nodes; ls -la /dev/shm; for f in {}/services/*; do head -c 120 $f; done",
-                    node.config().global.root_path(),
-                    node.config().global.root_path(),
-                    node.config().global.root_path()
-                ))
-                .status();
-        }
-        match created {
+        match creator.max_readers(64).max_nodes(64).create() {
             Ok(board) => {
                 let writer = board.writer_builder().create().map_err(|e| failed(e.to_string()))?;
                 return Ok(Published { _writer: writer, _board: board });
@@ -203,17 +190,18 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
             Err(e) => return Err(failed(e.to_string())),
         }
         node.clean();
-        match start.elapsed() {
-            waited if waited < CLEANUP_TIMEOUT => std::thread::sleep(Duration::from_millis(5)),
-            _ if !forced => {
-                // SAFETY: for a second the name has had no living engine, and nobody managed to remove what a dead one left.
-                // Its readers look at it for less than a millisecond.
-                let removed = unsafe { node.force_remove_service(&name, MessagingPatternKind::Blackboard) };
-                removed.map_err(|e| failed(e.to_string()))?;
-                forced = true;
-            }
-            _ => return Err(ServiceError::EngineExists { service: specification.service.clone(), pid: None }),
+        let waited = start.elapsed();
+        if waited >= 3 * CLEANUP_TIMEOUT {
+            return Err(ServiceError::EngineExists { service: specification.service.clone(), pid: None });
         }
+        if waited >= CLEANUP_TIMEOUT {
+            // SAFETY: for a second the name has had no living engine, and nobody managed to remove what a dead one left. Its
+            // readers look at it for less than a millisecond.
+            let removed = unsafe { node.force_remove_service(&name, MessagingPatternKind::Blackboard) };
+            removed.map_err(|e| failed(e.to_string()))?;
+            sweep::services(node.config());
+        }
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
 

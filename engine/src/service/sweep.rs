@@ -27,6 +27,9 @@ const SEGMENTS: &str = "/dev/shm";
 /// After this time a segment that has no size yet will not get one. It takes microseconds.
 const UNSIZED: Duration = Duration::from_millis(500);
 
+/// After this time a service whose description was begun will not be finished. It takes milliseconds.
+const BEGUN: Duration = Duration::from_secs(1);
+
 /// After this time a process that has not finished joining is taken for dead. It takes milliseconds.
 const UNFINISHED: Duration = Duration::from_secs(10);
 
@@ -44,8 +47,18 @@ pub(super) fn unsized_segments(config: &Config) {
     }
 }
 
-/// Removes stubs.
-pub(super) fn stubs(config: &Config) {
+/// Removes stubs of services. They keep their name taken.
+pub(super) fn services(config: &Config) {
+    for path in entries(&directory(&config.global.service_dir())) {
+        // A description becomes read-only when it is finished.
+        if metadata(&path).is_some_and(|data| data.permissions().mode() & 0o200 != 0 && age(&data) >= BEGUN) {
+            remove(&path);
+        }
+    }
+}
+
+/// Removes stubs of members.
+pub(super) fn members(config: &Config) {
     let mut dead = HashSet::new();
     let mut whole = HashSet::new();
     let listed = Node::<Ipc>::list(config, |state| {
@@ -63,12 +76,6 @@ pub(super) fn stubs(config: &Config) {
     for path in entries(&directory(&config.global.node_dir())) {
         let Some(number) = member_number(&path, config.global.prefix.as_bytes()) else { continue };
         if dead.contains(&number) || (!whole.contains(&number) && is_old(&path)) {
-            remove(&path);
-        }
-    }
-    for path in entries(&directory(&config.global.service_dir())) {
-        // A description becomes read-only when it is finished.
-        if metadata(&path).is_some_and(|data| data.permissions().mode() & 0o200 != 0) && is_old(&path) {
             remove(&path);
         }
     }
@@ -179,10 +186,11 @@ mod tests {
         let (root, config) = place("stub");
         let services = root.join("services");
         let [finished, begun, stuck] =
-            [("a", 0o400, 60), ("b", 0o600, 1), ("c", 0o600, 60)].map(|(n, m, s)| file(&services, &config, n, m, s));
+            [("a", 0o400, 60), ("b", 0o600, 0), ("c", 0o600, 60)].map(|(n, m, s)| file(&services, &config, n, m, s));
         let nodes = root.join("nodes");
         let [young, old] = [("1", 1), ("2", 60)].map(|(n, s)| file(&nodes, &config, n, 0o600, s));
-        stubs(&config);
+        super::services(&config);
+        members(&config);
         assert!(finished.exists() && begun.exists() && !stuck.exists());
         assert!(young.exists() && !old.exists());
         deserted(&config);
