@@ -237,11 +237,12 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
-/// Deaths come at any moment, also while starting and connecting. This takes half a minute.
+/// Deaths come at any moment, also while starting and connecting. `ENDLESS_TEST_ROUNDS=1000` looks for rarer moments.
 #[test]
 fn deaths_at_any_moment_are_survived() {
     let place = Place::new();
-    for round in 0..200_u64 {
+    let rounds = std::env::var("ENDLESS_TEST_ROUNDS").map_or(60, |rounds| rounds.parse().unwrap());
+    for round in 0..rounds {
         // Start, connection and play of a process take some 30 milliseconds.
         let moment = |step: u64| Duration::from_micros(round * step % 40_000);
         let mut engine = place.engine("gym", 3, 2);

@@ -168,6 +168,7 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
     let head = Head { layout_version: LAYOUT_VERSION, length, package };
     let name = Names::specification(&specification.service)?;
     let start = Instant::now();
+    let mut forced = false;
     loop {
         let mut creator = node.service_builder(&name).blackboard_creator::<u32>().add(HEAD, head);
         for (key, bytes) in (HEAD + 1..).zip(text.chunks(PIECE_BYTES)) {
@@ -195,11 +196,14 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
             return Err(ServiceError::EngineExists { service: specification.service.clone(), pid: None });
         }
         if waited >= CLEANUP_TIMEOUT {
+            sweep::services(node.config());
+        }
+        if waited >= CLEANUP_TIMEOUT && !forced {
+            forced = true;
             // SAFETY: for a second the name has had no living engine, and nobody managed to remove what a dead one left. Its
             // readers look at it for less than a millisecond.
             let removed = unsafe { node.force_remove_service(&name, MessagingPatternKind::Blackboard) };
             removed.map_err(|e| failed(e.to_string()))?;
-            sweep::services(node.config());
         }
         std::thread::sleep(Duration::from_millis(5));
     }
