@@ -42,3 +42,21 @@ impl<T> Drop for Here<T> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::rc::Rc;
+
+    use super::*;
+
+    #[test]
+    fn only_the_process_that_made_a_value_drops_it() {
+        let value = Rc::new(());
+        drop(Here::new(Rc::clone(&value)));
+        assert_eq!(Rc::strong_count(&value), 1);
+        drop(Here { value: Some(Rc::clone(&value)), process: 0 });
+        assert_eq!(Rc::strong_count(&value), 2);
+        let mut elsewhere = Here { value: Some(()), process: 0 };
+        assert!(!elsewhere.leave() && Here::new(()).leave());
+    }
+}

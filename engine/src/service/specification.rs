@@ -6,6 +6,7 @@
 
 use std::time::{Duration, Instant};
 
+use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::writer::Writer;
 use iceoryx2::prelude::{
     CallbackProgression, MessagingPattern as MessagingPatternKind, NodeState, PortFactory, Service, ZeroCopySend,
@@ -213,19 +214,23 @@ pub(super) fn publish(node: &Member, specification: &Specification) -> Result<Pu
 pub(super) fn refuse_second_engine(node: &Member, service: &str) -> Result<(), ServiceError> {
     let name = Names::specification(service)?;
     let Ok(board) = node.service_builder(&name).blackboard_opener::<u32>().open() else { return Ok(()) };
-    let owner = ports::first_node(|found| {
-        board.dynamic_config().list_writers(|details| {
-            found(details.node_id);
-            CallbackProgression::Continue
-        });
-    });
-    match owner {
+    match writer(&board) {
         Some(owner) if node.is_alive(owner) => {
             let pid = node.process_of(owner);
             Err(ServiceError::EngineExists { service: service.to_owned(), pid })
         }
         _ => Ok(()),
     }
+}
+
+/// The engine's node.
+fn writer(board: &blackboard::PortFactory<Ipc, u32>) -> Option<UniqueNodeId> {
+    ports::first_node(|found| {
+        board.dynamic_config().list_writers(|details| {
+            found(details.node_id);
+            CallbackProgression::Continue
+        });
+    })
 }
 
 /// Reads the specification of the engine of that name; `None` if there is none.
@@ -249,8 +254,8 @@ pub(super) fn read(node: &Member, service: &str) -> Result<Option<Specification>
         }
         Err(e) => return Err(failed(e.to_string())),
     };
-    // A board without a writer is what a dead engine left.
-    if board.dynamic_config().number_of_writers() == 0 {
+    if !writer(&board).is_some_and(|writer| node.is_alive(writer)) {
+        // What a dead engine left.
         return Ok(None);
     }
     let reader = board.reader_builder().create().map_err(|e| failed(e.to_string()))?;
