@@ -215,6 +215,40 @@ fn each_environment_may_have_options_of_its_own() {
 }
 
 #[test]
+fn a_reset_may_bring_other_options() {
+    let other = options(json!({"initial_command_count": 4, "agent_scale": 0.5}));
+    let mut fresh = Player::new(&PoolConfig { options: Options::Shared(other.clone()), ..config(2) }, 1);
+    let mut player = Player::new(&config(2), 1);
+    let before = player.frame(1);
+    let request = ResetRequest::Each { reset: &[2, 0], seed: &[3, 0] };
+    player.pool.reset_with(request, Some(&other), &mut player.blocks).unwrap();
+    assert_eq!(player.frame(1), before, "an environment that is not reset keeps its options");
+    for _ in 0..200 {
+        assert_eq!(player.frame(0), fresh.frame(0));
+        fresh.step(&[0, 0, 1, 1]);
+        player.step(&[0, 0, 1, 1]);
+    }
+    let before = player.pool.snapshot(0).unwrap();
+    let wrong = options(json!({"agent_scale": "large"}));
+    let refused = player.pool.reset_with(ResetRequest::All, Some(&wrong), &mut player.blocks);
+    assert!(matches!(refused, Err(PoolError::Parameters(_))));
+    assert_eq!(player.pool.snapshot(0).unwrap(), before, "nothing has moved");
+}
+
+#[test]
+fn without_frames_nothing_else_changes() {
+    let mut with = Player::new(&PoolConfig { features: true, ..config(3) }, 1);
+    let mut without = Player::new(&PoolConfig { features: true, frames: false, ..config(3) }, 1);
+    for _ in 0..100 {
+        with.step_at_random();
+        without.step_at_random();
+        assert!(without.batch().observation().is_empty());
+        assert_eq!(with.batch().reward(), without.batch().reward());
+        assert_eq!(with.batch().section::<f32>("features"), without.batch().section::<f32>("features"));
+    }
+}
+
+#[test]
 fn wrong_configurations_are_refused() {
     let refused = |config: PoolConfig| Pool::new(&config, &Threads::new(1).unwrap()).err().unwrap();
     let with = |given: Json| refused(PoolConfig { options: Options::Shared(options(given)), ..config(2) }).to_string();

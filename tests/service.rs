@@ -61,6 +61,19 @@ fn groups_are_reset_and_stepped_independently() {
     trainer.reset(0, ResetRequest::Each { reset: &[0, 2, 0, 1], seed: &[0, 7, 0, 0] }).unwrap();
     let again = trainer.receive(0, SECONDS).unwrap();
     assert_eq!(again.batch().episode_length(), [1, 0, 1, 0]);
+    drop((first, stepped));
+
+    let options = serde_json::from_str(r#"{"arena_size": 3}"#).unwrap();
+    trainer.reset_with(1, ResetRequest::Seed(7), Some(&options)).unwrap();
+    let smaller = trainer.receive(1, SECONDS).unwrap();
+    assert!(smaller.batch().observation() != second.batch().observation());
+    let wrong = serde_json::from_str(r#"{"agent_size": 1}"#).unwrap();
+    trainer.reset_with(1, ResetRequest::All, Some(&wrong)).unwrap();
+    let refused = trainer.receive(1, SECONDS).unwrap_err();
+    assert!(refused.to_string().contains("agent_size"), "{refused}");
+    let long = serde_json::from_value(serde_json::json!({"command_show_delay": vec![1; 20_000]})).unwrap();
+    let refused = trainer.reset_with(1, ResetRequest::All, Some(&long)).unwrap_err();
+    assert!(matches!(refused, ServiceError::OptionsTooLong { .. }));
 }
 
 #[test]

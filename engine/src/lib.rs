@@ -5,6 +5,7 @@
 //! puts the batches into shared memory, where a trainer reads them.
 
 pub mod batch;
+pub mod cli;
 pub mod envs;
 pub mod pool;
 pub mod random;

@@ -18,12 +18,13 @@ pub struct ActionHeader {
     pub trainer: u64,
     pub request: u64,
     pub seed: u64,
+    pub options: u64,
 }
 
 impl ActionHeader {
     pub fn reset_all(specification: &Specification) -> Self {
         let (layout_version, epoch) = (LAYOUT_VERSION, specification.epoch);
-        ActionHeader { layout_version, kind: 2, epoch, trainer: 42, request: 1, seed: 0 }
+        ActionHeader { layout_version, kind: 2, epoch, trainer: 42, request: 1, seed: 0, options: 0 }
     }
 }
 

@@ -1,12 +1,15 @@
 //! The project's chores: `cargo xtask test` passes all tests.
 
 mod original;
+mod python;
+mod venv;
 
 use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 const HELP: &str = "\
-cargo xtask test                 check the format, lint, and run all tests
+cargo xtask test                 check the format, lint, and run all tests, Rust's and Python's
+cargo xtask python               build the Python package, check it, and run its tests alone
 cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)
 cargo xtask original             set up the original in a virtual environment and print the path of its Python";
 
@@ -26,7 +29,8 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let done = match arguments[..] {
-        ["test"] => run(TEST, &[]),
+        ["test"] => run(TEST, &[]).and_then(|()| python::test()).map(|()| println!("all passed")),
+        ["python"] => python::test(),
         ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
         ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
         ["original"] => original::python().map(|python| println!("{}", python.display())),
@@ -66,6 +70,5 @@ fn run(commands: &[&[&str]], variables: &[(&str, &str)]) -> Result<(), String> {
         }
         println!("    {:.1} s", start.elapsed().as_secs_f64());
     }
-    println!("all passed");
     Ok(())
 }

@@ -6,7 +6,7 @@
 //!
 //! | section | type, row shape | what |
 //! | --- | --- | --- |
-//! | `observation` | uint8 (84, 84, 3) | the frame, indexed \[x\]\[y\]\[channel\] as the original returns it |
+//! | `observation` | uint8 (84, 84, 3) | the frame, indexed \[x\]\[y\]\[channel\] as the original returns it; unless left out |
 //! | `vector_observation` | float32 (180,) | the commands, one-hot; ids with `MortarMayhemB` only |
 //! | `features` | float32 (k,) | what the frame shows, in numbers; only where asked for |
 //! | `reward` | float64 () | reward of this step |
@@ -26,7 +26,7 @@ mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use layout::{Dtype, Element, Layout, Section};
-pub use view::{Batch, BatchMut, RowsMut, action_layout, batch_layout};
+pub use view::{Batch, BatchMut, Contents, OPTIONS_BYTES, RowsMut, action_layout, batch_layout};
 
 /// Version of the sections' meaning and of the messages that carry batches. A trainer refuses an engine of another version.
-pub const LAYOUT_VERSION: u32 = 1;
+pub const LAYOUT_VERSION: u32 = 2;

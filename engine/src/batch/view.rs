@@ -4,13 +4,27 @@ use super::block::Block;
 use super::layout::{Dtype, Element, Layout};
 use crate::envs::{SCREEN, Spec};
 
+/// Which sections a batch has where there is a choice.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Contents {
+    /// The frames. Without them nothing is drawn.
+    pub frames: bool,
+    /// The feature observation.
+    pub features: bool,
+    /// The last observation of episodes that same-step auto-reset ends.
+    pub final_observation: bool,
+}
+
 /// The sections of an observation, which same-step auto-reset keeps a second time for the episode that ended.
-fn observation_sections(spec: &Spec, features: bool) -> Vec<(&'static str, Dtype, Vec<usize>)> {
-    let mut sections = vec![("observation", Dtype::Uint8, vec![SCREEN, SCREEN, 3])];
+fn observation_sections(spec: &Spec, contents: Contents) -> Vec<(&'static str, Dtype, Vec<usize>)> {
+    let mut sections = Vec::new();
+    if contents.frames {
+        sections.push(("observation", Dtype::Uint8, vec![SCREEN, SCREEN, 3]));
+    }
     if spec.vector_observation > 0 {
         sections.push(("vector_observation", Dtype::Float32, vec![spec.vector_observation]));
     }
-    if features {
+    if contents.features {
         sections.push(("features", Dtype::Float32, vec![spec.features.len()]));
     }
     if spec.ground_truth > 0 {
@@ -20,10 +34,8 @@ fn observation_sections(spec: &Spec, features: bool) -> Vec<(&'static str, Dtype
 }
 
 /// The layout of a batch of `num_envs` environments.
-///
-/// `features` adds the feature observation, `final_observation` the last observation of episodes that same-step auto-reset ends.
-pub fn batch_layout(spec: &Spec, num_envs: usize, features: bool, final_observation: bool) -> Layout {
-    let mut sections = observation_sections(spec, features);
+pub fn batch_layout(spec: &Spec, num_envs: usize, contents: Contents) -> Layout {
+    let mut sections = observation_sections(spec, contents);
     sections.extend([
         ("reward", Dtype::Float64, vec![]),
         ("terminated", Dtype::Uint8, vec![]),
@@ -32,8 +44,8 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, features: bool, final_observat
         ("episode_length", Dtype::Int32, vec![]),
         ("info", Dtype::Float64, vec![spec.info.len()]),
     ]);
-    if final_observation {
-        sections.extend(observation_sections(spec, features).into_iter().map(|(name, dtype, shape)| {
+    if contents.final_observation {
+        sections.extend(observation_sections(spec, contents).into_iter().map(|(name, dtype, shape)| {
             let name = match name {
                 "observation" => "final_observation",
                 "vector_observation" => "final_vector_observation",
@@ -46,8 +58,12 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, features: bool, final_observat
     Layout::new(num_envs, sections)
 }
 
+/// Longest text of reset parameters in a message.
+pub const OPTIONS_BYTES: usize = 16 * 1024;
+
 /// The layout of the message that a trainer sends: `action` int32 (branches,) for a step; `reset` uint8 () and `seed` uint64 ()
-/// for a reset, where `reset` is 0 (leave alone), 1 (start the next episode) or 2 (start an episode with `seed`).
+/// for a reset, where `reset` is 0 (leave alone), 1 (start the next episode) or 2 (start an episode with `seed`); `options` for a
+/// reset with other reset parameters, JSON text that runs on over the rows, at least [`OPTIONS_BYTES`] in all.
 pub fn action_layout(spec: &Spec, num_envs: usize) -> Layout {
     Layout::new(
         num_envs,
@@ -55,6 +71,7 @@ pub fn action_layout(spec: &Spec, num_envs: usize) -> Layout {
             ("action", Dtype::Int32, vec![spec.action_space.branches().len()]),
             ("reset", Dtype::Uint8, vec![]),
             ("seed", Dtype::Uint64, vec![]),
+            ("options", Dtype::Uint8, vec![OPTIONS_BYTES.div_ceil(num_envs.max(1))]),
         ],
     )
 }

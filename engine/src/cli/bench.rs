@@ -4,9 +4,9 @@ use std::process::{Command, ExitCode};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym::batch::{Batch, zeroed};
-use endless_gym::envs::{self, Spec};
-use endless_gym::pool::{Pool, ResetRequest, Threads};
+use crate::batch::{Batch, zeroed};
+use crate::envs::{self, Spec};
+use crate::pool::{Pool, ResetRequest, Threads};
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;

@@ -1,11 +1,13 @@
 //! An engine in a process of its own.
 
+use std::ffi::OsString;
 use std::io::Read;
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use endless_gym::service::{ConnectConfig, ServiceError, Trainer};
+use crate::service::{ConnectConfig, ServiceError, Trainer};
 
 use super::Failure;
 
@@ -14,6 +16,14 @@ const START: Duration = Duration::from_secs(30);
 
 /// How often its start is looked for.
 const LOOK: Duration = Duration::from_millis(100);
+
+/// The command that starts `endless`, and its first arguments.
+static PROGRAM: OnceLock<Vec<OsString>> = OnceLock::new();
+
+/// Says which command starts `endless`. Only the first call counts.
+pub fn set_program(program: &[OsString]) {
+    PROGRAM.get_or_init(|| program.to_vec());
+}
 
 /// A child process that serves environments. It ends when this is dropped, and also when this process dies.
 pub struct EngineProcess {
@@ -25,7 +35,12 @@ impl EngineProcess {
     /// Starts `endless serve` with these arguments under a name of its own.
     pub fn start(arguments: &[String]) -> Result<Self, Failure> {
         let service = format!("endless-{}", std::process::id());
-        let child = Command::new(std::env::current_exe()?)
+        let (program, first) = PROGRAM
+            .get()
+            .and_then(|program| program.split_first())
+            .ok_or("the command that starts an engine is empty")?;
+        let child = Command::new(program)
+            .args(first)
             .args(["serve", "--child", "--service", &service])
             .args(arguments)
             .stdin(Stdio::piped())

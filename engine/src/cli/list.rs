@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use endless_gym::envs::{self, SCREEN, Spec};
+use crate::envs::{self, SCREEN, Spec};
 use serde_json::json;
 
 use super::Failure;
@@ -64,11 +64,12 @@ fn show(spec: &Spec) {
         rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
     }
     print(rows);
-    for (title, columns) in [("info at an episode's end", spec.info), ("feature (option `--features`)", spec.features)]
-    {
+    let info: Vec<_> = spec.info.iter().map(|column| [column.name, column.description]).collect();
+    let features: Vec<_> = spec.features.iter().map(|column| [column.name, column.description]).collect();
+    for (title, columns) in [("info at an episode's end", info), ("feature (option `--features`)", features)] {
         let mut rows = table([title, "meaning"]);
         for column in columns {
-            rows.add_row([column.name, column.description]);
+            rows.add_row(column);
         }
         print(format_args!("\n{rows}"));
     }

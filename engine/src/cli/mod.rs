@@ -1,4 +1,4 @@
-//! The commands of `endless`: thin layers over the library.
+//! The program `endless`: thin layers over the library. It is here so that the Python package brings it along.
 
 mod bench;
 mod demo;
@@ -11,6 +11,7 @@ mod serve;
 mod stop;
 mod verify;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -45,9 +46,12 @@ const DEFAULT_ENVIRONMENT: &str = "Endless-MortarMayhem-v0";
 /// What any command may fail with: it is shown as one line.
 type Failure = Box<dyn std::error::Error>;
 
-/// Runs the program.
-pub fn main() -> ExitCode {
-    let command = Cli::parse().command.unwrap_or_else(|| Command::Demo(demo::Args::default()));
+/// Runs the program with these arguments. `itself` is the command that starts the program anew, for commands that run an engine
+/// in a process of its own.
+pub fn main(arguments: impl IntoIterator<Item = OsString>, itself: &[OsString]) -> ExitCode {
+    engine_process::set_program(itself);
+    let arguments = std::iter::once("endless".into()).chain(arguments);
+    let command = Cli::parse_from(arguments).command.unwrap_or_else(|| Command::Demo(demo::Args::default()));
     let done = match command {
         Command::List(args) => list::run(&args),
         Command::Demo(args) => demo::run(&args),

@@ -1,7 +1,7 @@
 //! Options that several commands share.
 
+use crate::pool::{Autoreset, Options, PoolConfig, Seeding};
 use clap::ValueEnum;
-use endless_gym::pool::{Autoreset, Options, PoolConfig, Seeding};
 use serde_json::{Map, Value as Json};
 
 use super::Failure;

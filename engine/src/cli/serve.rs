@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-use endless_gym::pool::{PoolConfig, Threads};
-use endless_gym::service::{Engine, EngineConfig};
+use crate::pool::{PoolConfig, Threads};
+use crate::service::{Engine, EngineConfig};
 
 use super::options::{AutoresetMode, EnvironmentArgs};
 use super::output::{grouped, print};
@@ -37,6 +37,9 @@ pub struct Args {
     /// Add the feature observation: what a frame shows, in numbers.
     #[arg(long)]
     features: bool,
+    /// Leave the frames out, and draw nothing.
+    #[arg(long)]
+    no_frames: bool,
     /// Batches of a group that a trainer may hold at a time.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
@@ -53,6 +56,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     let pool = PoolConfig {
         autoreset: args.autoreset.into(),
         final_observation: args.final_observation,
+        frames: !args.no_frames,
         features: args.features,
         ..args.environment.configure(&args.id, args.num_envs)?
     };

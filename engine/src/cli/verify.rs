@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use endless_gym::trace::{Trace, replay};
+use crate::trace::{Trace, replay};
 use rayon::prelude::*;
 use serde_json::json;
 

@@ -19,13 +19,13 @@ use thiserror::Error;
 use crate::random::Generator;
 use crate::raster::Canvas;
 pub use parameters::{Kind, Parameter, ParameterError, ResetParameters};
-pub use spec::{ActionSpace, Column, FRAME_BYTES, SCREEN, Spec};
+pub use spec::{ActionSpace, Column, FRAME_BYTES, InfoColumn, SCREEN, Spec};
 
 /// Rules and pictures of one family of environments.
 ///
 /// [`step`](Environment::step) changes the state and [`draw`](Environment::draw) reads it: neither does the other's work. One
 /// object plays many episodes, and what an episode leaves behind matters, as in the original.
-pub trait Environment: Send {
+pub trait Environment: Send + Sync {
     /// What tells the family's ids apart.
     type Variant: Copy + Send + Sync;
 

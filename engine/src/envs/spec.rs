@@ -46,6 +46,15 @@ pub struct Column {
     pub description: &'static str,
 }
 
+/// A column of the final info.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct InfoColumn {
+    pub name: &'static str,
+    /// Whether the original's number is a Python int; otherwise it is a float.
+    pub is_integer: bool,
+    pub description: &'static str,
+}
+
 /// Everything that is fixed about an environment id.
 #[derive(Debug, Serialize)]
 pub struct Spec {
@@ -62,7 +71,7 @@ pub struct Spec {
     /// Numbers in the ground truth (float64 in 0..=1), 0 if there is none.
     pub ground_truth: usize,
     /// Columns of the final info beside `reward` and `length`.
-    pub info: &'static [Column],
+    pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32), an option of ours.
     pub features: &'static [Column],
     /// Reset parameters with the original's names and defaults.

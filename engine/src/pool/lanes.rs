@@ -8,7 +8,7 @@ use super::seeding::Seeds;
 use super::snapshot::{Saved, SnapshotError};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
-use crate::envs::{Environment, ResetParameters, Spec, view};
+use crate::envs::{Environment, ParameterError, ResetParameters, Spec, view};
 use crate::random::Generator;
 
 /// One environment with all that belongs to it alone.
@@ -77,7 +77,7 @@ impl<E: Environment> Lane<E> {
     }
 
     fn write_observation(&self, out: &mut BatchMut<'_>, row: usize) {
-        self.env.draw(out.observation.row(row));
+        write_if_present(out.observation.row(row), |r| self.env.draw(r));
         write_if_present(out.vector_observation.row(row), |r| self.env.vector_observation(r));
         write_if_present(out.features.row(row), |r| self.env.features(r));
         write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
@@ -98,12 +98,15 @@ fn write_if_present<T>(row: &mut [T], write: impl FnOnce(&mut [T])) {
 }
 
 /// Environments in a row, whatever their family: one virtual call for a whole batch.
-pub(super) trait Lanes: Send {
+pub(super) trait Lanes: Send + Sync {
     /// Steps all environments in `slices` contiguous slices that may run at the same time.
     fn step(&mut self, slices: usize, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>);
 
     /// Resets environments as `request` says and writes every environment's row.
     fn reset(&mut self, slices: usize, request: ResetRequest<'_>, out: BatchMut<'_>);
+
+    /// Gives the environments that `request` resets other reset parameters, from their next episode on.
+    fn set_options(&mut self, request: ResetRequest<'_>, options: &Options) -> Result<(), ParameterError>;
 
     /// The whole state of one environment.
     fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError>;
@@ -143,6 +146,15 @@ impl<E: Environment> FamilyLanes<E> {
             .collect();
         FamilyLanes { lanes, spec, variant }
     }
+
+    /// The assets for these options: those of an environment that has the same, or new ones.
+    fn with_options(&self, options: &Options) -> Result<(Arc<E::Assets>, Arc<Options>), ParameterError> {
+        if let Some(lane) = self.lanes.iter().find(|lane| *lane.options == *options) {
+            return Ok((Arc::clone(&lane.assets), Arc::clone(&lane.options)));
+        }
+        let parameters = ResetParameters::new(self.spec.id, self.spec.parameters, options)?;
+        Ok((Arc::new(E::assets(self.variant, &parameters)), Arc::new(options.clone())))
+    }
 }
 
 impl<E: Environment> Lanes for FamilyLanes<E> {
@@ -173,6 +185,17 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
         });
     }
 
+    fn set_options(&mut self, request: ResetRequest<'_>, options: &Options) -> Result<(), ParameterError> {
+        let (assets, options) = self.with_options(options)?;
+        for (env, lane) in self.lanes.iter_mut().enumerate() {
+            if request.resets(env) {
+                lane.assets = Arc::clone(&assets);
+                lane.options = Arc::clone(&options);
+            }
+        }
+        Ok(())
+    }
+
     fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
         let lane = &self.lanes[env];
         // The state is borrowed when it is saved and owned when it is restored; its encoding is the same.
@@ -194,15 +217,10 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
         if saved.id != self.spec.id {
             return Err(SnapshotError::OtherEnvironment { given: saved.id, expected: self.spec.id });
         }
-        let lane = &mut self.lanes[env];
         let options: Options =
             serde_json::from_str(&saved.options).map_err(|error| SnapshotError::Content(error.to_string()))?;
-        let (assets, options) = if options == *lane.options {
-            (Arc::clone(&lane.assets), Arc::clone(&lane.options))
-        } else {
-            let parameters = ResetParameters::new(self.spec.id, self.spec.parameters, &options)?;
-            (Arc::new(E::assets(self.variant, &parameters)), Arc::new(options))
-        };
+        let (assets, options) = self.with_options(&options)?;
+        let lane = &mut self.lanes[env];
         lane.env.restore(&assets, saved.state)?;
         lane.assets = assets;
         lane.options = options;

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
-use crate::batch::{BatchMut, Block, Layout, batch_layout};
+use crate::batch::{BatchMut, Block, Contents, Layout, batch_layout};
 use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
@@ -64,6 +64,8 @@ pub struct PoolConfig {
     /// Whether same-step auto-reset keeps the last observation of an episode, in the `final_*` sections.
     pub final_observation: bool,
     pub seeding: Seeding,
+    /// Whether the batch has the frames. Without them nothing is drawn.
+    pub frames: bool,
     /// Whether the batch has the feature observation.
     pub features: bool,
     /// Number of this pool's first environment, and of environments in all pools together, for seeding: an engine that serves
@@ -82,6 +84,7 @@ impl PoolConfig {
             autoreset: Autoreset::default(),
             final_observation: false,
             seeding: Seeding::Continue { seed: None },
+            frames: true,
             features: false,
             first_env: 0,
             total_envs: num_envs,
@@ -132,6 +135,16 @@ pub enum ResetRequest<'a> {
     Each { reset: &'a [u8], seed: &'a [u64] },
 }
 
+impl ResetRequest<'_> {
+    /// Whether environment number `env` starts an episode.
+    fn resets(&self, env: usize) -> bool {
+        match self {
+            ResetRequest::All | ResetRequest::Seed(_) => true,
+            ResetRequest::Each { reset, .. } => reset[env] != 0,
+        }
+    }
+}
+
 /// Environments of one id in lockstep.
 pub struct Pool {
     spec: &'static Spec,
@@ -166,8 +179,11 @@ impl Pool {
             layout: batch_layout(
                 spec,
                 config.num_envs,
-                config.features,
-                config.final_observation && config.autoreset == Autoreset::SameStep,
+                Contents {
+                    frames: config.frames,
+                    features: config.features,
+                    final_observation: config.final_observation && config.autoreset == Autoreset::SameStep,
+                },
             ),
             lanes,
             autoreset: config.autoreset,
@@ -188,6 +204,18 @@ impl Pool {
 
     /// Starts episodes and writes every environment's row: the current observation, a reward of 0, no flag.
     pub fn reset(&mut self, request: ResetRequest<'_>, batch: &mut [Block]) -> Result<(), PoolError> {
+        self.reset_with(request, None, batch)
+    }
+
+    /// As [`reset`](Pool::reset), with other reset parameters: the environments that start an episode play it and all later ones
+    /// with `options`, by the original's names, and the defaults for the rest. `None` leaves each environment its own. On an error
+    /// no environment has moved.
+    pub fn reset_with(
+        &mut self,
+        request: ResetRequest<'_>,
+        options: Option<&Map<String, Json>>,
+        batch: &mut [Block],
+    ) -> Result<(), PoolError> {
         let num_envs = self.layout.num_envs();
         match request {
             ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
@@ -200,6 +228,9 @@ impl Pool {
         }
         let (out, slices) = (self.batch_mut(batch)?, self.slices());
         let lanes = &mut self.lanes;
+        if let Some(options) = options {
+            lanes.set_options(request, options)?;
+        }
         self.threads.run(|| lanes.reset(slices, request, out));
         self.was_reset = true;
         Ok(())

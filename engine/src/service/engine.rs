@@ -7,6 +7,7 @@ use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::sample::Sample;
+use serde_json::{Map, Value as Json};
 
 use super::config::{Namespace, check_name};
 use super::error::{PACKAGE_VERSION, Rejection, ServiceError};
@@ -139,6 +140,7 @@ struct Group {
     action: Vec<i32>,
     reset: Vec<u8>,
     seed: Vec<u64>,
+    options: Option<Map<String, Json>>,
     /// The trainer that last reset all environments.
     trainer: Option<u64>,
     step: u64,
@@ -267,7 +269,7 @@ impl Group {
             PortError::Taken => ServiceError::middleware("cannot create a publisher")("it exists already".to_owned()),
         })?;
         let (action, reset, seed) = (Vec::new(), Vec::new(), Vec::new());
-        Ok(Group { pool, actions, observations, memory, action, reset, seed, trainer: None, step: 0 })
+        Ok(Group { pool, actions, observations, memory, action, reset, seed, options: None, trainer: None, step: 0 })
     }
 
     fn poll(&self) -> Result<Option<Sample<Ipc, [Block], ActionHeader>>, ServiceError> {
@@ -302,6 +304,14 @@ impl Group {
             }
             Kind::ResetAll | Kind::ResetSeed => {}
         }
+        self.options = match (kind, header.options as usize) {
+            (Kind::Step, _) | (_, 0) => None,
+            (_, length) => {
+                let text = layout.read::<u8>(payload, "options").get(..length).unwrap_or_default();
+                let options = serde_json::from_slice(text);
+                Some(options.map_err(|e| (Rejection::Options, format!("its reset parameters cannot be read: {e}")))?)
+            }
+        };
         let starts_all = match kind {
             Kind::Step => false,
             Kind::ResetEach => !self.reset.contains(&0),
@@ -321,11 +331,15 @@ impl Group {
         header: &ActionHeader,
         batch: &mut [Block],
     ) -> Result<Kind, (Rejection, String)> {
+        let options = self.options.as_ref();
         let done = match kind {
             Kind::Step => self.pool.step(&self.action, batch),
-            Kind::ResetAll => self.pool.reset(ResetRequest::All, batch),
-            Kind::ResetSeed => self.pool.reset(ResetRequest::Seed(header.seed), batch),
-            Kind::ResetEach => self.pool.reset(ResetRequest::Each { reset: &self.reset, seed: &self.seed }, batch),
+            Kind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
+            Kind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
+            Kind::ResetEach => {
+                let request = ResetRequest::Each { reset: &self.reset, seed: &self.seed };
+                self.pool.reset_with(request, options, batch)
+            }
         };
         done.map_err(|e| (Rejection::Pool, e.to_string()))?;
         self.trainer = Some(header.trainer);

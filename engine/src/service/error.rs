@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use crate::batch::LAYOUT_VERSION;
+use crate::batch::{LAYOUT_VERSION, OPTIONS_BYTES};
 use crate::pool::PoolError;
 
 /// Version of this package, as a message names it.
@@ -64,6 +64,10 @@ pub enum ServiceError {
     ActionRange { env: usize, given: Vec<i32>, space: String },
     #[error("a reset with {given} flags or seeds asked of {num_envs} environments; give one of both for each")]
     ResetCount { given: usize, num_envs: usize },
+    #[error(
+        "reset parameters of {given} bytes as JSON; a message takes {OPTIONS_BYTES}, so give lists with fewer items"
+    )]
+    OptionsTooLong { given: usize },
     #[error("group {group} still owes the answer to the last message; receive it before the next reset or step")]
     AnswerPending { group: usize },
     #[error("nothing was sent to group {group}; reset or step it before receiving")]
@@ -108,11 +112,19 @@ pub enum Rejection {
     NotReset,
     /// An action is out of range, or another error of the pool.
     Pool,
+    /// The reset parameters are no JSON object.
+    Options,
 }
 
 impl Rejection {
-    const ALL: [Rejection; 5] =
-        [Rejection::Version, Rejection::Kind, Rejection::Payload, Rejection::NotReset, Rejection::Pool];
+    const ALL: [Rejection; 6] = [
+        Rejection::Version,
+        Rejection::Kind,
+        Rejection::Payload,
+        Rejection::NotReset,
+        Rejection::Pool,
+        Rejection::Options,
+    ];
 
     /// The status in a header: 0 is for batches.
     pub(super) fn status(self) -> u32 {

@@ -54,11 +54,13 @@ pub(super) struct ActionHeader {
     pub request: u64,
     /// First seed of a [`Kind::ResetSeed`].
     pub seed: u64,
+    /// Bytes of the JSON text in the payload's `options`, for a reset with other reset parameters. 0: with the same.
+    pub options: u64,
 }
 
 impl ActionHeader {
     pub(super) fn new(kind: Kind, epoch: u64, trainer: u64, request: u64, seed: u64) -> Self {
-        ActionHeader { layout_version: LAYOUT_VERSION, kind: kind.code(), epoch, trainer, request, seed }
+        ActionHeader { layout_version: LAYOUT_VERSION, kind: kind.code(), epoch, trainer, request, seed, options: 0 }
     }
 }
 

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
+use serde_json::{Map, Value as Json};
 
 use super::config::Namespace;
 use super::error::ServiceError;
@@ -16,7 +17,7 @@ use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Names, Open, PortErro
 use super::received::{ObservationPort, Received};
 use super::specification::{self, Specification};
 use super::wait::wait;
-use crate::batch::Block;
+use crate::batch::{Block, OPTIONS_BYTES};
 use crate::pool::ResetRequest;
 
 /// How long a trainer hears nothing before it looks whether the engine still lives.
@@ -105,10 +106,30 @@ impl Trainer {
 
     /// Asks a group to start episodes; [`receive`](Trainer::receive) returns their first observations.
     pub fn reset(&mut self, group: usize, request: ResetRequest<'_>) -> Result<(), ServiceError> {
+        self.reset_with(group, request, None)
+    }
+
+    /// As [`reset`](Trainer::reset), with other reset parameters for the environments that start an episode, from then on; see
+    /// [`Pool::reset_with`](crate::pool::Pool::reset_with).
+    pub fn reset_with(
+        &mut self,
+        group: usize,
+        request: ResetRequest<'_>,
+        options: Option<&Map<String, Json>>,
+    ) -> Result<(), ServiceError> {
         let (specification, num_envs) = (Arc::clone(&self.specification), self.specification.num_envs);
+        let options = options.map(|options| Json::from(options.clone()).to_string()).unwrap_or_default();
+        if options.len() > OPTIONS_BYTES {
+            return Err(ServiceError::OptionsTooLong { given: options.len() });
+        }
+        let write_options = |message: &mut [Block]| {
+            let text = specification.action.write::<u8>(message, "options");
+            text[..options.len()].copy_from_slice(options.as_bytes());
+            Ok(options.len())
+        };
         match request {
-            ResetRequest::All => self.post(group, Kind::ResetAll, 0, |_| Ok(())),
-            ResetRequest::Seed(first) => self.post(group, Kind::ResetSeed, first, |_| Ok(())),
+            ResetRequest::All => self.post(group, Kind::ResetAll, 0, write_options),
+            ResetRequest::Seed(first) => self.post(group, Kind::ResetSeed, first, write_options),
             ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
                 let given = if reset.len() == num_envs { seed.len() } else { reset.len() };
                 Err(ServiceError::ResetCount { given, num_envs })
@@ -116,7 +137,7 @@ impl Trainer {
             ResetRequest::Each { reset, seed } => self.post(group, Kind::ResetEach, 0, |message| {
                 specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
                 specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
-                Ok(())
+                write_options(message)
             }),
         }
     }
@@ -142,7 +163,7 @@ impl Trainer {
         self.post(group, Kind::Step, 0, |message| {
             let actions = specification.action.write::<i32>(message, "action");
             fill(actions);
-            check_actions(&specification, actions)
+            check_actions(&specification, actions).map(|()| 0)
         })
     }
 
@@ -204,13 +225,13 @@ impl Trainer {
         Err(ServiceError::NoSuchGroup { service, given: group, groups })
     }
 
-    /// Writes a message in shared memory and sends it.
+    /// Writes a message in shared memory and sends it. `write` says how long the options are that it wrote.
     fn post(
         &mut self,
         group: usize,
         kind: Kind,
         seed: u64,
-        write: impl FnOnce(&mut [Block]) -> Result<(), ServiceError>,
+        write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<(), ServiceError> {
         self.check_group(group)?;
         if self.pending[group].is_some() {
@@ -223,10 +244,10 @@ impl Trainer {
         // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
         // fresh shared memory, and what a recycled chunk held before is a message.
         let mut message = unsafe { message.assume_init() };
-        write(message.payload_mut())?;
+        let options = write(message.payload_mut())? as u64;
         self.request += 1;
-        *message.user_header_mut() =
-            ActionHeader::new(kind, self.specification.epoch, self.trainer, self.request, seed);
+        let header = ActionHeader::new(kind, self.specification.epoch, self.trainer, self.request, seed);
+        *message.user_header_mut() = ActionHeader { options, ..header };
         let receivers = message.send().map_err(|e| failed(e.to_string()))?;
         if receivers == 0 && !self.link.node.is_alive(self.link.engine) {
             return Err(self.lost());

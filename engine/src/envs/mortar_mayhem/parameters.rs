@@ -3,7 +3,7 @@
 //! Source: `default_reset_parameters` and `process_reset_params` of the original. Where the original checks nothing, the limits
 //! are ours: wide enough for every use, narrow enough that no value makes the rules meaningless or the memory large.
 
-use crate::envs::{ActionSpace, Column, Family, Parameter, ResetParameters, Spec};
+use crate::envs::{ActionSpace, Column, Family, InfoColumn, Parameter, ResetParameters, Spec};
 
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 
@@ -203,17 +203,26 @@ const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
     Parameter::reward("reward_new_command_success", 0.0, "Reward for executing the whole sequence known so far."),
 ];
 
-const FINITE_INFO: &[Column] = &[
-    Column {
+const FINITE_INFO: &[InfoColumn] = &[
+    InfoColumn {
         name: "success",
+        is_integer: true,
         description: "1 if the last command was reached, as the original counts it: also if it failed",
     },
-    Column { name: "commands_completed", description: "share of the commands that were executed, 0 to 1" },
+    InfoColumn {
+        name: "commands_completed",
+        is_integer: false,
+        description: "share of the commands that were executed, 0 to 1",
+    },
 ];
 
-const ENDLESS_INFO: &[Column] = &[
-    Column { name: "commands_completed", description: "commands executed in the episode" },
-    Column { name: "max_command_sequence", description: "length of the longest sequence executed" },
+const ENDLESS_INFO: &[InfoColumn] = &[
+    InfoColumn { name: "commands_completed", is_integer: true, description: "commands executed in the episode" },
+    InfoColumn {
+        name: "max_command_sequence",
+        is_integer: true,
+        description: "length of the longest sequence executed",
+    },
 ];
 
 /// What the frame shows. The place of each column is used by [`super::features`].

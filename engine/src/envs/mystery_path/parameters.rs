@@ -4,7 +4,7 @@
 //! are ours: wide enough for every use, narrow enough that no value makes the rules meaningless or the memory large.
 
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
-use crate::envs::{ActionSpace, Column, Family, Parameter, ResetParameters, SCREEN, Spec};
+use crate::envs::{ActionSpace, Family, InfoColumn, Parameter, ResetParameters, SCREEN, Spec};
 
 /// What tells the ids of the family apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -168,15 +168,26 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
     REWARD_STEP,
 ];
 
-const NUM_FAILS: Column = Column { name: "num_fails", description: "steps that the agent was found off the path" };
+const NUM_FAILS: InfoColumn =
+    InfoColumn { name: "num_fails", is_integer: true, description: "steps that the agent was found off the path" };
 
-const FINITE_INFO: &[Column] =
-    &[Column { name: "success", description: "1 if the goal was reached, otherwise 0" }, NUM_FAILS];
-
-const ENDLESS_INFO: &[Column] = &[
+const FINITE_INFO: &[InfoColumn] = &[
+    InfoColumn { name: "success", is_integer: true, description: "1 if the goal was reached, otherwise 0" },
     NUM_FAILS,
-    Column { name: "max_x", description: "the farthest column of the path that the agent was on, from 0" },
-    Column { name: "tiles_visited", description: "tiles of the path that the agent was on, without the first" },
+];
+
+const ENDLESS_INFO: &[InfoColumn] = &[
+    NUM_FAILS,
+    InfoColumn {
+        name: "max_x",
+        is_integer: true,
+        description: "the farthest column of the path that the agent was on, from 0",
+    },
+    InfoColumn {
+        name: "tiles_visited",
+        is_integer: true,
+        description: "tiles of the path that the agent was on, without the first",
+    },
 ];
 
 /// The three ids of the family.

@@ -3,7 +3,7 @@
 //! Source: `default_reset_parameters` of the original. It checks no value, so the limits are ours: wide enough for every use,
 //! narrow enough that no value makes the rules meaningless, the memory large or a step slow.
 
-use crate::envs::{ActionSpace, Column, Family, Parameter, ResetParameters, Spec};
+use crate::envs::{ActionSpace, Family, InfoColumn, Parameter, ResetParameters, Spec};
 
 /// What tells the ids of the family apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -287,25 +287,30 @@ const ENDLESS_SEARING_SPOTLIGHTS: &[Parameter] = &[
     REWARD_COIN,
 ];
 
-const AGENT_HEALTH_LEFT: Column = Column {
+const AGENT_HEALTH_LEFT: InfoColumn = InfoColumn {
     name: "agent_health",
+    is_integer: false,
     description: "share of the health points that is left; not above 0 if the agent died",
 };
 
-const FINITE_INFO: &[Column] = &[
+const FINITE_INFO: &[InfoColumn] = &[
     AGENT_HEALTH_LEFT,
-    Column {
+    InfoColumn {
         name: "coins_collected",
+        is_integer: false,
         description: "share of the coins that were collected, 0 to 1; 0 if there were none",
     },
-    Column {
+    InfoColumn {
         name: "success",
+        is_integer: true,
         description: "1 if the agent collected all coins and, if there is one, left by the exit",
     },
 ];
 
-const ENDLESS_INFO: &[Column] =
-    &[AGENT_HEALTH_LEFT, Column { name: "coins_collected", description: "coins collected in the episode" }];
+const ENDLESS_INFO: &[InfoColumn] = &[
+    AGENT_HEALTH_LEFT,
+    InfoColumn { name: "coins_collected", is_integer: true, description: "coins collected in the episode" },
+];
 
 /// The two ids of the family.
 pub const SPECS: &[Spec] = &[

@@ -1,0 +1,38 @@
+"""Endless Gym: the Memory Gym environments, bit for bit, at memory speed, in shared memory.
+
+```python
+import endless_gym, gymnasium
+
+env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment, as the original's
+envs = gymnasium.make_vec("EndlessGym/MortarMayhem-v0", num_envs=1024)    # many, in this process
+envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # many, in an engine's process
+```
+"""
+
+from endless_gym._native import EngineLost, TooManyBatchesHeld, __version__, running_engines
+from endless_gym.engine import serve
+from endless_gym.env import Env
+from endless_gym.interop import DLPackView, pin_memory, torch_view
+from endless_gym.registration import register
+from endless_gym.specs import all_specs, spec
+from endless_gym.vector import EndlessVectorEnv, connect, make_vec
+
+__all__ = [
+    "DLPackView",
+    "EndlessVectorEnv",
+    "EngineLost",
+    "Env",
+    "TooManyBatchesHeld",
+    "__version__",
+    "all_specs",
+    "connect",
+    "make_vec",
+    "pin_memory",
+    "register",
+    "running_engines",
+    "serve",
+    "spec",
+    "torch_view",
+]
+
+register()

@@ -1,0 +1,149 @@
+"""An engine in a child process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import count
+from typing import Any
+
+from gymnasium.vector import AutoresetMode
+
+from endless_gym import _native
+from endless_gym.specs import options_text, spec
+from endless_gym.vector import EndlessVectorEnv, Options, autoreset_mode, connect, contents
+
+# Loads the native module from its file, without the package around it, which takes numpy and Gymnasium along.
+_PROGRAM = """
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+spec = spec_from_file_location("_native", sys.argv[1])
+native = module_from_spec(spec)
+spec.loader.exec_module(native)
+itself = [sys.executable, "-I", "-S", "-c", sys.orig_argv[sys.orig_argv.index("-c") + 1], sys.argv[1]]
+sys.exit(native.endless(sys.argv[2:], itself))
+"""
+
+_numbers = count()
+
+
+def program() -> list[str]:
+    """The command that starts the program `endless`."""
+    return [sys.executable, "-I", "-S", "-c", _PROGRAM, str(_native.__file__)]
+
+
+class EngineProcess:
+    """A child process that serves environments. It ends with `end`, and also when this process does."""
+
+    def __init__(self, arguments: list[str]) -> None:
+        self.service = f"python-{os.getpid()}-{next(_numbers)}"
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
+        # In a session of its own, so that Ctrl-C reaches this process alone, which then ends the engine.
+        self._process = subprocess.Popen(
+            [*program(), "serve", "--child", "--service", self.service, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            start_new_session=True,
+        )
+
+    @property
+    def pid(self) -> int:
+        """The process's number."""
+        return self._process.pid
+
+    def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
+        """Connects as the engine's trainer, once it is there."""
+        end = time.monotonic() + timeout
+        while True:
+            if (status := self._process.poll()) is not None:
+                self._errors.seek(0)
+                message = self._errors.read().decode(errors="replace").strip().removeprefix("endless: ")
+                raise RuntimeError(message or f"the engine ended with status {status}")
+            if self.service in _native.running_engines():
+                return connect(self.service, timeout=timeout, copy=copy, engine=self)
+            if time.monotonic() >= end:
+                raise TimeoutError(f"the engine has not started within {timeout} seconds")
+            time.sleep(0.01)
+
+    def end(self) -> None:
+        """Ends the process and waits for it."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._errors.close()
+
+
+def serve(
+    id: str,
+    num_envs: int = 1,
+    num_threads: int | None = None,
+    *,
+    groups: int = 1,
+    seed: int | None = None,
+    seeds: range | list[int] | None = None,
+    options: Options | None = None,
+    autoreset: str | AutoresetMode = "next_step",
+    observation: str = "rgb",
+    batches_held: int = 4,
+    timeout: float = 30.0,
+    copy: bool = False,
+) -> EndlessVectorEnv:
+    """Environments in an engine that this call starts in a process of its own. It ends when the environments are closed.
+
+    ```python
+    with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
+        observation, info = envs.reset()
+    ```
+
+    Args:
+        id: Environment id, such as `Endless-MortarMayhem-v0`.
+        num_envs: Environments in each group.
+        num_threads: The engine's threads; `None` for one for each core.
+        groups: Groups that are stepped independently, for `send` and `recv`.
+        seed: As for `make_vec`.
+        seeds: As for `make_vec`.
+        options: Reset parameters by the original's names.
+        autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
+        observation: `rgb`, `features` or `rgb+features`.
+        batches_held: Steps of a group whose arrays may be held at a time, 1 to 16.
+        timeout: Seconds to wait for the engine to start, and for each of its answers.
+        copy: Return writeable copies instead of read-only views into shared memory.
+
+    Raises:
+        RuntimeError: The engine cannot start; the message says why.
+    """
+    described, mode = spec(id), autoreset_mode(autoreset)
+    frames, features = contents(observation)
+    arguments: dict[str, Any] = {
+        "--env": described.id,
+        "--num-envs": num_envs,
+        "--threads": num_threads or 0,
+        "--groups": groups,
+        "--batches-held": batches_held,
+        "--autoreset": {"NextStep": "next-step", "SameStep": "same-step", "Disabled": "disabled"}[mode.value],
+    }
+    if seed is not None:
+        arguments["--seed"] = seed
+    if isinstance(seeds, range):
+        arguments["--seed-range"] = f"{seeds.start}..{seeds.stop}"
+    elif seeds is not None:
+        arguments["--seed-list"] = ",".join(map(str, seeds))
+    command = [f"{name}={value}" for name, value in arguments.items()]
+    command += [f"--option={name}={options_text({'': value})[5:-1]}" for name, value in (options or {}).items()]
+    command += ["--final-observation"] if mode is AutoresetMode.SAME_STEP else []
+    command += ["--features"] if features else []
+    command += [] if frames else ["--no-frames"]
+    engine = EngineProcess(command)
+    try:
+        return engine.connect(timeout, copy)
+    except BaseException:
+        engine.end()
+        raise

@@ -1,0 +1,175 @@
+"""One environment, as the original's class."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+from numpy.typing import NDArray
+
+from endless_gym import _native
+from endless_gym.specs import options_text, spec
+
+Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
+
+#: Environments whose ground truth the original makes of integers.
+_INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
+
+
+class Env(gymnasium.Env[Any, Any]):
+    """A Memory Gym environment: observations, rewards, flags and infos equal the original's byte for byte.
+
+    Observations are uint8 (84, 84, 3), indexed [x][y][channel] as the original returns them; the ids with `MortarMayhemB`
+    return a dict of `visual_observation` and `vector_observation` (float32 (180,)).
+
+    Args:
+        id: Environment id, such as `MortarMayhem-v0`.
+        render_mode: What `render` returns: `rgb_array` the frame as uint8 (84, 84, 3), `debug_rgb_array` the ground-truth view
+            as uint8 (336, 336, 3), both indexed [row][column][channel]. `human` shows that view in a window (needs pygame).
+        options: Reset parameters for every episode; those that `reset` is given are laid over them.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
+        "render_modes": ["human", "rgb_array", "debug_rgb_array"],
+        "render_fps": 25,
+    }
+
+    def __init__(self, id: str, render_mode: str | None = None, options: dict[str, Any] | None = None) -> None:
+        self._spec = spec(id)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"no render mode `{render_mode}`; there are {', '.join(self.metadata['render_modes'])}")
+        # The frame rate differs from id to id.
+        self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
+        self.render_mode = render_mode
+        self.action_space = self._spec.action_space()
+        self.observation_space = self._spec.observation_space()
+        self.has_ground_truth_info = self._spec.ground_truth > 0
+        if self.has_ground_truth_info:
+            self.ground_truth_space = self._spec.ground_truth_space()
+        self._truth_dtype = np.int64 if self._spec.id in _INTEGER_GROUND_TRUTH else np.float64
+        self._options = dict(options or {})
+        self._native = _native.Single(self._spec.id, options_text(self._options))
+        self._seed: int | None = None
+        self._window: _Window | None = None
+        self._was_reset = False
+        #: Reset parameters of the current episode, the defaults included.
+        self.reset_params: dict[str, Any] = {**self._spec.reset_parameters, **self._options}
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode ends, by the current reset parameters; -1 for none. As in the original."""
+        parameters = self.reset_params
+        if "max_steps" in parameters:
+            return int(parameters["max_steps"])
+        # Mortar Mayhem: clue and execution of the most commands at their slowest.
+        longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
+        clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
+        execution = longest["explosion_duration"] + longest["explosion_delay"]
+        return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds the environment as numpy's `default_rng` does. `None` goes on with its generator.
+            options: Reset parameters by the original's names. `None` stands for those given to the constructor.
+
+        Raises:
+            ValueError: A reset parameter is unknown or out of its range.
+        """
+        super().reset(seed=seed)
+        given = {**self._options, **(options or {})}
+        arrays = self._native.reset(seed, options_text(given))
+        self.reset_params = {**self._spec.reset_parameters, **given}
+        self._seed = seed
+        self._was_reset = True
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(arrays), self._info(arrays)
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Play one step. As in the original, every end of an episode is reported as `terminated`, also by the step limit."""
+        if not self._was_reset:
+            raise ResetNeeded("call `env.reset()` before `env.step()`")
+        arrays, reward, terminated, end = self._native.step(action)
+        info = self._info(arrays)
+        if end is not None:
+            info["reward"], info["length"], values = end
+            for (name, is_integer), value in zip(self._spec.info, values, strict=True):
+                info[name] = int(value) if is_integer else value
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(arrays), reward, terminated, False, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The current picture in the render mode; `None` where it is shown in a window or no mode was given."""
+        if self.render_mode == "rgb_array":
+            return self._native.rgb_array()
+        if self.render_mode == "debug_rgb_array":
+            return self._native.ground_truth_view()
+        if self.render_mode == "human":
+            if self._window is None:
+                self._window = _Window()
+            self._window.show(self._native.ground_truth_view(), f"{self._spec.id}, seed {self._seed}")
+            self._window.wait(self.metadata["render_fps"])
+        return None
+
+    def snapshot(self) -> bytes:
+        """The whole state, the generator included, for `restore`."""
+        return self._native.snapshot()
+
+    def restore(self, snapshot: bytes) -> tuple[Observation, dict[str, Any]]:
+        """Go on from a snapshot of an environment with the same id; returns what it looks like."""
+        arrays = self._native.restore(snapshot)
+        self._was_reset = True
+        return self._observation(arrays), self._info(arrays)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _observation(self, arrays: _native.SingleArrays) -> Observation:
+        if arrays[1] is None:
+            return arrays[0]
+        return {"visual_observation": arrays[0], "vector_observation": arrays[1]}
+
+    def _info(self, arrays: _native.SingleArrays) -> dict[str, Any]:
+        return {} if arrays[2] is None else {"ground_truth": arrays[2].astype(self._truth_dtype, copy=False)}
+
+
+class _Window:
+    """A window that shows pictures, by pygame."""
+
+    def __init__(self) -> None:
+        try:
+            import pygame
+        except ImportError as error:
+            raise ImportError('render_mode="human" needs pygame: pip install "endless-gym[render]"') from error
+        self._pygame = pygame
+        pygame.display.init()
+        self._screen = pygame.display.set_mode((SCREEN_VIEW, SCREEN_VIEW))
+        self._next = time.monotonic()
+
+    def show(self, picture: NDArray[np.uint8], title: str) -> None:
+        self._pygame.display.set_caption(title)
+        self._pygame.surfarray.blit_array(self._screen, picture.swapaxes(0, 1))
+        self._pygame.display.flip()
+        self._pygame.event.pump()
+
+    def wait(self, fps: int) -> None:
+        time.sleep(max(0.0, self._next - time.monotonic()))
+        self._next = time.monotonic() + 1 / fps
+
+    def close(self) -> None:
+        self._pygame.display.quit()
+
+
+#: Side of the ground-truth view in pixels.
+SCREEN_VIEW = 336

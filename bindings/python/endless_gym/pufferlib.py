@@ -1,0 +1,119 @@
+"""Endless Gym as a native PufferLib environment: one `PufferEnv` holds the whole batch.
+
+```python
+import pufferlib.vector
+from endless_gym.pufferlib import EndlessPufferEnv
+
+kwargs = {"env_id": "MysteryPath-Grid-v0", "num_envs": 1024}
+vecenv = pufferlib.vector.make(EndlessPufferEnv, env_kwargs=kwargs)
+```
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+try:
+    from pufferlib import PufferEnv
+except ImportError as error:
+    raise ImportError(
+        f"endless_gym.pufferlib needs PufferLib 3.0 and what it imports ({error}): pip install psutil gym-notices; "
+        "pip install --no-deps pufferlib==3.0.0 gym==0.26.2 pettingzoo shimmy; examples/pufferlib_rollout.py says more"
+    ) from error
+
+from endless_gym.vector import make_vec
+
+__all__ = ["EndlessPufferEnv"]
+
+
+class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
+    """A batch of Endless Gym environments, each of them one of PufferLib's agents.
+
+    Buffers: `observations` uint8 (num_envs, 84, 84, 3), `rewards` float32 (num_envs,), `terminals`, `truncations` and
+    `masks` bool (num_envs,). Where PufferLib passes buffers of its own, observations are copied into them. Where it
+    does not, which is its native backend, `observations` is the engine's own, read-only memory, another array after
+    each step.
+
+    An environment whose terminal or truncation is set shows its next episode's first observation already. The infos are
+    empty, or one dict with a list for each number that is known of the episodes that ended in this step:
+    `episode_return`, `episode_length`, and what the original environment reports.
+    """
+
+    def __init__(
+        self,
+        env_id: str = "Endless-MortarMayhem-v0",
+        num_envs: int = 64,
+        buf: dict[str, np.ndarray] | None = None,
+        seed: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Make `num_envs` environments; `kwargs` are those of `make_vec`. `buf` and `seed` are PufferLib's."""
+        self.envs = make_vec(
+            env_id, num_envs=num_envs, seed=_first_seed(seed, num_envs), autoreset="same_step", **kwargs
+        )
+        self.single_observation_space = self.envs.single_observation_space
+        self.single_action_space = self.envs.single_action_space
+        if not isinstance(self.single_observation_space, gymnasium.spaces.Box):
+            self.envs.close()
+            raise ValueError(
+                f"PufferEnv has Box observations only: choose another id than {env_id}, or one kind of them"
+            )
+        self.num_agents = num_envs
+        self._owns_buffers = buf is None
+        super().__init__(buf)
+
+    def reset(self, seed: int | None = None) -> tuple[np.ndarray, list[dict[str, Any]]]:
+        """Start an episode in every environment; number `i` with the seed `seed * num_envs + i`.
+
+        That way no two of the environments that PufferLib makes, whose seeds follow each other, play the same episodes.
+        """
+        observations, _ = self.envs.reset(seed=_first_seed(seed, self.num_agents))
+        self._show(observations)
+        self.rewards[:] = 0
+        self.terminals[:] = False
+        self.truncations[:] = False
+        self.masks[:] = True
+        return self.observations, []
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[dict[str, list[float]]]]:
+        """Step all environments with integer `actions`, (num_envs,) or (num_envs, 2)."""
+        actions = np.reshape(actions, (self.num_agents, *(self.single_action_space.shape or ())))
+        observations, rewards, terminated, truncated, info = self.envs.step(actions)
+        self._show(observations)
+        self.rewards[:] = rewards
+        self.terminals[:] = terminated
+        self.truncations[:] = truncated
+        infos = [_statistics(info)] if terminated.any() or truncated.any() else []
+        return self.observations, self.rewards, self.terminals, self.truncations, infos
+
+    def notify(self) -> None:
+        """PufferLib tells environments of its progress; these have no use for it."""
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.envs.close()
+
+    def _show(self, observations: np.ndarray) -> None:
+        if self._owns_buffers:
+            self.observations = observations
+        else:
+            np.copyto(self.observations, observations)
+
+
+def _first_seed(seed: int | None, num_envs: int) -> int | None:
+    return None if seed is None else seed * num_envs
+
+
+def _statistics(info: dict[str, Any]) -> dict[str, list[float]]:
+    """Return the numbers that a vector environment's `info` has for the episodes that have just ended."""
+    ended = info["_episode"]
+    statistics = {"episode_return": info["episode"]["r"], "episode_length": info["episode"]["l"]}
+    for key, values in info["final_info"].items():
+        if not key.startswith("_") and values.ndim == 1:
+            statistics[key] = values
+    return {key: values[ended].tolist() for key, values in statistics.items()}

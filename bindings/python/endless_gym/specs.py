@@ -1,0 +1,108 @@
+"""What is fixed about each environment id: spaces, reset parameters, infos."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from endless_gym import _native
+
+SCREEN = 84
+
+
+@dataclass(frozen=True)
+class Spec:
+    """An environment id, as the engine describes it."""
+
+    id: str
+    summary: str
+    #: Choices of each branch; one branch without `multi_discrete` is a Discrete space.
+    branches: tuple[int, ...]
+    multi_discrete: bool
+    vector_observation: int
+    ground_truth: int
+    #: Names of the final infos beside `reward` and `length`, and whether the original's number is an int.
+    info: tuple[tuple[str, bool], ...]
+    #: Names of the feature observation's columns.
+    features: tuple[str, ...]
+    #: Reset parameters with their defaults.
+    reset_parameters: dict[str, Any]
+    render_fps: int
+
+    def action_space(self) -> gymnasium.Space[Any]:
+        """The original's action space."""
+        if self.multi_discrete:
+            return spaces.MultiDiscrete(list(self.branches))
+        return spaces.Discrete(self.branches[0])
+
+    def observation_space(self, frames: bool = True, features: bool = False) -> gymnasium.Space[Any]:
+        """The original's observation space, or with the feature observation instead of or beside the frames."""
+        parts: dict[str, gymnasium.Space[Any]] = {}
+        if frames:
+            parts["visual_observation"] = spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8)
+        if features:
+            parts["features"] = spaces.Box(-np.inf, np.inf, (len(self.features),), np.float32)
+        if self.vector_observation:
+            parts["vector_observation"] = spaces.Box(0, 1, (self.vector_observation,), np.float32)
+        return spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
+
+    def ground_truth_space(self) -> gymnasium.Space[Any] | None:
+        """The original's space of `info["ground_truth"]`."""
+        if not self.ground_truth:
+            return None
+        return spaces.Box(0, 1, (self.ground_truth,), np.float32)
+
+
+@cache
+def all_specs() -> dict[str, Spec]:
+    """All environments by their ids."""
+    return {described["id"]: _spec(described) for described in json.loads(_native.specs())}
+
+
+def spec(id: str) -> Spec:
+    """The environment of that id, with or without the prefix `EndlessGym/`.
+
+    Raises:
+        ValueError: There is none; the message lists those that there are.
+    """
+    known = all_specs()
+    name = id.removeprefix("EndlessGym/")
+    if name not in known:
+        raise ValueError(f"no environment `{id}`; there are {', '.join(known)}")
+    return known[name]
+
+
+def options_text(options: Mapping[str, Any] | None) -> str:
+    """Reset parameters as the engine reads them."""
+    return "{}" if not options else json.dumps(dict(options), default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON does not know: numpy's numbers and arrays."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    raise TypeError(f"{value!r} cannot be the value of a reset parameter")
+
+
+def _spec(described: dict[str, Any]) -> Spec:
+    ((kind, choices),) = described["action_space"].items()
+    multi_discrete = kind == "MultiDiscrete"
+    return Spec(
+        id=described["id"],
+        summary=described["summary"],
+        branches=tuple(choices) if multi_discrete else (choices,),
+        multi_discrete=multi_discrete,
+        vector_observation=described["vector_observation"],
+        ground_truth=described["ground_truth"],
+        info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
+        features=tuple(column["name"] for column in described["features"]),
+        reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
+        render_fps=described["render_fps"],
+    )

@@ -1,0 +1,140 @@
+"""Endless Gym as a TorchRL environment whose batch size is the number of environments.
+
+```python
+from endless_gym.torchrl import EndlessEnv
+
+env = EndlessEnv.make("MysteryPath-Grid-v0", num_envs=64)
+data = env.rollout(128, break_when_any_done=False)    # batch size [64, 128]
+```
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+try:
+    import torch
+    from tensordict import TensorDict, TensorDictBase
+    from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+    from torchrl.envs import EnvBase
+except ImportError as error:
+    raise ImportError("endless_gym.torchrl needs TorchRL: pip install torchrl tensordict") from error
+
+from endless_gym import torch_view
+from endless_gym.vector import EndlessVectorEnv, make_vec
+
+__all__ = ["EndlessEnv"]
+
+
+class EndlessEnv(EnvBase):  # type: ignore[misc]
+    """A batch of Endless Gym environments for TorchRL, batch size [num_envs].
+
+    Entries, each with the batch size first:
+
+    * `observation`: uint8 (84, 84, 3); where the environment's space is a dict, an entry for each of its keys,
+    * `action`: int64 () for Discrete, (2,) for MultiDiscrete spaces,
+    * `reward`: float32 (1,); `done`, `terminated`, `truncated`: bool (1,).
+
+    The last observation of an episode is in `next`, and an environment resets when TorchRL asks for it, as it does by
+    itself in rollouts and collectors. On the CPU observations are copied out of the engine's memory, because TorchRL
+    keeps them and its transforms may write to them; to another device they are sent from there.
+    """
+
+    def __init__(self, envs: EndlessVectorEnv, device: torch.device | str = "cpu") -> None:
+        """Take over `envs`, made by `make_vec`, `serve` or `connect` with auto-reset disabled and one group."""
+        mode = gymnasium.vector.AutoresetMode(envs.metadata["autoreset_mode"])
+        if mode is not gymnasium.vector.AutoresetMode.DISABLED:
+            raise ValueError(f'TorchRL needs autoreset="disabled", not {mode.name.lower()!r}: it resets by itself')
+        if envs.num_groups != 1:
+            raise ValueError("TorchRL steps all environments together: make them in one group")
+        super().__init__(device=device, batch_size=[envs.num_envs])
+        self.envs = envs
+        self._seed: int | None = None
+        space = envs.single_observation_space
+        spaces = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
+        batch = self.batch_size
+        self.observation_spec = Composite(
+            {key: _observation_spec(space, batch, self.device) for key, space in spaces.items()},
+            shape=batch,
+            device=device,
+        )
+        self.action_spec = _action_spec(envs.single_action_space, batch, self.device)
+        self.reward_spec = Unbounded(shape=(*batch, 1), dtype=torch.float32, device=self.device)
+        flag = Categorical(2, shape=torch.Size((*batch, 1)), dtype=torch.bool, device=self.device)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=self.device
+        )
+
+    @classmethod
+    def make(cls, env_id: str, num_envs: int, device: torch.device | str = "cpu", **kwargs: Any) -> EndlessEnv:
+        """Make `num_envs` environments; `kwargs` are those of `make_vec`."""
+        return cls(make_vec(env_id, num_envs=num_envs, autoreset="disabled", **kwargs), device=device)
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or bool(mask.all()):
+            observations, _ = self.envs.reset(seed=self._seed)
+            self._seed = None
+        else:
+            mask = mask.reshape(self.batch_size).cpu().numpy()
+            observations, _ = self.envs.reset(options={"reset_mask": mask})
+        return TensorDict(
+            {**self._observe(observations), **self.full_done_spec.zero()},
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        actions = tensordict.get("action").cpu().numpy()
+        observations, reward, terminated, truncated, _ = self.envs.step(actions)
+        return TensorDict(
+            {
+                **self._observe(observations),
+                "reward": torch.tensor(reward, dtype=torch.float32, device=self.device).unsqueeze(-1),
+                "done": torch.tensor(np.logical_or(terminated, truncated), device=self.device).unsqueeze(-1),
+                "terminated": torch.tensor(terminated, device=self.device).unsqueeze(-1),
+                "truncated": torch.tensor(truncated, device=self.device).unsqueeze(-1),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = seed
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the environments."""
+        super().close(**kwargs)
+        self.envs.close()
+
+    def _observe(self, observations: np.ndarray | dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+        if not isinstance(observations, dict):
+            observations = {"observation": observations}
+        return {key: self._own(array) for key, array in observations.items()}
+
+    def _own(self, array: np.ndarray) -> torch.Tensor:
+        """Turn an observation into a tensor that shares no memory with the engine."""
+        if array.flags.writeable:
+            return torch.from_numpy(array).to(self.device)
+        return torch_view(array).to(self.device, copy=True)
+
+
+def _observation_spec(space: gymnasium.Space[Any], batch: torch.Size, device: torch.device) -> TensorSpec:
+    assert isinstance(space, gymnasium.spaces.Box)
+    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
+    if not space.is_bounded():
+        return Unbounded(shape=(*batch, *space.shape), dtype=dtype, device=device)
+    low, high = torch.as_tensor(space.low, device=device), torch.as_tensor(space.high, device=device)
+    return Bounded(low, high, shape=space.shape, dtype=dtype, device=device).expand(*batch, *space.shape)
+
+
+def _action_spec(space: gymnasium.Space[Any], batch: torch.Size, device: torch.device) -> TensorSpec:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return Categorical(int(space.n), shape=batch, device=device)
+    assert isinstance(space, gymnasium.spaces.MultiDiscrete)
+    # All branches have as many values; TorchRL then describes them by one Categorical with another dimension.
+    (values,) = set(space.nvec.tolist())
+    return Categorical(values, shape=torch.Size((*batch, len(space.nvec))), device=device)

@@ -1,0 +1,487 @@
+"""Many environments as one `gymnasium.vector.VectorEnv`: in this process, or in an engine's."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from endless_gym import _native
+from endless_gym.specs import Spec, options_text, spec
+
+Options = Mapping[str, Any]
+Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+#: What `observation` may be, and whether the batch then has frames and the feature observation.
+OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
+
+_MODES = {
+    "next_step": AutoresetMode.NEXT_STEP,
+    "same_step": AutoresetMode.SAME_STEP,
+    "disabled": AutoresetMode.DISABLED,
+}
+
+
+class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
+    """Environments of one id in lockstep.
+
+    `make_vec`, `serve` and `connect` make it. `step` returns arrays of `num_envs` rows: observation uint8 (n, 84, 84, 3) or as
+    `single_observation_space` says, reward float64 (n,), terminated and truncated bool (n,), and `info`. Arrays are read-only
+    views of the memory that the engine wrote to, and stay as they are for as long as they are held; with `copy=True` they are
+    writeable copies.
+
+    `info` has an array for each key, and under the key with a leading underscore where it is set, as in Gymnasium:
+    `ground_truth` float64 (n, k) where the original has it; in steps that end episodes the original's final infos (`reward`,
+    `length`, ...), and `episode` with return `r`, length `l` and seconds since the environments were made `t`. With same-step
+    auto-reset the final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended.
+    """
+
+    def __init__(
+        self,
+        backend: _Backend,
+        *,
+        described: Spec,
+        num_envs: int,
+        sections: Sequence[str],
+        autoreset: AutoresetMode,
+        copy: bool = False,
+        copy_options: Options | None = None,
+    ) -> None:
+        self._backend = backend
+        self._described = described
+        self.num_envs = num_envs
+        self.num_groups = backend.groups
+        self.single_observation_space = described.observation_space("observation" in sections, "features" in sections)
+        self.single_action_space = described.action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = {"autoreset_mode": autoreset, "render_fps": described.render_fps, "render_modes": []}
+        self._index = {name: place for place, name in enumerate(sections)}
+        names = {
+            "observation": "visual_observation",
+            "features": "features",
+            "vector_observation": "vector_observation",
+        }
+        self._observed = [(key, self._index[name]) for name, key in names.items() if name in self._index]
+        self._final_observed = [
+            (key, self._index[f"final_{name}"]) for name, key in names.items() if f"final_{name}" in self._index
+        ]
+        self._truth = self._index.get("ground_truth")
+        self._steps = [self._index[name] for name in ("reward", "terminated", "truncated")]
+        self._same_step = autoreset is AutoresetMode.SAME_STEP
+        self._all = np.ones(num_envs, dtype=np.bool_)
+        self._all.flags.writeable = False
+        self._start = time.perf_counter()
+        self._copy = copy
+        self._options = dict(copy_options or {})
+        self._changed_options = False
+        self._seed: int | None = None
+
+    def reset(  # type: ignore[override]
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Options | None = None,
+        group: int | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in every environment, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: Environment `i` is seeded with `seed + i`, or with item `i` of a list. `None` goes by the seeds that the
+                environments were made with, and then goes on with their generators.
+            options: Reset parameters for these and all later episodes, laid over those that the environments were made with;
+                and `reset_mask`, bool (n,), the environments that start an episode. Environments that were made with options
+                of their own each take none here.
+            group: The group of environments; with several groups all are reset, and the first group's are returned, unless
+                one is named.
+
+        Returns:
+            The observations and the info.
+        """
+        given = dict(options or {})
+        request = self._request(seed, given.pop("reset_mask", None))
+        text = None
+        if given or self._changed_options:
+            text = options_text({**self._options, **given})
+            self._changed_options = bool(given)
+        if group is not None or self.num_groups == 1:
+            return self._start_of(self._backend.reset(group or 0, request, text))
+        first, *others = (self._backend.reset(number, request, text) for number in range(self.num_groups))
+        del others
+        return self._start_of(first)
+
+    def step(self, actions: Any) -> Step:
+        """Play one step of every environment.
+
+        Args:
+            actions: Integers, (n, branches) or (n,) for one branch.
+
+        Raises:
+            ValueError: There are too many or too few actions, or one is out of its range. No environment has moved.
+            EngineLost: The engine's process has ended.
+            TooManyBatchesHeld: Arrays of too many earlier steps are held; drop them, or make the environments with `copy=True`.
+        """
+        return self._step(self._backend.step(actions))
+
+    def send(self, actions: Any, group: int = 0) -> None:
+        """Step a group without waiting for it; `recv` returns what came of it. `actions` as for `step`.
+
+        In this process the step is played when `recv` asks for it; in an engine's, at once.
+        """
+        self._backend.send(actions, group)
+
+    def recv(self, group: int | None = None) -> Step:
+        """What came of a group's `send`, waiting for it. `None` takes the group that is first; `info["group"]` tells which."""
+        number, arrays = self._backend.receive(group)
+        step = self._step(arrays)
+        step[4]["group"] = number
+        return step
+
+    def send_reset(self, group: int = 0, *, seed: int | None = None) -> None:
+        """Reset a group without waiting for it; `recv` returns its first observations with rewards of 0."""
+        self._backend.send_reset(group, seed)
+
+    def snapshot(self, env: int) -> bytes:
+        """The whole state of one environment, for `restore`. Only for environments in this process."""
+        return self._backend.pool().snapshot(env)
+
+    def restore(self, snapshots: Mapping[int, bytes]) -> tuple[Any, dict[str, Any]]:
+        """Put environments into the states of snapshots, also of other environments of the same id. Only in this process.
+
+        Returns:
+            The observations and the info of all environments.
+        """
+        pool = self._backend.pool()
+        for env, snapshot in snapshots.items():
+            pool.restore(env, snapshot)
+        return self._start_of(pool.observe())
+
+    def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
+        """What the original's `render()` shows a person, uint8 (336, 336, 3). Only for environments in this process."""
+        return self._backend.pool().ground_truth_view(env)
+
+    def reconnect(self, timeout: float = 30.0) -> None:
+        """Go on with an engine that was started in place of a lost one; `reset` it then."""
+        self._backend.reconnect(timeout)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the engine, if it is this object's own, and give up the connection. Arrays that are held stay as they are."""
+        self._backend.close()
+
+    def __enter__(self) -> EndlessVectorEnv:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _request(self, seed: int | Sequence[int | None] | None, mask: Any) -> _native.Reset | None:
+        if mask is None and (seed is None or isinstance(seed, (int, np.integer))):
+            return None if seed is None else int(seed)
+        if mask is None:
+            chosen = self._all
+        else:
+            chosen = np.asarray(mask)
+            if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
+                raise ValueError(
+                    f"`reset_mask` is {chosen.dtype} {chosen.shape}; give a bool array of shape ({self.num_envs},)"
+                )
+        seeds = seed if isinstance(seed, Sequence) else self._seeds(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds given for {self.num_envs} environments")
+        reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
+        return reset, [given or 0 for given in seeds]
+
+    def _seeds(self, seed: int | None) -> list[int | None]:
+        return [None if seed is None else seed + env for env in range(self.num_envs)]
+
+    def _observation(self, arrays: _native.Arrays, places: list[tuple[str, int]]) -> Any:
+        if len(places) == 1:
+            return arrays[places[0][1]]
+        return {key: arrays[place] for key, place in places}
+
+    def _copied(self, arrays: _native.Arrays) -> _native.Arrays:
+        return tuple(array.copy() for array in arrays) if self._copy else arrays
+
+    def _start_of(self, arrays: _native.Arrays) -> tuple[Any, dict[str, Any]]:
+        arrays = self._copied(arrays)
+        return self._observation(arrays, self._observed), self._info(arrays)
+
+    def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
+        if self._truth is None:
+            return {}
+        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all}
+
+    def _step(self, arrays: _native.Arrays) -> Step:
+        arrays = self._copied(arrays)
+        reward, terminated, truncated = (arrays[place] for place in self._steps)
+        info = self._info(arrays)
+        if terminated.any():
+            self._add_ends(info, arrays, terminated)
+        return self._observation(arrays, self._observed), reward, terminated, truncated, info
+
+    def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
+        """Adds what is told of episodes that this step ended."""
+        returns = np.where(ended, arrays[self._index["episode_return"]], 0.0)
+        lengths = np.where(ended, arrays[self._index["episode_length"]], 0)
+        final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
+        for column, (name, is_integer) in enumerate(self._described.info):
+            values = arrays[self._index["info"]][:, column]
+            final[name] = values.astype(np.int64) if is_integer else values.copy()
+            final[f"_{name}"] = ended
+        seconds = np.where(ended, time.perf_counter() - self._start, 0.0)
+        info["episode"] = {"r": returns, "l": lengths, "t": seconds}
+        info["_episode"] = ended
+        if not self._same_step:
+            info.update(final)
+            return
+        if "final_ground_truth" in self._index:
+            final["ground_truth"] = np.where(ended[:, None], arrays[self._index["final_ground_truth"]], 0.0)
+            final["_ground_truth"] = ended
+        info["final_info"], info["_final_info"] = final, ended
+        observations = np.full(self.num_envs, None, dtype=object)
+        for env in np.flatnonzero(ended):
+            parts = {key: arrays[place][env] for key, place in self._final_observed}
+            observations[env] = parts if len(parts) > 1 else next(iter(parts.values()))
+        info["final_obs"], info["_final_obs"] = observations, ended
+
+
+class _Backend:
+    """Where the environments are."""
+
+    groups = 1
+
+    def reset(self, group: int, request: _native.Reset | None, options: str | None) -> _native.Arrays:
+        raise NotImplementedError
+
+    def step(self, actions: Any) -> _native.Arrays:
+        raise NotImplementedError
+
+    def send(self, actions: Any, group: int) -> None:
+        raise NotImplementedError
+
+    def send_reset(self, group: int, seed: int | None) -> None:
+        raise NotImplementedError
+
+    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
+        raise NotImplementedError
+
+    def pool(self) -> _native.Pool:
+        raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
+
+    def reconnect(self, timeout: float) -> None:
+        raise RuntimeError("the environments are in this process; there is no engine to reconnect to")
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+
+class _InProcess(_Backend):
+    """In this process, in one pool for each group."""
+
+    def __init__(self, pools: list[_native.Pool]) -> None:
+        self._pools = pools
+        self.groups = len(pools)
+        self._sent: dict[int, Any] = {}
+
+    def reset(self, group: int, request: _native.Reset | None, options: str | None) -> _native.Arrays:
+        return self._group(group).reset(request, options)
+
+    def step(self, actions: Any) -> _native.Arrays:
+        return self._group(0).step(actions)
+
+    def send(self, actions: Any, group: int) -> None:
+        pool = self._group(group)
+        self._send(group, lambda: pool.step(actions))
+
+    def send_reset(self, group: int, seed: int | None) -> None:
+        pool = self._group(group)
+        self._send(group, lambda: pool.reset(seed))
+
+    def _send(self, group: int, work: Any) -> None:
+        if group in self._sent:
+            raise RuntimeError(f"group {group} still owes the answer to the last message; `recv` it first")
+        self._sent[group] = work
+
+    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
+        if not self._sent or (group is not None and group not in self._sent):
+            raise RuntimeError(f"nothing was sent to group {group or 0}; `send` before `recv`")
+        group = next(iter(self._sent)) if group is None else group
+        return group, self._sent.pop(group)()
+
+    def pool(self) -> _native.Pool:
+        return self._group(0)
+
+    def close(self) -> None:
+        self._pools, self._sent = [], {}
+
+    def _group(self, group: int) -> _native.Pool:
+        if not self._pools:
+            raise RuntimeError("the environments are closed")
+        if not 0 <= group < len(self._pools):
+            raise ValueError(f"there is no group {group}; there are 0 to {len(self._pools) - 1}")
+        return self._pools[group]
+
+
+class _Remote(_Backend):
+    """In an engine's process. `engine` is the process where it is this object's own."""
+
+    def __init__(self, connection: _native.Connection, groups: int, timeout: float, engine: Any = None) -> None:
+        self._connection: _native.Connection | None = connection
+        self.groups = groups
+        self._timeout = timeout
+        self._engine = engine
+
+    def reset(self, group: int, request: _native.Reset | None, options: str | None) -> _native.Arrays:
+        self._connected().reset(group, request, options)
+        return self._connected().receive(group, self._timeout)[1]
+
+    def step(self, actions: Any) -> _native.Arrays:
+        connection = self._connected()
+        connection.send(0, actions)
+        return connection.receive(0, self._timeout)[1]
+
+    def send(self, actions: Any, group: int) -> None:
+        self._connected().send(group, actions)
+
+    def send_reset(self, group: int, seed: int | None) -> None:
+        self._connected().reset(group, seed)
+
+    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
+        return self._connected().receive(group, self._timeout)
+
+    def reconnect(self, timeout: float) -> None:
+        self._connected().reconnect(timeout)
+
+    def close(self) -> None:
+        self._connection = None
+        if self._engine is not None:
+            self._engine.end()
+
+    def _connected(self) -> _native.Connection:
+        if self._connection is None:
+            raise RuntimeError("the environments are closed")
+        return self._connection
+
+
+def make_vec(
+    id: str,
+    num_envs: int = 1,
+    num_threads: int | None = None,
+    *,
+    seed: int | None = None,
+    seeds: range | Sequence[int] | None = None,
+    options: Options | Sequence[Options] | None = None,
+    autoreset: str | AutoresetMode = "next_step",
+    observation: str = "rgb",
+    groups: int = 1,
+    copy: bool = False,
+) -> EndlessVectorEnv:
+    """Environments in this process.
+
+    Args:
+        id: Environment id, such as `Endless-MortarMayhem-v0`.
+        num_envs: Environments in each group.
+        num_threads: Threads that step them; `None` for one for each core.
+        seed: Environment `i` is seeded with `seed + i` at its first reset and goes on with its generator. `None`: entropy.
+        seeds: Where each episode's seed comes from instead: a `range` to draw from, as the paper's training does from
+            `range(100_000)` (`seed` then fixes the draws), or a list that is played in turn.
+        options: Reset parameters by the original's names, for all environments or for each.
+        autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
+        observation: `rgb`, `features` (a short vector of what the frame shows; nothing is drawn), or both as a dict:
+            `rgb+features`.
+        groups: Groups of environments for `send` and `recv`.
+        copy: Return writeable copies instead of read-only views.
+    """
+    described, mode = spec(id), autoreset_mode(autoreset)
+    frames, features = contents(observation)
+    # Groups count their environments through, as an engine does.
+    pools = [
+        _native.Pool(
+            described.id,
+            num_envs,
+            num_threads=num_threads or 0,
+            options=options_text(options) if options is None or isinstance(options, Mapping) else _each(options),
+            autoreset=_name(mode),
+            first_env=group * num_envs,
+            total_envs=groups * num_envs,
+            seed=seed,
+            seed_range=(seeds.start, seeds.stop) if isinstance(seeds, range) else None,
+            seed_list=None if seeds is None or isinstance(seeds, range) else list(seeds),
+            frames=frames,
+            features=features,
+            final_observation=True,
+        )
+        for group in range(groups)
+    ]
+    return EndlessVectorEnv(
+        _InProcess(pools),
+        described=described,
+        num_envs=num_envs,
+        sections=pools[0].sections(),
+        autoreset=mode,
+        copy=copy,
+        copy_options=options if isinstance(options, Mapping) else None,
+    )
+
+
+def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: Any = None) -> EndlessVectorEnv:
+    """Environments of the engine with that name, which `endless serve --service NAME` or `serve` started.
+
+    Args:
+        service: The engine's name.
+        timeout: Seconds to wait for the engine to appear, and for each of its answers.
+        copy: Return writeable copies instead of read-only views into shared memory.
+        engine: Used by `serve`.
+
+    Raises:
+        ConnectionError: There is no such engine, or it has a trainer already.
+    """
+    connection = _native.Connection(service, timeout)
+    specification = json.loads(connection.specification())
+    (options, *others) = specification["options"]
+    return EndlessVectorEnv(
+        _Remote(connection, specification["groups"], timeout, engine),
+        described=spec(specification["id"]),
+        num_envs=specification["num_envs"],
+        sections=[section["name"] for section in specification["batch"]["sections"]],
+        autoreset=_MODES[specification["autoreset"]],
+        copy=copy,
+        copy_options=None if others else options,
+    )
+
+
+def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> EndlessVectorEnv:
+    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
+    if render_mode is not None:
+        raise gymnasium.error.Error("vector environments are not rendered; use `gymnasium.make` to render one")
+    return make_vec(id, num_envs, **kwargs)
+
+
+def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
+    """Gymnasium's auto-reset mode, also by its name."""
+    mode = given if isinstance(given, AutoresetMode) else _MODES.get(given)
+    if mode is None:
+        raise ValueError(f"no auto-reset mode `{given}`; there are {', '.join(_MODES)}")
+    return mode
+
+
+def contents(observation: str) -> tuple[bool, bool]:
+    """Whether a batch has frames and the feature observation."""
+    if observation not in OBSERVATIONS:
+        raise ValueError(f"no observation `{observation}`; there are {', '.join(OBSERVATIONS)}")
+    return OBSERVATIONS[observation]
+
+
+def _name(mode: AutoresetMode) -> str:
+    return next(name for name, known in _MODES.items() if known is mode)
+
+
+def _each(options: Sequence[Options]) -> str:
+    return f"[{', '.join(options_text(dict(each)) for each in options)}]"

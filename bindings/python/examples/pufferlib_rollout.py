@@ -1,0 +1,63 @@
+"""Step Endless Gym through PufferLib, with random actions.
+
+pip install endless-gym torch psutil setuptools wheel cython gym-notices
+pip install --no-deps gym==0.26.2 pettingzoo shimmy
+pip install --no-deps --no-build-isolation pufferlib==3.0.0
+python pufferlib_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 1024
+
+--no-deps, because PufferLib 3.0.0 asks for NumPy 1 and Gymnasium 0.29, but works with the current ones. Its setup
+compiles games of its own from sources that it downloads from GitHub. To do without them, unpack its source archive from
+PyPI, and in it:
+
+sed -i 's/^c_extensions = \\[\\]/c_extensions = c_extension_paths = []/' setup.py
+NO_OCEAN=1 NO_TRAIN=1 pip install --no-deps --no-build-isolation .
+"""
+
+import argparse
+import time
+
+import numpy as np
+import pufferlib.vector
+
+from endless_gym.pufferlib import EndlessPufferEnv
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0")
+    parser.add_argument("--num-envs", type=int, default=256)
+    parser.add_argument("--total-timesteps", type=int, default=500_000, help="steps in all environments together")
+    parser.add_argument("--backend", choices=["PufferEnv", "Serial", "Multiprocessing"], default="PufferEnv")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+
+    # The native backend is one batch in this process. The others make two, each with half of the environments.
+    batches = 1 if args.backend == "PufferEnv" else 2
+    vecenv = pufferlib.vector.make(
+        EndlessPufferEnv,
+        env_kwargs={"env_id": args.env_id, "num_envs": args.num_envs // batches},
+        num_envs=batches,
+        backend=args.backend,
+    )
+    rng = np.random.default_rng(args.seed)
+    highest = np.broadcast_to(vecenv.single_action_space.nvec, vecenv.action_space.shape)
+
+    vecenv.async_reset(args.seed)
+    steps, returns = 0, []
+    start = time.perf_counter()
+    while steps < args.total_timesteps:
+        observations, rewards, _terminals, _truncations, infos, _env_ids, _masks = vecenv.recv()
+        for info in infos:
+            returns += info["episode_return"]
+        vecenv.send(rng.integers(0, highest, dtype=np.int32))
+        steps += len(rewards)
+    seconds = time.perf_counter() - start
+
+    mean = f"{sum(returns) / len(returns):.3f}" if returns else "none yet"
+    print(f"observations={observations.shape} {observations.dtype}")
+    print(f"steps={steps} steps_per_second={steps / seconds:.0f} episodes={len(returns)} mean_return={mean}")
+    vecenv.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+//! One environment, as the original's class: an observation of its own for each step.
+
+use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
+use endless_gym::envs::{FRAME_BYTES, SCREEN};
+use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
+use numpy::{PyArray1, PyArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::{arguments, errors};
+
+/// What the original returns as arrays: frame, vector observation and ground truth; `None` where the environment has none.
+type Arrays<'py> = (Bound<'py, PyAny>, Option<Bound<'py, PyAny>>, Option<Bound<'py, PyAny>>);
+
+/// One environment without auto-reset.
+#[pyclass(module = "endless_gym._native")]
+pub struct Single {
+    pool: Pool,
+    blocks: Vec<Block>,
+    action: Vec<i32>,
+}
+
+#[pymethods]
+impl Single {
+    #[new]
+    fn new(id: &str, options: &str) -> PyResult<Self> {
+        let config = PoolConfig {
+            options: Options::Shared(arguments::options(options)?),
+            autoreset: Autoreset::Disabled,
+            ..PoolConfig::new(id, 1)
+        };
+        let threads = Threads::new(1).map_err(errors::pool)?;
+        let pool = Pool::new(&config, &threads).map_err(errors::pool)?;
+        let blocks = zeroed(pool.layout().blocks());
+        Ok(Single { pool, blocks, action: Vec::new() })
+    }
+
+    fn reset<'py>(&mut self, py: Python<'py>, seed: Option<u64>, options: &str) -> PyResult<Arrays<'py>> {
+        let options = arguments::options(options)?;
+        let request = seed.map_or(ResetRequest::All, ResetRequest::Seed);
+        self.pool.reset_with(request, Some(&options), &mut self.blocks).map_err(errors::pool)?;
+        self.arrays(py)
+    }
+
+    /// The arrays, the reward, whether the episode ended, and then its return, its length and the further infos.
+    #[allow(clippy::type_complexity)]
+    fn step<'py>(
+        &mut self,
+        py: Python<'py>,
+        action: &Bound<'py, PyAny>,
+    ) -> PyResult<(Arrays<'py>, f64, bool, Option<(f64, i32, Vec<f64>)>)> {
+        if let Ok(action) = action.extract::<i64>() {
+            self.action.clear();
+            self.action.push(i32::try_from(action).unwrap_or(-1));
+        } else {
+            arguments::actions(action, &mut self.action)?;
+        }
+        self.pool.step(&self.action, &mut self.blocks).map_err(errors::pool)?;
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        let ended = batch.terminated()[0] != 0;
+        let end = ended
+            .then(|| (batch.episode_return()[0], batch.episode_length()[0], batch.section::<f64>("info").to_vec()));
+        Ok((self.arrays(py)?, batch.reward()[0], ended, end))
+    }
+
+    /// The last frame as a picture, indexed \[row\]\[column\]\[channel\].
+    fn rgb_array<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let mut picture = vec![0; FRAME_BYTES];
+        rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), &mut picture);
+        Ok(PyArray1::from_vec(py, picture).reshape([SCREEN, SCREEN, 3])?.into_any())
+    }
+
+    /// The ground-truth view, indexed \[row\]\[column\]\[channel\].
+    fn ground_truth_view<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let mut view = vec![0; VIEW_BYTES];
+        self.pool.ground_truth_view(0, &mut view).map_err(errors::pool)?;
+        Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
+    }
+
+    fn snapshot<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
+        Ok(PyBytes::new(py, &self.pool.snapshot(0).map_err(errors::snapshot)?))
+    }
+
+    fn restore<'py>(&mut self, py: Python<'py>, snapshot: &[u8]) -> PyResult<Arrays<'py>> {
+        self.pool.restore(0, snapshot).map_err(errors::snapshot)?;
+        self.pool.observe(&mut self.blocks).map_err(errors::pool)?;
+        self.arrays(py)
+    }
+}
+
+impl Single {
+    fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Arrays<'py>> {
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        let frame = PyArray1::from_slice(py, batch.observation()).reshape([SCREEN, SCREEN, 3])?.into_any();
+        let vector = batch.section::<f32>("vector_observation");
+        let truth = batch.section::<f64>("ground_truth");
+        let vector = (!vector.is_empty()).then(|| PyArray1::from_slice(py, vector).into_any());
+        let truth = (!truth.is_empty()).then(|| PyArray1::from_slice(py, truth).into_any());
+        Ok((frame, vector, truth))
+    }
+}

@@ -1,0 +1,367 @@
+"""The adapters to Stable-Baselines3, TorchRL and PufferLib keep the tools' contracts. A test skips without its tool."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+import endless_gym
+
+# Random agents fail after some 30 steps.
+SHORT = "Endless-MortarMayhem-v0"
+IDS = ["MortarMayhem-v0", "MortarMayhem-Grid-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"]
+DICT_ID = "MortarMayhemB-Grid-v0"
+FRAME = (84, 84, 3)
+
+
+def random_actions(envs, rng: np.random.Generator, num_envs: int) -> np.ndarray:
+    """Actions for `num_envs` environments of `envs`, which has a ``single_action_space`` or an ``action_space``."""
+    space = getattr(envs, "single_action_space", None) or envs.action_space
+    highest = np.asarray(space.nvec if hasattr(space, "nvec") else space.n)
+    return rng.integers(0, highest, size=(num_envs, *space.shape))
+
+
+def reference(env_id: str, num_envs: int, autoreset: str, seed: int):
+    """The package's own vector environment, which an adapter is compared with."""
+    envs = endless_gym.make_vec(env_id, num_envs=num_envs, autoreset=autoreset)
+    return envs, envs.reset(seed=seed)[0]
+
+
+class TestStableBaselines3:
+    @pytest.fixture(autouse=True)
+    def adapter(self):
+        pytest.importorskip("stable_baselines3")
+        from endless_gym.sb3 import EndlessVecEnv
+
+        self.make = EndlessVecEnv.make
+        self.adapt = EndlessVecEnv
+
+    @pytest.mark.parametrize("env_id", IDS)
+    def test_shapes_and_dtypes(self, env_id):
+        venv = self.make(env_id, num_envs=5)
+        venv.seed(3)
+        obs = venv.reset()
+        assert obs.shape == (5, *FRAME)
+        assert obs.dtype == np.uint8
+        assert venv.observation_space.contains(obs[0])
+        assert len(venv.reset_infos) == 5
+        obs, rewards, dones, infos = venv.step(random_actions(venv, np.random.default_rng(0), 5))
+        assert obs.shape == (5, *FRAME)
+        assert obs.dtype == np.uint8
+        assert rewards.shape == (5,)
+        assert rewards.dtype == np.float32
+        assert dones.shape == (5,)
+        assert dones.dtype == np.bool_
+        assert len(infos) == 5
+        assert all(isinstance(info, dict) for info in infos)
+        rewards += 1  # on-policy algorithms add to the rewards of episodes that were cut off
+        venv.close()
+
+    def test_episodes_end_as_monitor_would_say(self):
+        num_envs, rng = 8, np.random.default_rng(1)
+        envs, obs = reference(SHORT, num_envs, "disabled", seed=11)
+        venv = self.make(SHORT, num_envs=num_envs)
+        venv.seed(11)
+        np.testing.assert_array_equal(venv.reset(), obs)
+        total, length, ended = np.zeros(num_envs), np.zeros(num_envs, int), 0
+        previous_infos, previous_done = None, None
+        for _ in range(200):
+            actions = random_actions(venv, rng, num_envs)
+            last, expected, terminated, truncated, _ = envs.step(actions)
+            total += expected
+            length += 1
+            done = terminated | truncated
+            following = last
+            if done.any():
+                following, _ = envs.reset(options={"reset_mask": done})
+            obs, rewards, dones, infos = venv.step(actions)
+            np.testing.assert_array_equal(dones, done)
+            np.testing.assert_array_equal(rewards, expected.astype(np.float32))
+            np.testing.assert_array_equal(obs[~done], last[~done])
+            assert following.shape == obs.shape
+            for index in range(num_envs):
+                if not done[index]:
+                    assert infos[index] == {"TimeLimit.truncated": False}
+                    continue
+                ended += 1
+                np.testing.assert_array_equal(infos[index]["terminal_observation"], last[index])
+                assert infos[index]["TimeLimit.truncated"] == bool(truncated[index] and not terminated[index])
+                assert infos[index]["episode"]["r"] == pytest.approx(total[index])
+                assert infos[index]["episode"]["l"] == length[index]
+                assert infos[index]["episode"]["t"] >= 0
+                assert infos[index]["reward"] == pytest.approx(total[index])
+                assert infos[index]["length"] == length[index]
+            if previous_infos is not None:
+                for index in np.flatnonzero(~done & ~previous_done):
+                    assert infos[index] is previous_infos[index], "the dict of a running episode is made once"
+            previous_infos, previous_done = infos, done
+            if done.any():
+                # The next episodes' seeds are the environments' own, so that both play the same.
+                np.testing.assert_array_equal(obs, following)
+            total[done], length[done] = 0, 0
+        assert ended >= num_envs
+        venv.close()
+        envs.close()
+
+    def test_dict_observations(self):
+        venv = self.make(DICT_ID, num_envs=3)
+        obs = venv.reset()
+        assert obs["visual_observation"].shape == (3, *FRAME)
+        assert obs["vector_observation"].shape == (3, 180)
+        assert obs["vector_observation"].dtype == np.float32
+        rng = np.random.default_rng(0)
+        for _ in range(400):
+            _, _, dones, infos = venv.step(random_actions(venv, rng, 3))
+            for index in np.flatnonzero(dones):
+                assert venv.observation_space.contains(infos[index]["terminal_observation"])
+                return
+        pytest.fail("no episode ended")
+
+    def test_seeds_and_options_are_for_the_next_reset(self):
+        venv = self.make(SHORT, num_envs=2)
+        venv.seed(5)
+        venv.set_options({"command_show_duration": [2]})
+        first = venv.reset()
+        venv.seed(5)
+        np.testing.assert_array_equal(first, venv.reset())
+        venv.set_options([{"command_show_duration": [2]}, {}])
+        with pytest.raises(ValueError, match="same options"):
+            venv.reset()
+        venv.close()
+
+    def test_rejects_other_reset_modes(self):
+        with endless_gym.make_vec(SHORT, num_envs=1) as envs, pytest.raises(ValueError, match="same_step"):
+            self.adapt(envs)
+
+    def test_wrappers_and_an_algorithm_accept_it(self):
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.evaluation import evaluate_policy
+        from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            venv = VecNormalize(VecFrameStack(self.make(SHORT, num_envs=4), 2), norm_obs=False)
+            model = PPO("CnnPolicy", venv, n_steps=32, batch_size=64, n_epochs=1, device="cpu").learn(128)
+            assert model.num_timesteps == 128
+            returns, lengths = evaluate_policy(
+                model, VecFrameStack(self.make(SHORT, num_envs=2), 2), n_eval_episodes=2, return_episode_rewards=True
+            )
+            assert len(returns) == len(lengths) == 2
+        assert venv.get_attr("render_mode") == [None] * 4
+        assert venv.env_is_wrapped(object, [0, 2]) == [False, False]
+        venv.close()
+
+    def test_steps_run_no_more_python_for_more_environments(self):
+        def lines_of_a_step(num_envs: int) -> int:
+            venv = self.make(SHORT, num_envs=num_envs)
+            venv.reset()
+            actions = np.zeros((num_envs, 2), np.int64)
+            venv.step(actions)  # imports and caches
+            lines = 0
+
+            def trace(frame, event, argument):
+                nonlocal lines
+                lines += event == "line"
+                return trace
+
+            before = sys.gettrace()
+            sys.settrace(trace)
+            try:
+                _, _, dones, _ = venv.step(actions)
+            finally:
+                sys.settrace(before)
+            assert not dones.any()
+            venv.close()
+            return lines
+
+        assert lines_of_a_step(512) == lines_of_a_step(2) > 5
+
+    def test_an_engine_in_another_process(self):
+        with endless_gym.serve(SHORT, num_envs=4, autoreset="same_step") as envs:
+            venv = self.adapt(envs)
+            venv.seed(2)
+            kept = [venv.reset()]
+            rng, ended = np.random.default_rng(0), 0
+            terminal = []
+            for _ in range(100):
+                obs, _, dones, infos = venv.step(random_actions(venv, rng, 4))
+                kept = [kept[-1], obs]  # as an algorithm does
+                terminal += [infos[index]["terminal_observation"] for index in np.flatnonzero(dones)]
+                ended += dones.sum()
+            assert ended >= 4
+            assert len(terminal) == ended, "terminal observations may be kept: they hold no shared memory"
+
+    def test_rejects_groups(self):
+        envs = endless_gym.make_vec(SHORT, num_envs=1, groups=2, autoreset="same_step")
+        with envs, pytest.raises(ValueError, match="one group"):
+            self.adapt(envs)
+
+
+class TestTorchRL:
+    @pytest.fixture(autouse=True)
+    def adapter(self):
+        pytest.importorskip("torchrl")
+        from endless_gym.torchrl import EndlessEnv
+
+        self.make = EndlessEnv.make
+        self.adapt = EndlessEnv
+
+    @pytest.mark.parametrize("env_id", [*IDS, SHORT, DICT_ID])
+    def test_specs(self, env_id):
+        from torchrl.envs import check_env_specs
+
+        env = self.make(env_id, num_envs=3)
+        check_env_specs(env, seed=0, break_when_any_done="both")
+        env.close()
+
+    def test_rollout_is_what_the_environments_return(self):
+        import torch
+
+        num_envs, steps, rng = 6, 150, np.random.default_rng(2)
+        envs, obs = reference(SHORT, num_envs, "disabled", seed=7)
+        env = self.make(SHORT, num_envs=num_envs)
+        env.set_seed(7)
+        actions = torch.from_numpy(np.stack([random_actions(envs, rng, num_envs) for _ in range(steps)]))
+        numbers = iter(actions)
+        data = env.rollout(steps, lambda td: td.set("action", next(numbers)), break_when_any_done=False)
+        assert data.batch_size == (num_envs, steps)
+        ended = 0
+        for t in range(steps):
+            now = data[:, t]
+            np.testing.assert_array_equal(now["observation"], obs)
+            obs, reward, terminated, truncated, _ = envs.step(actions[t].numpy())
+            np.testing.assert_array_equal(now["next", "observation"], obs)
+            np.testing.assert_array_equal(now["next", "reward"][:, 0], reward.astype(np.float32))
+            np.testing.assert_array_equal(now["next", "terminated"][:, 0], terminated)
+            np.testing.assert_array_equal(now["next", "truncated"][:, 0], truncated)
+            done = terminated | truncated
+            np.testing.assert_array_equal(now["next", "done"][:, 0], done)
+            ended += done.sum()
+            if done.any():
+                obs, _ = envs.reset(options={"reset_mask": done})
+        assert ended >= num_envs
+        env.close()
+        envs.close()
+
+    def test_observations_may_be_written_to(self):
+        env = self.make(SHORT, num_envs=2)
+        first = env.reset()
+        kept = first["observation"].clone()
+        second = env.step(env.rand_action(first.clone()))["next"]
+        second["observation"].zero_()
+        np.testing.assert_array_equal(first["observation"], kept)
+        env.close()
+
+    def test_rejects_other_reset_modes(self):
+        with endless_gym.make_vec(SHORT, num_envs=1) as envs, pytest.raises(ValueError, match="disabled"):
+            self.adapt(envs)
+
+    def test_an_engine_in_another_process(self):
+        with endless_gym.serve(SHORT, num_envs=4, autoreset="disabled") as envs:
+            data = self.adapt(envs).rollout(100, break_when_any_done=False)
+            assert data.batch_size == (4, 100), "a rollout keeps more observations than an engine lends"
+            assert data["next", "done"].sum() >= 4
+
+    def test_rejects_groups(self):
+        envs = endless_gym.make_vec(SHORT, num_envs=1, groups=2, autoreset="disabled")
+        with envs, pytest.raises(ValueError, match="one group"):
+            self.adapt(envs)
+
+
+class TestPufferLib:
+    @pytest.fixture(autouse=True)
+    def adapter(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)  # importing PufferLib puts a link into the working directory
+        pytest.importorskip("pufferlib")
+        from endless_gym.pufferlib import EndlessPufferEnv
+
+        self.env = EndlessPufferEnv
+
+    @pytest.mark.parametrize("env_id", IDS)
+    def test_shapes_and_dtypes(self, env_id):
+        env = self.env(env_id, num_envs=4)
+        assert env.num_agents == 4
+        assert not env.emulated
+        assert not env.done
+        assert env.driver_env is env
+        obs, infos = env.reset(seed=0)
+        assert obs.shape == env.observation_space.shape == (4, *FRAME)
+        assert obs.dtype == np.uint8
+        assert infos == []
+        obs, rewards, terminals, truncations, infos = env.step(random_actions(env, np.random.default_rng(0), 4))
+        assert obs.shape == (4, *FRAME)
+        assert obs.dtype == np.uint8
+        assert rewards.shape == (4,)
+        assert rewards.dtype == np.float32
+        assert terminals.shape == truncations.shape == (4,)
+        assert terminals.dtype == truncations.dtype == np.bool_
+        assert env.masks.all()
+        assert isinstance(infos, list)
+        env.close()
+
+    @pytest.mark.parametrize("buffers", [False, True])
+    def test_steps_are_those_of_the_environments(self, buffers):
+        num_envs, rng = 6, np.random.default_rng(4)
+        envs, obs = reference(SHORT, num_envs, "same_step", seed=3 * num_envs)
+        buf = None
+        if buffers:
+            buf = {
+                "observations": np.zeros((num_envs, *FRAME), np.uint8),
+                "rewards": np.zeros(num_envs, np.float32),
+                "terminals": np.zeros(num_envs, bool),
+                "truncations": np.zeros(num_envs, bool),
+                "masks": np.ones(num_envs, bool),
+                "actions": np.zeros((num_envs, 2), np.int32),
+            }
+        env = self.env(SHORT, num_envs=num_envs, buf=buf)
+        np.testing.assert_array_equal(env.reset(seed=3)[0], obs)
+        ended = 0
+        for _ in range(150):
+            actions = random_actions(env, rng, num_envs)
+            obs, reward, terminated, truncated, info = envs.step(actions)
+            env.send(actions.astype(np.int32))
+            got, rewards, terminals, truncations, infos, agents, masks = env.recv()
+            np.testing.assert_array_equal(got, obs)
+            np.testing.assert_array_equal(rewards, reward.astype(np.float32))
+            np.testing.assert_array_equal(terminals, terminated)
+            np.testing.assert_array_equal(truncations, truncated)
+            np.testing.assert_array_equal(agents, np.arange(num_envs))
+            assert masks.all()
+            if buffers:
+                assert got is buf["observations"]
+                assert rewards is buf["rewards"]
+                assert terminals is buf["terminals"]
+            done = terminated | truncated
+            ended += done.sum()
+            if done.any():
+                (statistics,) = infos
+                assert statistics["episode_return"] == info["episode"]["r"][done].tolist()
+                assert statistics["episode_length"] == info["episode"]["l"][done].tolist()
+                assert all(isinstance(values, list) and len(values) == done.sum() for values in statistics.values())
+            else:
+                assert infos == []
+        assert ended >= num_envs
+        env.close()
+        envs.close()
+
+    def test_a_serial_batch_plays_different_episodes(self):
+        import pufferlib.vector
+
+        vecenv = pufferlib.vector.make(
+            self.env, env_kwargs={"env_id": "MysteryPath-Grid-v0", "num_envs": 4}, num_envs=3, backend="Serial"
+        )
+        assert vecenv.num_agents == 12
+        obs, _ = vecenv.reset(seed=0)
+        with endless_gym.make_vec("MysteryPath-Grid-v0", num_envs=12) as envs:
+            np.testing.assert_array_equal(obs, envs.reset(seed=0)[0])
+        obs, rewards, *_ = vecenv.step(np.zeros(12, np.int32))
+        assert obs.shape == (12, *FRAME)
+        assert rewards.shape == (12,)
+        vecenv.close()
+
+    def test_refuses_dict_observations(self):
+        with pytest.raises(ValueError, match=DICT_ID):
+            self.env(DICT_ID, num_envs=2)

@@ -1,0 +1,136 @@
+"""One environment: the original's, byte for byte, and Gymnasium's own checks."""
+
+import json
+import pickle
+import subprocess
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import endless_gym
+
+IDS = list(endless_gym.all_specs())
+OPTIONS = {
+    "SearingSpotlights-v0": {"num_coins": [3], "agent_health": 2},
+    "MortarMayhem-Grid-v0": {"command_count": [3]},
+}
+
+
+def plain(value: object) -> object:
+    """As the original's side of the test writes it."""
+    if isinstance(value, np.ndarray):
+        return ("array", str(value.dtype), value.shape, value.tobytes())
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return value
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_it_is_the_original_step_for_step(id: str, original_python: str, tmp_path: Path) -> None:
+    env = gymnasium.make(f"EndlessGym/{id}", render_mode="debug_rgb_array")
+    env.action_space.seed(3)
+    actions = np.array([np.atleast_1d(env.action_space.sample()) for _ in range(400)])
+    np.save(tmp_path / "actions.npy", actions)
+    options = OPTIONS.get(id, {})
+    program = Path(__file__).parent / "original.py"
+    arguments = [id, tmp_path / "actions.npy", json.dumps(options), tmp_path / "out.pickle"]
+    subprocess.run([original_python, program, *arguments], check=True, capture_output=True)
+    described, expected = pickle.loads((tmp_path / "out.pickle").read_bytes())
+
+    def check(*entry: object) -> None:
+        wanted = expected.pop(0)
+        for name, given, original in zip(
+            ("observation", "reward", "terminated", "truncated", "info", "render"), entry, wanted, strict=True
+        ):
+            assert plain(given) == original, f"{name}, {len(expected)} before the end"
+
+    observation, info = env.reset(seed=11, options=options)
+    check(observation, None, None, None, info, env.render())
+    unwrapped = env.unwrapped
+    assert isinstance(unwrapped, endless_gym.Env)
+    assert repr(env.observation_space) == described["observation_space"]
+    assert repr(env.action_space) == described["action_space"]
+    assert unwrapped.metadata == described["metadata"]
+    assert unwrapped.has_ground_truth_info == described["has_ground_truth_info"]
+    assert repr(getattr(unwrapped, "ground_truth_space", None)) == described["ground_truth_space"]
+    assert unwrapped.max_episode_steps == described["max_episode_steps"]
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(int(action[0]) if len(action) == 1 else action)
+        check(observation, reward, terminated, truncated, info, env.render())
+        if terminated:
+            observation, info = env.reset(options=options)
+            check(observation, None, None, None, info, env.render())
+    assert not expected
+
+
+@pytest.mark.parametrize("id", IDS)
+@pytest.mark.filterwarnings("error")
+def test_gymnasiums_checker_passes(id: str) -> None:
+    for mode in (None, "rgb_array", "debug_rgb_array"):
+        check_env(gymnasium.make(f"EndlessGym/{id}", render_mode=mode).unwrapped, skip_render_check=True)
+
+
+def test_render_modes() -> None:
+    env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array")
+    observation, _ = env.reset(seed=1)
+    np.testing.assert_array_equal(env.render(), observation.swapaxes(0, 1))
+    with pytest.raises(ValueError, match="ansi"):
+        endless_gym.Env("MysteryPath-v0", render_mode="ansi")
+
+
+def test_observations_stay_as_they_are() -> None:
+    env = endless_gym.Env("MortarMayhem-v0")
+    first, _ = env.reset(seed=1)
+    kept = first.copy()
+    for _ in range(5):
+        env.step([1, 1])
+    np.testing.assert_array_equal(first, kept)
+    first[:] = 0
+
+
+def test_options_last_for_one_episode() -> None:
+    env = endless_gym.Env("MortarMayhem-v0")
+    assert env.reset(seed=1, options={"arena_size": 2})[0].sum() != env.reset(seed=1)[0].sum()
+    fixed = endless_gym.Env("MortarMayhem-v0", options={"arena_size": 2})
+    np.testing.assert_array_equal(fixed.reset(seed=1)[0], env.reset(seed=1, options={"arena_size": np.int64(2)})[0])
+
+
+def test_mistakes_are_exceptions() -> None:
+    env = endless_gym.Env("MortarMayhem-v0")
+    with pytest.raises(ResetNeeded):
+        env.step([0, 0])
+    with pytest.raises(ValueError, match="arena_sise"):
+        env.reset(options={"arena_sise": 2})
+    env.reset()
+    for wrong in ([0, 3], [0], [0, 0, 0], [-1, 0], [2**40, 0]):
+        with pytest.raises(ValueError, match=r"action|\[3, 3\]"):
+            env.step(wrong)
+    with pytest.raises(TypeError, match="integers"):
+        env.step([0.5, 0])
+    with pytest.raises(ValueError, match="MortarMayhem-v0"):
+        endless_gym.Env("Mortar")
+
+
+def test_a_snapshot_goes_on_identically() -> None:
+    env = endless_gym.Env("Endless-SearingSpotlights-v0")
+    env.reset(seed=4)
+    snapshot = env.snapshot()
+    rewards = [env.step([1, 2])[:3] for _ in range(50)]
+    env.restore(snapshot)
+    for wanted in rewards:
+        observation, reward, terminated, *_ = env.step([1, 2])
+        np.testing.assert_array_equal(observation, wanted[0])
+        assert (reward, terminated) == wanted[1:]
+
+
+def test_the_originals_ids_and_classes() -> None:
+    import endless_gym.memory_gym as memory_gym
+
+    env = gymnasium.make("MortarMayhem-Grid-v0")
+    assert isinstance(env.unwrapped, endless_gym.Env)
+    other = memory_gym.GridMortarMayhemEnv(render_mode="rgb_array")
+    np.testing.assert_array_equal(env.reset(seed=2)[0], other.reset(seed=2)[0])

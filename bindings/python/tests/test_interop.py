@@ -1,0 +1,82 @@
+"""Tensors of other libraries on the engine's memory."""
+
+import sys
+import types
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import endless_gym
+from endless_gym import interop
+
+
+@pytest.fixture
+def observation() -> np.ndarray:
+    return endless_gym.make_vec("MortarMayhem-v0", 4, seed=1).reset()[0]
+
+
+def test_torch_shares_the_memory_without_a_warning(observation: np.ndarray) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tensor = endless_gym.torch_view(observation)
+        other = torch.from_dlpack(endless_gym.DLPackView(observation))
+    assert tensor.data_ptr() == other.data_ptr() == observation.ctypes.data
+    np.testing.assert_array_equal(tensor.numpy(), observation)
+
+
+def test_torchs_own_functions_work(observation: np.ndarray) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert torch.from_numpy(observation).data_ptr() == observation.ctypes.data
+
+
+def test_every_type_and_a_part(observation: np.ndarray) -> None:
+    envs = endless_gym.make_vec("Endless-MortarMayhem-v0", 4, seed=1)
+    envs.reset()
+    for array in envs.step(np.zeros((4, 2), dtype=np.int64))[:4]:
+        np.testing.assert_array_equal(endless_gym.torch_view(array).numpy(), array)
+    part = observation[1::2, :, ::3]
+    np.testing.assert_array_equal(endless_gym.torch_view(part).numpy(), part)
+    with pytest.raises(TypeError, match="DLPack"):
+        endless_gym.torch_view(np.array(["a"]))
+
+
+def test_a_tensor_keeps_the_batch(observation: np.ndarray) -> None:
+    with endless_gym.serve("MortarMayhem-v0", 4, batches_held=2) as envs:
+        tensor = endless_gym.torch_view(envs.reset()[0])
+        kept = tensor.clone()
+        for _ in range(5):
+            envs.step(np.ones((4, 2), dtype=np.int64))
+        assert torch.equal(tensor, kept)
+        del tensor
+
+
+def test_page_locking_without_cuda_says_so(observation: np.ndarray) -> None:
+    if torch.cuda.is_available():
+        assert endless_gym.pin_memory(observation)
+        return
+    with pytest.warns(UserWarning, match="no CUDA device"):
+        assert not endless_gym.pin_memory(observation)
+
+
+def test_the_whole_mapping_is_page_locked(observation: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    runtime = types.SimpleNamespace(cudaHostRegister=lambda *call: calls.append(call) or (0 if call[2] == 0 else 801))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "cudart", lambda: runtime)
+    monkeypatch.setattr(interop, "_PINNED", set())
+    assert endless_gym.pin_memory(observation)
+    assert endless_gym.pin_memory(observation)
+    assert [flags for _, _, flags in calls] == [8, 0]
+    first, size, _ = calls[0]
+    assert first <= observation.ctypes.data
+    assert observation.ctypes.data + observation.nbytes <= first + size
+    assert first % 4096 == size % 4096 == 0
+
+
+def test_without_torch_the_message_says_so(observation: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.warns(UserWarning, match="not installed"):
+        assert not endless_gym.pin_memory(observation)

@@ -1,0 +1,135 @@
+"""Processes that die, are interrupted, or fork."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import endless_gym
+
+ID = "Endless-MortarMayhem-v0"
+ACTIONS = np.zeros((4, 2), dtype=np.int64)
+
+
+def test_a_dead_engine_is_an_exception() -> None:
+    envs = endless_gym.serve(ID, 4)
+    observation, _ = envs.reset()
+    kept = observation.copy()
+    os.kill(envs._backend._engine.pid, signal.SIGKILL)
+    with pytest.raises(endless_gym.EngineLost, match="ended"):
+        for _ in range(3):
+            envs.step(ACTIONS)
+    np.testing.assert_array_equal(observation, kept)
+    envs.close()
+
+
+def test_the_engine_ends_with_its_environments_and_with_its_process() -> None:
+    with endless_gym.serve(ID, 4) as envs:
+        service = envs._backend._engine.service
+        assert service in endless_gym.running_engines()
+        with pytest.raises(ConnectionError, match="already has a trainer"):
+            endless_gym.connect(service, timeout=1)
+    assert service not in endless_gym.running_engines()
+    program = f"import endless_gym, time; e = endless_gym.serve({ID!r}, 4); print('up', flush=True); time.sleep(60)"
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "up\n"
+    process.kill()
+    process.wait()
+    end = time.monotonic() + 10
+    while endless_gym.running_engines() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert endless_gym.running_engines() == []
+
+
+def test_ctrl_c_reaches_python_while_it_waits() -> None:
+    program = f"""
+import endless_gym, os, signal
+with endless_gym.serve({ID!r}, 4) as envs:
+    envs.reset()
+    os.kill(envs._backend._engine.pid, signal.SIGSTOP)
+    print("waiting", flush=True)
+    try:
+        envs.step([[0, 0]] * 4)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+    os.kill(envs._backend._engine.pid, signal.SIGCONT)
+"""
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "waiting\n"
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20)[0] == "interrupted\n"
+    assert process.returncode == 0
+
+
+def test_other_threads_run_while_one_waits() -> None:
+    import threading
+
+    with endless_gym.serve(ID, 4) as envs:
+        envs.reset()
+        os.kill(envs._backend._engine.pid, signal.SIGSTOP)
+        stepping = threading.Thread(target=envs.step, args=(ACTIONS,))
+        stepping.start()
+        start = time.monotonic()
+        assert sum(range(100_000)) > 0
+        assert time.monotonic() - start < 5
+        assert stepping.is_alive()
+        os.kill(envs._backend._engine.pid, signal.SIGCONT)
+        stepping.join(10)
+        assert not stepping.is_alive()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_child_does_no_harm() -> None:
+    with endless_gym.serve(ID, 4) as envs, endless_gym.make_vec(ID, 4, num_threads=2) as inside:
+        envs.reset()
+        inside.reset()
+        child = os.fork()
+        if child == 0:
+            refused = 0
+            for those in (envs, inside):
+                try:
+                    those.step(ACTIONS)
+                except RuntimeError:
+                    refused += 1
+            del envs, inside
+            os._exit(refused)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
+        for _ in range(10):
+            envs.step(ACTIONS)
+            inside.step(ACTIONS)
+
+
+def test_reconnecting_to_an_engine_that_was_started_again() -> None:
+    def engine() -> subprocess.Popen:
+        command = [*endless_gym.engine.program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=again"]
+        return subprocess.Popen(command, stdin=subprocess.PIPE)
+
+    first = engine()
+    envs = endless_gym.connect("again")
+    envs.reset()
+    first.kill()
+    first.wait()
+    with pytest.raises(endless_gym.EngineLost):
+        envs.step(ACTIONS)
+    second = engine()
+    envs.reconnect()
+    assert envs.reset(seed=1)[0].shape == (4, 84, 84, 3)
+    envs.step(ACTIONS)
+    envs.close()
+    second.stdin.close()
+    assert second.wait(10) == 0
+
+
+def test_the_program_comes_along() -> None:
+    command = [sys.executable, "-c", "import sys; from endless_gym.program import main; sys.exit(main())"]
+    listed = subprocess.run([*command, "list", "--json"], capture_output=True, text=True, check=True)
+    assert ID in listed.stdout
+    demo = [*command, "demo", "--seconds", "0.5", "--num-envs", "8"]
+    assert subprocess.run(demo, capture_output=True, check=False).returncode == 0
+    table = [sys.executable, "-m", "endless_gym", "--num-envs", "4", "--seconds", "0.01"]
+    assert ID in subprocess.run(table, capture_output=True, text=True, check=True).stdout

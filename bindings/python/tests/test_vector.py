@@ -1,0 +1,193 @@
+"""Many environments, in this process and in an engine's: both are the same class and give the same."""
+
+import contextlib
+import gc
+from collections.abc import Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import endless_gym
+
+ID = "Endless-MortarMayhem-v0"
+WHERE = [endless_gym.make_vec, endless_gym.serve]
+
+
+@contextlib.contextmanager
+def made(where, *args, **kwargs) -> Iterator[endless_gym.EndlessVectorEnv]:
+    with where(*args, **kwargs) as envs:
+        yield envs
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("id", [ID, "MortarMayhemB-Grid-v0", "Endless-SearingSpotlights-v0"])
+def test_it_does_as_gymnasiums_own_vector_environment(where, mode: AutoresetMode, id: str) -> None:
+    sync = SyncVectorEnv([lambda: endless_gym.Env(id) for _ in range(4)], autoreset_mode=mode)
+    with made(where, id, 4, autoreset=mode) as envs:
+        assert envs.metadata["autoreset_mode"] is mode
+        assert envs.single_observation_space == sync.single_observation_space
+        assert envs.action_space == sync.action_space
+        envs.action_space.seed(1)
+        compare(envs.reset(seed=5), sync.reset(seed=5))
+        ends = 0
+        for _ in range(300):
+            actions = envs.action_space.sample()
+            step, wanted = envs.step(actions), sync.step(actions)
+            ends += int(step[2].sum())
+            episode = step[4].pop("episode", None), step[4].pop("_episode", None)
+            compare(step, wanted)
+            if step[2].any():
+                final = wanted[4].get("final_info", wanted[4])
+                np.testing.assert_array_equal(episode[0]["r"], final["reward"])
+                np.testing.assert_array_equal(episode[0]["l"], final["length"])
+                np.testing.assert_array_equal(episode[1], step[2])
+        assert ends > 0
+
+
+def compare(given: object, wanted: object, path: str = "") -> None:
+    if isinstance(wanted, dict):
+        assert set(given) == set(wanted), path
+        for key, value in wanted.items():
+            compare(given[key], value, f"{path}.{key}")
+    elif isinstance(wanted, tuple) or (isinstance(wanted, np.ndarray) and wanted.dtype == object):
+        for number, (one, other) in enumerate(zip(given, wanted, strict=True)):
+            compare(one, other, f"{path}[{number}]")
+    else:
+        np.testing.assert_array_equal(given, wanted, err_msg=path)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_arrays_are_views_that_stay_as_they_are(where) -> None:
+    with made(where, ID, 3, seed=1) as envs:
+        first, _ = envs.reset()
+        kept = first.copy()
+        for _ in range(4):
+            envs.step(np.ones((3, 2), dtype=np.int64))
+        np.testing.assert_array_equal(first, kept)
+        assert not first.flags.writeable
+        assert not first.flags.owndata
+        with pytest.raises(ValueError, match="read-only"):
+            first[0] = 0
+    np.testing.assert_array_equal(first, kept)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_copies_are_the_users_own(where) -> None:
+    with made(where, ID, 2, seed=1, copy=True) as envs:
+        observation, _ = envs.reset()
+        held = [envs.step(np.zeros((2, 2), dtype=np.int64)) for _ in range(20)]
+        observation[:] = 0
+        assert len(held) == 20
+
+
+def test_memory_in_this_process_is_used_again() -> None:
+    envs = endless_gym.make_vec(ID, 2, seed=1)
+    envs.reset()
+    places = {envs.step(np.zeros((2, 2), dtype=np.int64))[0].ctypes.data for _ in range(20)}
+    assert len(places) <= 2
+
+
+def test_holding_too_many_is_an_error_that_says_what_to_do() -> None:
+    with endless_gym.serve(ID, 2, batches_held=3) as envs:
+        envs.reset()
+        held = []
+        with pytest.raises(endless_gym.TooManyBatchesHeld, match="copy"):
+            for _ in range(5):
+                held.append(envs.step(np.zeros((2, 2), dtype=np.int64)))
+        held.clear()
+        gc.collect()
+        envs.recv(0)
+        envs.step(np.zeros((2, 2), dtype=np.int64))
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_groups_are_stepped_independently(where) -> None:
+    with made(where, ID, 2, groups=2, seed=3) as envs, made(where, ID, 4, seed=3) as all_envs:
+        whole, _ = all_envs.reset()
+        for group in range(2):
+            envs.send_reset(group)
+        for group in (1, 0):
+            observation, reward, _, _, info = envs.recv(group)
+            assert info["group"] == group
+            assert not reward.any()
+            np.testing.assert_array_equal(observation, whole[2 * group : 2 * group + 2])
+        with pytest.raises(RuntimeError, match="nothing was sent to group 1"):
+            envs.recv(1)
+        envs.send(np.zeros((2, 2), dtype=np.int64), 1)
+        with pytest.raises(RuntimeError, match="owes"):
+            envs.send(np.zeros((2, 2), dtype=np.int64), 1)
+        assert envs.recv()[4]["group"] == 1
+        with pytest.raises(ValueError, match="group 7"):
+            envs.send(np.zeros((2, 2), dtype=np.int64), 7)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_options_and_masks_at_reset(where) -> None:
+    with made(where, "MortarMayhem-v0", 3, autoreset="disabled") as envs:
+        usual, _ = envs.reset(seed=1)
+        small, _ = envs.reset(seed=1, options={"arena_size": 2})
+        assert (usual != small).any()
+        assert (envs.reset(seed=1)[0] == usual).all()
+        envs.step(np.ones((3, 2), dtype=np.int64))
+        mask = np.array([False, True, False])
+        envs.reset(options={"reset_mask": mask})
+        mixed, _ = envs.reset(seed=[7, None, None], options={"reset_mask": ~mask})
+        np.testing.assert_array_equal(mixed[0], envs.reset(seed=7)[0][0])
+        with pytest.raises(ValueError, match="reset_mask"):
+            envs.reset(options={"reset_mask": [1, 0]})
+        with pytest.raises(ValueError, match="arena_sise"):
+            envs.reset(options={"arena_sise": 1})
+
+
+def test_the_feature_observation() -> None:
+    envs = endless_gym.make_vec(ID, 2, seed=1, observation="features")
+    observation, _ = envs.reset()
+    assert observation.dtype == np.float32
+    assert envs.observation_space.contains(observation)
+    both, _ = endless_gym.make_vec(ID, 2, seed=1, observation="rgb+features").reset()
+    np.testing.assert_array_equal(both["features"], observation)
+    assert both["visual_observation"].shape == (2, 84, 84, 3)
+
+
+def test_gymnasium_makes_it() -> None:
+    envs = gymnasium.make_vec(f"EndlessGym/{ID}", num_envs=8, seed=1, num_threads=1)
+    assert isinstance(envs, endless_gym.EndlessVectorEnv)
+    observation, _ = envs.reset()
+    np.testing.assert_array_equal(observation, endless_gym.make_vec(ID, 8, seed=1).reset()[0])
+    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
+    wrapped.reset()
+    wrapped.step(envs.action_space.sample())
+
+
+def test_seeds_of_episodes() -> None:
+    one = endless_gym.make_vec(ID, 2, seeds=[3, 4, 5]).reset()[0]
+    np.testing.assert_array_equal(one, endless_gym.make_vec(ID, 2, seed=3).reset()[0])
+    two = endless_gym.make_vec(ID, 64, seeds=range(2), seed=1).reset()[0]
+    assert len({frame.tobytes() for frame in two}) == 2
+
+
+def test_mistakes_are_exceptions() -> None:
+    with pytest.raises(ValueError, match="MortarMayhem-v0"):
+        endless_gym.make_vec("Mortar", 2)
+    with pytest.raises(ValueError, match="pixels"):
+        endless_gym.make_vec(ID, 2, observation="pixels")
+    with pytest.raises(ValueError, match="never"):
+        endless_gym.make_vec(ID, 2, autoreset="never")
+    with pytest.raises(ValueError, match="1 to"):
+        endless_gym.make_vec(ID, 0)
+    envs = endless_gym.make_vec(ID, 2)
+    with pytest.raises(RuntimeError, match="reset"):
+        envs.step(np.zeros((2, 2), dtype=np.int64))
+    envs.reset()
+    with pytest.raises(ValueError, match="2 environments"):
+        envs.step(np.zeros((3, 2), dtype=np.int64))
+    envs.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        envs.step(np.zeros((2, 2), dtype=np.int64))
+    with pytest.raises(RuntimeError, match="arena_sise"):
+        endless_gym.serve(ID, 2, options={"arena_sise": 1})
+    with pytest.raises(ConnectionError, match="nobody"):
+        endless_gym.connect("nobody", timeout=0)
