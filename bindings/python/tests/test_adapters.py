@@ -106,6 +106,21 @@ class TestStableBaselines3:
         venv.close()
         envs.close()
 
+    def test_the_ground_truth_at_an_end_is_the_ended_episodes(self):
+        venv = self.make("Endless-SearingSpotlights-v0", num_envs=2)
+        venv.seed(0)
+        venv.reset()
+        assert "ground_truth" in venv.reset_infos[0]
+        for _ in range(1000):
+            _, _, dones, infos = venv.step(np.zeros((2, 2), np.int64))
+            for index in np.flatnonzero(dones):
+                final, following = venv.info["final_info"]["ground_truth"][index], venv.info["ground_truth"][index]
+                assert not np.array_equal(final, following)
+                np.testing.assert_array_equal(infos[index]["ground_truth"], final)
+                assert "coins_collected" in infos[index]
+                return
+        pytest.fail("no episode ended")
+
     def test_dict_observations(self):
         venv = self.make(DICT_ID, num_envs=3)
         obs = venv.reset()
