@@ -43,7 +43,7 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, features: bool, final_observat
             (name, dtype, shape)
         }));
     }
-    Layout::new(num_envs, sections)
+    Layout::new(num_envs, sections).with_stamp()
 }
 
 /// The layout of the message that a trainer sends: `action` int32 (branches,) for a step; `reset` uint8 () and `seed` uint64 ()
@@ -157,7 +157,7 @@ impl<'a> Batch<'a> {
 
     /// The whole batch, sections and the padding between them.
     pub fn bytes(&self) -> &'a [u8] {
-        bytemuck::cast_slice(self.blocks)
+        bytemuck::cast_slice(&self.blocks[..self.blocks.len().min(self.layout.section_blocks())])
     }
 
     /// All numbers of a section; empty if the batch has none of that name and type.
