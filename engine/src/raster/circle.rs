@@ -100,6 +100,13 @@ impl Disc {
         })
     }
 
+    /// Whether the disc covers the pixel at a place from its centre.
+    #[inline]
+    pub fn contains(&self, (x, y): (i32, i32)) -> bool {
+        let index = if x < 0 { -x - 1 } else { x };
+        self.half_heights.get(index as usize).is_some_and(|half| (-half..*half).contains(&y))
+    }
+
     /// Those of some rows of the column `x` that the disc about `center` covers.
     #[inline]
     pub fn rows(&self, center: (i32, i32), x: usize, rows: &Range<usize>) -> Range<usize> {

@@ -5,11 +5,11 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::parameters::{MAX_SPOTLIGHTS, Parameters, Variant};
-use super::spotlight::Circle;
+use super::shape::Shape;
 use crate::envs::SCREEN;
 use crate::envs::background::{BACKGROUND_TILE, tiled_background};
 use crate::envs::character::CharacterSprites;
-use crate::raster::{Canvas, CornerRadii, Disc, Rect, Rgb, Sprite, Surface, blend_keyed, circle_outline, copy_run};
+use crate::raster::{Canvas, CornerRadii, Rect, Rgb, Sprite, Surface, blend_keyed, copy_run};
 
 const BLACK: Rgb = [0, 0, 0];
 const WHITE: Rgb = [255, 255, 255];
@@ -19,9 +19,6 @@ const COIN: Rgb = [255, 255, 0];
 const COIN_BORDER: Rgb = [255, 165, 0];
 const EXIT_OPEN: Rgb = [48, 141, 70];
 const EXIT_CLOSED: Rgb = [55, 55, 55];
-
-/// Bytes of a column of pixels.
-const COLUMN: usize = SCREEN * 3;
 
 /// What covers the screen behind everything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,69 +33,60 @@ pub(super) enum Ground {
 
 /// A background: the columns of its first and second tiles, which all others repeat.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Columns([[u8; COLUMN]; 2]);
+pub(super) struct Columns([[Rgb; SCREEN]; 2]);
+
+/// By column, whether it is one of the first tiles or of the second.
+const SECOND: [u8; SCREEN] = {
+    let mut second = [0; SCREEN];
+    let mut x = 0;
+    while x < SCREEN {
+        second[x] = (x / BACKGROUND_TILE % 2) as u8;
+        x += 1;
+    }
+    second
+};
 
 impl Columns {
     /// No light.
-    pub const BLACK: Columns = Columns([[0; COLUMN]; 2]);
+    pub const BLACK: Columns = Columns([[BLACK; SCREEN]; 2]);
 
     fn of(surface: &Surface) -> Self {
-        let columns = surface.pixels().as_chunks::<COLUMN>().0;
+        let columns = surface.pixels().as_chunks::<3>().0.as_chunks::<SCREEN>().0;
         Columns([columns[0], columns[BACKGROUND_TILE]])
     }
 
     #[inline]
-    fn column(&self, x: usize) -> &[u8; COLUMN] {
-        &self.0[x / BACKGROUND_TILE % 2]
+    fn column(&self, x: usize) -> &[Rgb; SCREEN] {
+        &self.0[usize::from(SECOND[x] & 1)]
+    }
+
+    /// The background's pixel at some place.
+    #[inline]
+    pub fn pixel(&self, x: usize, y: usize) -> Rgb {
+        self.column(x)[y]
     }
 
     /// The background under a black surface of some `alpha`.
     pub fn shaded(&self, alpha: u8) -> Self {
         match alpha {
             255 => Columns::BLACK,
-            _ => Columns(self.0.map(|column| column.map(|channel| blend_keyed(0, channel, alpha)))),
+            _ => Columns(self.0.map(|column| column.map(|pixel| pixel.map(|channel| blend_keyed(0, channel, alpha))))),
         }
     }
 
     /// Paints everything.
     #[inline]
     pub fn paint(&self, canvas: &mut Canvas<'_>) {
-        let first = canvas.rows().start * 3;
-        canvas.runs_mut().for_each(|(x, run)| copy_run(&self.column(x)[first..][..run.len()], run));
+        let rows = canvas.rows();
+        canvas.runs_mut().for_each(|(x, run)| copy_run(self.column(x)[rows.clone()].as_flattened(), run));
     }
 
     /// Paints some rows of a column, as far as there are any.
     #[inline]
     pub fn paint_run(&self, canvas: &mut Canvas<'_>, x: usize, rows: Range<usize>) {
         if rows.start < rows.end {
-            let bytes = rows.start * 3..rows.end * 3;
-            copy_run(&self.column(x)[bytes.clone()], &mut canvas.pixels_mut()[x * COLUMN..][bytes]);
-        }
-    }
-}
-
-/// A spotlight's circle of some radius.
-#[derive(Debug)]
-pub(super) struct Shape {
-    pub disc: Disc,
-    outline: Vec<(i32, i32)>,
-}
-
-impl Shape {
-    fn new(radius: i32) -> Self {
-        Shape { disc: Disc::new(radius), outline: circle_outline(radius) }
-    }
-
-    /// Draws the white outline of a half transparent surface over what the circle has brought back.
-    pub fn draw_outline(&self, canvas: &mut Canvas<'_>, centre: (i32, i32), alpha: u8) {
-        let (columns, rows) = (canvas.columns(), canvas.rows());
-        let pixels = canvas.pixels_mut().as_chunks_mut::<3>().0;
-        for (x, y) in &self.outline {
-            let (x, y) = ((centre.0 + x) as usize, (centre.1 + y) as usize);
-            if columns.contains(&x) && rows.contains(&y) {
-                let pixel = &mut pixels[x * SCREEN + y];
-                *pixel = pixel.map(|channel| blend_keyed(255, channel, alpha));
-            }
+            let target = &mut canvas.pixels_mut()[(x * SCREEN + rows.start) * 3..][..rows.len() * 3];
+            copy_run(self.column(x)[rows].as_flattened(), target);
         }
     }
 }
@@ -116,9 +104,6 @@ pub struct Assets {
     pub most_spotlights: usize,
     /// By [`Ground`].
     pub(super) grounds: [Columns; 4],
-    /// The circles of all radii that these parameters allow, and the first of the radii.
-    shapes: Vec<Shape>,
-    first_radius: i32,
     pub(super) coin: Sprite,
     pub(super) exit_side: i32,
     pub(super) exit_closed: Sprite,
@@ -136,8 +121,9 @@ impl Assets {
         let grounds = [tiled_background(BLUE), tiled_background(RED), plain(WHITE), plain(BLACK)];
         let coin_radius = (10.0 * parameters.coin_scale) as i32;
         let exit_side = (20.0 * parameters.exit_scale) as i32;
-        let first_radius = parameters.spot_min_radius as i32;
-        let last_radius = first_radius.max(parameters.spot_max_radius as i32);
+        // Made now, and not while it is played.
+        let radii = parameters.spot_min_radius as i16..=parameters.spot_max_radius as i16;
+        radii.map(Shape::of).for_each(|_| ());
         let [exit_closed, exit_open] = exit_pictures(exit_side, parameters.exit_scale);
         Assets {
             variant,
@@ -146,25 +132,11 @@ impl Assets {
             exit_radius: 20.0 / 2.0 * parameters.exit_scale,
             most_spotlights: most_spotlights(&parameters),
             grounds: grounds.each_ref().map(Columns::of),
-            shapes: (first_radius..=last_radius).map(Shape::new).collect(),
-            first_radius,
             coin: coin_picture(coin_radius, parameters.coin_scale),
             exit_side,
             exit_closed,
             exit_open,
             parameters,
-        }
-    }
-}
-
-impl Assets {
-    /// Hands out the shape of a circle. An episode's first frame may show one of other reset parameters.
-    #[inline]
-    pub(super) fn with_shape(&self, circle: &Circle, draw: impl FnOnce(&Shape)) {
-        let radius = i32::from(circle.radius);
-        match self.shapes.get((radius - self.first_radius) as usize) {
-            Some(shape) => draw(shape),
-            None => draw(&Shape::new(radius)),
         }
     }
 }

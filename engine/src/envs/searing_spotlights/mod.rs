@@ -28,6 +28,7 @@ mod light;
 pub mod parameters;
 mod rules;
 mod scene;
+mod shape;
 mod spawning;
 mod spotlight;
 #[cfg(test)]

@@ -8,6 +8,7 @@ use smallvec::SmallVec;
 use super::drawing::{Assets, Ground};
 use super::light;
 use super::rules::{BAR_HEIGHT, Exit, SearingSpotlights, State};
+use super::shape::Shape;
 use super::spotlight::Circle;
 use super::top_bar::Bar;
 use crate::envs::SCREEN;
@@ -151,26 +152,28 @@ impl Scene {
         }
         let mut damage = Damage::new(SCREEN, SCREEN);
         let change = light::Change::new(shown, self);
+        let lights: SmallVec<[Rect; 16]> = change.bounds().collect();
         if self.outlined || shown.outlined {
-            change.bounds().for_each(|bounds| damage.add(bounds));
+            lights.iter().for_each(|light| damage.add(*light));
         } else {
             change.paint(assets, canvas);
         }
-        self.add_things(shown, assets, &change, &mut damage);
+        self.add_things(shown, assets, &lights, &mut damage);
         self.bar.add_damage_since(&shown.bar, &mut damage);
         damage.repair(canvas, |canvas| self.paint(assets, canvas));
     }
 
     /// Adds the places of things that have changed or that the light has, as far as any of it is seen.
-    fn add_things(&self, shown: &Scene, assets: &Assets, change: &light::Change<'_>, damage: &mut Damage) {
+    fn add_things(&self, shown: &Scene, assets: &Assets, lights: &[Rect], damage: &mut Damage) {
         let shining = self.shining(assets);
         let mut add = |things: Things, shines: bool, changed: bool| {
-            for scene in [shown, self] {
+            let scenes = if changed { &[shown, self][..] } else { &[self] };
+            for scene in scenes {
                 scene.each(assets, things, |sprite, corner| {
                     let bounds = sprite.bounds_at(corner);
                     let is_lit = || scene.circles.iter().any(|circle| circle.bounds().overlaps(&bounds));
-                    let is_seen = || shines || self.darkness < 255 || is_lit();
-                    if if changed { is_seen() } else { change.touches(&bounds) } {
+                    let is_touched = || lights.iter().any(|light| light.overlaps(&bounds));
+                    if if changed { shines || self.darkness < 255 || is_lit() } else { is_touched() } {
                         damage.add(bounds);
                     }
                 });
@@ -229,16 +232,14 @@ impl Scene {
         let (columns, rows) = (canvas.columns(), canvas.rows());
         let clip = Rect::new(columns.start as i32, rows.start as i32, columns.len() as i32, rows.len() as i32);
         for circle in self.circles.iter().filter(|circle| circle.bounds().overlaps(&clip)) {
-            assets.with_shape(circle, |shape| {
-                let centre = circle.centre();
-                for DiscColumn { x, rows } in shape.disc.columns(centre, &columns, rows.clone()) {
-                    ground.paint_run(canvas, x, rows);
-                }
-                self.each(assets, hidden, |sprite, (x, y)| sprite.blit_within(canvas, x, y, &shape.disc, centre));
-                if self.outlined {
-                    shape.draw_outline(canvas, centre, darkness);
-                }
-            });
+            let (shape, centre) = (Shape::of(circle.radius), circle.centre());
+            for DiscColumn { x, rows } in shape.disc.columns(centre, &columns, rows.clone()) {
+                ground.paint_run(canvas, x, rows);
+            }
+            self.each(assets, hidden, |sprite, (x, y)| sprite.blit_within(canvas, x, y, &shape.disc, centre));
+            if self.outlined {
+                shape.draw_outline(canvas, centre, darkness);
+            }
         }
     }
 }

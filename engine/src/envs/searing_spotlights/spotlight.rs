@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
 use super::rules::{BAR_HEIGHT, FAR};
+use super::shape::Shape;
 use crate::envs::SCREEN;
 use crate::envs::vector::{lerp, rotate};
 use crate::random::Generator;
@@ -113,7 +114,13 @@ impl Circle {
         self.bounds().overlaps(&BELOW_BAR)
     }
 
-    /// Whether it covers a place.
+    /// Whether a pixel is lit by it.
+    #[inline]
+    pub fn covers(&self, (x, y): (i32, i32)) -> bool {
+        Shape::of(self.radius).disc.contains((x - i32::from(self.x), y - i32::from(self.y)))
+    }
+
+    /// Whether a place is within its radius.
     pub fn contains(&self, (x, y): (i32, i32)) -> bool {
         let (x, y, radius) = (x - i32::from(self.x), y - i32::from(self.y), i32::from(self.radius));
         x * x + y * y < radius * radius

@@ -64,9 +64,19 @@ impl Bar {
         if canvas.rows().start >= BAR_HEIGHT {
             return;
         }
+        let clip = canvas.columns();
+        let rows = canvas.rows().start..canvas.rows().end.min(BAR_HEIGHT);
+        let columns = canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0;
         let mut paint = |field: Range<usize>, color: Rgb| {
-            let field = Rect::new(field.start as i32, 0, field.len() as i32, BAR_HEIGHT as i32);
-            canvas.clipped(field).fill(color);
+            // A column's part of the bar is a block of its own, which is a store or two.
+            let block: [Rgb; BAR_HEIGHT] = [color; BAR_HEIGHT];
+            let field = field.start.max(clip.start)..field.end.min(clip.end);
+            let Some(columns) = columns.get_mut(field) else { return };
+            if rows.len() == BAR_HEIGHT {
+                columns.iter_mut().for_each(|column| column[..BAR_HEIGHT].copy_from_slice(&block));
+            } else {
+                columns.iter_mut().for_each(|column| column[rows.clone()].fill(color));
+            }
         };
         // In the order in which the original paints, each field over what earlier steps left behind.
         let damage = usize::from(self.damage);
