@@ -1,6 +1,5 @@
 //! The environments: the trait that each fills, the registry of ids, and their reset parameters.
 
-pub mod background;
 pub mod character;
 pub mod mortar_mayhem;
 pub mod mystery_path;

@@ -31,8 +31,11 @@ impl Rect {
     /// Whether a pixel lies in both rectangles.
     #[inline]
     pub fn overlaps(&self, other: &Rect) -> bool {
-        let both = self.intersection(other);
-        both.width > 0 && both.height > 0
+        self.x < other.x.saturating_add(other.width)
+            && other.x < self.x.saturating_add(self.width)
+            && self.y < other.y.saturating_add(other.height)
+            && other.y < self.y.saturating_add(self.height)
+            && [self.width, self.height, other.width, other.height].iter().all(|length| *length > 0)
     }
 
     /// The pixels that lie in both; of a size of 0 or less if there is none.

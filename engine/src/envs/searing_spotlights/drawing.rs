@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use super::parameters::{MAX_SPOTLIGHTS, Parameters, Variant};
 use super::shape::Shape;
 use crate::envs::SCREEN;
-use crate::envs::background::{BACKGROUND_TILE, tiled_background};
 use crate::envs::character::CharacterSprites;
 use crate::raster::{Canvas, CornerRadii, Rect, Rgb, Sprite, Surface, blend_keyed, copy_run};
 
@@ -20,6 +19,9 @@ const COIN_BORDER: Rgb = [255, 165, 0];
 const EXIT_OPEN: Rgb = [48, 141, 70];
 const EXIT_CLOSED: Rgb = [55, 55, 55];
 
+/// Side of a background's tile in pixels: 50 on the original's screen of 336 pixels, cut to whole pixels on this one.
+const TILE: usize = 12;
+
 /// What covers the screen behind everything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Ground {
@@ -31,33 +33,34 @@ pub(super) enum Ground {
     Black,
 }
 
-/// A background: the columns of its first and second tiles, which all others repeat.
+/// A background: a chessboard of two colours, which may be the same, as the columns of its first and second tiles.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Columns([[Rgb; SCREEN]; 2]);
+pub(super) struct Columns {
+    colors: [Rgb; 2],
+    columns: [[Rgb; SCREEN]; 2],
+}
 
-/// By column, whether it is one of the first tiles or of the second.
+/// By column or row, whether it is one of a second tile.
 const SECOND: [u8; SCREEN] = {
     let mut second = [0; SCREEN];
     let mut x = 0;
     while x < SCREEN {
-        second[x] = (x / BACKGROUND_TILE % 2) as u8;
+        second[x] = (x / TILE % 2) as u8;
         x += 1;
     }
     second
 };
 
 impl Columns {
-    /// No light.
-    pub const BLACK: Columns = Columns([[BLACK; SCREEN]; 2]);
-
-    fn of(surface: &Surface) -> Self {
-        let columns = surface.pixels().as_chunks::<3>().0.as_chunks::<SCREEN>().0;
-        Columns([columns[0], columns[BACKGROUND_TILE]])
+    /// The chessboard with the first colour in its corner.
+    fn new(colors: [Rgb; 2]) -> Self {
+        let column = |first: u8| SECOND.map(|second| colors[usize::from(first ^ second)]);
+        Columns { colors, columns: [column(0), column(1)] }
     }
 
     #[inline]
     fn column(&self, x: usize) -> &[Rgb; SCREEN] {
-        &self.0[usize::from(SECOND[x] & 1)]
+        &self.columns[usize::from(SECOND[x] & 1)]
     }
 
     /// The background's pixel at some place.
@@ -68,10 +71,7 @@ impl Columns {
 
     /// The background under a black surface of some `alpha`.
     pub fn shaded(&self, alpha: u8) -> Self {
-        match alpha {
-            255 => Columns::BLACK,
-            _ => Columns(self.0.map(|column| column.map(|pixel| pixel.map(|channel| blend_keyed(0, channel, alpha))))),
-        }
+        Columns::new(self.colors.map(|color| color.map(|channel| blend_keyed(0, channel, alpha))))
     }
 
     /// Paints everything.
@@ -113,12 +113,7 @@ pub struct Assets {
 impl Assets {
     /// Makes the pictures.
     pub fn new(variant: Variant, parameters: Parameters) -> Self {
-        let plain = |color: Rgb| {
-            let mut surface = Surface::new(SCREEN, SCREEN);
-            surface.fill(color);
-            surface
-        };
-        let grounds = [tiled_background(BLUE), tiled_background(RED), plain(WHITE), plain(BLACK)];
+        let grounds = [[WHITE, BLUE], [WHITE, RED], [WHITE; 2], [BLACK; 2]];
         let coin_radius = (10.0 * parameters.coin_scale) as i32;
         let exit_side = (20.0 * parameters.exit_scale) as i32;
         // Made now, and not while it is played.
@@ -131,7 +126,7 @@ impl Assets {
             coin_radius,
             exit_radius: 20.0 / 2.0 * parameters.exit_scale,
             most_spotlights: most_spotlights(&parameters),
-            grounds: grounds.each_ref().map(Columns::of),
+            grounds: grounds.map(Columns::new),
             coin: coin_picture(coin_radius, parameters.coin_scale),
             exit_side,
             exit_closed,

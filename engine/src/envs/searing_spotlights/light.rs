@@ -7,7 +7,7 @@ use std::ops::Range;
 
 use smallvec::SmallVec;
 
-use super::drawing::{Assets, Columns};
+use super::drawing::{Assets, Columns, Ground};
 use super::rules::BAR_HEIGHT;
 use super::scene::Scene;
 use super::shape::Shape;
@@ -74,8 +74,13 @@ impl<'a> Change<'a> {
 
     /// Paints what changes, as if there was nothing on the ground and no circle had an outline.
     pub fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
+        if self.moves.is_empty() {
+            return;
+        }
         let lit = &assets.grounds[self.scene.ground as usize];
-        let dark = lit.shaded(self.scene.darkness);
+        let black = &assets.grounds[Ground::Black as usize];
+        let shaded = (self.scene.darkness < 255).then(|| lit.shaded(self.scene.darkness));
+        let dark = shaded.as_ref().unwrap_or(black);
         // First what gets dark where no other circle shines, then what gets light.
         for change in &self.moves {
             match change {
@@ -91,11 +96,11 @@ impl<'a> Change<'a> {
                 Move::Moved(from, to) => {
                     let others = self.others(from, Some(to));
                     if others.is_empty() {
-                        paint_crescent(from, to, &dark, canvas);
+                        paint_crescent(from, to, dark, canvas);
                     } else {
                         for_each_pixel(from, to, |x, y| {
                             let is_lit = others.iter().any(|other| other.covers((x as i32, y as i32)));
-                            let ground = if is_lit { lit } else { &dark };
+                            let ground = if is_lit { lit } else { dark };
                             canvas.pixels_mut().as_chunks_mut::<3>().0[x * SCREEN + y] = ground.pixel(x, y);
                         });
                     }

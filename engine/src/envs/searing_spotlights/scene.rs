@@ -159,7 +159,15 @@ impl Scene {
             change.paint(assets, canvas);
         }
         self.add_things(shown, assets, &lights, &mut damage);
-        self.bar.add_damage_since(&shown.bar, &mut damage);
+        let shining = self.shining(assets);
+        for field in self.bar.changes_since(&shown.bar) {
+            if shining.any() {
+                damage.add(field);
+            } else {
+                // Nothing is above the bar.
+                self.bar.paint(assets.variant, &mut canvas.clipped(field));
+            }
+        }
         damage.repair(canvas, |canvas| self.paint(assets, canvas));
     }
 

@@ -2,10 +2,12 @@
 
 use std::ops::Range;
 
+use smallvec::SmallVec;
+
 use super::parameters::Variant;
 use super::rules::{BAR_HEIGHT, SearingSpotlights};
 use crate::envs::SCREEN;
-use crate::raster::{Canvas, Damage, Rect, Rgb};
+use crate::raster::{Canvas, Rect, Rgb};
 
 const BLACK: Rgb = [0, 0, 0];
 const GREY: Rgb = [50, 50, 50];
@@ -101,26 +103,28 @@ impl Bar {
         }
     }
 
-    /// Adds where a bar that shows `shown` differs.
-    pub fn add_damage_since(&self, shown: &Bar, damage: &mut Damage) {
-        let mut add = |field: Range<usize>| {
-            damage.add(Rect::new(field.start as i32, 0, field.len() as i32, BAR_HEIGHT as i32));
-        };
-        if self == shown {
-            return;
+    /// The fields that differ from those of a bar that shows `shown`.
+    pub fn changes_since(&self, shown: &Bar) -> SmallVec<[Rect; 4]> {
+        let field = |columns: Range<usize>| Rect::new(columns.start as i32, 0, columns.len() as i32, BAR_HEIGHT as i32);
+        let mut changes = SmallVec::new();
+        match (self, shown) {
+            _ if self == shown => {}
+            (
+                Bar { action: Some(action), damage, overflows: false, .. },
+                Bar { action: Some(shown_action), damage: shown_damage, overflows: false, .. },
+            ) => {
+                if damage != shown_damage {
+                    changes.push(field(usize::from(*damage.min(shown_damage))..usize::from(*damage.max(shown_damage))));
+                }
+                let fields = action.iter().zip(shown_action).zip(ACTION_FIELDS);
+                changes.extend(fields.filter(|((now, before), _)| now != before).map(|(_, columns)| field(columns)));
+                if self.reward != shown.reward {
+                    changes.push(field(self.reward_field()));
+                }
+            }
+            _ => changes.push(field(0..SCREEN)),
         }
-        let Bar { action: Some(action), damage: lost, overflows: false, .. } = *self else { return add(0..SCREEN) };
-        let Bar { action: Some(shown_action), damage: shown_lost, overflows: false, .. } = *shown else {
-            return add(0..SCREEN);
-        };
-        add(usize::from(lost.min(shown_lost))..HALF.min(lost.max(shown_lost).into()));
-        let branches = action.into_iter().zip(shown_action);
-        for (_, field) in branches.zip(ACTION_FIELDS).filter(|((now, before), _)| now != before) {
-            add(field);
-        }
-        if self.reward != shown.reward {
-            add(self.reward_field());
-        }
+        changes
     }
 
     fn reward_field(&self) -> Range<usize> {
