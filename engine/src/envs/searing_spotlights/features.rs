@@ -158,8 +158,8 @@ impl SearingSpotlights {
         if state.darkness > 0 {
             let circles = state.lit.iter().filter(|circle| circle.is_on_screen());
             for (circle, out) in circles.zip(out[SPOTLIGHT..].chunks_exact_mut(3)) {
-                let [x, y] = share((circle.x, circle.y));
-                out.copy_from_slice(&[circle.radius as f32 / SCREEN as f32, x, y]);
+                let [x, y] = share(circle.centre());
+                out.copy_from_slice(&[f32::from(circle.radius) / SCREEN as f32, x, y]);
                 lit += 1;
             }
         }

@@ -130,7 +130,7 @@ impl State {
             && self
                 .lit
                 .iter()
-                .all(|circle| near((circle.x, circle.y)) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius))
+                .all(|circle| near(circle.centre()) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius.into()))
             && self.coins.iter().copied().chain(self.exit.map(|exit| exit.location)).all(near)
             && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
             && self.coins_collected < u32::MAX / 2
