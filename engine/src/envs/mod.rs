@@ -37,7 +37,7 @@ pub trait Environment: Send + Sync {
     type State: Serialize + DeserializeOwned;
 
     /// What a frame shows, as a small value: with the assets, it decides every pixel. Two of them tell what has changed.
-    type Scene: Clone + PartialEq + Debug + Send;
+    type Scene: Clone + PartialEq + Debug + Send + Sync;
 
     /// Makes the shared part for one set of reset parameters.
     fn assets(variant: Self::Variant, parameters: &ResetParameters) -> Self::Assets;
