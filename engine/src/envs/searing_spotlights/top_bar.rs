@@ -30,7 +30,7 @@ const REWARD_ALONE: Range<usize> = HALF..SCREEN;
 /// What the bar shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Bar {
-    /// Columns of the health bar that have turned red; beyond [`HALF`] for health below zero.
+    /// Columns that have turned red; beyond [`HALF`] for health below zero.
     damage: u8,
     /// The red beyond the half covers the fields of the action.
     overflows: bool,
@@ -41,19 +41,12 @@ pub(super) struct Bar {
 }
 
 impl SearingSpotlights {
-    /// Columns of the health bar that have turned red; beyond [`HALF`] for health below zero.
-    pub(super) fn damage_width(&self) -> usize {
-        let lost = 1.0 - self.state.health_share(&self.assets.parameters);
-        ((HALF as f64 * lost) as usize).min(SCREEN)
-    }
-
     pub(super) fn bar(&self) -> Bar {
         let (state, parameters) = (&self.state, &self.assets.parameters);
-        let damage = self.damage_width();
         let shows_reward = parameters.show_last_positive_reward && !state.first_frame;
         Bar {
-            damage: damage as u8,
-            overflows: state.hit && damage > HALF,
+            damage: state.red_columns,
+            overflows: state.hit && usize::from(state.red_columns) > HALF,
             action: parameters.show_last_action.then(|| state.shown_action.map(|branch| branch as u8)),
             reward: shows_reward.then_some(state.shown_reward_positive),
         }
