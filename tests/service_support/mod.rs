@@ -1,4 +1,5 @@
 //! Processes for the tests of the service.
+#![allow(dead_code)] // Each test program uses its own part.
 
 pub mod foreign;
 
@@ -13,7 +14,7 @@ use std::time::Duration;
 use endless_gym::pool::{PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{ConnectConfig, Engine, EngineConfig, Namespace, ServiceError, Trainer};
 
-const ID: &str = "MortarMayhem-Grid-v0";
+pub const ID: &str = "MortarMayhem-Grid-v0";
 const ROLE: &str = "ENDLESS_TEST_ROLE";
 
 /// A namespace of its own for one test, with all that was started in it. It goes away with the test.
@@ -133,7 +134,8 @@ impl Drop for Running {
 }
 
 pub fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
-    let config = EngineConfig::new(service, PoolConfig::new(ID, num_envs), Threads::new(1).unwrap());
+    let pool = PoolConfig { check_drawing: true, ..PoolConfig::new(ID, num_envs) };
+    let config = EngineConfig::new(service, pool, Threads::new(1).unwrap());
     EngineConfig { namespace: namespace.clone(), groups, ..config }
 }
 

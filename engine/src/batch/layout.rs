@@ -4,6 +4,7 @@ use bytemuck::Pod;
 use serde::{Deserialize, Serialize};
 
 use super::block::{BLOCK_BYTES, Block, blocks_for};
+use super::stamp::Stamp;
 
 /// Number type of a section.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -72,17 +73,35 @@ impl Section {
 pub struct Layout {
     num_envs: usize,
     sections: Vec<Section>,
+    /// A block behind the sections belongs to the pool that writes them.
+    stamped: bool,
 }
 
 impl Layout {
     /// Lays `(name, dtype, row shape)` out one after the other, each aligned to 64 bytes.
     pub fn new<'a>(num_envs: usize, arrays: impl IntoIterator<Item = (&'a str, Dtype, Vec<usize>)>) -> Self {
-        let mut layout = Layout { num_envs, sections: Vec::new() };
+        let mut layout = Layout { num_envs, sections: Vec::new(), stamped: false };
         for (name, dtype, shape) in arrays {
             let offset = layout.blocks() * BLOCK_BYTES;
             layout.sections.push(Section { name: name.to_owned(), dtype, shape, offset });
         }
         layout
+    }
+
+    /// The same sections with room for a pool's stamp behind them.
+    pub(super) fn with_stamp(self) -> Self {
+        Layout { stamped: true, ..self }
+    }
+
+    /// The place of the pool's stamp.
+    pub(super) fn stamp_block(&self) -> Option<usize> {
+        self.stamped.then(|| self.section_blocks())
+    }
+
+    /// Makes the pool that next writes into `batch` draw every frame in full. Whoever has changed frames in a batch, and gives
+    /// it to a pool again, has to call this in between.
+    pub fn forget_frames(&self, batch: &mut [Block]) {
+        Stamp::default().write(self, batch);
     }
 
     /// Environments in the batch.
@@ -107,6 +126,11 @@ impl Layout {
 
     /// Blocks that the whole batch takes.
     pub fn blocks(&self) -> usize {
+        self.section_blocks() + usize::from(self.stamped)
+    }
+
+    /// Blocks that the sections take.
+    pub(super) fn section_blocks(&self) -> usize {
         self.sections.last().map_or(0, |last| blocks_for(last.offset + self.section_bytes(last)))
     }
 
@@ -172,6 +196,20 @@ mod tests {
         assert!(layout.read::<f64>(&batch, "b").is_empty());
         assert!(layout.read::<f32>(&batch, "a").is_empty());
         assert!(layout.read::<f64>(&batch[1..], "a").is_empty());
+    }
+
+    #[test]
+    fn the_stamp_lies_behind_the_sections() {
+        let layout = Layout::new(3, [("a", Dtype::Uint8, vec![30])]).with_stamp();
+        let mut batch = zeroed(layout.blocks());
+        assert_eq!(batch.len(), 3);
+        let stamp = Stamp { pool: 7, slot: 1, write: 2 };
+        stamp.write(&layout, &mut batch);
+        assert_eq!(Stamp::read(&layout, &batch), stamp);
+        assert_eq!(layout.read::<u8>(&batch, "a"), [0; 90]);
+        layout.forget_frames(&mut batch);
+        assert_eq!(Stamp::read(&layout, &batch), Stamp::default());
+        assert_eq!(Stamp::read(&layout, &batch[..2]), Stamp::default());
     }
 
     #[test]

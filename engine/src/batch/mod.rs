@@ -17,15 +17,21 @@
 //! | `info` | float64 (k,) | the original's further final infos, in the order of the environment's specification; zero in steps that do not end an episode |
 //! | `final_*` | as the section it is named after | same-step auto-reset, where asked for: the last values of an episode that ended in this step; other rows keep whatever was there |
 //!
+//! Behind the sections lies a block that belongs to the pool: it tells which of its writes the frames are from, so that the next
+//! one changes only what differs. Frames in a batch that a pool is to write into again are not to be changed by anybody else;
+//! whoever does calls [`Layout::forget_frames`] after it.
+//!
 //! In same-step auto-reset, `observation`, `vector_observation`, `features` and `ground_truth` already belong to the next
 //! episode in a step that ends one, while reward, flags, `episode_*` and `info` belong to the episode that ended.
 
 mod block;
 mod layout;
+mod stamp;
 mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use layout::{Dtype, Element, Layout, Section};
+pub(crate) use stamp::Stamp;
 pub use view::{Batch, BatchMut, Contents, OPTIONS_BYTES, RowsMut, action_layout, batch_layout};
 
 /// Version of the sections' meaning and of the messages that carry batches. A trainer refuses an engine of another version.

@@ -55,7 +55,7 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, contents: Contents) -> Layout 
             (name, dtype, shape)
         }));
     }
-    Layout::new(num_envs, sections)
+    Layout::new(num_envs, sections).with_stamp()
 }
 
 /// Longest text of reset parameters in a message.
@@ -174,7 +174,7 @@ impl<'a> Batch<'a> {
 
     /// The whole batch, sections and the padding between them.
     pub fn bytes(&self) -> &'a [u8] {
-        bytemuck::cast_slice(self.blocks)
+        bytemuck::cast_slice(&self.blocks[..self.blocks.len().min(self.layout.section_blocks())])
     }
 
     /// All numbers of a section; empty if the batch has none of that name and type.

@@ -2,10 +2,12 @@
 //!
 //! Source: the original's `character_controller.py`.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use super::vector::rotate;
-use crate::raster::{Canvas, Rgb, Sprite, Surface};
+use crate::raster::{Canvas, Rect, Rgb, Sprite, Surface};
 
 const BODY: Rgb = [250, 204, 153];
 const HANDS: Rgb = [250, 250, 250];
@@ -16,7 +18,7 @@ const TRANSPARENT: Rgb = [0, 0, 255];
 const MARGIN: i32 = 14;
 
 /// The character's eight pictures, one for each 45 degrees, at one scale.
-#[derive(Debug)]
+#[derive(PartialEq, Eq)]
 pub struct CharacterSprites {
     radius: i32,
     size: i32,
@@ -67,10 +69,22 @@ impl CharacterSprites {
         (&self.sprites[character.rotation as usize / 45 % self.sprites.len()], (x - corner, y - corner))
     }
 
+    /// The smallest rectangle about the character.
+    pub fn bounds(&self, character: &Character) -> Rect {
+        let (sprite, corner) = self.picture(character);
+        sprite.bounds_at(corner)
+    }
+
     /// Draws the character.
     pub fn draw(&self, character: &Character, canvas: &mut Canvas<'_>) {
         let (sprite, (x, y)) = self.picture(character);
         sprite.blit(canvas, x, y);
+    }
+}
+
+impl fmt::Debug for CharacterSprites {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("CharacterSprites").field("radius", &self.radius).finish_non_exhaustive()
     }
 }
 

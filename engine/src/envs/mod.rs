@@ -1,6 +1,5 @@
 //! The environments: the trait that each fills, the registry of ids, and their reset parameters.
 
-pub mod background;
 pub mod character;
 pub mod mortar_mayhem;
 pub mod mystery_path;
@@ -11,6 +10,7 @@ mod steering;
 mod vector;
 pub mod view;
 
+use std::fmt::Debug;
 use std::sync::Arc;
 
 use serde::{Serialize, de::DeserializeOwned};
@@ -23,8 +23,9 @@ pub use spec::{ActionSpace, Column, FRAME_BYTES, InfoColumn, SCREEN, Spec};
 
 /// Rules and pictures of one family of environments.
 ///
-/// [`step`](Environment::step) changes the state and [`draw`](Environment::draw) reads it: neither does the other's work. One
-/// object plays many episodes, and what an episode leaves behind matters, as in the original.
+/// [`step`](Environment::step) changes the state, [`scene`](Environment::scene) says what it looks like, and
+/// [`paint`](Environment::paint) paints that: none does another's work. One object plays many episodes, and what an episode
+/// leaves behind matters, as in the original.
 pub trait Environment: Send + Sync {
     /// What tells the family's ids apart.
     type Variant: Copy + Send + Sync;
@@ -34,6 +35,9 @@ pub trait Environment: Send + Sync {
 
     /// All that changes while an environment is played; what a snapshot keeps.
     type State: Serialize + DeserializeOwned;
+
+    /// What a frame shows, as a small value: with the assets, it decides every pixel. Two of them tell what has changed.
+    type Scene: Clone + PartialEq + Debug + Send + Sync;
 
     /// Makes the shared part for one set of reset parameters.
     fn assets(variant: Self::Variant, parameters: &ResetParameters) -> Self::Assets;
@@ -47,8 +51,22 @@ pub trait Environment: Send + Sync {
     /// Plays one step. `action` has one number for each branch of the action space, each within its range.
     fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition;
 
-    /// Draws the observation: `frame` holds [`FRAME_BYTES`] bytes, indexed \[x\]\[y\]\[channel\], of any content before.
-    fn draw(&self, frame: &mut [u8]);
+    /// The shared part that the environment now has.
+    fn shared(&self) -> &Arc<Self::Assets>;
+
+    /// What the observation shows.
+    fn scene(&self) -> Self::Scene;
+
+    /// Paints the observation, whatever was there before: all that lies within the canvas' clip.
+    fn paint(assets: &Self::Assets, scene: &Self::Scene, canvas: &mut Canvas<'_>);
+
+    /// Changes an observation that shows `shown` into one that shows `scene`, by painting what may differ.
+    fn repaint(assets: &Self::Assets, shown: &Self::Scene, scene: &Self::Scene, canvas: &mut Canvas<'_>);
+
+    /// Draws the observation in full: `frame` holds [`FRAME_BYTES`] bytes, indexed \[x\]\[y\]\[channel\].
+    fn draw(&self, frame: &mut [u8]) {
+        Self::paint(self.shared(), &self.scene(), &mut Canvas::new(frame, SCREEN, SCREEN));
+    }
 
     /// Draws the original's ground-truth view on a canvas of the observation's size, before the original scales it up. The
     /// state changes where an original counts its views.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value as Json};
 
 use super::seeding::Seeds;
+use super::shown::{Drawing, Shown, WrongFrame};
 use super::snapshot::{Saved, SnapshotError};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
@@ -39,6 +40,7 @@ impl<E: Environment> Lane<E> {
         self.ended = false;
     }
 
+    /// Plays a step and writes its row, without its frame.
     fn step(&mut self, autoreset: Autoreset, action: &[i32], out: &mut BatchMut<'_>, row: usize) {
         if self.ended && autoreset == Autoreset::NextStep {
             self.start_episode(None);
@@ -58,14 +60,14 @@ impl<E: Environment> Lane<E> {
         } else {
             out.info.row(row).fill(0.0);
         }
-        self.write_observation(out, row);
+        self.write_numbers(out, row);
     }
 
-    /// Writes the row of an environment that did not step: its current observation, and no reward.
+    /// Writes the row of an environment that did not step, without its frame: its current observation, and no reward.
     fn write_start(&self, out: &mut BatchMut<'_>, row: usize) {
         self.write_transition(out, row, 0.0, false);
         out.info.row(row).fill(0.0);
-        self.write_observation(out, row);
+        self.write_numbers(out, row);
     }
 
     fn write_transition(&self, out: &mut BatchMut<'_>, row: usize, reward: f64, terminated: bool) {
@@ -76,8 +78,8 @@ impl<E: Environment> Lane<E> {
         out.episode_length.row(row)[0] = self.episode_length;
     }
 
-    fn write_observation(&self, out: &mut BatchMut<'_>, row: usize) {
-        write_if_present(out.observation.row(row), |r| self.env.draw(r));
+    /// Writes what is observed beside the frame.
+    fn write_numbers(&self, out: &mut BatchMut<'_>, row: usize) {
         write_if_present(out.vector_observation.row(row), |r| self.env.vector_observation(r));
         write_if_present(out.features.row(row), |r| self.env.features(r));
         write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
@@ -97,13 +99,23 @@ fn write_if_present<T>(row: &mut [T], write: impl FnOnce(&mut [T])) {
     }
 }
 
+/// How a batch is to be written.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Work {
+    /// Contiguous slices that may be written at the same time.
+    pub slices: usize,
+    /// Where is noted what the frames of the batch show.
+    pub slot: usize,
+    pub drawing: Drawing,
+}
+
 /// Environments in a row, whatever their family: one virtual call for a whole batch.
 pub(super) trait Lanes: Send + Sync {
-    /// Steps all environments in `slices` contiguous slices that may run at the same time.
-    fn step(&mut self, slices: usize, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>);
+    /// Steps all environments.
+    fn step(&mut self, work: Work, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) -> Result<(), WrongFrame>;
 
     /// Resets environments as `request` says and writes every environment's row.
-    fn reset(&mut self, slices: usize, request: ResetRequest<'_>, out: BatchMut<'_>);
+    fn reset(&mut self, work: Work, request: ResetRequest<'_>, out: BatchMut<'_>) -> Result<(), WrongFrame>;
 
     /// Gives the environments that `request` resets other reset parameters, from their next episode on.
     fn set_options(&mut self, request: ResetRequest<'_>, options: &Options) -> Result<(), ParameterError>;
@@ -121,6 +133,8 @@ pub(super) trait Lanes: Send + Sync {
 /// The environments of one pool.
 pub(super) struct FamilyLanes<E: Environment> {
     lanes: Vec<Lane<E>>,
+    /// What the frames show, of each buffer by its slot.
+    shown: Vec<Vec<Shown<E>>>,
     spec: &'static Spec,
     variant: E::Variant,
 }
@@ -144,7 +158,33 @@ impl<E: Environment> FamilyLanes<E> {
                 options,
             })
             .collect();
-        FamilyLanes { lanes, spec, variant }
+        FamilyLanes { lanes, shown: Vec::new(), spec, variant }
+    }
+
+    /// Writes all rows: `play` writes everything but the frame of the row that it gets, with the environment's number.
+    fn write(
+        &mut self,
+        work: Work,
+        out: BatchMut<'_>,
+        play: impl Fn(usize, &mut Lane<E>, &mut BatchMut<'_>, usize) + Sync,
+    ) -> Result<(), WrongFrame> {
+        while self.shown.len() <= work.slot {
+            self.shown.push(self.lanes.iter().map(|_| Shown::nothing()).collect());
+        }
+        let whole = Slice { first: 0, lanes: &mut self.lanes, shown: &mut self.shown[work.slot], out };
+        whole.divide(work.slices, &|slice| {
+            let Slice { first, lanes, shown, mut out } = slice;
+            for (row, (lane, shown)) in lanes.iter_mut().zip(shown).enumerate() {
+                play(first + row, lane, &mut out, row);
+                let frame = out.observation.row(row);
+                if frame.is_empty() {
+                    continue;
+                }
+                let drawn = shown.update(&lane.env, work.drawing, frame);
+                drawn.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
+            }
+            Ok(())
+        })
     }
 
     /// The assets for these options: those of an environment that has the same, or new ones.
@@ -158,31 +198,26 @@ impl<E: Environment> FamilyLanes<E> {
 }
 
 impl<E: Environment> Lanes for FamilyLanes<E> {
-    fn step(&mut self, slices: usize, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) {
+    fn step(&mut self, work: Work, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) -> Result<(), WrongFrame> {
         let branches = self.spec.action_space.branches().len();
-        in_slices(slices, 0, &mut self.lanes, out, &|first, lanes, mut out| {
-            let actions = actions[first * branches..].chunks_exact(branches);
-            for (row, (lane, action)) in lanes.iter_mut().zip(actions).enumerate() {
-                lane.step(autoreset, action, &mut out, row);
-            }
-        });
+        self.write(work, out, |env, lane, out, row| {
+            lane.step(autoreset, &actions[env * branches..][..branches], out, row);
+        })
     }
 
-    fn reset(&mut self, slices: usize, request: ResetRequest<'_>, out: BatchMut<'_>) {
-        in_slices(slices, 0, &mut self.lanes, out, &|first, lanes, mut out| {
-            for (row, lane) in lanes.iter_mut().enumerate() {
-                match request {
-                    ResetRequest::All => lane.start_episode(None),
-                    ResetRequest::Seed(seed) => lane.start_episode(Some(seed.wrapping_add((first + row) as u64))),
-                    ResetRequest::Each { reset, seed } => match reset[first + row] {
-                        0 => {}
-                        1 => lane.start_episode(None),
-                        _ => lane.start_episode(Some(seed[first + row])),
-                    },
-                }
-                lane.write_start(&mut out, row);
+    fn reset(&mut self, work: Work, request: ResetRequest<'_>, out: BatchMut<'_>) -> Result<(), WrongFrame> {
+        self.write(work, out, |env, lane, out, row| {
+            match request {
+                ResetRequest::All => lane.start_episode(None),
+                ResetRequest::Seed(seed) => lane.start_episode(Some(seed.wrapping_add(env as u64))),
+                ResetRequest::Each { reset, seed } => match reset[env] {
+                    0 => {}
+                    1 => lane.start_episode(None),
+                    _ => lane.start_episode(Some(seed[env])),
+                },
             }
-        });
+            lane.write_start(out, row);
+        })
     }
 
     fn set_options(&mut self, request: ResetRequest<'_>, options: &Options) -> Result<(), ParameterError> {
@@ -237,24 +272,33 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
     }
 }
 
-/// Divides lanes and batch alike into contiguous slices and runs `work` on each, at the same time where threads are free.
-/// `first` is the number of the first lane.
-fn in_slices<L: Send>(
-    slices: usize,
+/// Consecutive environments with all that belongs to them.
+struct Slice<'a, E: Environment> {
+    /// Number of the first environment.
     first: usize,
-    lanes: &mut [L],
-    out: BatchMut<'_>,
-    work: &(impl Fn(usize, &mut [L], BatchMut<'_>) + Sync),
-) {
-    if slices <= 1 {
-        return work(first, lanes, out);
+    lanes: &'a mut [Lane<E>],
+    shown: &'a mut [Shown<E>],
+    out: BatchMut<'a>,
+}
+
+impl<E: Environment> Slice<'_, E> {
+    /// Divides everything alike into contiguous slices and has `work` done on each, at the same time where threads are free.
+    fn divide(
+        self,
+        slices: usize,
+        work: &(impl Fn(Slice<'_, E>) -> Result<(), WrongFrame> + Sync),
+    ) -> Result<(), WrongFrame> {
+        if slices <= 1 {
+            return work(self);
+        }
+        let left = slices / 2;
+        let middle = self.lanes.len() * left / slices;
+        let (left_lanes, right_lanes) = self.lanes.split_at_mut(middle);
+        let (left_shown, right_shown) = self.shown.split_at_mut(middle);
+        let (left_out, right_out) = self.out.split_at(middle);
+        let one = Slice { first: self.first, lanes: left_lanes, shown: left_shown, out: left_out };
+        let other = Slice { first: self.first + middle, lanes: right_lanes, shown: right_shown, out: right_out };
+        let (one, other) = rayon::join(|| one.divide(left, work), || other.divide(slices - left, work));
+        one.and(other)
     }
-    let left = slices / 2;
-    let middle = lanes.len() * left / slices;
-    let (left_lanes, right_lanes) = lanes.split_at_mut(middle);
-    let (left_out, right_out) = out.split_at(middle);
-    rayon::join(
-        || in_slices(left, first, left_lanes, left_out, work),
-        || in_slices(slices - left, first + middle, right_lanes, right_out, work),
-    );
 }

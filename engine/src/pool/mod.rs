@@ -1,7 +1,9 @@
 //! Many environments of one id, stepped in lockstep by worker threads.
 
+mod buffers;
 mod lanes;
 mod seeding;
+mod shown;
 mod snapshot;
 
 use std::collections::HashMap;
@@ -17,13 +19,19 @@ use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
 use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
-use lanes::{FamilyLanes, Lanes};
+use buffers::Buffers;
+use lanes::{FamilyLanes, Lanes, Work};
 pub use seeding::Seeding;
 use seeding::Seeds;
+use shown::Drawing;
+pub use shown::WrongFrame;
 pub use snapshot::{SNAPSHOT_VERSION, SnapshotError};
 
 /// Most environments in one pool.
 pub const MAX_ENVS: usize = 1 << 20;
+
+/// Environments that one thread steps in one go.
+const ENVS_IN_SLICE: usize = 32;
 
 /// When an episode that ended gives way to the next one. The names are Gymnasium's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -68,6 +76,8 @@ pub struct PoolConfig {
     pub frames: bool,
     /// Whether the batch has the feature observation.
     pub features: bool,
+    /// Whether every frame is drawn a second time, in full, and compared: a difference is [`PoolError::WrongFrame`]. For tests.
+    pub check_drawing: bool,
     /// Number of this pool's first environment, and of environments in all pools together, for seeding: an engine that serves
     /// several groups counts its environments through.
     pub first_env: usize,
@@ -86,6 +96,7 @@ impl PoolConfig {
             seeding: Seeding::Continue { seed: None },
             frames: true,
             features: false,
+            check_drawing: false,
             first_env: 0,
             total_envs: num_envs,
         }
@@ -116,7 +127,7 @@ impl Threads {
         self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
     }
 
-    fn run(&self, work: impl FnOnce() + Send) {
+    fn run<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         match &self.0 {
             Some(pool) => pool.install(work),
             None => work(),
@@ -150,6 +161,8 @@ pub struct Pool {
     spec: &'static Spec,
     layout: Layout,
     lanes: Box<dyn Lanes>,
+    buffers: Buffers,
+    check_drawing: bool,
     autoreset: Autoreset,
     threads: Threads,
     was_reset: bool,
@@ -186,6 +199,8 @@ impl Pool {
                 },
             ),
             lanes,
+            buffers: Buffers::new(),
+            check_drawing: config.check_drawing,
             autoreset: config.autoreset,
             threads: threads.clone(),
             was_reset: false,
@@ -226,12 +241,15 @@ impl Pool {
             }
             _ => {}
         }
-        let (out, slices) = (self.batch_mut(batch)?, self.slices());
-        let lanes = &mut self.lanes;
         if let Some(options) = options {
-            lanes.set_options(request, options)?;
+            // Not before all else has been checked, so that on an error nothing has moved.
+            let (given, needed) = (batch.len(), self.layout.blocks());
+            if given < needed {
+                return Err(PoolError::BatchTooShort { given, needed });
+            }
+            self.lanes.set_options(request, options)?;
         }
-        self.threads.run(|| lanes.reset(slices, request, out));
+        self.write(batch, |lanes, work, out| lanes.reset(work, request, out))?;
         self.was_reset = true;
         Ok(())
     }
@@ -243,9 +261,27 @@ impl Pool {
             return Err(PoolError::NotReset);
         }
         check_actions(self.spec, self.layout.num_envs(), actions)?;
-        let (out, slices) = (self.batch_mut(batch)?, self.slices());
-        let (lanes, autoreset) = (&mut self.lanes, self.autoreset);
-        self.threads.run(|| lanes.step(slices, autoreset, actions, out));
+        let autoreset = self.autoreset;
+        self.write(batch, |lanes, work, out| lanes.step(work, autoreset, actions, out))
+    }
+
+    /// Has a batch written, by as many threads as there are.
+    fn write(
+        &mut self,
+        batch: &mut [Block],
+        write: impl FnOnce(&mut dyn Lanes, Work, BatchMut<'_>) -> Result<(), WrongFrame> + Send,
+    ) -> Result<(), PoolError> {
+        let (given, needed) = (batch.len(), self.layout.blocks());
+        if given < needed {
+            return Err(PoolError::BatchTooShort { given, needed });
+        }
+        let buffer = self.buffers.begin(&self.layout, batch);
+        let drawing = Drawing { known: buffer.known, check: self.check_drawing };
+        let work = Work { slices: self.slices(), slot: buffer.slot, drawing };
+        let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
+        let lanes = &mut *self.lanes;
+        self.threads.run(|| write(lanes, work, out))?;
+        self.buffers.finish(buffer, &self.layout, batch);
         Ok(())
     }
 
@@ -288,13 +324,9 @@ impl Pool {
         Ok(())
     }
 
+    /// Several slices for each thread, so that none waits long for one whose environments have much to do.
     fn slices(&self) -> usize {
-        self.threads.count().min(self.layout.num_envs())
-    }
-
-    fn batch_mut<'a>(&self, batch: &'a mut [Block]) -> Result<BatchMut<'a>, PoolError> {
-        let given = batch.len();
-        BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed: self.layout.blocks() })
+        if self.threads.count() == 1 { 1 } else { self.layout.num_envs().div_ceil(ENVS_IN_SLICE) }
     }
 }
 
@@ -385,6 +417,8 @@ pub enum PoolError {
     NoSuchEnv { env: usize, num_envs: usize },
     #[error("{given} bytes given for a ground-truth view; it has {VIEW_BYTES}")]
     ViewSize { given: usize },
+    #[error(transparent)]
+    WrongFrame(#[from] WrongFrame),
     #[error("a batch of {given} blocks of 64 bytes given; the layout needs {needed}")]
     BatchTooShort { given: usize, needed: usize },
 }

@@ -66,8 +66,8 @@ impl Canvas<'_> {
     /// the pixels of its colour key, and as translucent as its alpha says.
     pub fn blit(&mut self, source: &Surface, x: i32, y: i32) {
         let (x, y) = (i64::from(x), i64::from(y));
-        let columns = clip(x, x + source.width() as i64 - 1, self.width());
-        let rows = clip(y, y + source.height() as i64 - 1, self.height());
+        let columns = clip(x, x + source.width() as i64 - 1, &self.columns());
+        let rows = clip(y, y + source.height() as i64 - 1, &self.rows());
         if columns.is_empty() || rows.is_empty() || source.alpha() == 0 {
             return;
         }

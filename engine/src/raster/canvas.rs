@@ -1,15 +1,21 @@
 //! Pixels to draw on, and the filling of runs and blocks that all shapes are made of.
 
-use super::Rgb;
+use std::ops::Range;
+
+use super::{Rect, Rgb, copy_run};
 
 /// Borrowed pixels with a width and a height: what all drawing goes to.
 ///
-/// Everything is clipped to the canvas, so any coordinate is allowed.
+/// Everything is clipped to the canvas, so any coordinate is allowed. A [`clipped`](Canvas::clipped) canvas lets only a
+/// rectangle of its pixels change, which is how a part of a picture is painted anew.
 #[derive(Debug)]
 pub struct Canvas<'a> {
     pixels: &'a mut [u8],
     width: usize,
     height: usize,
+    /// The pixels that may change.
+    columns: Range<usize>,
+    rows: Range<usize>,
 }
 
 impl<'a> Canvas<'a> {
@@ -22,7 +28,27 @@ impl<'a> Canvas<'a> {
     pub fn new(pixels: &'a mut [u8], width: usize, height: usize) -> Self {
         let size = width.checked_mul(height).and_then(|n| n.checked_mul(3));
         assert_eq!(size, Some(pixels.len()), "the canvas' size in bytes");
-        Self { pixels, width, height }
+        Self { pixels, width, height, columns: 0..width, rows: 0..height }
+    }
+
+    /// The same canvas, of which only what lies in `rect` may change.
+    #[inline]
+    pub fn clipped(&mut self, rect: Rect) -> Canvas<'_> {
+        let columns = clip(rect.x.into(), i64::from(rect.x) + i64::from(rect.width) - 1, &self.columns);
+        let rows = clip(rect.y.into(), i64::from(rect.y) + i64::from(rect.height) - 1, &self.rows);
+        Canvas { pixels: self.pixels, width: self.width, height: self.height, columns, rows }
+    }
+
+    /// The columns that may change.
+    #[inline]
+    pub fn columns(&self) -> Range<usize> {
+        self.columns.clone()
+    }
+
+    /// The rows that may change.
+    #[inline]
+    pub fn rows(&self) -> Range<usize> {
+        self.rows.clone()
     }
 
     /// Width in pixels.
@@ -37,21 +63,49 @@ impl<'a> Canvas<'a> {
         self.height
     }
 
-    /// The bytes, column by column, 3 a pixel.
+    /// All bytes, column by column, 3 a pixel.
     #[inline]
     pub fn pixels(&self) -> &[u8] {
         self.pixels
     }
 
-    /// The bytes, to be changed.
+    /// All bytes, to be changed; whoever does keeps to [`columns`](Canvas::columns) and [`rows`](Canvas::rows).
     #[inline]
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         self.pixels
     }
 
+    /// The part of each column that may change, with its column.
+    #[inline]
+    pub fn runs_mut(&mut self) -> impl Iterator<Item = (usize, &mut [u8])> {
+        let (height, rows) = (self.height * 3, self.rows.start * 3..self.rows.end * 3);
+        let columns =
+            self.pixels[self.columns.start * height..self.columns.end * height].chunks_exact_mut(height.max(1));
+        self.columns.clone().zip(columns).map(move |(x, column)| (x, &mut column[rows.clone()]))
+    }
+
     /// Paints every pixel.
     pub fn fill(&mut self, color: Rgb) {
-        fill_run(self.pixels, color);
+        if self.is_whole() {
+            fill_run(self.pixels, color);
+        } else {
+            self.runs_mut().for_each(|(_, run)| fill_run(run, color));
+        }
+    }
+
+    /// Copies every pixel from a picture of the canvas' size.
+    #[inline]
+    pub fn paste(&mut self, picture: &[u8]) {
+        if self.is_whole() {
+            self.pixels.copy_from_slice(picture);
+            return;
+        }
+        let (height, first) = (self.height, self.rows.start);
+        self.runs_mut().for_each(|(x, run)| copy_run(&picture[(x * height + first) * 3..][..run.len()], run));
+    }
+
+    fn is_whole(&self) -> bool {
+        self.columns.len() == self.width && self.rows.len() == self.height
     }
 
     /// Paints one pixel.
@@ -68,8 +122,8 @@ impl<'a> Canvas<'a> {
     /// Paints the columns `x0` to `x1` of the rows `y0` to `y1`, all included; nothing when an end
     /// lies before its start.
     pub(super) fn fill_block(&mut self, x0: i64, y0: i64, x1: i64, y1: i64, color: Rgb) {
-        let columns = clip(x0, x1, self.width);
-        let rows = clip(y0, y1, self.height);
+        let columns = clip(x0, x1, &self.columns);
+        let rows = clip(y0, y1, &self.rows);
         if rows.is_empty() {
             return;
         }
@@ -82,6 +136,9 @@ impl<'a> Canvas<'a> {
 
 /// Paints all pixels of a run.
 pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
+    if color == [color[0]; 3] {
+        return run.fill(color[0]);
+    }
     // Up to this length, pixels are painted one by one; the rest is copied, twice as much each time.
     let mut painted = run.len().min(96 * 3);
     run[..painted].as_chunks_mut().0.fill(color);
@@ -92,11 +149,11 @@ pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
     }
 }
 
-/// The part of `first..=last` that lies in `0..size`.
+/// The part of `first..=last` that lies in `within`.
 #[inline]
-pub(super) fn clip(first: i64, last: i64, size: usize) -> std::ops::Range<usize> {
-    let size = size as i64;
-    let start = first.clamp(0, size);
-    let end = last.saturating_add(1).clamp(start, size);
+pub(super) fn clip(first: i64, last: i64, within: &Range<usize>) -> Range<usize> {
+    let (low, high) = (within.start as i64, within.end as i64);
+    let start = first.clamp(low, high);
+    let end = last.saturating_add(1).clamp(start, high);
     start as usize..end as usize
 }

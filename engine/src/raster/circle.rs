@@ -83,26 +83,38 @@ impl Disc {
         self.half_heights.len() as i32
     }
 
-    /// The runs of the disc about `center` that lie on a canvas of `width` by `height` pixels, from
-    /// left to right, without the empty ones.
-    pub fn columns(&self, center: (i32, i32), width: usize, height: usize) -> impl Iterator<Item = DiscColumn> + '_ {
+    /// The runs of the disc about `center` that lie in some columns and rows, from left to right,
+    /// without the empty ones.
+    #[inline]
+    pub fn columns(
+        &self,
+        center: (i32, i32),
+        columns: &Range<usize>,
+        rows: Range<usize>,
+    ) -> impl Iterator<Item = DiscColumn> + '_ {
         let center_x = i64::from(center.0);
         let radius = i64::from(self.radius());
-        let columns = clip(center_x - radius, center_x + radius - 1, width);
-        columns.filter_map(move |x| {
-            let rows = self.rows(center, x, height);
+        clip(center_x - radius, center_x + radius - 1, columns).filter_map(move |x| {
+            let rows = self.rows(center, x, &rows);
             (!rows.is_empty()).then_some(DiscColumn { x, rows })
         })
     }
 
-    /// The rows of the column `x` that the disc about `center` covers on a canvas of `height` pixels.
+    /// Whether the disc covers the pixel at a place from its centre.
     #[inline]
-    pub fn rows(&self, center: (i32, i32), x: usize, height: usize) -> Range<usize> {
+    pub fn contains(&self, (x, y): (i32, i32)) -> bool {
+        let index = if x < 0 { -x - 1 } else { x };
+        self.half_heights.get(index as usize).is_some_and(|half| (-half..*half).contains(&y))
+    }
+
+    /// Those of some rows of the column `x` that the disc about `center` covers.
+    #[inline]
+    pub fn rows(&self, center: (i32, i32), x: usize, rows: &Range<usize>) -> Range<usize> {
         let right = x as i64 - i64::from(center.0);
         let index = if right < 0 { -right - 1 } else { right };
         let center_y = i64::from(center.1);
         match self.half_heights.get(index as usize) {
-            Some(&half) => clip(center_y - i64::from(half), center_y + i64::from(half) - 1, height),
+            Some(&half) => clip(center_y - i64::from(half), center_y + i64::from(half) - 1, rows),
             None => 0..0,
         }
     }
@@ -191,7 +203,7 @@ impl Canvas<'_> {
     /// Fills a circle with a ready [`Disc`]: the same pixels as [`Canvas::draw_circle`]'s.
     pub fn fill_disc(&mut self, color: Rgb, center: (i32, i32), disc: &Disc) {
         let height = self.height();
-        for DiscColumn { x, rows } in disc.columns(center, self.width(), height) {
+        for DiscColumn { x, rows } in disc.columns(center, &self.columns(), self.rows()) {
             let column = x * height;
             fill_run(&mut self.pixels_mut()[(column + rows.start) * 3..(column + rows.end) * 3], color);
         }

@@ -17,6 +17,7 @@
 mod blit;
 mod canvas;
 mod circle;
+mod damage;
 mod line;
 mod rectangle;
 mod rotate;
@@ -30,6 +31,7 @@ mod tests;
 pub use blit::{blend_keyed, blend_plain};
 pub use canvas::Canvas;
 pub use circle::{Disc, DiscColumn, circle_outline};
+pub use damage::Damage;
 pub use rectangle::{CornerRadii, Rect};
 pub use sprite::{Sprite, copy_run};
 pub use surface::Surface;

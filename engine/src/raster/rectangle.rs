@@ -21,6 +21,40 @@ impl Rect {
     pub const fn new(x: i32, y: i32, width: i32, height: i32) -> Self {
         Self { x, y, width, height }
     }
+
+    /// The column right of the rectangle and the row below it.
+    #[inline]
+    fn end(&self) -> (i32, i32) {
+        (self.x.saturating_add(self.width), self.y.saturating_add(self.height))
+    }
+
+    /// Whether a pixel lies in both rectangles.
+    #[inline]
+    pub fn overlaps(&self, other: &Rect) -> bool {
+        self.x < other.x.saturating_add(other.width)
+            && other.x < self.x.saturating_add(self.width)
+            && self.y < other.y.saturating_add(other.height)
+            && other.y < self.y.saturating_add(self.height)
+            && [self.width, self.height, other.width, other.height].iter().all(|length| *length > 0)
+    }
+
+    /// The pixels that lie in both; of a size of 0 or less if there is none.
+    #[inline]
+    pub fn intersection(&self, other: &Rect) -> Rect {
+        let (x, y) = (self.x.max(other.x), self.y.max(other.y));
+        let (own, others) = (self.end(), other.end());
+        let (right, bottom) = (own.0.min(others.0), own.1.min(others.1));
+        Rect { x, y, width: right.saturating_sub(x), height: bottom.saturating_sub(y) }
+    }
+
+    /// The smallest rectangle about both.
+    #[inline]
+    pub fn union(&self, other: &Rect) -> Rect {
+        let (x, y) = (self.x.min(other.x), self.y.min(other.y));
+        let (own, others) = (self.end(), other.end());
+        let (right, bottom) = (own.0.max(others.0), own.1.max(others.1));
+        Rect { x, y, width: right.saturating_sub(x), height: bottom.saturating_sub(y) }
+    }
 }
 
 /// The radii of a rectangle's corners in pixels; 0 is a square corner.

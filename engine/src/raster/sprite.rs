@@ -60,15 +60,23 @@ impl Sprite {
         let top = i64::from(y) + i64::from(self.bounds.y);
         let right = left + i64::from(self.bounds.width);
         let bottom = top + i64::from(self.bounds.height);
-        let (width, height) = (canvas.width() as i64, canvas.height() as i64);
-        if left >= 0 && top >= 0 && right <= width && bottom <= height {
+        let (columns, rows) = (canvas.columns(), canvas.rows());
+        let (first, end) = (columns.start as i64, columns.end as i64);
+        let (highest, lowest) = (rows.start as i64, rows.end as i64);
+        if left >= first && top >= highest && right <= end && bottom <= lowest {
             self.blit_whole(canvas, x, y);
-        } else if right > 0 && bottom > 0 && left < width && top < height {
+        } else if right > first && bottom > highest && left < end && top < lowest {
             self.blit_clipped(canvas, i64::from(x), i64::from(y));
         }
     }
 
-    /// Paints a sprite whose bounds lie on the canvas.
+    /// The smallest rectangle about the opaque pixels of the sprite with its top left corner at `(x, y)`.
+    #[inline]
+    pub fn bounds_at(&self, (x, y): (i32, i32)) -> Rect {
+        Rect { x: x.saturating_add(self.bounds.x), y: y.saturating_add(self.bounds.y), ..self.bounds }
+    }
+
+    /// Paints a sprite whose bounds may change as a whole.
     #[inline]
     fn blit_whole(&self, canvas: &mut Canvas<'_>, x: i32, y: i32) {
         let height = canvas.height();
@@ -85,11 +93,10 @@ impl Sprite {
     }
 
     /// Paints the part of the sprite that lies on the canvas.
-    #[cold]
     fn blit_clipped(&self, canvas: &mut Canvas<'_>, x: i64, y: i64) {
-        let (width, height) = (canvas.width(), canvas.height());
+        let (height, columns, rows) = (canvas.height(), canvas.columns(), canvas.rows());
         let pixels = canvas.pixels_mut();
-        for (column, rows, source) in self.runs_on(width, height, x, y) {
+        for (column, rows, source) in self.runs_on(columns, rows, x, y) {
             pixels[(column * height + rows.start) * 3..][..source.len()].copy_from_slice(source);
         }
     }
@@ -106,41 +113,42 @@ impl Sprite {
         {
             return;
         }
-        let (width, height) = (canvas.width(), canvas.height());
+        let (height, columns, rows) = (canvas.height(), canvas.columns(), canvas.rows());
         let pixels = canvas.pixels_mut();
-        for (column, rows, source) in self.runs_on(width, height, i64::from(x), i64::from(y)) {
-            let lit = disc.rows(center, column, height);
-            let (start, end) = (rows.start.max(lit.start), rows.end.min(lit.end));
-            if start < end {
-                let source = &source[(start - rows.start) * 3..(end - rows.start) * 3];
-                pixels[(column * height + start) * 3..][..source.len()].copy_from_slice(source);
+        for (column, rows, source) in self.runs_on(columns, rows, i64::from(x), i64::from(y)) {
+            let lit = disc.rows(center, column, &rows);
+            if !lit.is_empty() {
+                let source = &source[(lit.start - rows.start) * 3..(lit.end - rows.start) * 3];
+                pixels[(column * height + lit.start) * 3..][..source.len()].copy_from_slice(source);
             }
         }
     }
 
     /// Paints the sprite as it looks under a black surface of some `alpha` that has a colour key: 0 as it is, 255 black.
     pub fn blit_shaded(&self, canvas: &mut Canvas<'_>, x: i32, y: i32, alpha: u8) {
-        let (width, height) = (canvas.width(), canvas.height());
+        let (height, columns, rows) = (canvas.height(), canvas.columns(), canvas.rows());
         let pixels = canvas.pixels_mut();
-        for (column, rows, source) in self.runs_on(width, height, i64::from(x), i64::from(y)) {
+        for (column, rows, source) in self.runs_on(columns, rows, i64::from(x), i64::from(y)) {
             let target = &mut pixels[(column * height + rows.start) * 3..][..source.len()];
             target.iter_mut().zip(source).for_each(|(target, source)| *target = blend_keyed(0, *source, alpha));
         }
     }
 
-    /// The parts of the runs that lie on a canvas, for a sprite with its top left corner at `(x, y)`: column, rows, pixels.
+    /// The parts of the runs that lie in some columns and rows, for a sprite with its top left corner at `(x, y)`: column,
+    /// rows, pixels.
     fn runs_on(
         &self,
-        width: usize,
-        height: usize,
+        columns: Range<usize>,
+        rows: Range<usize>,
         x: i64,
         y: i64,
     ) -> impl Iterator<Item = (usize, Range<usize>, &[u8])> {
+        let columns = columns.start as i64..columns.end as i64;
         self.runs.iter().filter_map(move |run| {
             let column = x + i64::from(run.x);
             let row = y + i64::from(run.y);
-            let rows = clip(row, row + i64::from(run.length) - 1, height);
-            if rows.is_empty() || !(0..width as i64).contains(&column) {
+            let rows = clip(row, row + i64::from(run.length) - 1, &rows);
+            if rows.is_empty() || !columns.contains(&column) {
                 return None;
             }
             let start = run.start as usize + (rows.start as i64 - row) as usize * 3;

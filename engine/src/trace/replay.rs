@@ -62,6 +62,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
     let config = PoolConfig {
         options: Options::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
+        check_drawing: true,
         ..PoolConfig::new(&trace.env, 1)
     };
     let mut pool = Pool::new(&config, &Threads::new(1)?)?;

@@ -5,13 +5,16 @@ use std::sync::Arc;
 use super::commands::{COMMANDS, Command, PICTURE_SIZE, pictures};
 use super::parameters::{Parameters, Variant};
 use super::rules::MortarMayhem;
-use crate::envs::character::{Bounds, CharacterSprites};
-use crate::envs::{FRAME_BYTES, SCREEN};
-use crate::raster::{Canvas, Rect, Rgb, Sprite, Surface};
+use crate::envs::SCREEN;
+use crate::envs::character::{Bounds, Character, CharacterSprites};
+use crate::raster::{Canvas, Damage, Rect, Rgb, Sprite, Surface};
 
 /// Side of a tile in pixels.
 pub const TILE: i32 = 14;
 const TILE_BORDER: i32 = 1;
+
+/// Top left corner of the command pictures.
+const COMMAND_CORNER: (i32, i32) = ((SCREEN as i32 - PICTURE_SIZE) / 2, (SCREEN as i32 - PICTURE_SIZE) / 2);
 
 /// The ring that marks the target in the ground-truth view.
 const TARGET: Rgb = [0, 255, 0];
@@ -65,21 +68,63 @@ impl Assets {
     }
 }
 
+/// What a frame shows.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Scene {
+    /// The one tile that does not burn, while the others do.
+    spared: Option<(i32, i32)>,
+    character: Character,
+    /// The character's pictures, where they are those of an earlier episode.
+    former_sprites: Option<Arc<CharacterSprites>>,
+    command: Option<Command>,
+}
+
+impl Scene {
+    /// Paints the frame.
+    pub(super) fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
+        assets.paint_arena(self.spared, canvas);
+        self.sprites(assets).draw(&self.character, canvas);
+        if let Some(command) = self.command {
+            assets.draw_command(command, canvas);
+        }
+    }
+
+    /// Where a frame that shows `shown` differs.
+    pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets) -> Damage {
+        let mut damage = Damage::new(SCREEN, SCREEN);
+        if self.spared != shown.spared {
+            let (left, top, right, bottom) = assets.arena;
+            damage.add(Rect::new(left, top, right - left, bottom - top));
+        }
+        if self.command != shown.command {
+            let bounds = |command: Command| assets.commands[command.index()].bounds_at(COMMAND_CORNER);
+            [shown.command, self.command].into_iter().flatten().for_each(|command| damage.add(bounds(command)));
+        }
+        if (&self.character, &self.former_sprites) != (&shown.character, &shown.former_sprites) {
+            [shown, self].iter().for_each(|scene| damage.add(scene.sprites(assets).bounds(&scene.character)));
+        }
+        damage
+    }
+
+    fn sprites<'a>(&'a self, assets: &'a Assets) -> &'a CharacterSprites {
+        self.former_sprites.as_ref().unwrap_or(&assets.character)
+    }
+}
+
 impl MortarMayhem {
-    pub(super) fn draw_frame(&self, frame: &mut [u8]) {
-        let frame = &mut frame[..FRAME_BYTES];
-        self.draw_arena(frame);
+    pub(super) fn shown_scene(&self) -> Scene {
         let (sprites, character) = self.shown_character();
-        let mut canvas = Canvas::new(frame, SCREEN, SCREEN);
-        sprites.draw(character, &mut canvas);
-        if let Some(command) = self.state.shown_command {
-            self.assets.draw_command(command, &mut canvas);
+        Scene {
+            spared: self.visible_fire(),
+            character: *character,
+            former_sprites: (!Arc::ptr_eq(sprites, &self.assets.character)).then(|| Arc::clone(sprites)),
+            command: self.state.shown_command,
         }
     }
 
     /// The original's `_build_debug_surface`: the target is marked, and the clue goes on by one frame each time.
     pub(super) fn draw_debug_frame(&mut self, canvas: &mut Canvas<'_>) {
-        self.draw_arena(canvas.pixels_mut());
+        self.assets.paint_arena(self.visible_fire(), canvas);
         let (sprites, character) = self.last_moved();
         sprites.draw(character, canvas);
         if !self.state.clue.is_over()
@@ -88,37 +133,31 @@ impl MortarMayhem {
         {
             self.assets.draw_command(*command, canvas);
         }
-        let centre = |corner: i32, tile: i32| corner + tile * TILE + TILE / 2;
-        let (x, y) = self.state.target;
-        let target = (centre(self.assets.arena.0, x), centre(self.assets.arena.1, y));
-        canvas.draw_circle(TARGET, target, TILE / 2, TARGET_WIDTH);
-    }
-
-    fn draw_arena(&self, frame: &mut [u8]) {
-        match self.visible_fire() {
-            None => frame.copy_from_slice(&self.assets.calm),
-            Some((x, y)) => {
-                frame.copy_from_slice(&self.assets.burning);
-                self.assets.extinguish(frame, x, y);
-            }
-        }
+        let (left, top) = self.assets.corner(self.state.target);
+        canvas.draw_circle(TARGET, (left + TILE / 2, top + TILE / 2), TILE / 2, TARGET_WIDTH);
     }
 }
 
 impl Assets {
-    fn draw_command(&self, command: Command, canvas: &mut Canvas<'_>) {
-        let corner = (SCREEN as i32 - PICTURE_SIZE) / 2;
-        self.commands[command.index()].blit(canvas, corner, corner);
+    /// Paints the arena, which burns if a tile is spared.
+    fn paint_arena(&self, spared: Option<(i32, i32)>, canvas: &mut Canvas<'_>) {
+        match spared {
+            None => canvas.paste(&self.calm),
+            Some(tile) => {
+                canvas.paste(&self.burning);
+                let (left, top) = self.corner(tile);
+                canvas.clipped(Rect::new(left, top, TILE, TILE)).paste(&self.calm);
+            }
+        }
     }
 
-    /// Gives one tile of a burning arena its calm colours back.
-    fn extinguish(&self, frame: &mut [u8], x: i32, y: i32) {
-        let top = self.arena.1 + y * TILE;
-        for column in 0..TILE {
-            let left = self.arena.0 + x * TILE + column;
-            let start = (left as usize * SCREEN + top as usize) * 3;
-            let bytes = start..start + TILE as usize * 3;
-            frame[bytes.clone()].copy_from_slice(&self.calm[bytes]);
-        }
+    /// The top left corner of a tile.
+    fn corner(&self, (x, y): (i32, i32)) -> (i32, i32) {
+        (self.arena.0 + x * TILE, self.arena.1 + y * TILE)
+    }
+
+    fn draw_command(&self, command: Command, canvas: &mut Canvas<'_>) {
+        let (x, y) = COMMAND_CORNER;
+        self.commands[command.index()].blit(canvas, x, y);
     }
 }

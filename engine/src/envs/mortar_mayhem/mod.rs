@@ -10,7 +10,7 @@ mod rules;
 use std::sync::Arc;
 
 pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
-pub use drawing::Assets;
+pub use drawing::{Assets, Scene};
 pub use parameters::{Locomotion, Parameters, SPECS, Variant};
 pub use rules::{MortarMayhem, State};
 
@@ -22,6 +22,7 @@ impl Environment for MortarMayhem {
     type Variant = Variant;
     type Assets = Assets;
     type State = State;
+    type Scene = Scene;
 
     fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
         Assets::new(variant, Parameters::new(variant, parameters))
@@ -39,8 +40,20 @@ impl Environment for MortarMayhem {
         self.play(action, random)
     }
 
-    fn draw(&self, frame: &mut [u8]) {
-        self.draw_frame(frame);
+    fn shared(&self) -> &Arc<Assets> {
+        &self.assets
+    }
+
+    fn scene(&self) -> Scene {
+        self.shown_scene()
+    }
+
+    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.paint(assets, canvas);
+    }
+
+    fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.damage_since(shown, assets).repair(canvas, |canvas| scene.paint(assets, canvas));
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {

@@ -344,12 +344,12 @@ impl MortarMayhem {
     }
 
     /// The character that the frame shows, and its pictures.
-    pub(super) fn shown_character(&self) -> (&CharacterSprites, &Character) {
+    pub(super) fn shown_character(&self) -> (&Arc<CharacterSprites>, &Character) {
         if self.state.first_frame { (&self.assets.character, &self.state.agent) } else { self.last_moved() }
     }
 
     /// The character that moved last, in this episode or an earlier one, and its pictures.
-    pub(super) fn last_moved(&self) -> (&CharacterSprites, &Character) {
+    pub(super) fn last_moved(&self) -> (&Arc<CharacterSprites>, &Character) {
         match &self.state.shown {
             Shown::Former { character, .. } => (&self.former_sprites, character),
             Shown::Nobody | Shown::Current => (&self.assets.character, &self.state.agent),

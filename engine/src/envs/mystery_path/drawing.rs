@@ -1,11 +1,11 @@
 //! How Mystery Path looks: the pictures made once for each set of reset parameters, and how a frame is put together.
 
 use super::parameters::{Parameters, Variant};
-use super::path::{GRID, Tile};
+use super::path::{GRID, Tile, TileSet};
 use super::rules::State;
 use crate::envs::character::{Character, CharacterSprites};
 use crate::envs::{FRAME_BYTES, SCREEN};
-use crate::raster::{Canvas, Rect, Rgb, Sprite, Surface};
+use crate::raster::{Canvas, Damage, Rect, Rgb, Sprite, Surface};
 
 /// Side of a tile in pixels.
 pub const TILE: i32 = SCREEN as i32 / GRID;
@@ -116,31 +116,119 @@ fn fill_tile(canvas: &mut Canvas<'_>, (x, y): Tile, color: Rgb) {
     canvas.draw_rect(color, tile_at(x * TILE, y * TILE), 0);
 }
 
+/// What a frame shows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    goal: Option<Tile>,
+    origin: Option<Tile>,
+    past: PastPath,
+    agent: Character,
+    /// Rows of the stamina bar that are red, if it is shown.
+    spent: Option<i32>,
+    /// Centre of the red cross.
+    cross: Option<(i32, i32)>,
+    /// Pixels that the background has scrolled to the left.
+    background: i32,
+}
+
+/// The tiles of the past path that are on the screen.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct PastPath {
+    /// Left edge of the screen in pixels of the way.
+    camera: f64,
+    /// The tiles' first column.
+    first: i32,
+    /// By their columns from the first.
+    tiles: TileSet,
+}
+
+impl PastPath {
+    /// The tiles, each with its left edge in pixels, cut towards zero as it is drawn, and its top edge.
+    fn places(self) -> impl Iterator<Item = (i32, i32)> {
+        self.tiles.iter().map(move |(x, y)| ((f64::from((self.first + x) * TILE) - self.camera) as i32, y * TILE))
+    }
+}
+
+impl Scene {
+    /// Paints the frame.
+    pub(super) fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
+        assets.paint_background(self.background, canvas);
+        if let Some(goal) = self.goal {
+            fill_tile(canvas, goal, GREEN);
+        }
+        if let Some(origin) = self.origin {
+            fill_tile(canvas, origin, BLUE);
+        }
+        self.past.places().for_each(|(left, top)| assets.draw_past_tile(canvas, left, top));
+        assets.character.draw(&self.agent, canvas);
+        if let Some(spent) = self.spent {
+            draw_stamina(spent, canvas);
+        }
+        if let Some(centre) = self.cross {
+            assets.draw_cross(centre, canvas);
+        }
+    }
+
+    /// Where a frame that shows `shown` differs.
+    pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets) -> Damage {
+        let mut damage = Damage::new(SCREEN, SCREEN);
+        if self.background != shown.background {
+            damage.add(Rect::new(0, 0, SCREEN as i32, SCREEN as i32));
+            return damage;
+        }
+        let tiles = [(shown.goal, self.goal), (shown.origin, self.origin)];
+        for (before, now) in tiles.into_iter().filter(|(before, now)| before != now) {
+            [before, now].into_iter().flatten().for_each(|(x, y)| damage.add(tile_at(x * TILE, y * TILE)));
+        }
+        if self.past != shown.past {
+            let places = shown.past.places().chain(self.past.places());
+            places.for_each(|(left, top)| damage.add(tile_at(left, top)));
+        }
+        if self.agent != shown.agent {
+            [shown, self].iter().for_each(|scene| damage.add(assets.character.bounds(&scene.agent)));
+        }
+        if self.spent != shown.spent {
+            damage.add(stamina_bar(0, SCREEN as i32));
+        }
+        if self.cross != shown.cross {
+            let bounds = |centre: (i32, i32)| assets.cross.bounds_at(cross_corner(centre));
+            [shown.cross, self.cross].into_iter().flatten().for_each(|centre| damage.add(bounds(centre)));
+        }
+        damage
+    }
+}
+
+/// Part of the stamina bar.
+fn stamina_bar(y: i32, height: i32) -> Rect {
+    Rect { x: SCREEN as i32 - STAMINA_BAR, y, width: STAMINA_BAR, height }
+}
+
+fn draw_stamina(spent: i32, canvas: &mut Canvas<'_>) {
+    canvas.draw_rect(RED, stamina_bar(0, spent), 0);
+    canvas.draw_rect(GREEN, stamina_bar(spent, SCREEN as i32 - spent), 0);
+}
+
+fn cross_corner((x, y): (i32, i32)) -> (i32, i32) {
+    (x - CROSS / 2, y - CROSS / 2)
+}
+
 impl State {
-    pub(super) fn draw_frame(&self, assets: &Assets, frame: &mut [u8]) {
-        let frame = &mut frame[..FRAME_BYTES];
+    pub(super) fn scene(&self, assets: &Assets) -> Scene {
         let parameters = &assets.parameters;
-        self.draw_background(assets, frame);
-        let mut canvas = Canvas::new(frame, SCREEN, SCREEN);
-        if parameters.show_goal {
-            fill_tile(&mut canvas, self.route.end(), GREEN);
+        Scene {
+            goal: parameters.show_goal.then(|| self.route.end()),
+            origin: parameters.show_origin.then(|| self.route.start()),
+            past: if parameters.show_past_path { self.past(assets) } else { PastPath::default() },
+            agent: self.shown_agent(assets),
+            spent: parameters.show_stamina.then(|| self.spent_stamina(assets)),
+            cross: self.cross,
+            background: if parameters.show_background { self.journey.background() } else { 0 },
         }
-        if parameters.show_origin {
-            fill_tile(&mut canvas, self.route.start(), BLUE);
-        }
-        if parameters.show_past_path {
-            self.past_tiles(assets).for_each(|(left, (_, y))| assets.draw_past_tile(&mut canvas, left, y * TILE));
-        }
-        assets.character.draw(&self.shown_agent(assets), &mut canvas);
-        if parameters.show_stamina {
-            self.draw_stamina(assets, &mut canvas);
-        }
-        self.draw_cross(assets, &mut canvas);
     }
 
     /// Draws what the observation hides: the finite ids' path, goal, origin and walls, or the endless id's whole way and stamina.
     pub(super) fn draw_truth(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
-        self.draw_background(assets, canvas.pixels_mut());
+        assets.paint_background(self.journey.background(), canvas);
         if assets.variant == Variant::Endless {
             // The picture of the whole way is cut to whole pixels once, unlike the past path's tiles.
             let shift = -self.journey.camera() as i32;
@@ -154,19 +242,20 @@ impl State {
             self.route.walls().for_each(|tile| fill_tile(canvas, tile, RED));
         }
         assets.character.draw(&self.shown_agent(assets), canvas);
-        self.draw_cross(assets, canvas);
+        if let Some(centre) = self.cross {
+            assets.draw_cross(centre, canvas);
+        }
         if assets.variant == Variant::Endless {
-            self.draw_stamina(assets, canvas);
+            draw_stamina(self.spent_stamina(assets), canvas);
         }
     }
 
-    fn draw_background(&self, assets: &Assets, frame: &mut [u8]) {
-        if assets.background.is_empty() {
-            frame.fill(0);
-        } else {
-            let first = self.journey.background() as usize * SCREEN * 3;
-            frame.copy_from_slice(&assets.background[first..][..frame.len()]);
-        }
+    fn past(&self, assets: &Assets) -> PastPath {
+        // Never more than eight columns are on the screen.
+        let Some(first) = self.past_tiles(assets).map(|(_, (x, _))| x).min() else { return PastPath::default() };
+        let mut past = PastPath { camera: self.journey.camera(), first, tiles: TileSet::default() };
+        self.past_tiles(assets).for_each(|(_, (x, y))| past.tiles.insert((x - first, y)));
+        past
     }
 
     /// The past path's tiles that are on the screen, each with its left edge in pixels, cut towards zero as it is drawn.
@@ -186,22 +275,26 @@ impl State {
         }
     }
 
-    fn draw_cross(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
-        if let Some((x, y)) = self.cross {
-            assets.cross.blit(canvas, x - CROSS / 2, y - CROSS / 2);
-        }
-    }
-
-    fn draw_stamina(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
-        let bar = |y, height| Rect { x: SCREEN as i32 - STAMINA_BAR, y, width: STAMINA_BAR, height };
+    fn spent_stamina(&self, assets: &Assets) -> i32 {
         let left = self.journey.stamina_share(assets.parameters.stamina_level);
-        let spent = (SCREEN as f64 * (1.0 - left)) as i32;
-        canvas.draw_rect(RED, bar(0, spent), 0);
-        canvas.draw_rect(GREEN, bar(spent, SCREEN as i32 - spent), 0);
+        (SCREEN as f64 * (1.0 - left)) as i32
     }
 }
 
 impl Assets {
+    fn paint_background(&self, scrolled: i32, canvas: &mut Canvas<'_>) {
+        if self.background.is_empty() {
+            canvas.fill(BLACK);
+        } else {
+            canvas.paste(&self.background[scrolled as usize * SCREEN * 3..][..FRAME_BYTES]);
+        }
+    }
+
+    fn draw_cross(&self, centre: (i32, i32), canvas: &mut Canvas<'_>) {
+        let (x, y) = cross_corner(centre);
+        self.cross.blit(canvas, x, y);
+    }
+
     fn draw_past_tile(&self, canvas: &mut Canvas<'_>, left: i32, top: i32) {
         if (0..=SCREEN as i32 - TILE).contains(&left) {
             self.past_tile.blit(canvas, left, top);

@@ -26,7 +26,7 @@ mod tests;
 
 use std::sync::Arc;
 
-pub use drawing::Assets;
+pub use drawing::{Assets, Scene};
 pub use journey::Direction;
 pub use parameters::{Parameters, SPECS, Variant};
 pub use rules::State;
@@ -46,6 +46,7 @@ impl Environment for MysteryPath {
     type Variant = Variant;
     type Assets = Assets;
     type State = State;
+    type Scene = Scene;
 
     fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
         Assets::new(variant, Parameters::new(variant, parameters))
@@ -66,8 +67,20 @@ impl Environment for MysteryPath {
         self.state.play(&self.assets, action, random)
     }
 
-    fn draw(&self, frame: &mut [u8]) {
-        self.state.draw_frame(&self.assets, frame);
+    fn shared(&self) -> &Arc<Assets> {
+        &self.assets
+    }
+
+    fn scene(&self) -> Scene {
+        self.state.scene(&self.assets)
+    }
+
+    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.paint(assets, canvas);
+    }
+
+    fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.damage_since(shown, assets).repair(canvas, |canvas| scene.paint(assets, canvas));
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {

@@ -131,7 +131,7 @@ impl SearingSpotlights {
             out[AGENT + 1..AGENT + 3].copy_from_slice(&share(agent.position));
             out[AGENT + 3..AGENT + 5].copy_from_slice(&agent.heading());
         }
-        out[HEALTH] = 1.0 - self.damage_width().min(HALF) as f32 / HALF as f32;
+        out[HEALTH] = 1.0 - f32::from(self.state.red_columns.min(HALF as u8)) / HALF as f32;
         if parameters.show_last_action {
             let direction = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
             out[LAST_ACTION..LAST_ACTION + 2].copy_from_slice(&state.shown_action.map(direction));
@@ -158,8 +158,8 @@ impl SearingSpotlights {
         if state.darkness > 0 {
             let circles = state.lit.iter().filter(|circle| circle.is_on_screen());
             for (circle, out) in circles.zip(out[SPOTLIGHT..].chunks_exact_mut(3)) {
-                let [x, y] = share((circle.x, circle.y));
-                out.copy_from_slice(&[circle.radius as f32 / SCREEN as f32, x, y]);
+                let [x, y] = share(circle.centre());
+                out.copy_from_slice(&[f32::from(circle.radius) / SCREEN as f32, x, y]);
                 lit += 1;
             }
         }

@@ -24,8 +24,11 @@
 mod drawing;
 pub mod expert;
 mod features;
+mod light;
 pub mod parameters;
 mod rules;
+mod scene;
+mod shape;
 mod spawning;
 mod spotlight;
 #[cfg(test)]
@@ -37,6 +40,7 @@ use std::sync::Arc;
 pub use drawing::Assets;
 pub use parameters::{Parameters, SPECS, Variant};
 pub use rules::{SearingSpotlights, State};
+pub use scene::Scene;
 
 use crate::envs::{Environment, InvalidState, ResetParameters, Transition};
 use crate::random::Generator;
@@ -46,6 +50,7 @@ impl Environment for SearingSpotlights {
     type Variant = Variant;
     type Assets = Assets;
     type State = State;
+    type Scene = Scene;
 
     fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
         Assets::new(variant, Parameters::new(variant, parameters))
@@ -66,8 +71,20 @@ impl Environment for SearingSpotlights {
         self.state.play(&self.assets, action, random)
     }
 
-    fn draw(&self, frame: &mut [u8]) {
-        self.draw_frame(frame);
+    fn shared(&self) -> &Arc<Assets> {
+        &self.assets
+    }
+
+    fn scene(&self) -> Scene {
+        self.shown_scene()
+    }
+
+    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.paint(assets, canvas);
+    }
+
+    fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.repaint(shown, assets, canvas);
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {

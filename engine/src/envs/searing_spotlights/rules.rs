@@ -48,6 +48,8 @@ pub struct State {
     /// The frame is the first of its episode.
     pub(super) first_frame: bool,
     pub(super) health: f64,
+    /// Columns of the health bar that have turned red; beyond its half of the screen for health below zero.
+    pub(super) red_columns: u8,
     pub(super) spotlights: Vec<Spotlight>,
     spawn_timer: i64,
     spawns_left: i64,
@@ -95,6 +97,7 @@ impl State {
             former_agent: None,
             first_frame: true,
             health: 0.0,
+            red_columns: 0,
             spotlights: Vec::new(),
             spawn_timer: 0,
             spawns_left: 0,
@@ -124,13 +127,14 @@ impl State {
         self.agent.is_valid()
             && self.former_agent.is_none_or(|agent| agent.is_valid())
             && self.health.is_finite()
+            && usize::from(self.red_columns) <= SCREEN
             && self.spotlights.len() <= MAX_SPOTLIGHTS
             && self.spotlights.iter().all(Spotlight::is_valid)
             && self.lit.len() <= MAX_SPOTLIGHTS
             && self
                 .lit
                 .iter()
-                .all(|circle| near((circle.x, circle.y)) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius))
+                .all(|circle| near(circle.centre()) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius.into()))
             && self.coins.iter().copied().chain(self.exit.map(|exit| exit.location)).all(near)
             && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
             && self.coins_collected < u32::MAX / 2
@@ -150,6 +154,7 @@ impl State {
         self.success = false;
         self.hit = false;
         self.health = parameters.agent_health;
+        self.red_columns = 0;
         self.last_action = [0, 0];
         self.shown_action = [0, 0];
         self.last_reward_positive = false;
@@ -274,6 +279,10 @@ impl State {
         }
         if self.hit {
             self.health -= parameters.spot_damage;
+            let lost = (SCREEN / 2) as f64 * (1.0 - self.health_share(parameters));
+            // pygame keeps a width's low 32 bits, and paints no rectangle for a negative one.
+            let width = (lost as i64 as i32).clamp(0, SCREEN as i32);
+            self.red_columns = self.red_columns.max(width as u8);
         }
         self.lay_ground(parameters);
         if self.hit { parameters.reward_inside_spotlight } else { parameters.reward_outside_spotlight }

@@ -6,9 +6,11 @@ use serde::{Deserialize, Serialize};
 
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
 use super::rules::{BAR_HEIGHT, FAR};
+use super::shape::Shape;
 use crate::envs::SCREEN;
 use crate::envs::vector::{lerp, rotate};
 use crate::random::Generator;
+use crate::raster::Rect;
 
 /// A spotlight on its way across the screen, along a parabola from one place off the screen to another.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -80,31 +82,48 @@ impl Spotlight {
     /// The circle that it lights up.
     pub fn circle(&self) -> Circle {
         let [x, y] = self.location;
-        Circle { x: x as i32, y: y as i32, radius: self.radius }
+        Circle { x: x as i16, y: y as i16, radius: self.radius as i16 }
     }
 }
 
 /// A lit circle, in pixels of the screen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Circle {
-    pub x: i32,
-    pub y: i32,
-    pub radius: i32,
+    pub x: i16,
+    pub y: i16,
+    pub radius: i16,
 }
 
 impl Circle {
-    /// Whether a part of it may be seen: on the screen, and not only behind the bar at the top.
-    pub fn is_on_screen(&self) -> bool {
-        let columns = self.x - self.radius..self.x + self.radius;
-        let rows = self.y - self.radius..self.y + self.radius;
-        let size = SCREEN as i32;
-        columns.start < size && columns.end > 0 && rows.start < size && rows.end > BAR_HEIGHT as i32 && self.radius > 0
+    /// Its centre.
+    pub fn centre(&self) -> (i32, i32) {
+        (self.x.into(), self.y.into())
     }
 
-    /// Whether it covers a place.
+    /// The smallest rectangle about it.
+    #[inline]
+    pub fn bounds(&self) -> Rect {
+        let ((x, y), radius) = (self.centre(), i32::from(self.radius));
+        Rect::new(x - radius, y - radius, 2 * radius, 2 * radius)
+    }
+
+    /// Whether a part of it may be seen: on the screen, and not only behind the bar at the top.
+    #[inline]
+    pub fn is_on_screen(&self) -> bool {
+        const BELOW_BAR: Rect = Rect::new(0, BAR_HEIGHT as i32, SCREEN as i32, (SCREEN - BAR_HEIGHT) as i32);
+        self.bounds().overlaps(&BELOW_BAR)
+    }
+
+    /// Whether a pixel is lit by it.
+    #[inline]
+    pub fn covers(&self, (x, y): (i32, i32)) -> bool {
+        Shape::of(self.radius).disc.contains((x - i32::from(self.x), y - i32::from(self.y)))
+    }
+
+    /// Whether a place is within its radius.
     pub fn contains(&self, (x, y): (i32, i32)) -> bool {
-        let (x, y) = (x - self.x, y - self.y);
-        x * x + y * y < self.radius * self.radius
+        let (x, y, radius) = (x - i32::from(self.x), y - i32::from(self.y), i32::from(self.radius));
+        x * x + y * y < radius * radius
     }
 }
 

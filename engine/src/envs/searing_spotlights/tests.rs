@@ -207,3 +207,21 @@ fn features_tell_what_the_frame_shows() {
     assert_eq!((burnt[AGENT], burnt[HIT], burnt[LIGHT]), (1.0, 1.0, 0.0));
     assert!(burnt[HEALTH] < 1.0 && burnt[SPOTLIGHT] > 2.0);
 }
+
+#[test]
+fn a_width_beyond_32_bits_wraps() {
+    // What `pygame.draw.rect` of pygame 2.4 paints of a bar that is `width` wide.
+    for (width, red) in [(41_i64, 41), (1 << 30, 84), (1 << 31, 0), ((1 << 32) - 5, 0), ((1 << 32) + 5, 5)] {
+        let damage = (width as f64 + 0.5) / 42.0;
+        let options = json!({"spot_min_radius": 200.0, "spot_max_radius": 200.0, "spot_min_speed": 0.1,
+                             "spot_max_speed": 0.1, "agent_health": 1.0, "spot_damage": damage});
+        let (mut environment, mut random) = started(FINITE, &options, 8);
+        let mut steps = 0;
+        while !environment.state.hit {
+            environment.step(&[0, 0], &mut random);
+            steps += 1;
+            assert!(steps < 50);
+        }
+        assert_eq!(environment.state.red_columns, red, "{width}");
+    }
+}

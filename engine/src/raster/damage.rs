@@ -1,0 +1,98 @@
+//! Which parts of a picture have to be painted anew.
+
+use super::{Canvas, Rect};
+
+/// Most rectangles that are kept apart.
+const MOST: usize = 8;
+
+/// A few rectangles of a canvas, none of which overlap: the old and the new places of what has changed.
+#[derive(Clone, Copy, Debug)]
+pub struct Damage {
+    canvas: Rect,
+    rects: [Rect; MOST],
+    count: usize,
+}
+
+impl Damage {
+    /// No damage to a canvas of that size.
+    pub fn new(width: usize, height: usize) -> Self {
+        let canvas = Rect::new(0, 0, width as i32, height as i32);
+        Damage { canvas, rects: [Rect::default(); MOST], count: 0 }
+    }
+
+    /// Everything that changes within `rect` has to be painted.
+    #[inline]
+    pub fn add(&mut self, rect: Rect) {
+        let mut rect = self.canvas.intersection(&rect);
+        if rect.width <= 0 || rect.height <= 0 {
+            return;
+        }
+        let mut at = 0;
+        while at < self.count {
+            // One that has grown may overlap those that it was compared with before.
+            if self.rects[at].overlaps(&rect) || self.count == MOST {
+                rect = self.rects[at].union(&rect);
+                self.count -= 1;
+                self.rects[at] = self.rects[self.count];
+                at = 0;
+            } else {
+                at += 1;
+            }
+        }
+        self.rects[self.count] = rect;
+        self.count += 1;
+    }
+
+    /// Whether anything within `rect` is to be painted.
+    #[inline]
+    pub fn overlaps(&self, rect: &Rect) -> bool {
+        self.rects().iter().any(|damaged| damaged.overlaps(rect))
+    }
+
+    /// The rectangles.
+    pub fn rects(&self) -> &[Rect] {
+        &self.rects[..self.count]
+    }
+
+    /// Has all of it painted: `paint` gets the canvas with each of the rectangles as its clip.
+    #[inline]
+    pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
+        self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn covers(rects: &[Rect], x: i32, y: i32) -> usize {
+        rects.iter().filter(|rect| rect.overlaps(&Rect::new(x, y, 1, 1))).count()
+    }
+
+    proptest! {
+        #[test]
+        fn every_damaged_pixel_is_painted_once(
+            added in prop::collection::vec((-9..30_i32, -9..30_i32, -2..12_i32, -2..12_i32), 0..20),
+        ) {
+            let added: Vec<Rect> = added.iter().map(|&(x, y, width, height)| Rect::new(x, y, width, height)).collect();
+            let mut damage = Damage::new(24, 16);
+            added.iter().for_each(|rect| damage.add(*rect));
+            for (x, y) in (-9..40).flat_map(|x| (-9..40).map(move |y| (x, y))) {
+                let on_canvas = (0..24).contains(&x) && (0..16).contains(&y);
+                let painted = covers(damage.rects(), x, y);
+                prop_assert!(painted <= usize::from(on_canvas));
+                prop_assert!(painted == 1 || !on_canvas || covers(&added, x, y) == 0);
+            }
+        }
+    }
+
+    #[test]
+    fn far_away_is_no_damage() {
+        let mut damage = Damage::new(84, 84);
+        damage.add(Rect::new(i32::MAX, 3, i32::MAX, 4));
+        damage.add(Rect::new(i32::MIN, i32::MIN, 5, 5));
+        assert!(damage.rects().is_empty());
+    }
+}
