@@ -238,7 +238,7 @@ fn a_reset_may_bring_other_options() {
 #[test]
 fn without_frames_nothing_else_changes() {
     let mut with = Player::new(&PoolConfig { features: true, ..config(3) }, 1);
-    let mut without = Player::new(&PoolConfig { features: true, frames: false, ..config(3) }, 1);
+    let mut without = Player::new(&PoolConfig { features: true, frames: None, ..config(3) }, 1);
     for _ in 0..100 {
         with.step_at_random();
         without.step_at_random();

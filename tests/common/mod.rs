@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use endless_gym::envs::{Kind, Parameter, Spec};
+use endless_gym::raster::PixelFormat;
 use proptest::prelude::*;
 use serde_json::{Map, Value as Json};
 
@@ -66,4 +67,13 @@ pub fn options(spec: &'static Spec) -> impl Strategy<Value = Map<String, Json>> 
         })
         .collect();
     options.prop_map(|options| options.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect())
+}
+
+/// Any format of the pixels.
+pub fn pixel_format() -> impl Strategy<Value = PixelFormat> {
+    any::<[bool; 3]>().prop_map(|[grayscale, channels_first, row_major]| PixelFormat {
+        grayscale,
+        channels_first,
+        row_major,
+    })
 }

@@ -6,7 +6,7 @@
 //!
 //! | section | type, row shape | what |
 //! | --- | --- | --- |
-//! | `observation` | uint8 (84, 84, 3) | the frame, indexed \[x\]\[y\]\[channel\] as the original returns it; unless left out |
+//! | `observation` | uint8 (84, 84, 3) | the frame, indexed \[x\]\[y\]\[channel\] as the original returns it; or as [`Frames`] says; unless left out |
 //! | `vector_observation` | float32 (180,) | the commands, one-hot; ids with `MortarMayhemB` only |
 //! | `features` | float32 (k,) | what the frame shows, in numbers; only where asked for |
 //! | `reward` | float64 () | reward of this step |
@@ -25,11 +25,13 @@
 //! episode in a step that ends one, while reward, flags, `episode_*` and `info` belong to the episode that ended.
 
 mod block;
+mod frames;
 mod layout;
 mod stamp;
 mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
+pub use frames::{Frames, MAX_STACK};
 pub use layout::{Dtype, Element, Layout, Section};
 pub(crate) use stamp::Stamp;
 pub use view::{Batch, BatchMut, Contents, OPTIONS_BYTES, RowsMut, action_layout, batch_layout};

@@ -1,14 +1,15 @@
 //! A batch as arrays: for the pool, which writes it slice by slice, and for readers.
 
 use super::block::Block;
+use super::frames::Frames;
 use super::layout::{Dtype, Element, Layout};
-use crate::envs::{SCREEN, Spec};
+use crate::envs::Spec;
 
 /// Which sections a batch has where there is a choice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Contents {
-    /// The frames. Without them nothing is drawn.
-    pub frames: bool,
+    /// The frames; without them nothing is drawn.
+    pub frames: Option<Frames>,
     /// The feature observation.
     pub features: bool,
     /// The last observation of episodes that same-step auto-reset ends.
@@ -18,8 +19,8 @@ pub struct Contents {
 /// The sections of an observation, which same-step auto-reset keeps a second time for the episode that ended.
 fn observation_sections(spec: &Spec, contents: Contents) -> Vec<(&'static str, Dtype, Vec<usize>)> {
     let mut sections = Vec::new();
-    if contents.frames {
-        sections.push(("observation", Dtype::Uint8, vec![SCREEN, SCREEN, 3]));
+    if let Some(frames) = contents.frames {
+        sections.push(("observation", Dtype::Uint8, frames.shape()));
     }
     if spec.vector_observation > 0 {
         sections.push(("vector_observation", Dtype::Float32, vec![spec.vector_observation]));
@@ -182,7 +183,7 @@ impl<'a> Batch<'a> {
         self.layout.read(self.blocks, name)
     }
 
-    /// Frames, uint8 (num_envs, 84, 84, 3), indexed \[x\]\[y\]\[channel\].
+    /// Frames, uint8 (num_envs, 84, 84, 3), indexed \[x\]\[y\]\[channel\], or as [`Frames`] says.
     pub fn observation(&self) -> &'a [u8] {
         self.section("observation")
     }

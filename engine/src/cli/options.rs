@@ -1,6 +1,8 @@
 //! Options that several commands share.
 
+use crate::batch::Frames;
 use crate::pool::{Autoreset, Options, PoolConfig, Seeding};
+use crate::raster::PixelFormat;
 use clap::ValueEnum;
 use serde_json::{Map, Value as Json};
 
@@ -15,6 +17,35 @@ pub enum AutoresetMode {
     SameStep,
     /// Wait for the trainer to reset.
     Disabled,
+}
+
+/// What the frames are like.
+#[derive(clap::Args, Clone, Copy, Debug)]
+pub struct FrameArgs {
+    /// Leave the frames out, and draw nothing.
+    #[arg(long, conflicts_with_all = ["grayscale", "channels_first", "row_major", "frame_stack"])]
+    no_frames: bool,
+    /// Frames of brightness instead of colours, without an index for the channel.
+    #[arg(long)]
+    grayscale: bool,
+    /// Frames with the channel as their first index.
+    #[arg(long)]
+    channels_first: bool,
+    /// Frames indexed [row][column] instead of [x][y].
+    #[arg(long)]
+    row_major: bool,
+    /// The last N frames of the episode as one observation, oldest first.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    frame_stack: usize,
+}
+
+impl FrameArgs {
+    /// What the batch is to have.
+    pub fn frames(self) -> Option<Frames> {
+        let FrameArgs { no_frames, grayscale, channels_first, row_major, frame_stack } = self;
+        let format = PixelFormat { grayscale, channels_first, row_major };
+        (!no_frames).then_some(Frames { format, stack: frame_stack })
+    }
 }
 
 /// What the environments are like.

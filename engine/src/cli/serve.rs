@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use crate::pool::{PoolConfig, Threads};
 use crate::service::{Engine, EngineConfig};
 
-use super::options::{AutoresetMode, EnvironmentArgs};
+use super::options::{AutoresetMode, EnvironmentArgs, FrameArgs};
 use super::output::{grouped, print};
 use super::{Failure, stop};
 
@@ -37,9 +37,8 @@ pub struct Args {
     /// Add the feature observation: what a frame shows, in numbers.
     #[arg(long)]
     features: bool,
-    /// Leave the frames out, and draw nothing.
-    #[arg(long)]
-    no_frames: bool,
+    #[command(flatten)]
+    frames: FrameArgs,
     /// Batches of a group that a trainer may hold at a time.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
@@ -56,7 +55,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     let pool = PoolConfig {
         autoreset: args.autoreset.into(),
         final_observation: args.final_observation,
-        frames: !args.no_frames,
+        frames: args.frames.frames(),
         features: args.features,
         ..args.environment.configure(&args.id, args.num_envs)?
     };

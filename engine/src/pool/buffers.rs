@@ -79,7 +79,7 @@ impl Buffers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::batch::{Contents, batch_layout, zeroed};
+    use crate::batch::{Contents, Frames, batch_layout, zeroed};
     use crate::envs;
 
     fn write(buffers: &mut Buffers, layout: &Layout, batch: &mut [Block]) -> Buffer {
@@ -89,7 +89,7 @@ mod tests {
     }
 
     fn layout() -> Layout {
-        let contents = Contents { frames: true, features: false, final_observation: false };
+        let contents = Contents { frames: Some(Frames::default()), features: false, final_observation: false };
         batch_layout(envs::specs().next().unwrap(), 1, contents)
     }
 

@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value as Json};
 
+use super::history::History;
 use super::seeding::Seeds;
-use super::shown::{Drawing, Shown, WrongFrame};
+use super::shown::{self, Drawing, Shown, WrongFrame};
 use super::snapshot::{Saved, SnapshotError};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
@@ -20,6 +21,7 @@ struct Lane<E: Environment> {
     seeds: Seeds,
     episode_return: f64,
     episode_length: i32,
+    history: History<E::Scene>,
     /// The last step ended the episode, and the next one is to start a new one (next-step auto-reset).
     ended: bool,
     /// The reset parameters that were given.
@@ -35,18 +37,25 @@ impl<E: Environment> Lane<E> {
             self.random = Generator::from_seed(seed);
         }
         self.env.reset(&self.assets, &mut self.random);
+        self.history.restart(|| self.env.scene());
         self.episode_return = 0.0;
         self.episode_length = 0;
         self.ended = false;
     }
 
+    /// The scenes of the observation's frames.
+    fn scenes(&self) -> impl Iterator<Item = E::Scene> {
+        self.history.scenes(|| self.env.scene())
+    }
+
     /// Plays a step and writes its row, without its frame.
-    fn step(&mut self, autoreset: Autoreset, action: &[i32], out: &mut BatchMut<'_>, row: usize) {
+    fn step(&mut self, autoreset: Autoreset, drawing: Drawing, action: &[i32], out: &mut BatchMut<'_>, row: usize) {
         if self.ended && autoreset == Autoreset::NextStep {
             self.start_episode(None);
             return self.write_start(out, row);
         }
         let transition = self.env.step(action, &mut self.random);
+        self.history.push(|| self.env.scene());
         self.episode_return += transition.reward;
         self.episode_length += 1;
         self.ended = transition.terminated;
@@ -54,7 +63,7 @@ impl<E: Environment> Lane<E> {
         if transition.terminated {
             self.env.info(out.info.row(row));
             if autoreset == Autoreset::SameStep {
-                self.write_final_observation(out, row);
+                self.write_final_observation(drawing, out, row);
                 self.start_episode(None);
             }
         } else {
@@ -85,8 +94,12 @@ impl<E: Environment> Lane<E> {
         write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
     }
 
-    fn write_final_observation(&self, out: &mut BatchMut<'_>, row: usize) {
-        write_if_present(out.final_observation.row(row), |r| self.env.draw(r));
+    fn write_final_observation(&self, drawing: Drawing, out: &mut BatchMut<'_>, row: usize) {
+        write_if_present(out.final_observation.row(row), |r| {
+            for (scene, frame) in self.scenes().zip(r.chunks_exact_mut(r.len() / self.history.length())) {
+                shown::draw::<E>(self.env.shared(), &scene, drawing.format, frame);
+            }
+        });
         write_if_present(out.final_vector_observation.row(row), |r| self.env.vector_observation(r));
         write_if_present(out.final_features.row(row), |r| self.env.features(r));
         write_if_present(out.final_ground_truth.row(row), |r| self.env.ground_truth(r));
@@ -135,6 +148,8 @@ pub(super) struct FamilyLanes<E: Environment> {
     lanes: Vec<Lane<E>>,
     /// What the frames show, of each buffer by its slot.
     shown: Vec<Vec<Shown<E>>>,
+    /// Frames in an observation.
+    stack: usize,
     spec: &'static Spec,
     variant: E::Variant,
 }
@@ -144,6 +159,7 @@ impl<E: Environment> FamilyLanes<E> {
     pub(super) fn new(
         spec: &'static Spec,
         variant: E::Variant,
+        stack: usize,
         environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds)>,
     ) -> Self {
         let lanes = environments
@@ -154,11 +170,12 @@ impl<E: Environment> FamilyLanes<E> {
                 seeds,
                 episode_return: 0.0,
                 episode_length: 0,
+                history: History::new(stack),
                 ended: false,
                 options,
             })
             .collect();
-        FamilyLanes { lanes, shown: Vec::new(), spec, variant }
+        FamilyLanes { lanes, shown: Vec::new(), stack, spec, variant }
     }
 
     /// Writes all rows: `play` writes everything but the frame of the row that it gets, with the environment's number.
@@ -169,19 +186,23 @@ impl<E: Environment> FamilyLanes<E> {
         play: impl Fn(usize, &mut Lane<E>, &mut BatchMut<'_>, usize) + Sync,
     ) -> Result<(), WrongFrame> {
         while self.shown.len() <= work.slot {
-            self.shown.push(self.lanes.iter().map(|_| Shown::nothing()).collect());
+            self.shown.push((0..self.lanes.len() * self.stack).map(|_| Shown::nothing()).collect());
         }
-        let whole = Slice { first: 0, lanes: &mut self.lanes, shown: &mut self.shown[work.slot], out };
+        let (stack, shown) = (self.stack, &mut self.shown[work.slot]);
+        let whole = Slice { first: 0, lanes: &mut self.lanes, shown, stack, out };
         whole.divide(work.slices, &|slice| {
-            let Slice { first, lanes, shown, mut out } = slice;
-            for (row, (lane, shown)) in lanes.iter_mut().zip(shown).enumerate() {
+            let Slice { first, lanes, shown, mut out, .. } = slice;
+            for (row, (lane, shown)) in lanes.iter_mut().zip(shown.chunks_exact_mut(stack)).enumerate() {
                 play(first + row, lane, &mut out, row);
-                let frame = out.observation.row(row);
-                if frame.is_empty() {
+                let frames = out.observation.row(row);
+                if frames.is_empty() {
                     continue;
                 }
-                let drawn = shown.update(&lane.env, work.drawing, frame);
-                drawn.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
+                let frames = frames.chunks_exact_mut(frames.len() / stack);
+                for ((scene, shown), frame) in lane.scenes().zip(shown).zip(frames) {
+                    let drawn = shown.update(lane.env.shared(), scene, work.drawing, frame);
+                    drawn.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
+                }
             }
             Ok(())
         })
@@ -201,7 +222,7 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
     fn step(&mut self, work: Work, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) -> Result<(), WrongFrame> {
         let branches = self.spec.action_space.branches().len();
         self.write(work, out, |env, lane, out, row| {
-            lane.step(autoreset, &actions[env * branches..][..branches], out, row);
+            lane.step(autoreset, work.drawing, &actions[env * branches..][..branches], out, row);
         })
     }
 
@@ -257,6 +278,7 @@ impl<E: Environment> Lanes for FamilyLanes<E> {
         let (assets, options) = self.with_options(&options)?;
         let lane = &mut self.lanes[env];
         lane.env.restore(&assets, saved.state)?;
+        lane.history.restart(|| lane.env.scene());
         lane.assets = assets;
         lane.options = options;
         lane.random = saved.random;
@@ -277,7 +299,9 @@ struct Slice<'a, E: Environment> {
     /// Number of the first environment.
     first: usize,
     lanes: &'a mut [Lane<E>],
+    /// By environment, as many as there are frames in an observation.
     shown: &'a mut [Shown<E>],
+    stack: usize,
     out: BatchMut<'a>,
 }
 
@@ -294,10 +318,11 @@ impl<E: Environment> Slice<'_, E> {
         let left = slices / 2;
         let middle = self.lanes.len() * left / slices;
         let (left_lanes, right_lanes) = self.lanes.split_at_mut(middle);
-        let (left_shown, right_shown) = self.shown.split_at_mut(middle);
+        let (left_shown, right_shown) = self.shown.split_at_mut(middle * self.stack);
         let (left_out, right_out) = self.out.split_at(middle);
-        let one = Slice { first: self.first, lanes: left_lanes, shown: left_shown, out: left_out };
-        let other = Slice { first: self.first + middle, lanes: right_lanes, shown: right_shown, out: right_out };
+        let (first, stack) = (self.first, self.stack);
+        let one = Slice { first, lanes: left_lanes, shown: left_shown, stack, out: left_out };
+        let other = Slice { first: first + middle, lanes: right_lanes, shown: right_shown, stack, out: right_out };
         let (one, other) = rayon::join(|| one.divide(left, work), || other.divide(slices - left, work));
         one.and(other)
     }

@@ -1,6 +1,7 @@
 //! Many environments of one id, stepped in lockstep by worker threads.
 
 mod buffers;
+mod history;
 mod lanes;
 mod seeding;
 mod shown;
@@ -13,12 +14,13 @@ use std::sync::Arc;
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
-use crate::batch::{BatchMut, Block, Contents, Layout, batch_layout};
+use crate::batch::{BatchMut, Block, Contents, Frames, Layout, MAX_STACK, batch_layout};
 use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
 use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
+use crate::raster::PixelFormat;
 use buffers::Buffers;
 use lanes::{FamilyLanes, Lanes, Work};
 pub use seeding::Seeding;
@@ -72,8 +74,8 @@ pub struct PoolConfig {
     /// Whether same-step auto-reset keeps the last observation of an episode, in the `final_*` sections.
     pub final_observation: bool,
     pub seeding: Seeding,
-    /// Whether the batch has the frames. Without them nothing is drawn.
-    pub frames: bool,
+    /// What the frames in the batch look like; without them nothing is drawn.
+    pub frames: Option<Frames>,
     /// Whether the batch has the feature observation.
     pub features: bool,
     /// Whether every frame is drawn a second time, in full, and compared: a difference is [`PoolError::WrongFrame`]. For tests.
@@ -94,7 +96,7 @@ impl PoolConfig {
             autoreset: Autoreset::default(),
             final_observation: false,
             seeding: Seeding::Continue { seed: None },
-            frames: true,
+            frames: Some(Frames::default()),
             features: false,
             check_drawing: false,
             first_env: 0,
@@ -162,6 +164,7 @@ pub struct Pool {
     layout: Layout,
     lanes: Box<dyn Lanes>,
     buffers: Buffers,
+    format: PixelFormat,
     check_drawing: bool,
     autoreset: Autoreset,
     threads: Threads,
@@ -174,6 +177,11 @@ impl Pool {
         let spec = envs::spec(&config.id)?;
         if !(1..=MAX_ENVS).contains(&config.num_envs) {
             return Err(PoolError::NumEnvs { given: config.num_envs });
+        }
+        if let Some(Frames { stack: given, .. }) = config.frames
+            && !(1..=MAX_STACK).contains(&given)
+        {
+            return Err(PoolError::Stack { given });
         }
         match &config.seeding {
             Seeding::List(seeds) if seeds.is_empty() => return Err(PoolError::NoSeeds),
@@ -200,6 +208,7 @@ impl Pool {
             ),
             lanes,
             buffers: Buffers::new(),
+            format: config.frames.unwrap_or_default().format,
             check_drawing: config.check_drawing,
             autoreset: config.autoreset,
             threads: threads.clone(),
@@ -276,7 +285,7 @@ impl Pool {
             return Err(PoolError::BatchTooShort { given, needed });
         }
         let buffer = self.buffers.begin(&self.layout, batch);
-        let drawing = Drawing { known: buffer.known, check: self.check_drawing };
+        let drawing = Drawing { known: buffer.known, format: self.format, check: self.check_drawing };
         let work = Work { slices: self.slices(), slot: buffer.slot, drawing };
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
         let lanes = &mut *self.lanes;
@@ -300,7 +309,8 @@ impl Pool {
     /// Puts an environment of the same id into the state that a snapshot was taken in, also one of another pool, with other
     /// reset parameters: it goes on identically. [`observe`](Pool::observe) shows what it looks like.
     ///
-    /// The seeds of later episodes are the snapshot's too where both pools have the same kind of [`Seeding`].
+    /// The seeds of later episodes are the snapshot's too where both pools have the same kind of [`Seeding`]. An observation of
+    /// several frames shows the snapshot's as if it was the episode's first.
     pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
         self.check_env(env)?;
         self.lanes.restore(env, snapshot)
@@ -383,7 +393,8 @@ fn family_lanes<E: Environment>(
     let environments = made.into_iter().enumerate().map(|(env, (options, assets))| {
         (assets, options, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs))
     });
-    Ok(FamilyLanes::new(spec, variant, environments))
+    let stack = config.frames.unwrap_or_default().stack;
+    Ok(FamilyLanes::new(spec, variant, stack, environments))
 }
 
 /// A pool that cannot be made, or a call that it cannot carry out.
@@ -399,6 +410,8 @@ pub enum PoolError {
     OptionsCount { given: usize, num_envs: usize },
     #[error("{given} environments asked for; a pool has 1 to {MAX_ENVS}")]
     NumEnvs { given: usize },
+    #[error("a stack of {given} frames asked for; an observation has 1 to {MAX_STACK}")]
+    Stack { given: usize },
     #[error("the list of seeds is empty; give at least one")]
     NoSeeds,
     #[error("the range of seeds {start}..{end} is empty or ends above 2^63 - 1")]

@@ -71,18 +71,13 @@ impl Canvas<'_> {
         if columns.is_empty() || rows.is_empty() || source.alpha() == 0 {
             return;
         }
-        let height = self.height();
-        let start = columns.start * height + rows.start;
-        let source_start = (columns.start as i64 - x) as usize * source.height() + (rows.start as i64 - y) as usize;
-        // Columns that are complete on both sides lie one after the other, as one long run.
-        let is_complete = rows.len() == height && source.height() == height;
-        let (count, length) = if is_complete { (1, columns.len() * height) } else { (columns.len(), rows.len()) };
         let mixing = Mixing::of(source);
-        for column in 0..count {
-            let run = &source.pixels().as_chunks::<3>().0[source_start + column * source.height()..][..length];
-            let below = &mut self.pixels_mut().as_chunks_mut::<3>().0[start + column * height..][..length];
+        for column in columns {
+            let first = (column as i64 - x) as usize * source.height() + (rows.start as i64 - y) as usize;
+            let run = &source.pixels().as_chunks::<3>().0[first..][..rows.len()];
             for (first, opaque) in opaque_runs(run, source.color_key()) {
-                let below = below[first..][..opaque.len()].as_flattened_mut();
+                let row = rows.start + first;
+                let below = self.run_mut(column, row..row + opaque.len());
                 mixing.paint(opaque.as_flattened(), below, source.alpha());
             }
         }

@@ -16,6 +16,8 @@ pub struct Canvas<'a> {
     /// The pixels that may change.
     columns: Range<usize>,
     rows: Range<usize>,
+    /// Of each column, a bit for each row in which a pixel was painted; `None` where nobody wants to know.
+    painted: Option<&'a mut [u128]>,
 }
 
 impl<'a> Canvas<'a> {
@@ -28,7 +30,25 @@ impl<'a> Canvas<'a> {
     pub fn new(pixels: &'a mut [u8], width: usize, height: usize) -> Self {
         let size = width.checked_mul(height).and_then(|n| n.checked_mul(3));
         assert_eq!(size, Some(pixels.len()), "the canvas' size in bytes");
-        Self { pixels, width, height, columns: 0..width, rows: 0..height }
+        Self { pixels, width, height, columns: 0..width, rows: 0..height, painted: None }
+    }
+
+    /// The same canvas, which notes what is painted: by column, a bit for each row.
+    ///
+    /// # Panics
+    ///
+    /// When there are more columns than numbers, or more rows than bits.
+    pub(super) fn noting(self, painted: &'a mut [u128]) -> Self {
+        assert!(painted.len() >= self.width && self.height <= u128::BITS as usize);
+        Self { painted: Some(painted), ..self }
+    }
+
+    /// Notes that some rows of some columns are painted.
+    #[inline]
+    fn note(&mut self, columns: Range<usize>, rows: &Range<usize>) {
+        if let Some(painted) = &mut self.painted {
+            note(&mut painted[columns], rows);
+        }
     }
 
     /// The same canvas, of which only what lies in `rect` may change.
@@ -36,7 +56,8 @@ impl<'a> Canvas<'a> {
     pub fn clipped(&mut self, rect: Rect) -> Canvas<'_> {
         let columns = clip(rect.x.into(), i64::from(rect.x) + i64::from(rect.width) - 1, &self.columns);
         let rows = clip(rect.y.into(), i64::from(rect.y) + i64::from(rect.height) - 1, &self.rows);
-        Canvas { pixels: self.pixels, width: self.width, height: self.height, columns, rows }
+        let painted = self.painted.as_deref_mut();
+        Canvas { pixels: self.pixels, width: self.width, height: self.height, columns, rows, painted }
     }
 
     /// The columns that may change.
@@ -69,15 +90,26 @@ impl<'a> Canvas<'a> {
         self.pixels
     }
 
-    /// All bytes, to be changed; whoever does keeps to [`columns`](Canvas::columns) and [`rows`](Canvas::rows).
+    /// Some rows of a column, all of which are to be painted; whoever does keeps to [`columns`](Canvas::columns) and
+    /// [`rows`](Canvas::rows).
     #[inline]
-    pub fn pixels_mut(&mut self) -> &mut [u8] {
-        self.pixels
+    pub fn run_mut(&mut self, x: usize, rows: Range<usize>) -> &mut [u8] {
+        self.note(x..x + 1, &rows);
+        let column = x * self.height;
+        &mut self.pixels[(column + rows.start) * 3..(column + rows.end) * 3]
     }
 
-    /// The part of each column that may change, with its column.
+    /// One pixel that is to be painted.
+    #[inline]
+    pub fn pixel_mut(&mut self, x: usize, y: usize) -> &mut Rgb {
+        self.note(x..x + 1, &(y..y + 1));
+        &mut self.pixels.as_chunks_mut::<3>().0[x * self.height + y]
+    }
+
+    /// The part of each column that may change, with its column; all of it is to be painted.
     #[inline]
     pub fn runs_mut(&mut self) -> impl Iterator<Item = (usize, &mut [u8])> {
+        self.note(self.columns.clone(), &self.rows.clone());
         let (height, rows) = (self.height * 3, self.rows.start * 3..self.rows.end * 3);
         let columns =
             self.pixels[self.columns.start * height..self.columns.end * height].chunks_exact_mut(height.max(1));
@@ -87,6 +119,7 @@ impl<'a> Canvas<'a> {
     /// Paints every pixel.
     pub fn fill(&mut self, color: Rgb) {
         if self.is_whole() {
+            self.note(0..self.width, &(0..self.height));
             fill_run(self.pixels, color);
         } else {
             self.runs_mut().for_each(|(_, run)| fill_run(run, color));
@@ -97,6 +130,7 @@ impl<'a> Canvas<'a> {
     #[inline]
     pub fn paste(&mut self, picture: &[u8]) {
         if self.is_whole() {
+            self.note(0..self.width, &(0..self.height));
             self.pixels.copy_from_slice(picture);
             return;
         }
@@ -128,9 +162,16 @@ impl<'a> Canvas<'a> {
             return;
         }
         for x in columns {
-            let column = x * self.height;
-            fill_run(&mut self.pixels[(column + rows.start) * 3..(column + rows.end) * 3], color);
+            fill_run(self.run_mut(x, rows.clone()), color);
         }
+    }
+}
+
+/// Notes that some rows of columns are painted.
+fn note(painted: &mut [u128], rows: &Range<usize>) {
+    if rows.start < rows.end {
+        let bits = u128::MAX >> (u128::BITS as usize - rows.len()) << rows.start;
+        painted.iter_mut().for_each(|column| *column |= bits);
     }
 }
 

@@ -202,10 +202,8 @@ impl Canvas<'_> {
 
     /// Fills a circle with a ready [`Disc`]: the same pixels as [`Canvas::draw_circle`]'s.
     pub fn fill_disc(&mut self, color: Rgb, center: (i32, i32), disc: &Disc) {
-        let height = self.height();
         for DiscColumn { x, rows } in disc.columns(center, &self.columns(), self.rows()) {
-            let column = x * height;
-            fill_run(&mut self.pixels_mut()[(column + rows.start) * 3..(column + rows.end) * 3], color);
+            fill_run(self.run_mut(x, rows), color);
         }
     }
 

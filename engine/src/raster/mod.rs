@@ -5,7 +5,9 @@
 //! SDL mixes a translucent surface into another one.
 //!
 //! A picture is built on a [`Surface`]; a [`Canvas`] draws into pixels that lie elsewhere, such as
-//! an observation; a [`Sprite`] and a [`Disc`] are pictures made ready to be painted quickly.
+//! an observation; a [`Sprite`] and a [`Disc`] are pictures made ready to be painted quickly. A
+//! [`Sketch`] remembers what was painted on it, and a [`PixelFormat`] carries that to where the
+//! pixels are to lie in another order, or as grey.
 //!
 //! Pixels are RGB, column by column: the byte of channel `c` of the pixel `(x, y)` is
 //! `(x * height + y) * 3 + c`. A whole surface is thus byte for byte the array `[x][y][c]` that
@@ -18,10 +20,12 @@ mod blit;
 mod canvas;
 mod circle;
 mod damage;
+mod format;
 mod line;
 mod rectangle;
 mod rotate;
 mod scale;
+mod sketch;
 mod sprite;
 mod surface;
 
@@ -32,7 +36,9 @@ pub use blit::{blend_keyed, blend_plain};
 pub use canvas::Canvas;
 pub use circle::{Disc, DiscColumn, circle_outline};
 pub use damage::Damage;
+pub use format::PixelFormat;
 pub use rectangle::{CornerRadii, Rect};
+pub use sketch::Sketch;
 pub use sprite::{Sprite, copy_run};
 pub use surface::Surface;
 

@@ -79,25 +79,20 @@ impl Sprite {
     /// Paints a sprite whose bounds may change as a whole.
     #[inline]
     fn blit_whole(&self, canvas: &mut Canvas<'_>, x: i32, y: i32) {
-        let height = canvas.height();
-        // Negative where the sprite's empty margin reaches beyond the canvas; the runs do not.
-        let corner = i64::from(x) * height as i64 + i64::from(y);
-        let pixels = canvas.pixels_mut();
         let mut remaining = self.pixels.as_slice();
         for run in &self.runs {
-            let start = (corner + i64::from(run.x) * height as i64 + i64::from(run.y)) as usize * 3;
+            // The sprite's empty margin may reach beyond the canvas; the runs do not.
+            let (column, row) = ((x + run.x as i32) as usize, (y + run.y as i32) as usize);
             let (source, rest) = remaining.split_at(run.length as usize * 3);
             remaining = rest;
-            copy_run(source, &mut pixels[start..][..source.len()]);
+            copy_run(source, canvas.run_mut(column, row..row + run.length as usize));
         }
     }
 
     /// Paints the part of the sprite that lies on the canvas.
     fn blit_clipped(&self, canvas: &mut Canvas<'_>, x: i64, y: i64) {
-        let (height, columns, rows) = (canvas.height(), canvas.columns(), canvas.rows());
-        let pixels = canvas.pixels_mut();
-        for (column, rows, source) in self.runs_on(columns, rows, x, y) {
-            pixels[(column * height + rows.start) * 3..][..source.len()].copy_from_slice(source);
+        for (column, rows, source) in self.runs_on(canvas.columns(), canvas.rows(), x, y) {
+            canvas.run_mut(column, rows).copy_from_slice(source);
         }
     }
 
@@ -113,23 +108,19 @@ impl Sprite {
         {
             return;
         }
-        let (height, columns, rows) = (canvas.height(), canvas.columns(), canvas.rows());
-        let pixels = canvas.pixels_mut();
-        for (column, rows, source) in self.runs_on(columns, rows, i64::from(x), i64::from(y)) {
+        for (column, rows, source) in self.runs_on(canvas.columns(), canvas.rows(), i64::from(x), i64::from(y)) {
             let lit = disc.rows(center, column, &rows);
             if !lit.is_empty() {
                 let source = &source[(lit.start - rows.start) * 3..(lit.end - rows.start) * 3];
-                pixels[(column * height + lit.start) * 3..][..source.len()].copy_from_slice(source);
+                canvas.run_mut(column, lit).copy_from_slice(source);
             }
         }
     }
 
     /// Paints the sprite as it looks under a black surface of some `alpha` that has a colour key: 0 as it is, 255 black.
     pub fn blit_shaded(&self, canvas: &mut Canvas<'_>, x: i32, y: i32, alpha: u8) {
-        let (height, columns, rows) = (canvas.height(), canvas.columns(), canvas.rows());
-        let pixels = canvas.pixels_mut();
-        for (column, rows, source) in self.runs_on(columns, rows, i64::from(x), i64::from(y)) {
-            let target = &mut pixels[(column * height + rows.start) * 3..][..source.len()];
+        for (column, rows, source) in self.runs_on(canvas.columns(), canvas.rows(), i64::from(x), i64::from(y)) {
+            let target = canvas.run_mut(column, rows);
             target.iter_mut().zip(source).for_each(|(target, source)| *target = blend_keyed(0, *source, alpha));
         }
     }

@@ -366,6 +366,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Specification {
         num_envs: config.pool.num_envs,
         batch: pool.layout().clone(),
         action: action_layout(spec, config.pool.num_envs),
+        frames: config.pool.frames,
         action_space: spec.action_space.into(),
         info: spec.info.iter().map(|column| column.name.to_owned()).collect(),
         features: features.iter().map(|column| column.name.to_owned()).collect(),

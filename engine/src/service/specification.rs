@@ -22,7 +22,7 @@ use super::error::{PACKAGE_VERSION, ServiceError};
 use super::node::{Ipc, Member};
 use super::ports::{self, CLEANUP_TIMEOUT, Limits, Names, SPECIFICATION_PREFIX};
 use super::sweep;
-use crate::batch::{LAYOUT_VERSION, Layout};
+use crate::batch::{Frames, LAYOUT_VERSION, Layout};
 use crate::envs::ActionSpace;
 use crate::pool::Autoreset;
 
@@ -47,6 +47,8 @@ pub struct Specification {
     pub batch: Layout,
     /// The layout of the message that steps or resets a group.
     pub action: Layout,
+    /// What the frames in a batch look like, if it has any.
+    pub frames: Option<Frames>,
     pub action_space: Actions,
     /// Names of the columns of `info`.
     pub info: Vec<String>,
@@ -75,7 +77,7 @@ impl Specification {
             ("environment", self.id == other.id),
             ("number of groups", self.groups == other.groups),
             ("number of environments", self.num_envs == other.num_envs),
-            ("batch layout", self.batch == other.batch && self.action == other.action),
+            ("batch layout", self.batch == other.batch && self.action == other.action && self.frames == other.frames),
             ("action space", self.action_space == other.action_space),
             ("set of columns", self.info == other.info && self.features == other.features),
             ("set of options", self.options == other.options),

@@ -85,8 +85,7 @@ impl Columns {
     #[inline]
     pub fn paint_run(&self, canvas: &mut Canvas<'_>, x: usize, rows: Range<usize>) {
         if rows.start < rows.end {
-            let target = &mut canvas.pixels_mut()[(x * SCREEN + rows.start) * 3..][..rows.len() * 3];
-            copy_run(self.column(x)[rows].as_flattened(), target);
+            copy_run(self.column(x)[rows.clone()].as_flattened(), canvas.run_mut(x, rows));
         }
     }
 }

@@ -101,7 +101,7 @@ impl<'a> Change<'a> {
                         for_each_pixel(from, to, |x, y| {
                             let is_lit = others.iter().any(|other| other.covers((x as i32, y as i32)));
                             let ground = if is_lit { lit } else { dark };
-                            canvas.pixels_mut().as_chunks_mut::<3>().0[x * SCREEN + y] = ground.pixel(x, y);
+                            *canvas.pixel_mut(x, y) = ground.pixel(x, y);
                         });
                     }
                 }
@@ -156,6 +156,5 @@ fn for_each_pixel(from: &Circle, to: &Circle, mut paint: impl FnMut(usize, usize
 /// Paints the pixels that a circle leaves on its way.
 #[inline]
 fn paint_crescent(from: &Circle, to: &Circle, ground: &Columns, canvas: &mut Canvas<'_>) {
-    let pixels = canvas.pixels_mut().as_chunks_mut::<3>().0;
-    for_each_pixel(from, to, |x, y| pixels[x * SCREEN + y] = ground.pixel(x, y));
+    for_each_pixel(from, to, |x, y| *canvas.pixel_mut(x, y) = ground.pixel(x, y));
 }

@@ -3,7 +3,6 @@
 use std::sync::OnceLock;
 
 use super::parameters::MAX_SPOT_RADIUS;
-use crate::envs::SCREEN;
 use crate::raster::{Canvas, Disc, blend_keyed, circle_outline};
 
 /// How far a circle may have moved for what changes to be known beforehand, in pixels along each axis.
@@ -55,11 +54,10 @@ impl Shape {
     /// Draws the white outline of a half transparent surface over what the circle has brought back.
     pub fn draw_outline(&self, canvas: &mut Canvas<'_>, centre: (i32, i32), alpha: u8) {
         let (columns, rows) = (canvas.columns(), canvas.rows());
-        let pixels = canvas.pixels_mut().as_chunks_mut::<3>().0;
         for (x, y) in &self.outline {
             let (x, y) = ((centre.0 + x) as usize, (centre.1 + y) as usize);
             if columns.contains(&x) && rows.contains(&y) {
-                let pixel = &mut pixels[x * SCREEN + y];
+                let pixel = canvas.pixel_mut(x, y);
                 *pixel = pixel.map(|channel| blend_keyed(255, channel, alpha));
             }
         }

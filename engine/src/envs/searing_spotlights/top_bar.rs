@@ -7,7 +7,7 @@ use smallvec::SmallVec;
 use super::parameters::Variant;
 use super::rules::{BAR_HEIGHT, SearingSpotlights};
 use crate::envs::SCREEN;
-use crate::raster::{Canvas, Rect, Rgb};
+use crate::raster::{Canvas, Rect, Rgb, copy_run};
 
 const BLACK: Rgb = [0, 0, 0];
 const GREY: Rgb = [50, 50, 50];
@@ -61,16 +61,10 @@ impl Bar {
         }
         let clip = canvas.columns();
         let rows = canvas.rows().start..canvas.rows().end.min(BAR_HEIGHT);
-        let columns = canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0;
         let mut paint = |field: Range<usize>, color: Rgb| {
-            // A column's part of the bar is a block of its own, which is a store or two.
             let block: [Rgb; BAR_HEIGHT] = [color; BAR_HEIGHT];
-            let field = field.start.max(clip.start)..field.end.min(clip.end);
-            let Some(columns) = columns.get_mut(field) else { return };
-            if rows.len() == BAR_HEIGHT {
-                columns.iter_mut().for_each(|column| column[..BAR_HEIGHT].copy_from_slice(&block));
-            } else {
-                columns.iter_mut().for_each(|column| column[rows.clone()].fill(color));
+            for x in field.start.max(clip.start)..field.end.min(clip.end) {
+                copy_run(block[..rows.len()].as_flattened(), canvas.run_mut(x, rows.clone()));
             }
         };
         // In the order in which the original paints, each field over what earlier steps left behind.

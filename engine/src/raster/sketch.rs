@@ -1,0 +1,126 @@
+//! A picture that remembers which of its pixels were painted, for those who then carry only these elsewhere.
+
+use std::ops::Range;
+
+use super::{Canvas, Rgb};
+
+/// A picture that is painted in parts. What was not painted since the last [`canvas`](Sketch::canvas) means nothing.
+#[derive(Clone, Debug)]
+pub struct Sketch {
+    pixels: Vec<u8>,
+    width: usize,
+    height: usize,
+    /// By column, a bit for each row.
+    painted: Vec<u128>,
+}
+
+impl Sketch {
+    /// An unpainted sketch of at most 128 rows.
+    ///
+    /// # Panics
+    ///
+    /// With more rows.
+    pub fn new(width: usize, height: usize) -> Self {
+        assert!(height <= u128::BITS as usize, "a sketch of {height} rows");
+        Sketch { pixels: vec![0; width * height * 3], width, height, painted: vec![0; width] }
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// Forgets everything; what is painted on the canvas is remembered.
+    pub fn canvas(&mut self) -> Canvas<'_> {
+        self.painted.fill(0);
+        Canvas::new(&mut self.pixels, self.width, self.height).noting(&mut self.painted)
+    }
+
+    /// Hands out what was painted: column, rows, pixels.
+    pub fn for_each_run(&self, mut run: impl FnMut(usize, Range<usize>, &[Rgb])) {
+        let columns = self.pixels.as_chunks::<3>().0.chunks_exact(self.height.max(1));
+        for (x, (bits, column)) in self.painted.iter().zip(columns).enumerate() {
+            let mut rest = *bits;
+            while rest != 0 {
+                let start = rest.trailing_zeros() as usize;
+                let end = start + (rest >> start).trailing_ones() as usize;
+                run(x, start..end, &column[start..end]);
+                rest = rest.checked_shr(end as u32).unwrap_or(0).checked_shl(end as u32).unwrap_or(0);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::raster::{Rect, Sprite, Surface};
+
+    /// The pixels that were painted.
+    fn painted(sketch: &Sketch) -> Vec<(usize, usize)> {
+        let mut painted = Vec::new();
+        sketch.for_each_run(|x, rows, _| painted.extend(rows.map(|y| (x, y))));
+        painted
+    }
+
+    #[test]
+    fn only_what_is_painted_is_handed_out() {
+        let mut sketch = Sketch::new(5, 128);
+        let mut canvas = sketch.canvas();
+        *canvas.pixel_mut(1, 127) = [1, 2, 3];
+        canvas.draw_rect([9; 3], Rect::new(3, 0, 9, 2), 0);
+        canvas.clipped(Rect::new(0, 126, 1, 9)).fill([7; 3]);
+        assert_eq!(painted(&sketch), [(0, 126), (0, 127), (1, 127), (3, 0), (3, 1), (4, 0), (4, 1)]);
+        let mut colors = Vec::new();
+        sketch.for_each_run(|_, _, run| colors.extend_from_slice(run));
+        assert_eq!(colors, [[7; 3], [7; 3], [1, 2, 3], [9; 3], [9; 3], [9; 3], [9; 3]]);
+        sketch.canvas().fill([0; 3]);
+        assert_eq!(painted(&sketch).len(), 5 * 128);
+        sketch.canvas();
+        assert_eq!(painted(&sketch), []);
+    }
+
+    /// Whatever paints: each pixel that changes is handed out, and with what it has become.
+    #[test]
+    fn everything_that_paints_is_noticed() {
+        let mut surface = Surface::new(7, 9);
+        surface.fill([0, 0, 255]);
+        surface.draw_circle([200, 100, 0], (4, 4), 3, 0);
+        surface.set_color_key(Some([0, 0, 255]));
+        let sprite = Sprite::new(&surface);
+        let disc = crate::raster::Disc::new(4);
+        let picture = vec![55; 20 * 30 * 3];
+        type Paint<'a> = &'a dyn Fn(&mut Canvas<'_>);
+        let ways: [Paint<'_>; 12] = [
+            &|canvas| canvas.fill([1, 2, 3]),
+            &|canvas| canvas.clipped(Rect::new(3, 4, 5, 6)).fill([1, 2, 3]),
+            &|canvas| canvas.paste(&picture),
+            &|canvas| canvas.clipped(Rect::new(3, 4, 5, 6)).paste(&picture),
+            &|canvas| canvas.blit(&surface, 3, 25),
+            &|canvas| sprite.blit(canvas, 5, 6),
+            &|canvas| sprite.blit(canvas, -3, 26),
+            &|canvas| sprite.blit_within(canvas, 5, 6, &disc, (8, 9)),
+            &|canvas| sprite.blit_shaded(canvas, 15, -2, 100),
+            &|canvas| canvas.fill_disc([4, 5, 6], (2, 3), &disc),
+            &|canvas| canvas.draw_circle([4, 5, 6], (10, 12), 9, 3),
+            &|canvas| canvas.draw_line([4, 5, 6], (-2, 3), (30, 20), 3),
+        ];
+        for (number, paint) in ways.iter().enumerate() {
+            let mut expected = Sketch::new(20, 30);
+            paint(&mut Canvas::new(&mut expected.pixels, 20, 30));
+            let mut sketch = Sketch::new(20, 30);
+            paint(&mut sketch.canvas());
+            let mut found = vec![0; sketch.pixels.len()];
+            sketch.for_each_run(|x, rows, run| {
+                found[(x * 30 + rows.start) * 3..][..run.len() * 3].copy_from_slice(run.as_flattened());
+            });
+            assert!(found.iter().any(|byte| *byte != 0), "way {number} paints nothing");
+            assert!(found == expected.pixels, "way {number}");
+        }
+    }
+}
