@@ -1,8 +1,9 @@
-//! The original, live: fresh seeds, options and actions, of which nothing may differ.
+//! The original, live: random seeds, options and actions, of which nothing may differ.
 //!
 //! The engine plays first, with experts that err now and then, so that episodes get far; the original plays the same actions; the
-//! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original, which `cargo xtask test` sets up, and
-//! `ENDLESS_LIVE_STEPS` the steps to compare for each id.
+//! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original, which `cargo xtask test` sets up. With
+//! `ENDLESS_LIVE_STEPS`, the steps to compare for each id, as `cargo xtask live` sets it, every run is another one; without, all
+//! runs are the same.
 
 mod common;
 
@@ -14,7 +15,7 @@ use endless_gym::envs::{self, Spec};
 use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::trace::{Trace, replay};
 use proptest::prelude::*;
-use proptest::test_runner::{Config, TestRunner};
+use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::{Map, Value as Json, json};
@@ -133,12 +134,17 @@ const NEWER: [&str; 3] = ["reward_new_command_success", "reward_path_progress_de
 
 fn compare(id: &str) {
     let spec = envs::spec(id).unwrap();
-    let wanted: usize = std::env::var("ENDLESS_LIVE_STEPS").map_or(1500, |text| text.parse().unwrap());
+    let asked: Option<usize> = std::env::var("ENDLESS_LIVE_STEPS").ok().map(|text| text.parse().unwrap());
+    let wanted = asked.unwrap_or(1500);
+    let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
+    let mut runner = match asked {
+        Some(_) => TestRunner::new(config),
+        None => TestRunner::new_with_rng(config, TestRng::deterministic_rng(RngAlgorithm::ChaCha)),
+    };
     let original = std::cell::RefCell::new(Original::start());
     let (steps, raised) = (std::cell::Cell::new(0), std::cell::Cell::new(0));
     while steps.get() < wanted {
-        let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
-        TestRunner::new(config)
+        runner
             .run(&case(spec), |case| {
                 let answer = original.borrow_mut().play(&play(spec, &case));
                 if answer.get("error").is_some() {

@@ -69,10 +69,10 @@ fn results_do_not_depend_on_the_number_of_threads() {
         let config = PoolConfig {
             seeding: Seeding::Range { start: 0, end: 100_000, seed: Some(1) },
             features: true,
-            ..PoolConfig::new(spec.id, 37)
+            ..PoolConfig::new(spec.id, 131)
         };
         let mut players: Vec<Player> = [1, 2, 3, 64].map(|threads| Player::new(&config, threads)).into();
-        for step in 0..150 {
+        for step in 0..80 {
             for player in &mut players {
                 player.step_at_random();
             }

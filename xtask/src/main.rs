@@ -1,5 +1,6 @@
 //! The project's chores: `cargo xtask test` passes all tests.
 
+mod instructions;
 mod original;
 mod python;
 mod venv;
@@ -10,6 +11,7 @@ use std::time::Instant;
 const HELP: &str = "\
 cargo xtask test                 check the format, lint, and run all tests, Rust's and Python's
 cargo xtask python               build the Python package, check it, and run its tests alone
+cargo xtask instructions         count the instructions of a step, and compare with what is recorded (--record records)
 cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)
 cargo xtask original             set up the original in a virtual environment and print the path of its Python";
 
@@ -29,8 +31,13 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let done = match arguments[..] {
-        ["test"] => run(TEST, &[]).and_then(|()| python::test()).map(|()| println!("all passed")),
+        ["test"] => run(TEST, &[])
+            .and_then(|()| instructions::run(false))
+            .and_then(|()| python::test())
+            .map(|()| println!("all passed")),
         ["python"] => python::test(),
+        ["instructions"] => instructions::run(false),
+        ["instructions", "--record"] => instructions::run(true),
         ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
         ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
         ["original"] => original::python().map(|python| println!("{}", python.display())),

@@ -194,11 +194,9 @@ fn in_process(args: &Args, spec: &'static Spec, threads: usize, stop: &AtomicBoo
     let mut pool = Pool::new(&args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut blocks)?;
-    let mut player = RandomPlayer::new(spec);
-    let mut actions = vec![0; args.num_envs * spec.action_space.branches().len()];
+    let mut actions = Actions::new(spec, args.num_envs);
     time(args, stop, || {
-        player.act(&mut actions);
-        pool.step(&actions, &mut blocks)?;
+        pool.step(actions.next(), &mut blocks)?;
         Ok(())
     })
 }
@@ -212,7 +210,7 @@ fn through_service(args: &Args, spec: &'static Spec, reads: bool, stop: &AtomicB
     arguments.extend(args.environment.arguments());
     let mut engine = EngineProcess::start(&arguments)?;
     let mut trainer = engine.connect()?;
-    let mut player = RandomPlayer::new(spec);
+    let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;
     time(args, stop, || {
         let received = trainer.receive(0, PATIENCE)?;
@@ -221,9 +219,36 @@ fn through_service(args: &Args, spec: &'static Spec, reads: bool, stop: &AtomicB
         }
         // Given back before the next step is asked for, so that the engine writes to memory that is warm in its cache.
         drop(received);
-        trainer.send_with(0, |actions| player.act(actions))?;
+        trainer.send(0, actions.next())?;
         Ok(())
     })
+}
+
+/// Random actions, drawn before the clock starts, as those of the original are.
+struct Actions {
+    numbers: Vec<i32>,
+    /// Numbers of one environment, and of all.
+    branches: usize,
+    length: usize,
+    step: usize,
+}
+
+impl Actions {
+    /// Steps after which the same actions come again, in other states.
+    const STEPS: usize = 1009;
+
+    fn new(spec: &Spec, num_envs: usize) -> Self {
+        let branches = spec.action_space.branches().len();
+        let mut numbers = vec![0; (num_envs + Self::STEPS) * branches];
+        RandomPlayer::new(spec).act(&mut numbers);
+        Actions { numbers, branches, length: num_envs * branches, step: 0 }
+    }
+
+    /// The actions of all environments in one step: each plays in this one what the one after it played in the last.
+    fn next(&mut self) -> &[i32] {
+        self.step = (self.step + 1) % Self::STEPS;
+        &self.numbers[self.step * self.branches..][..self.length]
+    }
 }
 
 /// Touches every byte of a batch.

@@ -35,6 +35,9 @@ pub const MAX_ENVS: usize = 1 << 20;
 /// Environments that one thread steps in one go.
 const ENVS_IN_SLICE: usize = 32;
 
+/// Fewer environments than these are stepped by the calling thread: they are done before others have woken up.
+const ENVS_FOR_THREADS: usize = 128;
+
 /// When an episode that ended gives way to the next one. The names are Gymnasium's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Autoreset {
@@ -129,10 +132,11 @@ impl Threads {
         self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
     }
 
-    fn run<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+    /// Has work done that divides itself into `slices`.
+    fn run<T: Send>(&self, slices: usize, work: impl FnOnce() -> T + Send) -> T {
         match &self.0 {
-            Some(pool) => pool.install(work),
-            None => work(),
+            Some(pool) if slices > 1 => pool.install(work),
+            _ => work(),
         }
     }
 }
@@ -289,7 +293,7 @@ impl Pool {
         let work = Work { slices: self.slices(), slot: buffer.slot, drawing };
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
         let lanes = &mut *self.lanes;
-        self.threads.run(|| write(lanes, work, out))?;
+        self.threads.run(work.slices, || write(lanes, work, out))?;
         self.buffers.finish(buffer, &self.layout, batch);
         Ok(())
     }
@@ -336,7 +340,8 @@ impl Pool {
 
     /// Several slices for each thread, so that none waits long for one whose environments have much to do.
     fn slices(&self) -> usize {
-        if self.threads.count() == 1 { 1 } else { self.layout.num_envs().div_ceil(ENVS_IN_SLICE) }
+        let num_envs = self.layout.num_envs();
+        if self.threads.count() == 1 || num_envs < ENVS_FOR_THREADS { 1 } else { num_envs.div_ceil(ENVS_IN_SLICE) }
     }
 }
 

@@ -1,0 +1,51 @@
+//! Cost of one environment alone, by id: a step without a picture, a reset, a frame drawn in full, and the features.
+
+mod actions;
+
+use std::sync::Arc;
+
+use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main, measurement::WallTime};
+use endless_gym::envs::mortar_mayhem::MortarMayhem;
+use endless_gym::envs::mystery_path::MysteryPath;
+use endless_gym::envs::searing_spotlights::SearingSpotlights;
+use endless_gym::envs::{self, Environment, FRAME_BYTES, Family, ResetParameters, Spec};
+use endless_gym::random::Generator;
+use serde_json::Map;
+
+use actions::Actions;
+
+fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &'static Spec, variant: E::Variant) {
+    let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
+    let assets = Arc::new(E::assets(variant, &parameters));
+    let mut env = E::new(&assets);
+    let mut random = Generator::from_seed(1);
+    env.reset(&assets, &mut random);
+    let mut actions = Actions::new(spec, 1);
+    group.bench_function(format!("{}/step", spec.id), |bencher| {
+        bencher.iter(|| {
+            if env.step(actions.next(), &mut random).terminated {
+                env.reset(&assets, &mut random);
+            }
+        });
+    });
+    group.bench_function(format!("{}/reset", spec.id), |bencher| bencher.iter(|| env.reset(&assets, &mut random)));
+    let mut frame = vec![0; FRAME_BYTES];
+    group.bench_function(format!("{}/draw", spec.id), |bencher| bencher.iter(|| env.draw(&mut frame)));
+    let mut features = vec![0.0; spec.features.len()];
+    group.bench_function(format!("{}/features", spec.id), |bencher| bencher.iter(|| env.features(&mut features)));
+}
+
+fn environments(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("environment");
+    for spec in envs::specs() {
+        match spec.family {
+            Family::MortarMayhem(variant) => measure::<MortarMayhem>(&mut group, spec, variant),
+            Family::MysteryPath(variant) => measure::<MysteryPath>(&mut group, spec, variant),
+            Family::SearingSpotlights(variant) => measure::<SearingSpotlights>(&mut group, spec, variant),
+        }
+    }
+    group.finish();
+}
+
+criterion_group!(benches, environments);
+criterion_main!(benches);

@@ -1,0 +1,69 @@
+//! Cost of a pool's step: one thread and several, and observations of other formats.
+
+mod actions;
+
+use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime};
+use endless_gym::batch::{Frames, zeroed};
+use endless_gym::envs::{self, Spec};
+use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use endless_gym::raster::PixelFormat;
+
+use actions::Actions;
+
+fn measure(group: &mut BenchmarkGroup<'_, WallTime>, name: String, spec: &Spec, config: &PoolConfig, threads: usize) {
+    let mut pool = Pool::new(config, &Threads::new(threads).unwrap()).unwrap();
+    let mut batch = zeroed(pool.layout().blocks());
+    pool.reset(ResetRequest::All, &mut batch).unwrap();
+    let mut actions = Actions::new(spec, config.num_envs);
+    group.throughput(Throughput::Elements(config.num_envs as u64));
+    group.bench_function(name, |bencher| bencher.iter(|| pool.step(actions.next(), &mut batch).unwrap()));
+}
+
+fn config(spec: &Spec, num_envs: usize) -> PoolConfig {
+    PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) }
+}
+
+/// Every id, in and beyond the processor's caches.
+fn step(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("pool/step");
+    for (spec, num_envs) in envs::specs().flat_map(|spec| [64, 1024, 16384].map(|num_envs| (spec, num_envs))) {
+        measure(&mut group, format!("{}/{num_envs}", spec.id), spec, &config(spec, num_envs), 1);
+    }
+}
+
+/// More threads for the same work.
+fn threads(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("pool/threads");
+    let cores = Threads::new(0).unwrap().count();
+    let mut counts = vec![1, 2, 4, 8, 16, cores];
+    counts.retain(|count| *count <= cores);
+    counts.sort_unstable();
+    counts.dedup();
+    for id in ["Endless-MortarMayhem-v0", "SearingSpotlights-v0"] {
+        let spec = envs::spec(id).unwrap();
+        for threads in &counts {
+            measure(&mut group, format!("{id}/{threads}"), spec, &config(spec, 4096), *threads);
+        }
+    }
+}
+
+/// What the formats cost beside the original's.
+fn formats(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("pool/formats");
+    let spec = envs::spec("Endless-MysteryPath-v0").unwrap();
+    let plain = PixelFormat::default();
+    for (name, format, stack) in [
+        ("standard", plain, 1),
+        ("grayscale", PixelFormat { grayscale: true, ..plain }, 1),
+        ("channels_first", PixelFormat { channels_first: true, ..plain }, 1),
+        ("row_major", PixelFormat { row_major: true, ..plain }, 1),
+        ("grayscale_stack_4", PixelFormat { grayscale: true, ..plain }, 4),
+        ("grayscale_stack_16", PixelFormat { grayscale: true, ..plain }, 16),
+    ] {
+        let config = PoolConfig { frames: Some(Frames { format, stack }), ..config(spec, 64) };
+        measure(&mut group, name.to_owned(), spec, &config, 1);
+    }
+}
+
+criterion_group!(benches, step, threads, formats);
+criterion_main!(benches);

@@ -1,0 +1,63 @@
+//! Instructions that a step takes, against recorded budgets: they tell a slower step from a noisy machine.
+
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::process::Command;
+
+use crate::venv::workspace;
+
+/// Steps that `benches/instructions.rs` has counted, of all environments together.
+const STEPS: u64 = 250 * 16;
+
+/// By how much a count may differ: processors of other kinds copy memory by other instructions.
+const MARGIN_PERCENT: u64 = 10;
+
+/// Counts, and compares with the budgets; with `record`, the counts become the budgets.
+pub fn run(record: bool) -> Result<(), String> {
+    let file = budgets_file();
+    let text = std::fs::read_to_string(&file).map_err(|error| format!("{}: {error}", file.display()))?;
+    let mut recorded = String::new();
+    let mut failures = Vec::new();
+    println!("{:30} {:>24} {:>8}", "environment", "instructions for a step", "budget");
+    for line in text.lines() {
+        let (id, budget) = line.split_once(' ').unwrap_or((line, "0"));
+        let budget: u64 = budget.parse().map_err(|error| format!("{}: {line}: {error}", file.display()))?;
+        let count = count(id)? / STEPS;
+        println!("{id:30} {count:24} {budget:8}");
+        let _ = writeln!(recorded, "{id} {count}");
+        if count.abs_diff(budget) * 100 > budget * MARGIN_PERCENT {
+            failures.push(format!("{id} takes {count} instructions for a step, {budget} are recorded"));
+        }
+    }
+    if record {
+        return std::fs::write(&file, recorded).map_err(|error| format!("{}: {error}", file.display()));
+    }
+    if failures.is_empty() {
+        return Ok(());
+    }
+    failures.push("if that is meant to be so, record it: cargo xtask instructions --record".to_owned());
+    Err(failures.join("\n"))
+}
+
+fn budgets_file() -> PathBuf {
+    workspace().join("benches/instructions.txt")
+}
+
+/// Instructions of all counted steps of an environment, by callgrind.
+fn count(id: &str) -> Result<u64, String> {
+    const VALGRIND: &str =
+        "valgrind --tool=callgrind --callgrind-out-file=/dev/null --toggle-collect=instructions::steps";
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let target = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
+    let output = Command::new(cargo)
+        .args(["bench", "--locked", "--package", "endless-gym", "--bench", "instructions", "--", id])
+        .env(target, VALGRIND)
+        .output()
+        .map_err(|error| format!("cargo bench cannot be run: {error}"))?;
+    let printed = String::from_utf8_lossy(&output.stderr);
+    let collected = printed.lines().find_map(|line| line.split_once("Collected :")).map(|(_, count)| count.trim());
+    match collected.and_then(|count| count.parse().ok()) {
+        Some(count) if count > 0 && output.status.success() => Ok(count),
+        _ => Err(format!("no instructions of {id} were counted; is valgrind installed?\n{printed}")),
+    }
+}
