@@ -4,19 +4,13 @@ use std::process::Command;
 use std::time::Instant;
 
 use crate::original;
-use crate::venv::{execute, target, venv, workspace};
+use crate::venv::{Install, execute, target, venv, workspace};
 
 /// Builds the wheel, installs it into a virtual environment beside the tools that it is tested with, lints, checks the types, and
 /// runs the tests.
 pub fn test() -> Result<(), String> {
     let package = workspace().join("bindings/python");
-    let read = |name: &str| {
-        std::fs::read_to_string(package.join(name)).map_err(|error| format!("bindings/python/{name}: {error}"))
-    };
-    let requirements = read("requirements-test.txt")?;
-    let requirements: Vec<&str> =
-        requirements.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
-    let folder = venv("python", original::base()?, &requirements)?;
+    let folder = venv("python", original::base()?, &[Install::of_file("requirements-test.txt")?, pufferlib()?])?;
     let wheels = target()?.join("wheels");
     let _ = std::fs::remove_dir_all(&wheels);
 
@@ -36,6 +30,15 @@ pub fn test() -> Result<(), String> {
     let mut pytest = Command::new(folder.join("bin/pytest"));
     pytest.args(["-q", "--timeout", "300"]).current_dir(&package);
     run("pytest", pytest.env("ENDLESS_ORIGINAL_PYTHON", original::python()?))
+}
+
+/// PufferLib, of which PyPI has a source archive alone, without the games and the trainer in C that it would compile.
+fn pufferlib() -> Result<Install, String> {
+    let mut install = Install::of_file("requirements-pufferlib.txt")?;
+    install.arguments.extend(["--no-deps", "--no-build-isolation"].map(str::to_owned));
+    let path = workspace().join("xtask/pufferlib").display().to_string();
+    install.environment = vec![("NO_OCEAN", "1".to_owned()), ("NO_TRAIN", "1".to_owned()), ("PYTHONPATH", path)];
+    Ok(install)
 }
 
 fn run(what: &str, command: &mut Command) -> Result<(), String> {

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import endless_gym
+from endless_gym.program import program
 
 ID = "Endless-MortarMayhem-v0"
 ACTIONS = np.zeros((4, 2), dtype=np.int64)
@@ -106,7 +107,7 @@ def test_a_forked_child_does_no_harm() -> None:
 
 def test_reconnecting_to_an_engine_that_was_started_again() -> None:
     def engine() -> subprocess.Popen:
-        command = [*endless_gym.engine.program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=again"]
+        command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=again"]
         return subprocess.Popen(command, stdin=subprocess.PIPE)
 
     first = engine()
