@@ -43,7 +43,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     `make_vec`, `serve` and `connect` make it. `step` returns arrays of `num_envs` rows: observation uint8 (n, 84, 84, 3) or as
     `single_observation_space` says, reward float64 (n,), terminated and truncated bool (n,), and `info`. Arrays are read-only
     views of the memory that the engine wrote to, and stay as they are for as long as they are held; with `copy=True` they are
-    writeable copies.
+    writeable copies. `torch.from_numpy` warns of read-only arrays; `endless_gym.torch_view` does the same without the warning.
 
     `info` has an array for each key, and under the key with a leading underscore where it is set, as in Gymnasium:
     `ground_truth` float64 (n, k) where the original has it; in steps that end episodes the original's final infos (`reward`,
@@ -146,7 +146,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._backend.send(actions, group)
 
     def recv(self, group: int | None = None) -> Step:
-        """What came of a group's `send`, waiting for it. `None` takes the group that is first; `info["group"]` tells which."""
+        """What `step` returns, for a group's `send`, waiting for it. `None` takes the group that is first; `info["group"]` tells
+        which.
+        """
         number, arrays = self._backend.receive(group)
         step = self._step(arrays)
         step[4]["group"] = number
