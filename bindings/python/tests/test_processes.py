@@ -49,6 +49,8 @@ def test_the_engine_ends_with_its_environments_and_with_its_process() -> None:
 def test_ctrl_c_reaches_python_while_it_waits() -> None:
     program = f"""
 import endless_gym, os, signal
+# What a shell starts in the background ignores Ctrl-C, and so does what is started there.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 with endless_gym.serve({ID!r}, 4) as envs:
     envs.reset()
     os.kill(envs._backend._engine.pid, signal.SIGSTOP)
