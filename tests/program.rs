@@ -218,6 +218,8 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["serve", "--option", "arena_sise=3"], "no reset parameter `arena_sise`"),
         (vec!["serve", "--option", "max_steps"], "expected NAME=VALUE"),
         (vec!["serve", "--option", "agent_speed=fast"], "`agent_speed` is \"fast\", but has to be: number"),
+        (vec!["serve", "--env-options", "3"], "expected a JSON object"),
+        (vec!["serve", "--num-envs", "2", "--env-options", "{}"], "1 "),
         (vec!["serve", "--num-envs", "0"], "0 environments"),
         (vec!["serve", "--groups", "0"], "0 groups"),
         (vec!["serve", "--service", "a/b"], "`a/b` cannot name an engine"),

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::Command;
 
-use crate::venv::venv;
+use crate::venv::{Install, venv};
 
 /// Pinned, so that every comparison is with the same original. pygame 2.4.0, which it asks for, ends at Python 3.11.
 const PACKAGES: [&str; 2] = ["memory-gym==1.0.2", "numpy==1.26.4"];
@@ -11,7 +11,7 @@ const PYTHONS: [&str; 2] = ["python3.11", "python3"];
 
 /// The path of that Python, which is made if it is not there yet.
 pub fn python() -> Result<PathBuf, String> {
-    Ok(venv("original", base()?, &PACKAGES)?.join("bin/python"))
+    Ok(venv("original", base()?, &[Install::of(&PACKAGES)])?.join("bin/python"))
 }
 
 /// The name of a Python 3.11.

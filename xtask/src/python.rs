@@ -1,41 +1,76 @@
-//! The Python package: its wheel, and the checks and tests of it.
+//! The Python package: its wheel, the checks and tests of it, and how fast it is.
 
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
 
 use crate::original;
-use crate::venv::{execute, target, venv, workspace};
+use crate::venv::{Install, execute, target, venv, workspace};
 
-/// Builds the wheel, installs it into a virtual environment beside the tools that it is tested with, lints, checks the types, and
-/// runs the tests.
+/// Lints, checks the types, and runs the tests.
 pub fn test() -> Result<(), String> {
-    let package = workspace().join("bindings/python");
-    let read = |name: &str| {
-        std::fs::read_to_string(package.join(name)).map_err(|error| format!("bindings/python/{name}: {error}"))
-    };
-    let requirements = read("requirements-test.txt")?;
-    let requirements: Vec<&str> =
-        requirements.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
-    let folder = venv("python", original::base()?, &requirements)?;
-    let wheels = target()?.join("wheels");
-    let _ = std::fs::remove_dir_all(&wheels);
-
+    let package = package();
     // The profile of the tests, whose dependencies are built already.
-    let mut maturin = Command::new(folder.join("bin/maturin"));
-    maturin.args(["build", "--locked", "--profile", "dev", "--interpreter"]).arg(folder.join("bin/python"));
-    maturin.arg("--manifest-path").arg(package.join("Cargo.toml")).arg("--out").arg(&wheels);
-    run("maturin build", &mut maturin)?;
-    let wheel = std::fs::read_dir(&wheels).ok().and_then(|mut files| files.next()).and_then(Result::ok);
-    let wheel = wheel.ok_or("maturin built no wheel")?.path();
-    let install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--force-reinstall", "--no-deps"];
-    run("pip install", Command::new(folder.join("bin/python")).args(install).arg(wheel))?;
-
-    run("ruff format", Command::new(folder.join("bin/ruff")).args(["format", "--check"]).arg(&package))?;
-    run("ruff check", Command::new(folder.join("bin/ruff")).arg("check").arg(&package))?;
+    let folder = install("dev")?;
+    let ruff = |what: &str, arguments: &[&str]| {
+        let program = folder.join("bin/ruff");
+        run(what, Command::new(&program).current_dir(&package).args(arguments))?;
+        let mut benches = Command::new(&program);
+        benches.current_dir(workspace()).args(arguments).args([
+            "--config",
+            "bindings/python/pyproject.toml",
+            "benches",
+        ]);
+        run(&format!("{what}, benches"), &mut benches)
+    };
+    ruff("ruff format", &["format", "--check"])?;
+    ruff("ruff check", &["check"])?;
     run("mypy", Command::new(folder.join("bin/mypy")).current_dir(&package))?;
     let mut pytest = Command::new(folder.join("bin/pytest"));
     pytest.args(["-q", "--timeout", "300"]).current_dir(&package);
     run("pytest", pytest.env("ENDLESS_ORIGINAL_PYTHON", original::python()?))
+}
+
+/// Compares steps per second with the original's.
+pub fn bench(arguments: &[&str]) -> Result<(), String> {
+    let folder = install("release")?;
+    let mut script = Command::new(folder.join("bin/python"));
+    script.arg(workspace().join("benches/python_comparison.py"));
+    script.arg("--original").arg(original::python()?).args(arguments);
+    run("benches/python_comparison.py", &mut script)
+}
+
+fn package() -> PathBuf {
+    workspace().join("bindings/python")
+}
+
+/// Builds the wheel and installs it into a virtual environment beside the tools that it is tested with, whose folder it returns.
+fn install(profile: &str) -> Result<PathBuf, String> {
+    let folder = venv("python", original::base()?, &[Install::of_file("requirements-test.txt")?, pufferlib()?])?;
+    let wheels = target()?.join("wheels");
+    let _ = std::fs::remove_dir_all(&wheels);
+    let mut maturin = Command::new(folder.join("bin/maturin"));
+    maturin.args(["build", "--locked", "--profile", profile, "--interpreter"]).arg(folder.join("bin/python"));
+    maturin.arg("--manifest-path").arg(package().join("Cargo.toml")).arg("--out").arg(&wheels);
+    run("maturin build", &mut maturin)?;
+    let wheel = only_file(&wheels)?;
+    let install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--force-reinstall", "--no-deps"];
+    run("pip install", Command::new(folder.join("bin/python")).args(install).arg(wheel))?;
+    Ok(folder)
+}
+
+fn only_file(folder: &Path) -> Result<PathBuf, String> {
+    let file = std::fs::read_dir(folder).ok().and_then(|mut files| files.next()).and_then(Result::ok);
+    Ok(file.ok_or("maturin built no wheel")?.path())
+}
+
+/// PufferLib, of which PyPI has a source archive alone, without the games and the trainer in C that it would compile.
+fn pufferlib() -> Result<Install, String> {
+    let mut install = Install::of_file("requirements-pufferlib.txt")?;
+    install.arguments.extend(["--no-deps", "--no-build-isolation"].map(str::to_owned));
+    let path = workspace().join("xtask/pufferlib").display().to_string();
+    install.environment = vec![("NO_OCEAN", "1".to_owned()), ("NO_TRAIN", "1".to_owned()), ("PYTHONPATH", path)];
+    Ok(install)
 }
 
 fn run(what: &str, command: &mut Command) -> Result<(), String> {

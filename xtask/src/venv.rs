@@ -14,19 +14,45 @@ pub fn target() -> Result<PathBuf, String> {
     std::path::absolute(target).map_err(|error| error.to_string())
 }
 
-/// The folder of the virtual environment `name`, made from the Python `base` with what `packages` tell pip to install. One that
-/// is there with the same packages is taken as it is.
-pub fn venv(name: &str, base: &str, packages: &[&str]) -> Result<PathBuf, String> {
+/// One call of `pip install`.
+#[derive(Clone, Debug, Default)]
+pub struct Install {
+    /// Packages with their versions, and pip's options.
+    pub arguments: Vec<String>,
+    pub environment: Vec<(&'static str, String)>,
+}
+
+impl Install {
+    pub fn of(packages: &[&str]) -> Self {
+        Install { arguments: packages.iter().copied().map(str::to_owned).collect(), ..Install::default() }
+    }
+
+    /// What a requirements file of the Python package lists.
+    pub fn of_file(name: &str) -> Result<Self, String> {
+        let file = workspace().join("bindings/python").join(name);
+        let text = std::fs::read_to_string(&file).map_err(|error| format!("{}: {error}", file.display()))?;
+        let packages: Vec<&str> = text.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
+        Ok(Install::of(&packages))
+    }
+}
+
+/// The folder of the virtual environment `name`, made from the Python `base` with what `installs` tell pip to install, one after
+/// the other. One that is there with the same is taken as it is.
+pub fn venv(name: &str, base: &str, installs: &[Install]) -> Result<PathBuf, String> {
     let folder = target()?.join("venvs").join(name);
     let stamp = folder.join("packages");
-    let wanted = packages.join("\n");
+    let wanted = format!("{installs:#?}");
     if std::fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) {
         return Ok(folder);
     }
     eprintln!("==> virtual environment {}", folder.display());
     execute(Command::new(base).args(["-m", "venv", "--clear"]).arg(&folder))?;
-    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
-    execute(Command::new(folder.join("bin/python")).args(pip).args(packages))?;
+    for install in installs {
+        let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
+        let mut command = Command::new(folder.join("bin/python"));
+        command.args(pip).args(&install.arguments);
+        execute(command.envs(install.environment.iter().map(|(name, value)| (name, value))))?;
+    }
     std::fs::write(stamp, wanted).map_err(|error| error.to_string())?;
     Ok(folder)
 }

@@ -9,13 +9,18 @@ envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # many
 ```
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from endless_gym._native import EngineLost, TooManyBatchesHeld, __version__, running_engines
-from endless_gym.engine import serve
 from endless_gym.env import Env
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
 from endless_gym.specs import all_specs, spec
-from endless_gym.vector import EndlessVectorEnv, connect, make_vec
+
+if TYPE_CHECKING:
+    from endless_gym.engine import serve
+    from endless_gym.vector import EndlessVectorEnv, connect, make_vec
 
 __all__ = [
     "DLPackView",
@@ -34,5 +39,21 @@ __all__ = [
     "spec",
     "torch_view",
 ]
+
+# Loaded when they are asked for: they need Gymnasium 1.1, and programs that are held to 0.29 can do without them.
+_LATER = {"serve": "engine", "EndlessVectorEnv": "vector", "connect": "vector", "make_vec": "vector"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 register()

@@ -4,35 +4,18 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
 
-from gymnasium.vector import AutoresetMode
-
 from endless_gym import _native
-from endless_gym.specs import options_text, spec
-from endless_gym.vector import EndlessVectorEnv, Options, autoreset_mode, connect, contents
-
-# Loads the native module from its file, without the package around it, which takes numpy and Gymnasium along.
-_PROGRAM = """
-import sys
-from importlib.util import module_from_spec, spec_from_file_location
-spec = spec_from_file_location("_native", sys.argv[1])
-native = module_from_spec(spec)
-spec.loader.exec_module(native)
-itself = [sys.executable, "-I", "-S", "-c", sys.orig_argv[sys.orig_argv.index("-c") + 1], sys.argv[1]]
-sys.exit(native.endless(sys.argv[2:], itself))
-"""
+from endless_gym.program import program
+from endless_gym.specs import json_text, spec
+from endless_gym.vector import AutoresetMode, EndlessVectorEnv, Options, autoreset_mode, connect, contents
 
 _numbers = count()
-
-
-def program() -> list[str]:
-    """The command that starts the program `endless`."""
-    return [sys.executable, "-I", "-S", "-c", _PROGRAM, str(_native.__file__)]
 
 
 class EngineProcess:
@@ -88,8 +71,8 @@ def serve(
     *,
     groups: int = 1,
     seed: int | None = None,
-    seeds: range | list[int] | None = None,
-    options: Options | None = None,
+    seeds: range | Sequence[int] | None = None,
+    options: Options | Sequence[Options] | None = None,
     autoreset: str | AutoresetMode = "next_step",
     observation: str = "rgb",
     batches_held: int = 4,
@@ -110,7 +93,7 @@ def serve(
         groups: Groups that are stepped independently, for `send` and `recv`.
         seed: As for `make_vec`.
         seeds: As for `make_vec`.
-        options: Reset parameters by the original's names.
+        options: As for `make_vec`.
         autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
         observation: `rgb`, `features` or `rgb+features`.
         batches_held: Steps of a group whose arrays may be held at a time, 1 to 16.
@@ -137,7 +120,10 @@ def serve(
     elif seeds is not None:
         arguments["--seed-list"] = ",".join(map(str, seeds))
     command = [f"{name}={value}" for name, value in arguments.items()]
-    command += [f"--option={name}={options_text({'': value})[5:-1]}" for name, value in (options or {}).items()]
+    if options is None or isinstance(options, Mapping):
+        command += [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
+    else:
+        command += [f"--env-options={json_text(dict(each))}" for each in options]
     command += ["--final-observation"] if mode is AutoresetMode.SAME_STEP else []
     command += ["--features"] if features else []
     command += [] if frames else ["--no-frames"]

@@ -18,6 +18,9 @@ Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
 #: Environments whose ground truth the original makes of integers.
 _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
+#: Side of the ground-truth view in pixels.
+_VIEW = 336
+
 
 class Env(gymnasium.Env[Any, Any]):
     """A Memory Gym environment: observations, rewards, flags and infos equal the original's byte for byte.
@@ -54,6 +57,7 @@ class Env(gymnasium.Env[Any, Any]):
         self._native = _native.Single(self._spec.id, options_text(self._options))
         self._seed: int | None = None
         self._window: _Window | None = None
+        self._is_shown = False
         self._was_reset = False
         #: Reset parameters of the current episode, the defaults included.
         self.reset_params: dict[str, Any] = {**self._spec.reset_parameters, **self._options}
@@ -88,8 +92,9 @@ class Env(gymnasium.Env[Any, Any]):
         self.reset_params = {**self._spec.reset_parameters, **given}
         self._seed = seed
         self._was_reset = True
+        self._is_shown = False
         if self.render_mode == "human":
-            self.render()
+            self._show()
         return self._observation(arrays), self._info(arrays)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -102,8 +107,9 @@ class Env(gymnasium.Env[Any, Any]):
             info["reward"], info["length"], values = end
             for (name, is_integer), value in zip(self._spec.info, values, strict=True):
                 info[name] = int(value) if is_integer else value
+        self._is_shown = False
         if self.render_mode == "human":
-            self.render()
+            self._show()
         return self._observation(arrays), reward, terminated, False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
@@ -113,10 +119,8 @@ class Env(gymnasium.Env[Any, Any]):
         if self.render_mode == "debug_rgb_array":
             return self._native.ground_truth_view()
         if self.render_mode == "human":
-            if self._window is None:
-                self._window = _Window()
-            self._window.show(self._native.ground_truth_view(), f"{self._spec.id}, seed {self._seed}")
-            self._window.wait(self.metadata["render_fps"])
+            # `reset` and `step` show the picture, as Gymnasium asks; the original leaves that to calls of this.
+            self._show()
         return None
 
     def snapshot(self) -> bytes:
@@ -127,6 +131,7 @@ class Env(gymnasium.Env[Any, Any]):
         """Go on from a snapshot of an environment with the same id; returns what it looks like."""
         arrays = self._native.restore(snapshot)
         self._was_reset = True
+        self._is_shown = False
         return self._observation(arrays), self._info(arrays)
 
     def close(self) -> None:
@@ -134,6 +139,16 @@ class Env(gymnasium.Env[Any, Any]):
         if self._window is not None:
             self._window.close()
             self._window = None
+
+    def _show(self) -> None:
+        """Shows the current picture once: the ground-truth view goes through a shown clue with each call."""
+        if self._is_shown:
+            return
+        if self._window is None:
+            self._window = _Window()
+        self._window.show(self._native.ground_truth_view(), f"{self._spec.id}, seed {self._seed}")
+        self._window.wait(self.metadata["render_fps"])
+        self._is_shown = True
 
     def _observation(self, arrays: _native.SingleArrays) -> Observation:
         if arrays[1] is None:
@@ -154,7 +169,7 @@ class _Window:
             raise ImportError('render_mode="human" needs pygame: pip install "endless-gym[render]"') from error
         self._pygame = pygame
         pygame.display.init()
-        self._screen = pygame.display.set_mode((SCREEN_VIEW, SCREEN_VIEW))
+        self._screen = pygame.display.set_mode((_VIEW, _VIEW))
         self._next = time.monotonic()
 
     def show(self, picture: NDArray[np.uint8], title: str) -> None:
@@ -169,7 +184,3 @@ class _Window:
 
     def close(self) -> None:
         self._pygame.display.quit()
-
-
-#: Side of the ground-truth view in pixels.
-SCREEN_VIEW = 336

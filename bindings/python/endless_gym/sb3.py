@@ -60,8 +60,10 @@ class EndlessVecEnv(VecEnv):
         self.info: dict[str, Any] = {}
         self._running: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
-        # Stable-Baselines3 wraps observations in tensors, which warns of read-only arrays, and only reads them.
-        warnings.filterwarnings("ignore", message="The given NumPy array is not writ", category=UserWarning)
+        # Stable-Baselines3 wraps observations in tensors, which warns of read-only arrays, and only reads them. The filter is for
+        # its own modules: a trainer's code is still warned.
+        module = r"(stable_baselines3|sb3_contrib)\."
+        warnings.filterwarnings("ignore", "The given NumPy array is not writ", UserWarning, module)
 
     @classmethod
     def make(cls, env_id: str, num_envs: int, **kwargs: Any) -> EndlessVecEnv:

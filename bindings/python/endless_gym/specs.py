@@ -81,7 +81,12 @@ def spec(id: str) -> Spec:
 
 def options_text(options: Mapping[str, Any] | None) -> str:
     """Reset parameters as the engine reads them."""
-    return "{}" if not options else json.dumps(dict(options), default=_plain)
+    return "{}" if not options else json_text(dict(options))
+
+
+def json_text(value: Any) -> str:
+    """JSON, also of numpy's numbers and arrays."""
+    return json.dumps(value, default=_plain)
 
 
 def _plain(value: Any) -> Any:

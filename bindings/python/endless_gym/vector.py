@@ -9,12 +9,20 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.specs import Spec, options_text, spec
+
+try:
+    from gymnasium.vector import AutoresetMode as AutoresetMode
+    from gymnasium.vector import VectorEnv
+except ImportError as error:
+    raise ImportError(
+        f"many environments at a time need Gymnasium 1.1 or newer, and there is {gymnasium.__version__}: "
+        "pip install 'gymnasium>=1.1'; with this one, `gymnasium.make` and its own vector environments work"
+    ) from error
 
 Options = Mapping[str, Any]
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -35,7 +43,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     `make_vec`, `serve` and `connect` make it. `step` returns arrays of `num_envs` rows: observation uint8 (n, 84, 84, 3) or as
     `single_observation_space` says, reward float64 (n,), terminated and truncated bool (n,), and `info`. Arrays are read-only
     views of the memory that the engine wrote to, and stay as they are for as long as they are held; with `copy=True` they are
-    writeable copies.
+    writeable copies. `torch.from_numpy` warns of read-only arrays; `endless_gym.torch_view` does the same without the warning.
 
     `info` has an array for each key, and under the key with a leading underscore where it is set, as in Gymnasium:
     `ground_truth` float64 (n, k) where the original has it; in steps that end episodes the original's final infos (`reward`,
@@ -138,7 +146,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._backend.send(actions, group)
 
     def recv(self, group: int | None = None) -> Step:
-        """What came of a group's `send`, waiting for it. `None` takes the group that is first; `info["group"]` tells which."""
+        """What `step` returns, for a group's `send`, waiting for it. `None` takes the group that is first; `info["group"]` tells
+        which.
+        """
         number, arrays = self._backend.receive(group)
         step = self._step(arrays)
         step[4]["group"] = number
@@ -392,7 +402,8 @@ def make_vec(
         seed: Environment `i` is seeded with `seed + i` at its first reset and goes on with its generator. `None`: entropy.
         seeds: Where each episode's seed comes from instead: a `range` to draw from, as the paper's training does from
             `range(100_000)` (`seed` then fixes the draws), or a list that is played in turn.
-        options: Reset parameters by the original's names, for all environments or for each.
+        options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each,
+            those of the first group first.
         autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
         observation: `rgb`, `features` (a short vector of what the frame shows; nothing is drawn), or both as a dict:
             `rgb+features`.
@@ -407,7 +418,7 @@ def make_vec(
             described.id,
             num_envs,
             num_threads=num_threads or 0,
-            options=options_text(options) if options is None or isinstance(options, Mapping) else _each(options),
+            options=_pool_options(options, group * num_envs, num_envs, groups),
             autoreset=_name(mode),
             first_env=group * num_envs,
             total_envs=groups * num_envs,
@@ -483,5 +494,10 @@ def _name(mode: AutoresetMode) -> str:
     return next(name for name, known in _MODES.items() if known is mode)
 
 
-def _each(options: Sequence[Options]) -> str:
-    return f"[{', '.join(options_text(dict(each)) for each in options)}]"
+def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
+    """The reset parameters of one group's environments, as the native module reads them."""
+    if given is None or isinstance(given, Mapping):
+        return options_text(given)
+    if len(given) != groups * num_envs:
+        raise ValueError(f"{len(given)} sets of reset parameters given for {groups * num_envs} environments")
+    return f"[{', '.join(options_text(each) for each in given[first : first + num_envs])}]"

@@ -1,16 +1,13 @@
 """Step Endless Gym through PufferLib, with random actions.
 
-pip install endless-gym torch psutil setuptools wheel cython gym-notices
+pip install endless-gym torch psutil setuptools wheel gym-notices
 pip install --no-deps gym==0.26.2 pettingzoo shimmy
 pip install --no-deps --no-build-isolation pufferlib==3.0.0
 python pufferlib_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 1024
 
---no-deps, because PufferLib 3.0.0 asks for NumPy 1 and Gymnasium 0.29, but works with the current ones. Its setup
-compiles games of its own from sources that it downloads from GitHub. To do without them, unpack its source archive from
-PyPI, and in it:
-
-sed -i 's/^c_extensions = \\[\\]/c_extensions = c_extension_paths = []/' setup.py
-NO_OCEAN=1 NO_TRAIN=1 pip install --no-deps --no-build-isolation .
+--no-deps, because PufferLib 3.0.0 asks for NumPy 1 and Gymnasium 0.29, but works with the current ones. Its setup compiles
+games of its own from sources that it downloads from GitHub. To do without them, put NO_OCEAN=1 NO_TRAIN=1 before its line, and
+on the PYTHONPATH a folder with a file `sitecustomize.py` that says: import builtins; builtins.c_extension_paths = []
 """
 
 import argparse

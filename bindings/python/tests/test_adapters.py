@@ -1,7 +1,8 @@
-"""The adapters to Stable-Baselines3, TorchRL and PufferLib keep the tools' contracts. A test skips without its tool."""
+"""The adapters to Stable-Baselines3, TorchRL and PufferLib keep the tools' contracts."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import warnings
 
@@ -33,7 +34,6 @@ def reference(env_id: str, num_envs: int, autoreset: str, seed: int):
 class TestStableBaselines3:
     @pytest.fixture(autouse=True)
     def adapter(self):
-        pytest.importorskip("stable_baselines3")
         from endless_gym.sb3 import EndlessVecEnv
 
         self.make = EndlessVecEnv.make
@@ -169,6 +169,24 @@ class TestStableBaselines3:
         assert venv.env_is_wrapped(object, [0, 2]) == [False, False]
         venv.close()
 
+    def test_only_stable_baselines3_is_spared_torchs_warning(self):
+        # In a process of its own, since PyTorch warns once.
+        program = f"""
+import numpy as np, torch, warnings
+from endless_gym.sb3 import EndlessVecEnv
+from stable_baselines3.common.utils import obs_as_tensor
+venv = EndlessVecEnv.make({SHORT!r}, num_envs=2)
+observation = venv.reset()
+torch.set_warn_always(True)
+for read in (lambda: obs_as_tensor(observation, "cpu"), lambda: torch.as_tensor(observation)):
+    warnings.simplefilter("always", append=True)
+    with warnings.catch_warnings(record=True) as caught:
+        read()
+    print(len(caught))
+"""
+        printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+        assert printed.split() == ["0", "1"]
+
     def test_steps_run_no_more_python_for_more_environments(self):
         def lines_of_a_step(num_envs: int) -> int:
             venv = self.make(SHORT, num_envs=num_envs)
@@ -218,7 +236,6 @@ class TestStableBaselines3:
 class TestTorchRL:
     @pytest.fixture(autouse=True)
     def adapter(self):
-        pytest.importorskip("torchrl")
         from endless_gym.torchrl import EndlessEnv
 
         self.make = EndlessEnv.make
@@ -290,7 +307,6 @@ class TestPufferLib:
     @pytest.fixture(autouse=True)
     def adapter(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)  # importing PufferLib puts a link into the working directory
-        pytest.importorskip("pufferlib")
         from endless_gym.pufferlib import EndlessPufferEnv
 
         self.env = EndlessPufferEnv

@@ -82,6 +82,26 @@ def test_render_modes() -> None:
         endless_gym.Env("MysteryPath-v0", render_mode="ansi")
 
 
+@pytest.mark.parametrize("id", ["MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"])
+def test_a_window_shows_the_ground_truth_view(id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    shown, silent = (gymnasium.make(f"EndlessGym/{id}", render_mode=mode) for mode in ("human", "debug_rgb_array"))
+    for env in (shown, silent):
+        env.reset(seed=3)
+        env.render()
+    for _ in range(3):
+        shown.step(np.array([1, 2]))
+        silent.step(np.array([1, 2]))
+        assert shown.render() is None  # it is shown already
+        picture = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        np.testing.assert_array_equal(picture, silent.render())
+        assert pygame.display.get_caption()[0] == f"{id}, seed 3"
+    shown.close()
+    assert not pygame.display.get_init()
+
+
 def test_observations_stay_as_they_are() -> None:
     env = endless_gym.Env("MortarMayhem-v0")
     first, _ = env.reset(seed=1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import endless_gym
+from endless_gym.program import program
 
 ID = "Endless-MortarMayhem-v0"
 ACTIONS = np.zeros((4, 2), dtype=np.int64)
@@ -48,6 +49,8 @@ def test_the_engine_ends_with_its_environments_and_with_its_process() -> None:
 def test_ctrl_c_reaches_python_while_it_waits() -> None:
     program = f"""
 import endless_gym, os, signal
+# What a shell starts in the background ignores Ctrl-C, and so does what is started there.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 with endless_gym.serve({ID!r}, 4) as envs:
     envs.reset()
     os.kill(envs._backend._engine.pid, signal.SIGSTOP)
@@ -106,7 +109,7 @@ def test_a_forked_child_does_no_harm() -> None:
 
 def test_reconnecting_to_an_engine_that_was_started_again() -> None:
     def engine() -> subprocess.Popen:
-        command = [*endless_gym.engine.program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=again"]
+        command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=again"]
         return subprocess.Popen(command, stdin=subprocess.PIPE)
 
     first = engine()

@@ -142,6 +142,20 @@ def test_options_and_masks_at_reset(where) -> None:
             envs.reset(options={"arena_sise": 1})
 
 
+@pytest.mark.parametrize("where", WHERE)
+def test_environments_may_have_options_of_their_own(where) -> None:
+    each = [{"arena_size": size} for size in (2, 3, 4, 5)]
+    with made(where, "MortarMayhem-v0", 2, groups=2, seed=1, options=each) as envs:
+        for group in range(2):
+            observation, _ = envs.reset(group=group)
+            for env in range(2):
+                number = 2 * group + env
+                alone = endless_gym.Env("MortarMayhem-v0", options=each[number])
+                np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
+    with pytest.raises((ValueError, RuntimeError), match=r"3 .* 2 environments"):
+        where("MortarMayhem-v0", 2, options=each[:3])
+
+
 def test_the_feature_observation() -> None:
     envs = endless_gym.make_vec(ID, 2, seed=1, observation="features")
     observation, _ = envs.reset()

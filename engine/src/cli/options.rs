@@ -54,6 +54,9 @@ pub struct EnvironmentArgs {
     /// Reset parameter of all environments, such as `arena_size=6` or `command_count=[5,10]`; may be given several times.
     #[arg(long = "option", value_name = "NAME=VALUE")]
     options: Vec<String>,
+    /// Reset parameters of one environment as a JSON object; given once for each environment of all groups, in their order.
+    #[arg(long, value_name = "JSON", conflicts_with = "options")]
+    env_options: Vec<String>,
     /// Seed: environment i starts with SEED + i. From the system's entropy if left out.
     #[arg(long)]
     seed: Option<u64>,
@@ -76,6 +79,7 @@ impl EnvironmentArgs {
     pub fn arguments(&self) -> Vec<String> {
         let mut arguments: Vec<String> =
             self.options.iter().flat_map(|option| ["--option".to_owned(), option.clone()]).collect();
+        arguments.extend(self.env_options.iter().map(|options| format!("--env-options={options}")));
         arguments.extend(self.seed.map(|seed| format!("--seed={seed}")));
         arguments.extend(self.seed_range.map(|(start, end)| format!("--seed-range={start}..{end}")));
         if !self.seed_list.is_empty() {
@@ -96,12 +100,18 @@ impl EnvironmentArgs {
             let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
             options.insert(name.to_owned(), value);
         }
+        let each = self.env_options.iter().map(|options| {
+            serde_json::from_str(options)
+                .map_err(|error| format!("--env-options {options}: expected a JSON object: {error}"))
+        });
+        let each = each.collect::<Result<Vec<_>, _>>()?;
+        let options = if each.is_empty() { Options::Shared(options) } else { Options::Each(each) };
         let seeding = match (self.seed_range, &self.seed_list[..]) {
             (Some((start, end)), _) => Seeding::Range { start, end, seed: self.seed },
             (None, []) => Seeding::Continue { seed: self.seed },
             (None, list) => Seeding::List(list.to_vec()),
         };
-        Ok(PoolConfig { options: Options::Shared(options), seeding, ..PoolConfig::new(id, num_envs) })
+        Ok(PoolConfig { options, seeding, ..PoolConfig::new(id, num_envs) })
     }
 }
 

@@ -1,0 +1,211 @@
+"""Steps per second from Python, beside the original's: whole episodes with random actions, medians of several rounds.
+
+cargo xtask bench-python                       # sets everything up, and runs this; further arguments are passed on
+
+It wants the package with `stable-baselines3` in its own Python 3.11, and by `--original` another one with `memory-gym`. The
+original pins Gymnasium 0.29 and numpy 1: its environments run in a process that finds its Python's packages first, and
+Stable-Baselines3 among those of this one. In each round every contender is measured once, one after the other, since other
+programs on the machine disturb a measurement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import endless_gym
+import gymnasium
+import numpy as np
+from endless_gym.program import program
+
+IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"]
+VECTORS = ["SyncVectorEnv", "AsyncVectorEnv", "SubprocVecEnv"]
+SIZES = [64, 1024]
+
+
+class Original:
+    """The process that steps the original."""
+
+    def __init__(self, python: str) -> None:
+        where = "import sys, sysconfig; print(sys.version_info[:2] == (3, 11), sysconfig.get_path('purelib'))"
+        right, packages = subprocess.check_output([python, "-c", where], text=True).split(maxsplit=1)
+        if right != "True" or sys.version_info[:2] != (3, 11):
+            sys.exit("this script and the original both need Python 3.11, whose packages they share")
+        self._process = subprocess.Popen(
+            [sys.executable, "-W", "ignore", str(Path(__file__).with_name("python_original.py"))],
+            env={**os.environ, "PYTHONPATH": packages.strip(), "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+
+    def measure(self, kind: str, id: str, num_envs: int, seconds: float) -> float:
+        """Steps per second of one kind of it."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        asked = {"kind": kind, "id": id, "num_envs": num_envs, "seconds": seconds}
+        print(json.dumps(asked), file=self._process.stdin, flush=True)
+        answer = self._process.stdout.readline()
+        if not answer:
+            sys.exit(f"the original's process ended at {asked}; run {self._process.args} to see why")
+        return float(answer)
+
+    def best(self, kind: str, id: str, seconds: float) -> int:
+        """The number of environments with which a kind is fastest."""
+        cores = os.cpu_count() or 1
+        numbers = {1, cores, 2 * cores, 4 * cores, 16, 64}
+        return max(sorted(numbers), key=lambda number: self.measure(kind, id, number, seconds))
+
+
+def vector(make: Any, id: str, num_envs: int, threads: int, seconds: float) -> float:
+    """Steps per second of `make_vec` or `serve`."""
+    with make(id, num_envs, num_threads=threads or None, seed=0) as envs:
+        envs.reset()
+        envs.action_space.seed(0)
+        actions = [np.asarray(envs.action_space.sample()) for _ in range(251)]
+        for number in range(20):
+            envs.step(actions[number])
+        batches, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            envs.step(actions[batches % len(actions)])
+            batches += 1
+        return batches * num_envs / (time.perf_counter() - start)
+
+
+def single(id: str, seconds: float) -> float:
+    """Steps per second of one environment."""
+    env = gymnasium.make(f"EndlessGym/{id}")
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(1009)]
+    env.reset(seed=0)
+    steps, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        if env.step(actions[steps % len(actions)])[2]:
+            env.reset()
+        steps += 1
+    return steps / (time.perf_counter() - start)
+
+
+def service_from_rust(id: str, num_envs: int, threads: int, seconds: float) -> float:
+    """Steps per second that `endless bench` reaches with the service, from Rust."""
+    arguments = {"env": id, "num-envs": num_envs, "threads": threads, "seconds": seconds, "rounds": 1}
+    command = [*program(), "bench", "--json", *(f"--{name}={value}" for name, value in arguments.items())]
+    (row,) = json.loads(subprocess.check_output(command, stderr=subprocess.DEVNULL))
+    ways = {entry["way"]: entry["steps_per_second"] for entry in row["measurements"]}
+    return float(ways["service, only receives"])
+
+
+def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, Any]:
+    """All contenders for one environment."""
+    cores = os.cpu_count() or 1
+    best = {kind: original.best(kind, id, args.seconds / 2) for kind in VECTORS}
+    contenders: dict[str, Any] = {}
+    for kind in VECTORS:
+        contenders[f"original, {kind}, {best[kind]} environments"] = (original.measure, kind, id, best[kind])
+    contenders[f"original, {cores} independent processes"] = (original.measure, "independent", id, cores)
+    contenders["original, gymnasium.make"] = (original.measure, "single", id, 1)
+    contenders["gymnasium.make"] = (single, id)
+    for size in SIZES:
+        contenders[f"make_vec, {size} environments"] = (vector, endless_gym.make_vec, id, size, args.threads)
+        contenders[f"serve, {size} environments"] = (vector, endless_gym.serve, id, size, args.threads)
+    contenders[f"service from Rust, {SIZES[-1]} environments"] = (service_from_rust, id, SIZES[-1], args.threads)
+    results: dict[str, list[float]] = {name: [] for name in contenders}
+    for number in range(args.rounds):
+        for name, (measure, *arguments) in contenders.items():
+            progress(f"{id}, round {number + 1} of {args.rounds}: {name}")
+            results[name].append(measure(*arguments, args.seconds))
+    progress("")
+    medians = {name: statistics.median(values) for name, values in results.items()}
+    vectors = {name: median for name, median in medians.items() if any(kind in name for kind in VECTORS)}
+    return {
+        "id": id,
+        "steps_per_second": {name: [round(value) for value in values] for name, values in results.items()},
+        "best_original": max(vectors, key=lambda name: vectors[name]),
+        "medians": {name: round(median) for name, median in medians.items()},
+        "targets": targets(medians, max(vectors.values())),
+    }
+
+
+def targets(medians: dict[str, float], original: float) -> list[dict[str, Any]]:
+    """What is promised, what was reached, and whether that is enough."""
+    rows = []
+    for size in SIZES:
+        for way in ("make_vec", "serve"):
+            reached = medians[f"{way}, {size} environments"] / original
+            rows.append((f"{way} with {size} environments, times the best vectorised original", 100.0, reached))
+    reached = medians["gymnasium.make"] / medians["original, gymnasium.make"]
+    rows.append(("gymnasium.make, times the original's", 20.0, reached))
+    size = SIZES[-1]
+    reached = medians[f"serve, {size} environments"] / medians[f"service from Rust, {size} environments"]
+    rows.append((f"serve with {size} environments, of the same from Rust", 0.9, reached))
+    return [
+        {"what": what, "target": target, "reached": round(reached, 2), "met": reached >= target}
+        for what, target, reached in rows
+    ]
+
+
+def show(row: dict[str, Any]) -> None:
+    """Prints the tables of one environment."""
+    reference = row["medians"][row["best_original"]]
+    print(f"{row['id']:46}{'steps/s':>12}{'lowest':>12}{'highest':>12}{'x best original':>17}")
+    for name, values in row["steps_per_second"].items():
+        median = row["medians"][name]
+        print(f"  {name:44}{median:12,}{min(values):12,}{max(values):12,}{median / reference:17.1f}")
+    for target in row["targets"]:
+        met = "met" if target["met"] else "MISSED"
+        print(f"  {target['what']}: {target['reached']:.2f}, target {target['target']:.2f}, {met}")
+    print(flush=True)
+
+
+def machine() -> dict[str, Any]:
+    """What it was measured on."""
+    models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    return {
+        "processor": models[0].split(":")[1].strip() if models else platform.machine(),
+        "cores": os.cpu_count(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "endless_gym": endless_gym.__version__,
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def progress(text: str) -> None:
+    """Says on a terminal what is being measured."""
+    if sys.stderr.isatty():
+        print(f"\r{text:110}\r", end="", file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--original", required=True, metavar="PYTHON", help="a Python with memory-gym 1.0.2")
+    parser.add_argument("--ids", nargs="+", default=IDS, metavar="ID", help="environments (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="measurements of each contender (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=1.0, help="of one measurement (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=0, help="the engine's, 0 for one for each core (default: 0)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything to this file")
+    args = parser.parse_args()
+    described = machine()
+    print(", ".join(f"{name} {value}" for name, value in described.items()))
+    print(f"medians of {args.rounds} rounds of {args.seconds} s\n", flush=True)
+    original, rows = Original(args.original), []
+    for id in args.ids:
+        rows.append(compare(id, original, args))
+        show(rows[-1])
+    if args.json:
+        whole = {"machine": described, "rounds": args.rounds, "seconds": args.seconds, "environments": rows}
+        args.json.write_text(json.dumps(whole, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

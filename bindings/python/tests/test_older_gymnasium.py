@@ -1,0 +1,51 @@
+"""Programs that are held to Gymnasium 0.29 and numpy 1, as the original is, run with the package in its place."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import endless_gym
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """Variables with which the original's Python finds the package that is tested here, too."""
+    (tmp_path / "endless_gym").symlink_to(Path(endless_gym.__file__).parent)
+    return {**os.environ, "PYTHONPATH": str(tmp_path), "SDL_VIDEODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
+
+
+def test_it_plays_as_the_original(original_python: str, environment: dict[str, str]) -> None:
+    program = Path(__file__).parent / "older_gymnasium.py"
+    records = []
+    for module in ("memory_gym", "endless_gym.memory_gym"):
+        command = [original_python, "-W", "ignore", program, module]
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr
+        # The original's libraries print lines of their own first.
+        records.append(json.loads(ran.stdout.splitlines()[-1]))
+    original, ours = records
+    assert original.keys() == ours.keys()
+    for id, entries in original.items():
+        for number, (wanted, given) in enumerate(zip(entries, ours[id], strict=True)):
+            assert given == wanted, f"{id}, entry {number}"
+
+
+def test_what_needs_a_newer_one_says_so(original_python: str, environment: dict[str, str]) -> None:
+    program = """
+import endless_gym, gymnasium
+print(gymnasium.__version__)
+for name in ("make_vec", "serve", "connect", "EndlessVectorEnv"):
+    try:
+        getattr(endless_gym, name)
+    except ImportError as error:
+        print(error)
+"""
+    command = [original_python, "-c", program]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    version, *messages = ran.stdout.splitlines()
+    assert version.startswith("0.29")
+    assert len(messages) == 4
+    assert all("need Gymnasium 1.1 or newer, and there is 0.29" in message for message in messages)
