@@ -16,7 +16,7 @@ from endless_gym._native import EngineLost, TooManyBatchesHeld, __version__, run
 from endless_gym.env import Env
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
-from endless_gym.specs import all_specs, spec
+from endless_gym.specs import Frames, all_specs, spec
 
 if TYPE_CHECKING:
     from endless_gym.engine import serve
@@ -27,6 +27,7 @@ __all__ = [
     "EndlessVectorEnv",
     "EngineLost",
     "Env",
+    "Frames",
     "TooManyBatchesHeld",
     "__version__",
     "all_specs",

@@ -33,7 +33,7 @@ class Pool:
         seed: int | None,
         seed_range: tuple[int, int] | None,
         seed_list: Sequence[int] | None,
-        frames: bool,
+        frames: tuple[bool, bool, bool, int] | None,
         features: bool,
         final_observation: bool,
     ) -> None: ...

@@ -12,7 +12,7 @@ from typing import Any
 
 from endless_gym import _native
 from endless_gym.program import program
-from endless_gym.specs import json_text, spec
+from endless_gym.specs import Frames, json_text, spec
 from endless_gym.vector import AutoresetMode, EndlessVectorEnv, Options, autoreset_mode, connect, contents
 
 _numbers = count()
@@ -75,6 +75,7 @@ def serve(
     options: Options | Sequence[Options] | None = None,
     autoreset: str | AutoresetMode = "next_step",
     observation: str = "rgb",
+    frames: Frames | None = None,
     batches_held: int = 4,
     timeout: float = 30.0,
     copy: bool = False,
@@ -96,6 +97,7 @@ def serve(
         options: As for `make_vec`.
         autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
         observation: `rgb`, `features` or `rgb+features`.
+        frames: As for `make_vec`.
         batches_held: Steps of a group whose arrays may be held at a time, 1 to 16.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writeable copies instead of read-only views into shared memory.
@@ -104,7 +106,7 @@ def serve(
         RuntimeError: The engine cannot start; the message says why.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
-    frames, features = contents(observation)
+    frames, features = contents(observation, frames)
     arguments: dict[str, Any] = {
         "--env": described.id,
         "--num-envs": num_envs,
@@ -126,7 +128,7 @@ def serve(
         command += [f"--env-options={json_text(dict(each))}" for each in options]
     command += ["--final-observation"] if mode is AutoresetMode.SAME_STEP else []
     command += ["--features"] if features else []
-    command += [] if frames else ["--no-frames"]
+    command += frames.command() if frames else ["--no-frames"]
     engine = EngineProcess(command)
     try:
         return engine.connect(timeout, copy)

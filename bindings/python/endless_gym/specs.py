@@ -18,6 +18,48 @@ SCREEN = 84
 
 
 @dataclass(frozen=True)
+class Frames:
+    """What the frames of an observation look like. The default is the original's: uint8 (84, 84, 3), [x][y][channel].
+
+    The engine writes them so, with nothing to convert afterwards, and only the pixels that change.
+    """
+
+    #: Brightness instead of colours, without an index for the channel, as Gymnasium's `GrayscaleObservation`.
+    grayscale: bool = False
+    #: The channel is the first index of a frame, as PyTorch's convolutions want it.
+    channels_first: bool = False
+    #: [row][column] instead of [x][y].
+    row_major: bool = False
+    #: The last frames of the episode in one observation, oldest first, 1 to 64; with more than 1 they are the first index, as in
+    #: Gymnasium's `FrameStackObservation`. An episode's first frame stands for those before it.
+    stack: int = 1
+
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one environment's observation."""
+        channels = () if self.grayscale else (3,)
+        frame = (*channels, SCREEN, SCREEN) if self.channels_first else (SCREEN, SCREEN, *channels)
+        return frame if self.stack == 1 else (self.stack, *frame)
+
+    def arguments(self) -> tuple[bool, bool, bool, int]:
+        """As the native module takes it."""
+        return self.grayscale, self.channels_first, self.row_major, self.stack
+
+    def command(self) -> list[str]:
+        """As `endless serve` takes it."""
+        flags = {
+            "--grayscale": self.grayscale,
+            "--channels-first": self.channels_first,
+            "--row-major": self.row_major,
+        }
+        return [*(flag for flag, given in flags.items() if given), f"--frame-stack={self.stack}"]
+
+    @staticmethod
+    def of_specification(described: dict[str, Any] | None) -> Frames | None:
+        """What an engine says that it serves."""
+        return None if described is None else Frames(**described["format"], stack=described["stack"])
+
+
+@dataclass(frozen=True)
 class Spec:
     """An environment id, as the engine describes it."""
 
@@ -42,11 +84,11 @@ class Spec:
             return spaces.MultiDiscrete(list(self.branches))
         return spaces.Discrete(self.branches[0])
 
-    def observation_space(self, frames: bool = True, features: bool = False) -> gymnasium.Space[Any]:
+    def observation_space(self, frames: Frames | None = Frames(), features: bool = False) -> gymnasium.Space[Any]:
         """The original's observation space, or with the feature observation instead of or beside the frames."""
         parts: dict[str, gymnasium.Space[Any]] = {}
-        if frames:
-            parts["visual_observation"] = spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8)
+        if frames is not None:
+            parts["visual_observation"] = spaces.Box(0, 255, frames.shape(), np.uint8)
         if features:
             parts["features"] = spaces.Box(-np.inf, np.inf, (len(self.features),), np.float32)
         if self.vector_observation:

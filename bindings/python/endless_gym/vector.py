@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.specs import Spec, options_text, spec
+from endless_gym.specs import Frames, Spec, options_text, spec
 
 try:
     from gymnasium.vector import AutoresetMode as AutoresetMode
@@ -57,6 +57,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         *,
         described: Spec,
         num_envs: int,
+        frames: Frames | None,
         sections: Sequence[str],
         autoreset: AutoresetMode,
         copy: bool = False,
@@ -66,7 +67,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._described = described
         self.num_envs = num_envs
         self.num_groups = backend.groups
-        self.single_observation_space = described.observation_space("observation" in sections, "features" in sections)
+        self.single_observation_space = described.observation_space(frames, "features" in sections)
         self.single_action_space = described.action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -390,6 +391,7 @@ def make_vec(
     options: Options | Sequence[Options] | None = None,
     autoreset: str | AutoresetMode = "next_step",
     observation: str = "rgb",
+    frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
 ) -> EndlessVectorEnv:
@@ -407,11 +409,12 @@ def make_vec(
         autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
         observation: `rgb`, `features` (a short vector of what the frame shows; nothing is drawn), or both as a dict:
             `rgb+features`.
+        frames: What frames look like where they are not as the original's: grey, channels first, row-major, several of them.
         groups: Groups of environments for `send` and `recv`.
         copy: Return writeable copies instead of read-only views.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
-    frames, features = contents(observation)
+    frames, features = contents(observation, frames)
     # Groups count their environments through, as an engine does.
     pools = [
         _native.Pool(
@@ -425,7 +428,7 @@ def make_vec(
             seed=seed,
             seed_range=(seeds.start, seeds.stop) if isinstance(seeds, range) else None,
             seed_list=None if seeds is None or isinstance(seeds, range) else list(seeds),
-            frames=frames,
+            frames=frames.arguments() if frames else None,
             features=features,
             final_observation=True,
         )
@@ -435,6 +438,7 @@ def make_vec(
         _InProcess(pools),
         described=described,
         num_envs=num_envs,
+        frames=frames,
         sections=pools[0].sections(),
         autoreset=mode,
         copy=copy,
@@ -461,6 +465,7 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
         _Remote(connection, specification["groups"], timeout, engine),
         described=spec(specification["id"]),
         num_envs=specification["num_envs"],
+        frames=Frames.of_specification(specification["frames"]),
         sections=[section["name"] for section in specification["batch"]["sections"]],
         autoreset=_MODES[specification["autoreset"]],
         copy=copy,
@@ -483,11 +488,14 @@ def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
     return mode
 
 
-def contents(observation: str) -> tuple[bool, bool]:
-    """Whether a batch has frames and the feature observation."""
+def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The frames that a batch has, and whether it has the feature observation."""
     if observation not in OBSERVATIONS:
         raise ValueError(f"no observation `{observation}`; there are {', '.join(OBSERVATIONS)}")
-    return OBSERVATIONS[observation]
+    has_frames, has_features = OBSERVATIONS[observation]
+    if frames is not None and not has_frames:
+        raise ValueError(f"the observation `{observation}` has no frames; leave out {frames}")
+    return (frames or Frames()) if has_frames else None, has_features
 
 
 def _name(mode: AutoresetMode) -> str:

@@ -1,6 +1,8 @@
 //! What Python hands over: actions, options, seeds.
 
+use endless_gym::batch::Frames;
 use endless_gym::pool::{Autoreset, Options, ResetRequest, Seeding};
+use endless_gym::raster::PixelFormat;
 use numpy::{PyArrayMethods, PyReadonlyArrayDyn};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -33,6 +35,11 @@ pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
 /// What does not fit an i32 is as far out of range as what is just outside.
 fn clamp(action: i64) -> i32 {
     i32::try_from(action).unwrap_or(-1)
+}
+
+/// Grey, channels first, row-major, number of frames.
+pub fn frames((grayscale, channels_first, row_major, stack): (bool, bool, bool, usize)) -> Frames {
+    Frames { format: PixelFormat { grayscale, channels_first, row_major }, stack }
 }
 
 /// Reset parameters from the JSON text of an object.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use endless_gym::batch::{Block, Frames, zeroed};
+use endless_gym::batch::{Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
 use endless_gym::pool::{self as engine, PoolConfig, Threads};
 use numpy::{PyArray1, PyArrayMethods};
@@ -51,7 +51,7 @@ impl Pool {
         seed: Option<u64>,
         seed_range: Option<(u64, u64)>,
         seed_list: Option<Vec<u64>>,
-        frames: bool,
+        frames: Option<(bool, bool, bool, usize)>,
         features: bool,
         final_observation: bool,
     ) -> PyResult<Self> {
@@ -59,7 +59,7 @@ impl Pool {
             options: arguments::pool_options(options)?,
             autoreset: arguments::autoreset(autoreset)?,
             seeding: arguments::seeding(seed, seed_range, seed_list),
-            frames: frames.then(Frames::default),
+            frames: frames.map(arguments::frames),
             features,
             final_observation,
             first_env,

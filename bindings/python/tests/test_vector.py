@@ -205,3 +205,61 @@ def test_mistakes_are_exceptions() -> None:
         endless_gym.serve(ID, 2, options={"arena_sise": 1})
     with pytest.raises(ConnectionError, match="nobody"):
         endless_gym.connect("nobody", timeout=0)
+
+
+def transposed(axes: tuple[int, ...]):
+    """A wrapper that changes the order of a frame's axes."""
+
+    def wrap(env: gymnasium.Env) -> gymnasium.Env:
+        shape = tuple(env.observation_space.shape[axis] for axis in axes)
+        space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+        return gymnasium.wrappers.TransformObservation(env, lambda frame: frame.transpose(axes), space)
+
+    return wrap
+
+
+def stacked(number: int):
+    return lambda env: gymnasium.wrappers.FrameStackObservation(env, number)
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize(
+    ("frames", "wrappers"),
+    [
+        (endless_gym.Frames(grayscale=True), [gymnasium.wrappers.GrayscaleObservation]),
+        (endless_gym.Frames(grayscale=True, stack=4), [gymnasium.wrappers.GrayscaleObservation, stacked(4)]),
+        (endless_gym.Frames(channels_first=True), [transposed((2, 0, 1))]),
+        (endless_gym.Frames(row_major=True), [transposed((1, 0, 2))]),
+        (endless_gym.Frames(channels_first=True, row_major=True, stack=2), [transposed((2, 1, 0)), stacked(2)]),
+    ],
+)
+def test_frames_are_as_gymnasiums_wrappers_make_them(where, mode: AutoresetMode, frames, wrappers) -> None:
+    def wrapped() -> gymnasium.Env:
+        env: gymnasium.Env = endless_gym.Env("Endless-SearingSpotlights-v0")
+        for wrapper in wrappers:
+            env = wrapper(env)
+        return env
+
+    sync = SyncVectorEnv([wrapped] * 3, autoreset_mode=mode)
+    with made(where, "Endless-SearingSpotlights-v0", 3, autoreset=mode, frames=frames) as envs:
+        assert envs.single_observation_space == sync.single_observation_space
+        envs.action_space.seed(1)
+        compare(envs.reset(seed=5)[0], sync.reset(seed=5)[0])
+        ends = 0
+        for _ in range(150):
+            actions = envs.action_space.sample()
+            step, wanted = envs.step(actions), sync.step(actions)
+            compare(step[:4], wanted[:4])
+            if "final_obs" in wanted[4]:
+                compare(step[4]["final_obs"], wanted[4]["final_obs"])
+            ends += int(step[2].sum())
+        assert ends > 0
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_frames_that_cannot_be_are_refused(where) -> None:
+    with pytest.raises(ValueError, match="has no frames"):
+        where(ID, 2, observation="features", frames=endless_gym.Frames(stack=2))
+    with pytest.raises((ValueError, RuntimeError), match="a stack of 65 frames"):
+        where(ID, 2, frames=endless_gym.Frames(stack=65))
