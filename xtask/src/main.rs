@@ -12,7 +12,7 @@ const HELP: &str = "\
 cargo xtask test                 check the format, lint, and run all tests, Rust's and Python's
 cargo xtask python               build the Python package, check it, and run its tests alone
 cargo xtask instructions         count the instructions of a step, and compare with what is recorded (--record records)
-cargo xtask bench-python [ARGS]  compare steps per second from Python with the original (--help shows ARGS)
+cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help shows ARGS)
 cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)
 cargo xtask original             set up the original in a virtual environment and print the path of its Python";
 
@@ -39,7 +39,7 @@ fn main() -> ExitCode {
         ["python"] => python::test(),
         ["instructions"] => instructions::run(false),
         ["instructions", "--record"] => instructions::run(true),
-        ["bench-python", ref arguments @ ..] => python::bench(arguments),
+        ["bench", ref arguments @ ..] => python::bench(arguments),
         ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
         ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
         ["original"] => original::python().map(|python| println!("{}", python.display())),

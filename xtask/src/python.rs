@@ -31,13 +31,18 @@ pub fn test() -> Result<(), String> {
     run("pytest", pytest.env("ENDLESS_ORIGINAL_PYTHON", original::python()?))
 }
 
-/// Compares steps per second with the original's.
+/// Compares steps per second with the original's, and for scale with EnvPool's own environments where it can be installed.
 pub fn bench(arguments: &[&str]) -> Result<(), String> {
     let folder = install("release")?;
+    let envpool = venv("envpool", original::base()?, &[Install::of(&["envpool==1.2.5"])]);
     let mut script = Command::new(folder.join("bin/python"));
-    script.arg(workspace().join("benches/python_comparison.py"));
+    script.arg(workspace().join("benches/comparison.py"));
     script.arg("--original").arg(original::python()?).args(arguments);
-    run("benches/python_comparison.py", &mut script)
+    match envpool {
+        Ok(folder) => drop(script.arg("--envpool").arg(folder.join("bin/python"))),
+        Err(message) => eprintln!("without EnvPool: {message}"),
+    }
+    run("benches/comparison.py", &mut script)
 }
 
 fn package() -> PathBuf {

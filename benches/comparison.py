@@ -1,11 +1,13 @@
-"""Steps per second from Python, beside the original's: whole episodes with random actions, medians of several rounds.
+"""Steps per second beside the original's, from Rust and from Python: whole episodes with random actions, medians of rounds.
 
-cargo xtask bench-python                       # sets everything up, and runs this; further arguments are passed on
+cargo xtask bench                      # sets everything up, and runs this; further arguments are passed on
+cargo xtask bench --markdown t.md --json t.json
 
 It wants the package with `stable-baselines3` in its own Python 3.11, and by `--original` another one with `memory-gym`. The
 original pins Gymnasium 0.29 and numpy 1: its environments run in a process that finds its Python's packages first, and
-Stable-Baselines3 among those of this one. In each round every contender is measured once, one after the other, since other
-programs on the machine disturb a measurement.
+Stable-Baselines3 among those of this one. EnvPool's own environments and a plain copy of memory show the scale; PufferLib's own
+are not among them, since they fetch sources over the network to be built. In each round every contender is measured once, one
+after the other, since other programs on the machine disturb a measurement.
 """
 
 from __future__ import annotations
@@ -30,6 +32,12 @@ IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpot
 VECTORS = ["SyncVectorEnv", "AsyncVectorEnv", "SubprocVecEnv"]
 SIZES = [64, 1024]
 
+#: EnvPool's environment that is most like ours in what it hands over, four grey frames of 84x84, and its fastest.
+ENVPOOL = ["Pong-v5", "CartPole-v1"]
+
+#: What is promised: times the best vectorised original, times the original's single environment, share of the service's speed.
+VECTORISED, SINGLE, OF_RUST = 300.0, 20.0, 0.9
+
 
 class Original:
     """The process that steps the original."""
@@ -40,7 +48,7 @@ class Original:
         if right != "True" or sys.version_info[:2] != (3, 11):
             sys.exit("this script and the original both need Python 3.11, whose packages they share")
         self._process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", str(Path(__file__).with_name("python_original.py"))],
+            [sys.executable, "-W", "ignore", str(Path(__file__).with_name("comparison_original.py"))],
             env={**os.environ, "PYTHONPATH": packages.strip(), "OMP_NUM_THREADS": "1"},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -95,13 +103,51 @@ def single(id: str, seconds: float) -> float:
     return steps / (time.perf_counter() - start)
 
 
-def service_from_rust(id: str, num_envs: int, threads: int, seconds: float) -> float:
-    """Steps per second that `endless bench` reaches with the service, from Rust."""
+def rust(id: str, num_envs: int, threads: int, seconds: float) -> dict[str, float]:
+    """Steps per second that `endless bench` reaches, by way."""
     arguments = {"env": id, "num-envs": num_envs, "threads": threads, "seconds": seconds, "rounds": 1}
     command = [*program(), "bench", "--json", *(f"--{name}={value}" for name, value in arguments.items())]
     (row,) = json.loads(subprocess.check_output(command, stderr=subprocess.DEVNULL))
-    ways = {entry["way"]: entry["steps_per_second"] for entry in row["measurements"]}
-    return float(ways["service, only receives"])
+    return {
+        f"Rust, {entry['way']}, {num_envs} environments": entry["steps_per_second"] for entry in row["measurements"]
+    }
+
+
+def envpool(python: str, id: str, num_envs: int, seconds: float) -> float:
+    """Steps per second of one of EnvPool's own environments."""
+    script = str(Path(__file__).with_name("comparison_envpool.py"))
+    command = [python, "-W", "ignore", script, id, str(num_envs), str(seconds)]
+    return float(subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True).split()[-1])
+
+
+def memory_bandwidth() -> float:
+    """Gigabytes a second that a plain copy of much memory writes, and reads as many."""
+    source = np.ones(1 << 28, dtype=np.uint8)
+    target = np.zeros_like(source)
+    start = time.perf_counter()
+    np.copyto(target, source)
+    return source.nbytes / (time.perf_counter() - start) / 1e9
+
+
+def scale(args: argparse.Namespace) -> dict[str, float]:
+    """Medians of what shows the scale."""
+    contenders: dict[str, Any] = {"memory, GB/s written by a plain copy": (memory_bandwidth,)}
+    if args.envpool:
+        for id in ENVPOOL:
+            contenders[f"EnvPool's {id}, {SIZES[0]} environments, steps/s"] = (
+                envpool,
+                args.envpool,
+                id,
+                SIZES[0],
+                args.seconds,
+            )
+    results: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(args.rounds):
+        for name, (measure, *arguments) in contenders.items():
+            progress(name)
+            results[name].append(measure(*arguments))
+    progress("")
+    return {name: round(statistics.median(values), 1) for name, values in results.items()}
 
 
 def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, Any]:
@@ -117,12 +163,15 @@ def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, 
     for size in SIZES:
         contenders[f"make_vec, {size} environments"] = (vector, endless_gym.make_vec, id, size, args.threads)
         contenders[f"serve, {size} environments"] = (vector, endless_gym.serve, id, size, args.threads)
-    contenders[f"service from Rust, {SIZES[-1]} environments"] = (service_from_rust, id, SIZES[-1], args.threads)
     results: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(args.rounds):
         for name, (measure, *arguments) in contenders.items():
             progress(f"{id}, round {number + 1} of {args.rounds}: {name}")
             results[name].append(measure(*arguments, args.seconds))
+        for size in SIZES:
+            progress(f"{id}, round {number + 1} of {args.rounds}: Rust, {size} environments")
+            for name, value in rust(id, size, args.threads, args.seconds).items():
+                results.setdefault(name, []).append(value)
     progress("")
     medians = {name: statistics.median(values) for name, values in results.items()}
     vectors = {name: median for name, median in medians.items() if any(kind in name for kind in VECTORS)}
@@ -141,12 +190,12 @@ def targets(medians: dict[str, float], original: float) -> list[dict[str, Any]]:
     for size in SIZES:
         for way in ("make_vec", "serve"):
             reached = medians[f"{way}, {size} environments"] / original
-            rows.append((f"{way} with {size} environments, times the best vectorised original", 100.0, reached))
+            rows.append((f"{way} with {size} environments, times the best vectorised original", VECTORISED, reached))
     reached = medians["gymnasium.make"] / medians["original, gymnasium.make"]
-    rows.append(("gymnasium.make, times the original's", 20.0, reached))
+    rows.append(("gymnasium.make, times the original's", SINGLE, reached))
     size = SIZES[-1]
-    reached = medians[f"serve, {size} environments"] / medians[f"service from Rust, {size} environments"]
-    rows.append((f"serve with {size} environments, of the same from Rust", 0.9, reached))
+    reached = medians[f"serve, {size} environments"] / medians[f"Rust, service, only receives, {size} environments"]
+    rows.append((f"serve with {size} environments, of the same from Rust", OF_RUST, reached))
     return [
         {"what": what, "target": target, "reached": round(reached, 2), "met": reached >= target}
         for what, target, reached in rows
@@ -164,6 +213,25 @@ def show(row: dict[str, Any]) -> None:
         met = "met" if target["met"] else "MISSED"
         print(f"  {target['what']}: {target['reached']:.2f}, target {target['target']:.2f}, {met}")
     print(flush=True)
+
+
+def markdown(whole: dict[str, Any]) -> str:
+    """Everything as Markdown."""
+    lines = ["# Steps per second beside the original's", ""]
+    lines += [f"- {name.replace('_', ' ')}: {value}" for name, value in whole["machine"].items()]
+    lines += [f"- medians of {whole['rounds']} rounds of {whole['seconds']} s", ""]
+    lines += ["| for scale | |", "| --- | ---: |"]
+    lines += [f"| {name} | {value:,} |" for name, value in whole["scale"].items()]
+    for row in whole["environments"]:
+        reference = row["medians"][row["best_original"]]
+        lines += ["", f"## {row['id']}", "", "| | steps/s | lowest | highest | x best vectorised original |"]
+        lines += ["| --- | ---: | ---: | ---: | ---: |"]
+        for name, values in row["steps_per_second"].items():
+            median = row["medians"][name]
+            lines.append(f"| {name} | {median:,} | {min(values):,} | {max(values):,} | {median / reference:.1f} |")
+        lines += ["", "| | target | reached |", "| --- | ---: | ---: |"]
+        lines += [f"| {target['what']} | {target['target']} | {target['reached']} |" for target in row["targets"]]
+    return "\n".join(lines) + "\n"
 
 
 def machine() -> dict[str, Any]:
@@ -193,17 +261,26 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="measurements of each contender (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=1.0, help="of one measurement (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="the engine's, 0 for one for each core (default: 0)")
+    parser.add_argument("--envpool", metavar="PYTHON", help="a Python with envpool, for its own environments")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything to this file")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables to this file")
     args = parser.parse_args()
     described = machine()
     print(", ".join(f"{name} {value}" for name, value in described.items()))
     print(f"medians of {args.rounds} rounds of {args.seconds} s\n", flush=True)
+    shown_scale = scale(args)
+    for name, value in shown_scale.items():
+        print(f"{name:58}{value:14,}")
+    print(flush=True)
     original, rows = Original(args.original), []
     for id in args.ids:
         rows.append(compare(id, original, args))
         show(rows[-1])
+    whole = {"machine": described, "rounds": args.rounds, "seconds": args.seconds}
+    whole |= {"scale": shown_scale, "environments": rows}
+    if args.markdown:
+        args.markdown.write_text(markdown(whole))
     if args.json:
-        whole = {"machine": described, "rounds": args.rounds, "seconds": args.seconds, "environments": rows}
         args.json.write_text(json.dumps(whole, indent=2) + "\n")
 
 
