@@ -119,6 +119,10 @@ pub struct Summary {
     pub undelivered: u64,
 }
 
+/// Chunks of a group that are in memory from the start: one is written while the trainer reads the other. More come into use,
+/// and take memory, where a trainer or an observer holds more; [`Engine::new`] has made sure that there is room for them.
+const CHUNKS_AT_START: usize = 2;
+
 /// Environments behind a name, ready to be stepped by a trainer.
 pub struct Engine {
     // Ports go before the node that they belong to.
@@ -263,7 +267,7 @@ impl Group {
             .create()
             .map_err(|e| ServiceError::middleware("cannot create a subscriber")(e.to_string()))?;
         let service = services.observations(number, limits)?;
-        let publisher = ports::publisher(&service, pool.layout().blocks(), limits.resident());
+        let publisher = ports::publisher(&service, pool.layout().blocks(), CHUNKS_AT_START);
         let (observations, memory) = publisher.map_err(|e| match e {
             PortError::Other(e) => e,
             PortError::Taken => ServiceError::middleware("cannot create a publisher")("it exists already".to_owned()),
