@@ -31,7 +31,7 @@ fn paint(criterion: &mut Criterion) {
     group.bench_function("blit_within", |bencher| {
         bencher.iter(|| sprite.blit_within(&mut canvas, 30, 31, &disc, center))
     });
-    group.bench_function("blit_shaded", |bencher| bencher.iter(|| sprite.blit_shaded(&mut canvas, 30, 31, 100)));
+    group.bench_function("shaded", |bencher| bencher.iter(|| sprite.shaded(100)));
     group.bench_function("disc", |bencher| bencher.iter(|| canvas.fill_disc([1, 2, 3], center, &disc)));
     group.finish();
 }

@@ -52,6 +52,11 @@ impl CharacterSprites {
         CharacterSprites { radius, size, sprites }
     }
 
+    /// The pictures as they look under a black surface of some `alpha`.
+    pub fn shaded(&self, alpha: u8) -> Self {
+        CharacterSprites { sprites: self.sprites.each_ref().map(|sprite| sprite.shaded(alpha)), ..*self }
+    }
+
     /// Radius of the body in pixels.
     pub fn radius(&self) -> i32 {
         self.radius

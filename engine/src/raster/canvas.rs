@@ -43,9 +43,15 @@ impl<'a> Canvas<'a> {
         Self { painted: Some(painted), ..self }
     }
 
+    /// Whether somebody wants to know what is painted.
+    #[inline]
+    pub fn is_noting(&self) -> bool {
+        self.painted.is_some()
+    }
+
     /// Notes that some rows of some columns are painted.
     #[inline]
-    fn note(&mut self, columns: Range<usize>, rows: &Range<usize>) {
+    pub fn note(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         if let Some(painted) = &mut self.painted {
             note(&mut painted[columns], rows);
         }
@@ -87,6 +93,13 @@ impl<'a> Canvas<'a> {
     /// All bytes, column by column, 3 a pixel.
     #[inline]
     pub fn pixels(&self) -> &[u8] {
+        self.pixels
+    }
+
+    /// All bytes, to be changed; whoever does keeps to [`columns`](Canvas::columns) and [`rows`](Canvas::rows), and
+    /// [notes](Canvas::note) what it paints.
+    #[inline]
+    pub fn pixels_mut(&mut self) -> &mut [u8] {
         self.pixels
     }
 
@@ -134,8 +147,13 @@ impl<'a> Canvas<'a> {
             self.pixels.copy_from_slice(picture);
             return;
         }
-        let (height, first) = (self.height, self.rows.start);
-        self.runs_mut().for_each(|(x, run)| copy_run(&picture[(x * height + first) * 3..][..run.len()], run));
+        self.note(self.columns.clone(), &self.rows.clone());
+        let height = self.height;
+        let length = self.rows.len() * 3;
+        for x in self.columns.clone() {
+            let start = (x * height + self.rows.start) * 3;
+            copy_run(&picture[start..start + length], &mut self.pixels[start..start + length]);
+        }
     }
 
     fn is_whole(&self) -> bool {
@@ -178,7 +196,7 @@ fn note(painted: &mut [u128], rows: &Range<usize>) {
 /// Paints all pixels of a run.
 pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
     if color == [color[0]; 3] {
-        return run.fill(color[0]);
+        return fill_bytes(run, color[0]);
     }
     // Up to this length, pixels are painted one by one; the rest is copied, twice as much each time.
     let mut painted = run.len().min(96 * 3);
@@ -187,6 +205,27 @@ pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
         let length = painted.min(run.len() - painted);
         run.copy_within(..length, painted);
         painted += length;
+    }
+}
+
+/// Fills bytes: a few of them in registers, where filling any number would be a call.
+#[inline]
+fn fill_bytes(bytes: &mut [u8], byte: u8) {
+    match bytes.len() {
+        16..32 => fill_ends::<16>(bytes, byte),
+        32..64 => fill_ends::<32>(bytes, byte),
+        _ => bytes.fill(byte),
+    }
+}
+
+/// Fills the first `N` bytes and the last.
+#[inline]
+fn fill_ends<const N: usize>(bytes: &mut [u8], byte: u8) {
+    if let Some(first) = bytes.first_chunk_mut::<N>() {
+        *first = [byte; N];
+    }
+    if let Some(last) = bytes.last_chunk_mut::<N>() {
+        *last = [byte; N];
     }
 }
 

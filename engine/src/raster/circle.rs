@@ -100,11 +100,19 @@ impl Disc {
         })
     }
 
+    /// How far the column at a place from the centre reaches up and down; 0 where there is none.
+    #[inline]
+    pub fn half_height(&self, x: i64) -> i32 {
+        // Both sides of the centre are alike: the column -1 is as far away as 0.
+        self.half_heights.get((x ^ (x >> 63)) as usize).copied().unwrap_or(0)
+    }
+
     /// Whether the disc covers the pixel at a place from its centre.
     #[inline]
     pub fn contains(&self, (x, y): (i32, i32)) -> bool {
-        let index = if x < 0 { -x - 1 } else { x };
-        self.half_heights.get(index as usize).is_some_and(|half| (-half..*half).contains(&y))
+        // Both sides of the centre are alike: the column -1 is as far away as 0.
+        let distance = |from_centre: i32| from_centre ^ (from_centre >> 31);
+        self.half_heights.get(distance(x) as usize).is_some_and(|half| distance(y) < *half)
     }
 
     /// Those of some rows of the column `x` that the disc about `center` covers.

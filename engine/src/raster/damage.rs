@@ -30,8 +30,8 @@ impl Damage {
         let mut at = 0;
         while at < self.count {
             // One that has grown may overlap those that it was compared with before.
-            if self.rects[at].overlaps(&rect) || self.count == MOST {
-                rect = self.rects[at].union(&rect);
+            if meets(&self.rects[at], &rect) || self.count == MOST {
+                rect = about(&self.rects[at], &rect);
                 self.count -= 1;
                 self.rects[at] = self.rects[self.count];
                 at = 0;
@@ -59,6 +59,24 @@ impl Damage {
     pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
         self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
     }
+}
+
+/// [`Rect::overlaps`] for rectangles that lie on the canvas and have pixels, whose numbers are small.
+#[inline]
+fn meets(one: &Rect, other: &Rect) -> bool {
+    one.x < other.x + other.width
+        && other.x < one.x + one.width
+        && one.y < other.y + other.height
+        && other.y < one.y + one.height
+}
+
+/// [`Rect::union`] for the same.
+#[inline]
+fn about(one: &Rect, other: &Rect) -> Rect {
+    let (x, y) = (one.x.min(other.x), one.y.min(other.y));
+    let right = (one.x + one.width).max(other.x + other.width);
+    let bottom = (one.y + one.height).max(other.y + other.height);
+    Rect { x, y, width: right - x, height: bottom - y }
 }
 
 #[cfg(test)]

@@ -105,7 +105,7 @@ mod tests {
             &|canvas| sprite.blit(canvas, 5, 6),
             &|canvas| sprite.blit(canvas, -3, 26),
             &|canvas| sprite.blit_within(canvas, 5, 6, &disc, (8, 9)),
-            &|canvas| sprite.blit_shaded(canvas, 15, -2, 100),
+            &|canvas| sprite.shaded(100).blit(canvas, 15, -2),
             &|canvas| canvas.fill_disc([4, 5, 6], (2, 3), &disc),
             &|canvas| canvas.draw_circle([4, 5, 6], (10, 12), 9, 3),
             &|canvas| canvas.draw_line([4, 5, 6], (-2, 3), (30, 20), 3),

@@ -13,6 +13,8 @@ pub struct Sprite {
     /// The pixels of all runs, one run after the other.
     pixels: Vec<u8>,
     bounds: Rect,
+    /// The same pixels in blocks of fixed sizes, for a sprite that is painted as a whole.
+    blocks: Blocks,
 }
 
 /// Opaque pixels of one column, without a gap.
@@ -42,8 +44,12 @@ impl Sprite {
                 runs.push(Run { x: x as u32, y: y as u32, length: run.len() as u32, start });
             }
         }
-        let bounds = bounds(&runs);
-        Self { runs, pixels, bounds }
+        Self::from_runs(runs, pixels)
+    }
+
+    fn from_runs(runs: Vec<Run>, pixels: Vec<u8>) -> Self {
+        let (bounds, blocks) = (bounds(&runs), Blocks::new(&runs, &pixels));
+        Self { runs, pixels, bounds, blocks }
     }
 
     /// The smallest rectangle about the opaque pixels, from the sprite's top left corner: what
@@ -63,8 +69,10 @@ impl Sprite {
         let (columns, rows) = (canvas.columns(), canvas.rows());
         let (first, end) = (columns.start as i64, columns.end as i64);
         let (highest, lowest) = (rows.start as i64, rows.end as i64);
-        if left >= first && top >= highest && right <= end && bottom <= lowest {
-            self.blit_whole(canvas, x, y);
+        if left >= first && top >= highest && right <= end && bottom <= lowest && !canvas.is_noting() {
+            // Negative where the sprite's empty margin reaches beyond the canvas; the blocks do not.
+            let corner = i64::from(x) * canvas.height() as i64 + i64::from(y);
+            self.blocks.copy(corner, canvas);
         } else if right > first && bottom > highest && left < end && top < lowest {
             self.blit_clipped(canvas, i64::from(x), i64::from(y));
         }
@@ -76,23 +84,10 @@ impl Sprite {
         Rect { x: x.saturating_add(self.bounds.x), y: y.saturating_add(self.bounds.y), ..self.bounds }
     }
 
-    /// Paints a sprite whose bounds may change as a whole.
-    #[inline]
-    fn blit_whole(&self, canvas: &mut Canvas<'_>, x: i32, y: i32) {
-        let mut remaining = self.pixels.as_slice();
-        for run in &self.runs {
-            // The sprite's empty margin may reach beyond the canvas; the runs do not.
-            let (column, row) = ((x + run.x as i32) as usize, (y + run.y as i32) as usize);
-            let (source, rest) = remaining.split_at(run.length as usize * 3);
-            remaining = rest;
-            copy_run(source, canvas.run_mut(column, row..row + run.length as usize));
-        }
-    }
-
-    /// Paints the part of the sprite that lies on the canvas.
+    /// Paints the part of the sprite that lies on the canvas, run by run.
     fn blit_clipped(&self, canvas: &mut Canvas<'_>, x: i64, y: i64) {
         for (column, rows, source) in self.runs_on(canvas.columns(), canvas.rows(), x, y) {
-            canvas.run_mut(column, rows).copy_from_slice(source);
+            copy_run(source, canvas.run_mut(column, rows));
         }
     }
 
@@ -108,21 +103,25 @@ impl Sprite {
         {
             return;
         }
-        for (column, rows, source) in self.runs_on(canvas.columns(), canvas.rows(), i64::from(x), i64::from(y)) {
-            let lit = disc.rows(center, column, &rows);
-            if !lit.is_empty() {
-                let source = &source[(lit.start - rows.start) * 3..(lit.end - rows.start) * 3];
-                canvas.run_mut(column, lit).copy_from_slice(source);
+        let (columns, rows) = (canvas.columns(), canvas.rows());
+        let (x, y, top) = (i64::from(x), i64::from(y), i64::from(center.1));
+        for run in &self.runs {
+            let (column, row) = (x + i64::from(run.x), y + i64::from(run.y));
+            let half = i64::from(disc.half_height(column - i64::from(center.0)));
+            let first = row.max(rows.start as i64).max(top - half);
+            let end = (row + i64::from(run.length)).min(rows.end as i64).min(top + half);
+            if first < end && columns.contains(&(column as usize)) {
+                let length = (end - first) as usize * 3;
+                let source = &self.pixels[run.start as usize + (first - row) as usize * 3..][..length];
+                copy_run(source, canvas.run_mut(column as usize, first as usize..end as usize));
             }
         }
     }
 
-    /// Paints the sprite as it looks under a black surface of some `alpha` that has a colour key: 0 as it is, 255 black.
-    pub fn blit_shaded(&self, canvas: &mut Canvas<'_>, x: i32, y: i32, alpha: u8) {
-        for (column, rows, source) in self.runs_on(canvas.columns(), canvas.rows(), i64::from(x), i64::from(y)) {
-            let target = canvas.run_mut(column, rows);
-            target.iter_mut().zip(source).for_each(|(target, source)| *target = blend_keyed(0, *source, alpha));
-        }
+    /// The sprite as it looks under a black surface of some `alpha` that has a colour key: 0 as it is, 255 black.
+    pub fn shaded(&self, alpha: u8) -> Sprite {
+        let pixels = self.pixels.iter().map(|channel| blend_keyed(0, *channel, alpha)).collect();
+        Self::from_runs(self.runs.clone(), pixels)
     }
 
     /// The parts of the runs that lie in some columns and rows, for a sprite with its top left corner at `(x, y)`: column,
@@ -148,6 +147,84 @@ impl Sprite {
     }
 }
 
+/// Runs by their lengths, each as two blocks of a fixed size that may overlap. Copies of fixed sizes are a few moves each,
+/// without a loop or a call.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+struct Blocks {
+    one: BlocksOf<3>,
+    two: BlocksOf<6>,
+    four: BlocksOf<12>,
+    eight: BlocksOf<24>,
+    sixteen: BlocksOf<48>,
+}
+
+impl Blocks {
+    fn new(runs: &[Run], pixels: &[u8]) -> Self {
+        let mut blocks = Self::default();
+        for run in runs {
+            // Two of the largest blocks at a time.
+            for above in (0..run.length).step_by(32) {
+                let (y, length) = (run.y + above, (run.length - above).min(32));
+                let pixels = &pixels[(run.start + above * 3) as usize..][..length as usize * 3];
+                match length {
+                    0..2 => blocks.one.add(run.x, y, pixels),
+                    2..4 => blocks.two.add(run.x, y, pixels),
+                    4..8 => blocks.four.add(run.x, y, pixels),
+                    8..16 => blocks.eight.add(run.x, y, pixels),
+                    16.. => blocks.sixteen.add(run.x, y, pixels),
+                }
+            }
+        }
+        blocks
+    }
+
+    /// Paints them all, from the pixel of that number on, counted column by column.
+    #[inline]
+    fn copy(&self, corner: i64, canvas: &mut Canvas<'_>) {
+        self.one.copy(corner, canvas);
+        self.two.copy(corner, canvas);
+        self.four.copy(corner, canvas);
+        self.eight.copy(corner, canvas);
+        self.sixteen.copy(corner, canvas);
+    }
+}
+
+/// Runs of `N` to `2 N` bytes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+struct BlocksOf<const N: usize>(Vec<Pair<N>>);
+
+/// The first and the last bytes of a run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Pair<const N: usize> {
+    /// Position of the first pixel from the sprite's top left corner.
+    x: u32,
+    y: u32,
+    /// Bytes from the first block to the last.
+    step: u32,
+    first: [u8; N],
+    last: [u8; N],
+}
+
+impl<const N: usize> BlocksOf<N> {
+    fn add(&mut self, x: u32, y: u32, run: &[u8]) {
+        if let (Some(first), Some(last)) = (run.first_chunk(), run.last_chunk()) {
+            self.0.push(Pair { x, y, step: (run.len() - N) as u32, first: *first, last: *last });
+        }
+    }
+
+    #[inline]
+    fn copy(&self, corner: i64, canvas: &mut Canvas<'_>) {
+        let height = canvas.height() as i64;
+        let pixels = canvas.pixels_mut();
+        for Pair { x, y, step, first, last } in &self.0 {
+            let start = (corner + i64::from(*x) * height + i64::from(*y)) as usize * 3;
+            let run = &mut pixels[start..][..*step as usize + N];
+            run[..N].copy_from_slice(first);
+            run[*step as usize..].copy_from_slice(last);
+        }
+    }
+}
+
 /// The smallest rectangle about some runs.
 fn bounds(runs: &[Run]) -> Rect {
     let left = runs.iter().map(|run| run.x).min().unwrap_or(0);
@@ -157,27 +234,28 @@ fn bounds(runs: &[Run]) -> Rect {
     Rect::new(left as i32, top as i32, (right - left) as i32, (bottom - top) as i32)
 }
 
-/// Copies a short run between slices of the same length. Blocks of fixed sizes are moved in registers,
-/// where a copy of any length would be a call; the last block overlaps the one before it.
+/// Copies a run between slices of the same length: as two blocks of a fixed size that may overlap, which are moved in
+/// registers. A copy of any length would be a call, which only pays for long ones.
 #[inline]
 pub fn copy_run(source: &[u8], target: &mut [u8]) {
-    if source.len() >= 32 {
-        copy_blocks::<32>(source, target);
-    } else if source.len() >= 16 {
-        copy_blocks::<16>(source, target);
-    } else if source.len() >= 8 {
-        copy_blocks::<8>(source, target);
-    } else {
-        copy_blocks::<3>(source, target);
+    match source.len() {
+        3 => copy_ends::<3>(source, target),
+        4..8 => copy_ends::<4>(source, target),
+        8..16 => copy_ends::<8>(source, target),
+        16..32 => copy_ends::<16>(source, target),
+        32..64 => copy_ends::<32>(source, target),
+        64..128 => copy_ends::<64>(source, target),
+        _ => target.copy_from_slice(source),
     }
 }
 
+/// Copies the first `N` bytes and the last.
 #[inline]
-fn copy_blocks<const N: usize>(source: &[u8], target: &mut [u8]) {
-    for (source, target) in source.as_chunks::<N>().0.iter().zip(target.as_chunks_mut::<N>().0) {
+fn copy_ends<const N: usize>(source: &[u8], target: &mut [u8]) {
+    if let (Some(source), Some(target)) = (source.first_chunk::<N>(), target.first_chunk_mut()) {
         *target = *source;
     }
-    if let (Some(source), Some(target)) = (source.last_chunk::<N>(), target.last_chunk_mut::<N>()) {
+    if let (Some(source), Some(target)) = (source.last_chunk::<N>(), target.last_chunk_mut()) {
         *target = *source;
     }
 }

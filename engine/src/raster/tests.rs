@@ -282,7 +282,7 @@ proptest! {
         cover.set_alpha(alpha.into());
         expected.blit(&cover, 0, 0);
         let mut found = Surface::new(33, 27);
-        sprite.blit_shaded(&mut found.canvas(), at.0, at.1, alpha);
+        sprite.shaded(alpha).blit(&mut found.canvas(), at.0, at.1);
         prop_assert_eq!(found.pixels(), expected.pixels());
     }
 }

@@ -176,16 +176,26 @@ impl Scene {
             damage.add(Rect::new(0, 0, SCREEN as i32, SCREEN as i32));
             return damage;
         }
-        let tiles = [(shown.goal, self.goal), (shown.origin, self.origin)];
-        for (before, now) in tiles.into_iter().filter(|(before, now)| before != now) {
-            [before, now].into_iter().flatten().for_each(|(x, y)| damage.add(tile_at(x * TILE, y * TILE)));
+        let mut add_tile = |tile: Option<Tile>| {
+            if let Some((x, y)) = tile {
+                damage.add(tile_at(x * TILE, y * TILE));
+            }
+        };
+        if self.goal != shown.goal {
+            add_tile(shown.goal);
+            add_tile(self.goal);
+        }
+        if self.origin != shown.origin {
+            add_tile(shown.origin);
+            add_tile(self.origin);
         }
         if self.past != shown.past {
             let places = shown.past.places().chain(self.past.places());
             places.for_each(|(left, top)| damage.add(tile_at(left, top)));
         }
         if self.agent != shown.agent {
-            [shown, self].iter().for_each(|scene| damage.add(assets.character.bounds(&scene.agent)));
+            damage.add(assets.character.bounds(&shown.agent));
+            damage.add(assets.character.bounds(&self.agent));
         }
         if self.spent != shown.spent {
             damage.add(stamina_bar(0, SCREEN as i32));

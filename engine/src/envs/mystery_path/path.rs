@@ -146,19 +146,19 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
         f64::from((x - goal.0).pow(2) + (y - goal.1).pow(2)).sqrt()
     };
     let mut price = [0_i64; 64];
-    let mut promise = [0.0_f64; 64];
     let mut reached_from = [NOWHERE; 64];
-    let mut open_list = [0_u8; MAX_LENGTH];
-    open_list[0] = start;
+    // Each tile with what it promises, side by side, since every search of the list reads all promises.
+    let mut open_list = [(0.0_f64, 0_u8); MAX_LENGTH];
+    open_list[0] = (0.0, start);
     let mut open_count = 1;
     let mut open = TileSet(1 << start);
     // Walls and tiles outside of the grid are never entered, like tiles that are done with.
     let mut closed = TileSet(walls.0 | !TileSet::GRID.0);
     while open_count > 0 {
         let list = &open_list[..open_count];
-        let first = promise[usize::from(list[0])];
-        let winner = list.iter().position(|index| promise[usize::from(*index)] < first).unwrap_or(0);
-        let current = list[winner];
+        let (first, _) = list[0];
+        let winner = list.iter().position(|(promise, _)| *promise < first).unwrap_or(0);
+        let (_, current) = list[winner];
         if current == end {
             break;
         }
@@ -175,9 +175,8 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
             let cost = price[usize::from(current)] + random.integers(LOWEST_PRICE, PRICE_END);
             if !open.holds(next) {
                 price[place] = cost;
-                promise[place] = cost as f64 + distance(next);
                 open.0 |= 1 << next;
-                open_list[open_count] = next;
+                open_list[open_count] = (cost as f64 + distance(next), next);
                 open_count += 1;
             } else if cost >= price[place] {
                 continue;

@@ -1,14 +1,14 @@
 //! The pictures made from a set of reset parameters.
 
-use std::ops::Range;
+use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 
 use super::parameters::{MAX_SPOTLIGHTS, Parameters, Variant};
 use super::shape::Shape;
-use crate::envs::SCREEN;
 use crate::envs::character::CharacterSprites;
-use crate::raster::{Canvas, CornerRadii, Rect, Rgb, Sprite, Surface, blend_keyed, copy_run};
+use crate::envs::{FRAME_BYTES, SCREEN};
+use crate::raster::{Canvas, CornerRadii, Disc, DiscColumn, Rect, Rgb, Sprite, Surface, blend_keyed, copy_run};
 
 const BLACK: Rgb = [0, 0, 0];
 const WHITE: Rgb = [255, 255, 255];
@@ -63,12 +63,6 @@ impl Columns {
         &self.columns[usize::from(SECOND[x] & 1)]
     }
 
-    /// The background's pixel at some place.
-    #[inline]
-    pub fn pixel(&self, x: usize, y: usize) -> Rgb {
-        self.column(x)[y]
-    }
-
     /// The background under a black surface of some `alpha`.
     pub fn shaded(&self, alpha: u8) -> Self {
         Columns::new(self.colors.map(|color| color.map(|channel| blend_keyed(0, channel, alpha))))
@@ -77,16 +71,79 @@ impl Columns {
     /// Paints everything.
     #[inline]
     pub fn paint(&self, canvas: &mut Canvas<'_>) {
-        let rows = canvas.rows();
-        canvas.runs_mut().for_each(|(x, run)| copy_run(self.column(x)[rows.clone()].as_flattened(), run));
+        if self.colors[0] == self.colors[1] {
+            return canvas.fill(self.colors[0]);
+        }
+        let (columns, rows) = (canvas.columns(), canvas.rows());
+        if columns.len() < SCREEN || rows.len() < SCREEN {
+            canvas.runs_mut().for_each(|(x, run)| copy_run(self.column(x)[rows.clone()].as_flattened(), run));
+            return;
+        }
+        canvas.note(columns, &rows);
+        // The first two columns of tiles, and from then on what is painted already, twice as much each time.
+        let mut painted = 2 * TILE;
+        let first = canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0.iter_mut().take(painted);
+        first.enumerate().for_each(|(x, column)| *column = *self.column(x));
+        while painted < SCREEN {
+            let count = painted.min(SCREEN - painted);
+            canvas.pixels_mut().copy_within(..count * SCREEN * 3, painted * SCREEN * 3);
+            painted += count;
+        }
     }
 
-    /// Paints some rows of a column, as far as there are any.
-    #[inline]
-    pub fn paint_run(&self, canvas: &mut Canvas<'_>, x: usize, rows: Range<usize>) {
-        if rows.start < rows.end {
+    /// Paints a disc.
+    pub fn paint_disc(&self, canvas: &mut Canvas<'_>, disc: &Disc, center: (i32, i32)) {
+        let (columns, rows) = (canvas.columns(), canvas.rows());
+        for DiscColumn { x, rows } in disc.columns(center, &columns, rows) {
             copy_run(self.column(x)[rows.clone()].as_flattened(), canvas.run_mut(x, rows));
         }
+    }
+
+    fn picture(&self) -> Box<Frame> {
+        let mut frame = Box::new([0; FRAME_BYTES]);
+        self.paint(&mut Canvas::new(&mut *frame, SCREEN, SCREEN));
+        frame
+    }
+}
+
+/// All pixels of a screen.
+pub(super) type Frame = [u8; FRAME_BYTES];
+
+/// What backgrounds and things look like at some darkness.
+#[derive(Debug)]
+pub(super) struct Look {
+    /// By [`Ground`].
+    grounds: [Columns; 4],
+    /// The same as pictures of the whole screen, made once they are asked for: few of the darknesses on the way last.
+    pictures: [OnceLock<Box<Frame>>; 4],
+    pub coin: Sprite,
+    pub exit_closed: Sprite,
+    pub exit_open: Sprite,
+    pub character: CharacterSprites,
+}
+
+impl Look {
+    fn shaded(&self, alpha: u8) -> Self {
+        Look {
+            grounds: self.grounds.map(|ground| ground.shaded(alpha)),
+            pictures: Default::default(),
+            coin: self.coin.shaded(alpha),
+            exit_closed: self.exit_closed.shaded(alpha),
+            exit_open: self.exit_open.shaded(alpha),
+            character: self.character.shaded(alpha),
+        }
+    }
+
+    /// A background, to be painted as a whole.
+    #[inline]
+    pub fn ground(&self, ground: Ground) -> &Columns {
+        &self.grounds[ground as usize]
+    }
+
+    /// A background, to copy scattered pixels from.
+    #[inline]
+    pub fn picture(&self, ground: Ground) -> &Frame {
+        self.pictures[ground as usize].get_or_init(|| self.ground(ground).picture())
     }
 }
 
@@ -95,18 +152,16 @@ impl Columns {
 pub struct Assets {
     pub variant: Variant,
     pub parameters: Parameters,
-    pub character: CharacterSprites,
     /// Within this many pixels of their centres the agent's border reaches coins and exit.
     pub coin_radius: i32,
     pub exit_radius: f64,
     /// Spotlights that an environment has at a time, more or less.
     pub most_spotlights: usize,
-    /// By [`Ground`].
-    pub(super) grounds: [Columns; 4],
-    pub(super) coin: Sprite,
     pub(super) exit_side: i32,
-    pub(super) exit_closed: Sprite,
-    pub(super) exit_open: Sprite,
+    /// As it is lit.
+    pub(super) lit: Look,
+    /// By the darkness, made once it is that dark.
+    dark: Box<[OnceLock<Box<Look>>; 256]>,
 }
 
 impl Assets {
@@ -121,17 +176,32 @@ impl Assets {
         let [exit_closed, exit_open] = exit_pictures(exit_side, parameters.exit_scale);
         Assets {
             variant,
-            character: CharacterSprites::new(parameters.agent_scale),
             coin_radius,
             exit_radius: 20.0 / 2.0 * parameters.exit_scale,
             most_spotlights: most_spotlights(&parameters),
-            grounds: grounds.map(Columns::new),
-            coin: coin_picture(coin_radius, parameters.coin_scale),
             exit_side,
-            exit_closed,
-            exit_open,
+            lit: Look {
+                grounds: grounds.map(Columns::new),
+                pictures: Default::default(),
+                coin: coin_picture(coin_radius, parameters.coin_scale),
+                exit_closed,
+                exit_open,
+                character: CharacterSprites::new(parameters.agent_scale),
+            },
+            dark: Box::new([const { OnceLock::new() }; 256]),
             parameters,
         }
+    }
+
+    /// What everything looks like outside of the light.
+    #[inline]
+    pub(super) fn dark(&self, darkness: u8) -> &Look {
+        self.dark[usize::from(darkness)].get_or_init(|| Box::new(self.lit.shaded(darkness)))
+    }
+
+    /// Radius of the agent in pixels.
+    pub(super) fn agent_radius(&self) -> i32 {
+        self.lit.character.radius()
     }
 }
 

@@ -207,7 +207,7 @@ impl State {
     pub(super) fn play(&mut self, assets: &Assets, action: &[i32], random: &mut Generator) -> Transition {
         let parameters = &assets.parameters;
         self.first_frame = false;
-        self.agent.step_within(action, parameters.agent_speed, assets.character.radius(), WALKABLE);
+        self.agent.step_within(action, parameters.agent_speed, assets.agent_radius(), WALKABLE);
         self.shown_action = self.last_action;
         self.last_action = [action[0], action[1]];
         self.dim_light(parameters);
@@ -223,7 +223,7 @@ impl State {
         let mut left = false;
         if let Some(exit) = self.exit.as_mut().filter(|_| coins_done) {
             exit.open = true;
-            left = reaches(exit.location, self.agent, assets.exit_radius + f64::from(assets.character.radius()));
+            left = reaches(exit.location, self.agent, assets.exit_radius + f64::from(assets.agent_radius()));
             reward += if left { parameters.reward_exit } else { 0.0 };
         }
         let all_collected = coins_done && self.num_coins > 0 && !parameters.use_exit && !assets.variant.endless;
@@ -272,7 +272,7 @@ impl State {
             } else {
                 spotlight.advance();
                 self.lit.push(spotlight.circle());
-                let reach = spotlight.radius + assets.character.radius();
+                let reach = spotlight.radius + assets.agent_radius();
                 self.hit |= distance(spotlight.location, agent) <= f64::from(reach);
             }
             index += 1;
@@ -299,7 +299,7 @@ impl State {
 
     /// The agent collects the coins that it reaches. Returns the reward.
     fn collect(&mut self, assets: &Assets) -> f64 {
-        let reach = f64::from(assets.coin_radius + assets.character.radius());
+        let reach = f64::from(assets.coin_radius + assets.agent_radius());
         let mut reward = 0.0;
         let mut index = 0;
         while let Some(&coin) = self.coins.get(index) {
@@ -316,7 +316,7 @@ impl State {
 
     /// The agent collects the only coin if it reaches it, and another appears. Returns the reward.
     fn collect_for_ever(&mut self, assets: &Assets, random: &mut Generator) -> f64 {
-        let reach = f64::from(assets.coin_radius + assets.character.radius());
+        let reach = f64::from(assets.coin_radius + assets.agent_radius());
         match self.coins.first_mut() {
             Some(coin) if reaches(*coin, self.agent, reach) => {
                 *coin = next_coin(Some(*coin), random);

@@ -5,7 +5,7 @@
 
 use smallvec::SmallVec;
 
-use super::drawing::{Assets, Ground};
+use super::drawing::{Assets, Ground, Look};
 use super::light;
 use super::rules::{BAR_HEIGHT, Exit, SearingSpotlights, State};
 use super::shape::Shape;
@@ -13,7 +13,7 @@ use super::spotlight::Circle;
 use super::top_bar::Bar;
 use crate::envs::SCREEN;
 use crate::envs::character::Character;
-use crate::raster::{Canvas, Damage, DiscColumn, Rect, Sprite};
+use crate::raster::{Canvas, Damage, Rect, Sprite};
 
 /// Among more circles than these, it is faster to paint everything than to find out what has changed.
 const MANY: usize = 64;
@@ -57,30 +57,36 @@ impl SearingSpotlights {
         // Without a coin, the original paints the empty, black surface that was meant for it.
         let curtain = self.assets.variant.endless && state.coins.is_empty();
         let coins_shine = state.coins_shine(parameters);
-        let scene = Scene {
+        let covered = curtain && coins_shine;
+        Scene {
             ground: if curtain { Ground::Black } else { state.ground },
             coins_shine,
-            covered: curtain && coins_shine,
+            covered,
+            circles: if covered { SmallVec::new() } else { state.shown_circles() },
             agent: state.shown_agent(),
-            ..self.lit_scene()
-        };
-        if scene.covered { Scene { circles: SmallVec::new(), ..scene } } else { scene }
+            ..self.unlit_scene()
+        }
     }
 
     /// What there is, with nothing that is hidden or covered.
     fn lit_scene(&self) -> Scene {
+        Scene { circles: self.state.shown_circles(), agent: self.state.true_agent(), ..self.unlit_scene() }
+    }
+
+    /// A scene without circles.
+    #[inline]
+    fn unlit_scene(&self) -> Scene {
         let state = &self.state;
-        let dark = state.darkness > 0;
         Scene {
             ground: state.ground,
             darkness: state.darkness,
             covered: false,
-            outlined: dark && state.outlined,
+            outlined: state.darkness > 0 && state.outlined,
             coins_shine: false,
-            circles: state.lit.iter().filter(|circle| dark && circle.is_on_screen()).copied().collect(),
+            circles: SmallVec::new(),
             coins: SmallVec::from_slice(&state.coins),
             exit: state.exit,
-            agent: state.true_agent(),
+            agent: Character::default(),
             bar: self.bar(),
         }
     }
@@ -93,13 +99,24 @@ impl SearingSpotlights {
         for things in
             [Things { exit: true, ..nothing }, Things { coins: true, ..nothing }, Things { agent: true, ..nothing }]
         {
-            scene.each(assets, things, |sprite, (x, y)| sprite.blit(canvas, x, y));
+            scene.each(assets, &assets.lit, things, |sprite, (x, y)| sprite.blit(canvas, x, y));
         }
         scene.bar.paint(assets.variant, canvas);
     }
 }
 
 impl State {
+    /// The lit circles on the screen, where it is not lit anyway.
+    fn shown_circles(&self) -> SmallVec<[Circle; 12]> {
+        let mut circles = SmallVec::new();
+        if self.darkness > 0 {
+            for circle in self.lit.iter().filter(|circle| circle.is_on_screen()) {
+                circles.push(*circle);
+            }
+        }
+        circles
+    }
+
     /// The agent as the frame shows it: an episode's first frame turns it upwards.
     pub fn shown_agent(&self) -> Character {
         if self.first_frame { Character { rotation: 0, ..self.agent } } else { self.agent }
@@ -136,9 +153,9 @@ impl Scene {
         };
         let above_bar =
             Things { coins: false, exit: shining.exit && !below_bar.exit, agent: shining.agent && !below_bar.agent };
-        self.each(assets, below_bar, |sprite, (x, y)| sprite.blit(canvas, x, y));
+        self.each(assets, &assets.lit, below_bar, |sprite, (x, y)| sprite.blit(canvas, x, y));
         self.bar.paint(assets.variant, canvas);
-        self.each(assets, above_bar, |sprite, (x, y)| sprite.blit(canvas, x, y));
+        self.each(assets, &assets.lit, above_bar, |sprite, (x, y)| sprite.blit(canvas, x, y));
     }
 
     /// Changes a frame that shows `shown`.
@@ -152,45 +169,49 @@ impl Scene {
         }
         let mut damage = Damage::new(SCREEN, SCREEN);
         let change = light::Change::new(shown, self);
-        let lights: SmallVec<[Rect; 16]> = change.bounds().collect();
         if self.outlined || shown.outlined {
-            lights.iter().for_each(|light| damage.add(*light));
+            change.bounds().for_each(|light| damage.add(light));
         } else {
             change.paint(assets, canvas);
         }
-        self.add_things(shown, assets, &lights, &mut damage);
-        let shining = self.shining(assets);
-        for field in self.bar.changes_since(&shown.bar) {
-            if shining.any() {
-                damage.add(field);
+        self.add_things(shown, assets, &change, &mut damage);
+        if self.bar != shown.bar {
+            if self.shining(assets).any() {
+                self.bar.changes_since(&shown.bar).for_each(|field| damage.add(field));
             } else {
                 // Nothing is above the bar.
-                self.bar.paint(assets.variant, &mut canvas.clipped(field));
+                self.bar.repaint(&shown.bar, assets.variant, canvas);
             }
         }
         damage.repair(canvas, |canvas| self.paint(assets, canvas));
     }
 
     /// Adds the places of things that have changed or that the light has, as far as any of it is seen.
-    fn add_things(&self, shown: &Scene, assets: &Assets, lights: &[Rect], damage: &mut Damage) {
+    fn add_things(&self, shown: &Scene, assets: &Assets, change: &light::Change<'_>, damage: &mut Damage) {
         let shining = self.shining(assets);
-        let mut add = |things: Things, shines: bool, changed: bool| {
-            let scenes = if changed { &[shown, self][..] } else { &[self] };
-            for scene in scenes {
-                scene.each(assets, things, |sprite, corner| {
+        let add = |things: Things, shines: bool, changed: bool, damage: &mut Damage| {
+            if changed {
+                for scene in [shown, self] {
+                    scene.each(assets, &assets.lit, things, |sprite, corner| {
+                        let bounds = sprite.bounds_at(corner);
+                        if shines || self.darkness < 255 || scene.circles.iter().any(|circle| circle.reaches(&bounds)) {
+                            damage.add(bounds);
+                        }
+                    });
+                }
+            } else {
+                self.each(assets, &assets.lit, things, |sprite, corner| {
                     let bounds = sprite.bounds_at(corner);
-                    let is_lit = || scene.circles.iter().any(|circle| circle.bounds().overlaps(&bounds));
-                    let is_touched = || lights.iter().any(|light| light.overlaps(&bounds));
-                    if if changed { shines || self.darkness < 255 || is_lit() } else { is_touched() } {
+                    if change.reaches(&bounds) {
                         damage.add(bounds);
                     }
                 });
             }
         };
         let nothing = Things { coins: false, exit: false, agent: false };
-        add(Things { coins: true, ..nothing }, shining.coins, self.coins != shown.coins);
-        add(Things { exit: true, ..nothing }, shining.exit, self.exit != shown.exit);
-        add(Things { agent: true, ..nothing }, shining.agent, self.agent != shown.agent);
+        add(Things { coins: true, ..nothing }, shining.coins, self.coins != shown.coins, damage);
+        add(Things { exit: true, ..nothing }, shining.exit, self.exit != shown.exit, damage);
+        add(Things { agent: true, ..nothing }, shining.agent, self.agent != shown.agent, damage);
     }
 
     /// What is seen in the dark.
@@ -201,52 +222,42 @@ impl Scene {
 
     /// Hands out the pictures of some things and the places of their top left corners, from the lowest to the uppermost.
     #[inline]
-    fn each(&self, assets: &Assets, things: Things, mut paint: impl FnMut(&Sprite, (i32, i32))) {
-        if !things.any() {
-            return;
-        }
+    fn each(&self, assets: &Assets, look: &Look, things: Things, mut paint: impl FnMut(&Sprite, (i32, i32))) {
         if things.coins {
             for (x, y) in &self.coins {
-                paint(&assets.coin, (x - assets.coin_radius, y - assets.coin_radius));
+                paint(&look.coin, (x - assets.coin_radius, y - assets.coin_radius));
             }
         }
         if let Some(exit) = self.exit.filter(|_| things.exit) {
-            let picture = if exit.open { &assets.exit_open } else { &assets.exit_closed };
+            let picture = if exit.open { &look.exit_open } else { &look.exit_closed };
             let (x, y) = exit.location;
             paint(picture, (x - assets.exit_side / 2, y - assets.exit_side / 2));
         }
         if things.agent {
-            let (sprite, corner) = assets.character.picture(&self.agent);
+            let (sprite, corner) = look.character.picture(&self.agent);
             paint(sprite, corner);
         }
     }
 
     /// Paints the ground and what is hidden on it, as the light shows them.
     fn paint_light(&self, assets: &Assets, hidden: Things, canvas: &mut Canvas<'_>) {
-        let ground = &assets.grounds[self.ground as usize];
-        let darkness = self.darkness;
-        match darkness {
-            0 => {
-                ground.paint(canvas);
-                self.each(assets, hidden, |sprite, (x, y)| sprite.blit(canvas, x, y));
-                return;
-            }
-            255 => canvas.fill([0; 3]),
-            _ => {
-                ground.shaded(darkness).paint(canvas);
-                self.each(assets, hidden, |sprite, (x, y)| sprite.blit_shaded(canvas, x, y, darkness));
-            }
+        let dark = assets.dark(self.darkness);
+        dark.ground(self.ground).paint(canvas);
+        // What is black is not seen in the dark.
+        if self.darkness < 255 {
+            self.each(assets, dark, hidden, |sprite, (x, y)| sprite.blit(canvas, x, y));
         }
+        let ground = assets.lit.ground(self.ground);
         let (columns, rows) = (canvas.columns(), canvas.rows());
         let clip = Rect::new(columns.start as i32, rows.start as i32, columns.len() as i32, rows.len() as i32);
-        for circle in self.circles.iter().filter(|circle| circle.bounds().overlaps(&clip)) {
+        for circle in self.circles.iter().filter(|circle| circle.reaches(&clip)) {
             let (shape, centre) = (Shape::of(circle.radius), circle.centre());
-            for DiscColumn { x, rows } in shape.disc.columns(centre, &columns, rows.clone()) {
-                ground.paint_run(canvas, x, rows);
-            }
-            self.each(assets, hidden, |sprite, (x, y)| sprite.blit_within(canvas, x, y, &shape.disc, centre));
+            ground.paint_disc(canvas, &shape.disc, centre);
+            self.each(assets, &assets.lit, hidden, |sprite, (x, y)| {
+                sprite.blit_within(canvas, x, y, &shape.disc, centre);
+            });
             if self.outlined {
-                shape.draw_outline(canvas, centre, darkness);
+                shape.draw_outline(canvas, centre, self.darkness);
             }
         }
     }

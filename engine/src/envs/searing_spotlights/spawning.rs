@@ -14,46 +14,54 @@ const ROW: u128 = (1 << SCREEN) - 1;
 pub(super) struct Places {
     /// Row by row, bit `x` for the place `(x, y)`.
     taken: [u128; SCREEN],
+    /// Free places of each row.
+    free: [u8; SCREEN],
 }
 
 impl Places {
     /// Every place is free.
     pub fn new() -> Self {
-        Places { taken: [0; SCREEN] }
+        Places { taken: [0; SCREEN], free: [SCREEN as u8; SCREEN] }
     }
 
     /// Takes all places that are less than `radius` pixels away from `(x, y)`.
     pub fn block(&mut self, (x, y): (i32, i32), radius: i32) {
-        for (row, taken) in (0..).zip(&mut self.taken) {
-            let rest = radius * radius - (row - y) * (row - y);
-            if rest > 0 {
-                let reach = (rest - 1).isqrt();
-                *taken |= first_places(x + reach + 1) & !first_places(x - reach);
-            }
+        for away in 0..radius {
+            let reach = (radius * radius - away * away - 1).isqrt();
+            let near = first_places(x + reach + 1) & !first_places(x - reach);
+            self.take(y - away, near);
+            self.take(y + away, near);
+        }
+    }
+
+    /// Takes some places of a row, if there is such a row.
+    #[inline]
+    fn take(&mut self, row: i32, places: u128) {
+        if let Some(taken) = self.taken.get_mut(row as usize) {
+            self.free[row as usize] -= (places & !*taken).count_ones() as u8;
+            *taken |= places;
         }
     }
 
     /// Draws one of the free places, each as likely as another, and takes those around it. Where none is free, as with very
     /// many coins, all are: there the original raises an error.
     pub fn sample(&mut self, radius: i32, random: &mut Generator) -> (i32, i32) {
-        let free = |taken: &u128| (!taken & ROW).count_ones();
-        let mut count: u32 = self.taken.iter().map(free).sum();
+        let mut count: u32 = self.free.iter().map(|free| u32::from(*free)).sum();
         if count == 0 {
             *self = Places::new();
             count = (SCREEN * SCREEN) as u32;
         }
         let mut number = random.integers(0, i64::from(count)) as u32;
         let mut place = (0, 0);
-        for (row, taken) in (0..).zip(&self.taken) {
-            let in_row = free(taken);
-            if number < in_row {
+        for ((row, taken), free) in (0..).zip(&self.taken).zip(&self.free) {
+            if number < u32::from(*free) {
                 let mut places = !taken & ROW;
                 // Without the free places before it, it is the lowest.
                 (0..number).for_each(|_| places &= places - 1);
                 place = (places.trailing_zeros() as i32, row);
                 break;
             }
-            number -= in_row;
+            number -= u32::from(*free);
         }
         self.block(place, radius);
         place
@@ -97,8 +105,9 @@ mod tests {
             prop_assert_eq!(found, expected);
             let mut after = blocked.clone();
             after.push((found, radius));
-            let free: u32 = places.taken.iter().map(|taken| (!taken & ROW).count_ones()).sum();
-            prop_assert_eq!(free as usize, listed(&after).len());
+            let counted: Vec<u32> = places.taken.iter().map(|taken| (!taken & ROW).count_ones()).collect();
+            prop_assert_eq!(counted, places.free.map(u32::from));
+            prop_assert_eq!(places.free.iter().map(|free| usize::from(*free)).sum::<usize>(), listed(&after).len());
         }
     }
 

@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
 use super::rules::{BAR_HEIGHT, FAR};
-use super::shape::Shape;
 use crate::envs::SCREEN;
 use crate::envs::vector::{lerp, rotate};
 use crate::random::Generator;
@@ -110,14 +109,35 @@ impl Circle {
     /// Whether a part of it may be seen: on the screen, and not only behind the bar at the top.
     #[inline]
     pub fn is_on_screen(&self) -> bool {
-        const BELOW_BAR: Rect = Rect::new(0, BAR_HEIGHT as i32, SCREEN as i32, (SCREEN - BAR_HEIGHT) as i32);
-        self.bounds().overlaps(&BELOW_BAR)
+        let (low, high) = (-self.radius, SCREEN as i16 + self.radius);
+        let is_within = |at: i16, low: i16| low < at && at < high;
+        is_within(self.x, low) && is_within(self.y, BAR_HEIGHT as i16 + low) && self.radius > 0
     }
 
-    /// Whether a pixel is lit by it.
+    /// Whether none of its rows is above or below the screen or behind the bar.
     #[inline]
-    pub fn covers(&self, (x, y): (i32, i32)) -> bool {
-        Shape::of(self.radius).disc.contains((x - i32::from(self.x), y - i32::from(self.y)))
+    pub fn has_all_rows(&self) -> bool {
+        (BAR_HEIGHT as i16 + self.radius..=SCREEN as i16 - self.radius).contains(&self.y)
+    }
+
+    /// Whether it may light a pixel of a rectangle: whether the rectangle's nearest point is within its radius.
+    #[inline]
+    pub fn reaches(&self, rect: &Rect) -> bool {
+        self.comes_within(0, rect)
+    }
+
+    /// Whether it would reach a rectangle with a radius of so much more.
+    #[inline]
+    pub fn comes_within(&self, more: i32, rect: &Rect) -> bool {
+        let radius = i32::from(self.radius) + more;
+        // Below zero where the centre is within.
+        let gap = |at: i16, low: i32, length: i32| (low - i32::from(at)).max(i32::from(at) - low - length);
+        let x = gap(self.x, rect.x, rect.width);
+        if x >= radius {
+            return false;
+        }
+        let y = gap(self.y, rect.y, rect.height);
+        y < radius && x.max(0).pow(2) + y.max(0).pow(2) < radius * radius
     }
 
     /// Whether a place is within its radius.
@@ -129,7 +149,8 @@ impl Circle {
 
 #[cfg(test)]
 mod tests {
-    use super::Circle;
+    use super::*;
+    use crate::envs::searing_spotlights::shape::Shape;
 
     #[test]
     fn circles_are_seen_up_to_the_last_pixel() {
@@ -141,7 +162,20 @@ mod tests {
             assert!(!circle(x, y).is_on_screen(), "{x}, {y}");
         }
         assert!(!Circle { x: 40, y: 40, radius: 0 }.is_on_screen());
+        assert!(circle(0, 14).has_all_rows() && circle(84, 74).has_all_rows());
+        assert!(!circle(40, 13).has_all_rows() && !circle(40, 75).has_all_rows());
         assert!(circle(40, 40).contains((49, 40)));
         assert!(!circle(40, 40).contains((50, 40)));
+    }
+
+    #[test]
+    fn circles_reach_what_they_light() {
+        for radius in 0..=MAX_SPOT_RADIUS {
+            let (circle, disc) = (Circle { x: 0, y: 0, radius: radius as i16 }, &Shape::of(radius as i16).disc);
+            for (x, y) in (-radius..radius).flat_map(|x| (-radius..radius).map(move |y| (x, y))) {
+                let pixel = Rect::new(x, y, 1, 1);
+                assert!(circle.reaches(&pixel) || !disc.contains((x, y)), "radius {radius}: {x}, {y}");
+            }
+        }
     }
 }

@@ -2,12 +2,10 @@
 
 use std::ops::Range;
 
-use smallvec::SmallVec;
-
 use super::parameters::Variant;
 use super::rules::{BAR_HEIGHT, SearingSpotlights};
 use crate::envs::SCREEN;
-use crate::raster::{Canvas, Rect, Rgb, copy_run};
+use crate::raster::{Canvas, Rect, Rgb};
 
 const BLACK: Rgb = [0, 0, 0];
 const GREY: Rgb = [50, 50, 50];
@@ -56,65 +54,98 @@ impl SearingSpotlights {
 impl Bar {
     /// Paints the bar, which covers the screen's first [`BAR_HEIGHT`] rows.
     pub fn paint(&self, variant: Variant, canvas: &mut Canvas<'_>) {
-        if canvas.rows().start >= BAR_HEIGHT {
-            return;
-        }
-        let clip = canvas.columns();
-        let rows = canvas.rows().start..canvas.rows().end.min(BAR_HEIGHT);
-        let mut paint = |field: Range<usize>, color: Rgb| {
-            let block: [Rgb; BAR_HEIGHT] = [color; BAR_HEIGHT];
-            for x in field.start.max(clip.start)..field.end.min(clip.end) {
-                copy_run(block[..rows.len()].as_flattened(), canvas.run_mut(x, rows.clone()));
-            }
-        };
         // In the order in which the original paints, each field over what earlier steps left behind.
         let damage = usize::from(self.damage);
-        paint(HALF.min(damage)..HALF, HEALTH);
+        fill(canvas, HALF.min(damage)..HALF, HEALTH);
         match self.action {
             Some(action) => {
-                paint(0..HALF.min(damage), DAMAGE);
+                fill(canvas, 0..HALF.min(damage), DAMAGE);
                 for (branch, field) in action.into_iter().zip(ACTION_FIELDS) {
-                    paint(field, ACTIONS[usize::from(branch)]);
+                    fill(canvas, field, ACTIONS[usize::from(branch)]);
                 }
             }
             None => {
-                paint(HALF..SCREEN, if variant.endless { BLACK } else { GREY });
-                paint(0..damage, DAMAGE);
+                fill(canvas, HALF..SCREEN, if variant.endless { BLACK } else { GREY });
+                fill(canvas, 0..damage, DAMAGE);
             }
         }
         if self.overflows {
-            paint(HALF..damage, DAMAGE);
+            fill(canvas, HALF..damage, DAMAGE);
         }
-        if let Some(positive) = self.reward {
-            paint(self.reward_field(), if positive { POSITIVE_REWARD } else { GREY });
+        self.paint_reward(canvas);
+    }
+
+    /// Changes a bar that shows `shown`.
+    pub fn repaint(&self, shown: &Bar, variant: Variant, canvas: &mut Canvas<'_>) {
+        let (Some(action), Some(shown_action), true) = (self.action, shown.action, self.differs_by_fields(shown))
+        else {
+            return self.paint(variant, canvas);
+        };
+        let (damage, shown_damage) = (usize::from(self.damage), usize::from(shown.damage));
+        fill(canvas, damage..shown_damage.min(HALF), HEALTH);
+        fill(canvas, shown_damage..damage.min(HALF), DAMAGE);
+        // The field of the reward covers a part of both.
+        let covered = if self.reward.is_some() { REWARD_BETWEEN } else { HALF + QUARTER..HALF + QUARTER };
+        let fields = [HALF..covered.start, covered.end..SCREEN];
+        for ((now, before), field) in action.into_iter().zip(shown_action).zip(fields) {
+            if now != before {
+                fill(canvas, field, ACTIONS[usize::from(now)]);
+            }
+        }
+        if self.reward != shown.reward {
+            self.paint_reward(canvas);
         }
     }
 
-    /// The fields that differ from those of a bar that shows `shown`.
-    pub fn changes_since(&self, shown: &Bar) -> SmallVec<[Rect; 4]> {
-        let field = |columns: Range<usize>| Rect::new(columns.start as i32, 0, columns.len() as i32, BAR_HEIGHT as i32);
-        let mut changes = SmallVec::new();
-        match (self, shown) {
-            _ if self == shown => {}
-            (
-                Bar { action: Some(action), damage, overflows: false, .. },
-                Bar { action: Some(shown_action), damage: shown_damage, overflows: false, .. },
-            ) => {
-                if damage != shown_damage {
-                    changes.push(field(usize::from(*damage.min(shown_damage))..usize::from(*damage.max(shown_damage))));
-                }
-                let fields = action.iter().zip(shown_action).zip(ACTION_FIELDS);
-                changes.extend(fields.filter(|((now, before), _)| now != before).map(|(_, columns)| field(columns)));
-                if self.reward != shown.reward {
-                    changes.push(field(self.reward_field()));
-                }
-            }
-            _ => changes.push(field(0..SCREEN)),
+    fn paint_reward(&self, canvas: &mut Canvas<'_>) {
+        if let Some(positive) = self.reward {
+            fill(canvas, self.reward_field(), if positive { POSITIVE_REWARD } else { GREY });
         }
-        changes
+    }
+
+    /// Whether only some fields have to be painted to change a bar that shows `shown`.
+    fn differs_by_fields(&self, shown: &Bar) -> bool {
+        self.reward.is_some() == shown.reward.is_some() && !self.overflows && !shown.overflows
+    }
+
+    /// Rectangles about what differs from a bar that shows `shown`.
+    pub fn changes_since(&self, shown: &Bar) -> impl Iterator<Item = Rect> {
+        let mut changes = [0..SCREEN, 0..0, 0..0, 0..0];
+        if let (Some(action), Some(shown_action), true) = (self.action, shown.action, self.differs_by_fields(shown)) {
+            let (damage, shown_damage) = (usize::from(self.damage), usize::from(shown.damage));
+            let [left, right] = ACTION_FIELDS;
+            changes = [
+                damage.min(shown_damage)..damage.max(shown_damage),
+                if action[0] == shown_action[0] { 0..0 } else { left },
+                if action[1] == shown_action[1] { 0..0 } else { right },
+                if self.reward == shown.reward { 0..0 } else { self.reward_field() },
+            ];
+        }
+        let field = |columns: Range<usize>| Rect::new(columns.start as i32, 0, columns.len() as i32, BAR_HEIGHT as i32);
+        changes.into_iter().map(field)
     }
 
     fn reward_field(&self) -> Range<usize> {
         if self.action.is_some() { REWARD_BETWEEN } else { REWARD_ALONE }
+    }
+}
+
+/// Paints some columns of the bar, as far as they may change.
+#[inline]
+fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: Rgb) {
+    let (clip, rows) = (canvas.columns(), canvas.rows());
+    let rows = rows.start..rows.end.min(BAR_HEIGHT);
+    let columns = columns.start.max(clip.start)..columns.end.min(clip.end);
+    if columns.start >= columns.end {
+        return;
+    }
+    canvas.note(columns.clone(), &rows);
+    let columns = &mut canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0[columns];
+    if rows.len() == BAR_HEIGHT {
+        // A column's part of the bar is a block of its own, which is a store or two.
+        let block: [Rgb; BAR_HEIGHT] = [color; BAR_HEIGHT];
+        columns.iter_mut().for_each(|column| column[..BAR_HEIGHT].copy_from_slice(&block));
+    } else if !rows.is_empty() {
+        columns.iter_mut().for_each(|column| column[rows.clone()].fill(color));
     }
 }
