@@ -94,6 +94,18 @@ impl<E: Environment> Lane<E> {
         write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
     }
 
+    /// Makes the frames of the observation show the environment. `shown` has what is noted about each of them.
+    #[inline]
+    fn draw(&self, shown: &mut [Shown<E>], drawing: Drawing, frames: &mut [u8]) -> Result<(), WrongFrame> {
+        let assets = self.env.shared();
+        if let [shown] = shown {
+            return shown.update(assets, self.env.scene(), drawing, frames);
+        }
+        let frames = frames.chunks_exact_mut(frames.len() / shown.len());
+        let mut drawn = self.scenes().zip(shown).zip(frames);
+        drawn.try_for_each(|((scene, shown), frame)| shown.update(assets, scene, drawing, frame))
+    }
+
     fn write_final_observation(&self, drawing: Drawing, out: &mut BatchMut<'_>, row: usize) {
         write_if_present(out.final_observation.row(row), |r| {
             for (scene, frame) in self.scenes().zip(r.chunks_exact_mut(r.len() / self.history.length())) {
@@ -195,12 +207,8 @@ impl<E: Environment> FamilyLanes<E> {
             for (row, (lane, shown)) in lanes.iter_mut().zip(shown.chunks_exact_mut(stack)).enumerate() {
                 play(first + row, lane, &mut out, row);
                 let frames = out.observation.row(row);
-                if frames.is_empty() {
-                    continue;
-                }
-                let frames = frames.chunks_exact_mut(frames.len() / stack);
-                for ((scene, shown), frame) in lane.scenes().zip(shown).zip(frames) {
-                    let drawn = shown.update(lane.env.shared(), scene, work.drawing, frame);
+                if !frames.is_empty() {
+                    let drawn = lane.draw(shown, work.drawing, frames);
                     drawn.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
                 }
             }
