@@ -16,7 +16,7 @@ from agents_helpers import settings
 
 from endless_gym.agents import checkpoint
 from endless_gym.agents.evaluate import evaluate, mean
-from endless_gym.agents.settings import PRESETS, Settings, Transformer
+from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import main, train
 
 GRID = "MortarMayhem-Grid-v0"

@@ -148,7 +148,7 @@ class Agent(nn.Module):
         width = settings.model.body_width or (self.memory.width if remembers else settings.recurrence.hidden_size)
         self.body = nn.Sequential(orthogonal(nn.Linear(self.memory.width, width)), nn.ReLU())
         self.policy = PolicyHead(width, settings.model.head_width, branches)
-        self.value = ValueHead(width, settings.model.head_width)
+        self.value = ValueHead(width, settings.model.head_width, settings.model.value_gain)
         self.reconstruction: ReconstructionHead | None = None
         if settings.ppo.reconstruction_coefficient:
             if FRAME not in shapes:

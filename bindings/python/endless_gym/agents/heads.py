@@ -26,10 +26,10 @@ class PolicyHead(nn.Module):
 class ValueHead(nn.Module):
     """The expected return, (n,)."""
 
-    def __init__(self, input_width: int, width: int) -> None:
+    def __init__(self, input_width: int, width: int, gain: float) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, 1), 1.0)
+            orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, 1), gain)
         )
 
     def forward(self, x: Tensor) -> Tensor:

@@ -95,6 +95,8 @@ class Model:
     """units of the layer after the memory; 0 for the memory's width"""
     head_width: int = 512
     """units of the hidden layer of the policy's and the value's head"""
+    value_gain: float = 1.0
+    """scale of the value head's first weights; with rewards of 0.1, small ones save the first updates"""
     stack: int = 4
     """grey frames that the agent `stack` observes; the paper stacks 4 and 16"""
 
@@ -303,8 +305,15 @@ def _presets() -> dict[str, Settings]:
             "max_gradient_norm": 0.5,
         },
         recurrence={"hidden_size": 128, "sequence_length": 64},
-        transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
-        model={"vector_width": 64, "head_width": 64},
+        transformer={
+            "layers": 2,
+            "width": 64,
+            "window": 64,
+            "sequence_length": 32,
+            "shared_heads": False,
+            "initialisation": "tfixup",
+        },
+        model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
     )
     return {"paper": paper, "old": old, "throughput": throughput, "quick": quick}
 

@@ -138,7 +138,7 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor, distance: Tensor) -> Tensor:
         """The stream after this block; as for `Attention.forward`."""
-        attended = self.attention(self.norm_query(x), keys, values, mask, distance)
+        attended: Tensor = self.attention(self.norm_query(x), keys, values, mask, distance)
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
         added = self.fc(self.norm_fc(x)).relu()
         return x + added if self.gate_fc is None else self.gate_fc(x, added)

@@ -1,0 +1,105 @@
+"""Steps per second of training, end to end, on the CPU: `endless-train` beside CleanRL's ppo_trxl and a plain recurrent PPO.
+
+    python speed.py --original PYTHON --cleanrl FOLDER
+
+PYTHON has the original (memory-gym 1.0.2), torch, and what CleanRL's ppo_trxl needs; FOLDER is CleanRL's folder `ppo_trxl`. Both
+sides have the same number of environments, steps, minibatches, epochs, window and threads, run in turns, and are measured between
+the ends of their second and their last update. CleanRL's network lacks the 512-wide hidden layers of the two heads, that
+`endless-train` has to compute. The table goes to standard output, the numbers to `--output`.
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+
+def timed(command: list[str], threads: int, pattern: str, folder: str) -> list[float]:
+    """Runs a command, and returns when it printed each line that matches."""
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "SDL_VIDEODRIVER": "dummy", "PYTHONUNBUFFERED": "1"}
+    if command[0] != sys.executable:
+        environment.pop("PYTHONPATH", None)
+    times = []
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=folder
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if re.search(pattern, line):
+                times.append(time.perf_counter())
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with status {process.returncode}")
+    return times
+
+
+def rate(times: list[float], batch: int) -> float:
+    """Steps per second after the first update, which warms up."""
+    return batch * (len(times) - 1) / (times[-1] - times[0])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--original", required=True)
+    parser.add_argument("--cleanrl", default="")
+    parser.add_argument("--env", default="Endless-MortarMayhem-v0")
+    parser.add_argument("--num-envs", type=int, default=8)
+    parser.add_argument("--steps", type=int, default=128)
+    parser.add_argument("--window", type=int, default=256)
+    parser.add_argument("--updates", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--output", type=Path)
+    args = parser.parse_args()
+    batch, rows = args.num_envs * args.steps, []
+    for name in ("trxl", "gru") if args.cleanrl else ("gru",):
+        sides: dict[str, list[float]] = {"endless": [], "other": []}
+        shares: dict[str, float] = {}
+        for _ in range(args.rounds):
+            with tempfile.TemporaryDirectory() as folder:
+                ours = [
+                    *(sys.executable, "-m", "endless_gym.agents.train", "--env", args.env, "--agent", name),
+                    *(f"--environment.num-envs={args.num_envs}", f"--ppo.steps={args.steps}"),
+                    *(f"--ppo.updates={args.updates}", f"--transformer.window={args.window}", "--device=cpu"),
+                    *(f"--threads={args.threads}", f"--environment.num-threads={args.threads}", f"--run={folder}/run"),
+                ]
+                sides["endless"].append(rate(timed(ours, args.threads, r"steps/s|/s  ", folder), batch))
+                lines = Path(f"{folder}/run/progress.jsonl").read_text().splitlines()
+                progress = [json.loads(line) for line in lines][1:]
+                spent = {key[8:]: sum(row[key] for row in progress) for key in progress[0] if key.startswith("seconds/")}
+                shares = {key: seconds / sum(spent.values()) for key, seconds in spent.items()}
+                if name == "trxl":
+                    other = [
+                        *(args.original, str(Path(args.cleanrl).resolve() / "ppo_trxl.py"), "--env-id", args.env),
+                        *(f"--num-envs={args.num_envs}", f"--num-steps={args.steps}", "--no-cuda"),
+                        *(f"--total-timesteps={batch * args.updates}", f"--trxl-memory-length={args.window}"),
+                    ]
+                    pattern = r"SPS="
+                else:
+                    other = [
+                        *(args.original, str(HERE / "plain_recurrent.py"), "--env", args.env),
+                        *(f"--num-envs={args.num_envs}", f"--steps={args.steps}", f"--updates={args.updates}"),
+                        f"--threads={args.threads}",
+                    ]
+                    pattern = r"steps="
+                sides["other"].append(rate(timed(other, args.threads, pattern, folder), batch))
+        ours_, other_ = (statistics.median(sides[side]) for side in ("endless", "other"))
+        against = "CleanRL ppo_trxl" if name == "trxl" else "plain recurrent PPO"
+        row = {"agent": name, "against": against, "endless_train": ours_, "other": other_, "times": ours_ / other_}
+        rows.append({**row, "rounds": sides, "shares_of_time": shares, "load": os.getloadavg()[0]})
+        told = ", ".join(f"{key} {share:.1%}" for key, share in shares.items())
+        print(f"{name}: {ours_:.1f} steps/s, {against} {other_:.1f} steps/s: {ours_ / other_:.1f} times ({told})", flush=True)
+    if args.output:
+        settings = {key: str(value) for key, value in vars(args).items() if key not in ("original", "cleanrl", "output")}
+        args.output.write_text(json.dumps({"settings": settings, "results": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
