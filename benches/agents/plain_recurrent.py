@@ -1,8 +1,8 @@
 """Recurrent PPO on the original environments, plainly: what `speed.py` compares `endless-train --agent gru` with.
 
-In the manner of the authors' training code: a process for each environment behind a pipe, frames as floats, an episode's steps cut
-into sequences and padded to the longest one, padding included in all of the network and taken out before the losses. Model and
-hyperparameters are those of the preset `paper`.
+In the manner of the authors' training code: a process for each environment behind a pipe, frames as floats, the steps of an
+episode as one sequence that is padded to the longest one's length; padding goes through the whole network and is taken out
+before the losses. Model and hyperparameters are those of the preset `paper`.
 
 It needs the original (memory-gym 1.0.2) and torch; it prints a line for each update: the steps played so far.
 """
@@ -35,6 +35,15 @@ def worker(pipe, env_id: str) -> None:
         else:
             observation, reward, done, truncated, _ = env.step(action)
             pipe.send((frame(observation), reward, done or truncated))
+
+
+def padded(data, pieces: list[tuple[int, int, int]]) -> torch.Tensor:
+    """Pieces (environment, first step, step after the last) of data (n, steps, ...), all as long as the longest."""
+    data, longest = torch.as_tensor(data), max(b - a for _, a, b in pieces)
+    out = torch.zeros((len(pieces), longest, *data.shape[2:]), dtype=data.dtype)
+    for i, (env, a, b) in enumerate(pieces):
+        out[i, : b - a] = data[env, a:b]
+    return out
 
 
 class Agent(nn.Module):
@@ -98,7 +107,7 @@ def main() -> None:
                 policy, values[:, t], hidden = agent(torch.tensor(now), hidden, 1)
                 chosen = [branch.sample() for branch in policy]
                 actions[:, t] = torch.stack(chosen, 1)
-                log_probs[:, t] = torch.stack([branch.log_prob(c) for branch, c in zip(policy, chosen)], 1)
+                log_probs[:, t] = torch.stack([branch.log_prob(c) for branch, c in zip(policy, chosen, strict=True)], 1)
                 for env in range(n):
                     action = actions[env, t].numpy()
                     pipes[env].send(int(action[0]) if len(branches) == 1 else action)
@@ -118,19 +127,19 @@ def main() -> None:
         pieces = []
         for env in range(n):
             starts = [0, *(np.flatnonzero(dones[env, :-1]) + 1)]
-            pieces += [(env, a, b) for a, b in zip(starts, [*starts[1:], steps])]
+            pieces += [(env, a, b) for a, b in zip(starts, [*starts[1:], steps], strict=True)]
         longest = max(b - a for _, a, b in pieces)
 
-        def padded(data):
-            data, out = torch.as_tensor(data), None
-            out = torch.zeros((len(pieces), longest, *data.shape[2:]), dtype=data.dtype)
-            for i, (env, a, b) in enumerate(pieces):
-                out[i, : b - a] = data[env, a:b]
-            return out
 
-        batch = {"frames": frames, "actions": actions, "log_probs": log_probs, "values": values, "advantages": advantages}
-        batch = {name: padded(data) for name, data in batch.items()}
-        mask = padded(torch.ones(n, steps, dtype=torch.bool))
+        batch = {
+            "frames": frames,
+            "actions": actions,
+            "log_probs": log_probs,
+            "values": values,
+            "advantages": advantages,
+        }
+        batch = {name: padded(data, pieces) for name, data in batch.items()}
+        mask = padded(torch.ones(n, steps, dtype=torch.bool), pieces)
         start = torch.stack([states[env, a] for env, a, _ in pieces])
         for _ in range(3):
             for chosen in torch.randperm(len(pieces)).chunk(args.minibatches):

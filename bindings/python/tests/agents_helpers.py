@@ -62,5 +62,7 @@ def play(
         acted = agent.act({"features": observation}, memory, generator)
         rows.append((first, acted.action, acted.log_prob, acted.value))
         memory.forget(end)
+    # A segment ends with a look at what comes next, which must leave it as it is.
+    agent.estimate({"features": observed[-1]}, memory)
     first, action, log_prob, value = (torch.stack(column) for column in zip(*rows, strict=True))
     return first, action, log_prob, value

@@ -15,7 +15,11 @@ import torch
 from agents_helpers import settings
 
 from endless_gym.agents import checkpoint
+from endless_gym.agents.agent import make_agent
+from endless_gym.agents.clock import Clock
+from endless_gym.agents.environments import Environments
 from endless_gym.agents.evaluate import evaluate, mean
+from endless_gym.agents.rollout import Player
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import main, train
 
@@ -46,6 +50,24 @@ def same(one: Any, two: Any) -> bool:
     if isinstance(one, (list, tuple)):
         return len(one) == len(two) and all(map(same, one, two))
     return bool(one == two)
+
+
+@pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
+def test_nothing_has_changed_before_the_first_step_of_learning(agent: str, tmp_path: Path) -> None:
+    """What the network says of two played segments is what it said while it played them."""
+    given = small(agent, tmp_path)
+    with Environments(given) as environments:
+        torch.manual_seed(1)
+        made = make_agent(given, environments.spec)
+        player = Player(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+        for _ in range(2):
+            segment, _ = player.play(Clock())
+            flat, states = segment.flat(), [memory.state for memory in player.memories]
+            for plan in made.memory.plan(states, segment.first, 2, torch.Generator().manual_seed(1)):
+                evaluated = made.evaluate({key: part[plan.steps] for key, part in flat.observation.items()}, plan)
+                log_prob = evaluated.log_prob(flat.action[plan.steps])
+                torch.testing.assert_close(log_prob, flat.log_prob[plan.steps], rtol=1e-5, atol=1e-5)
+                torch.testing.assert_close(evaluated.value, flat.value[plan.steps], rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])

@@ -305,14 +305,7 @@ def _presets() -> dict[str, Settings]:
             "max_gradient_norm": 0.5,
         },
         recurrence={"hidden_size": 128, "sequence_length": 64},
-        transformer={
-            "layers": 2,
-            "width": 64,
-            "window": 64,
-            "sequence_length": 32,
-            "shared_heads": False,
-            "initialisation": "tfixup",
-        },
+        transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
         model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
     )
     return {"paper": paper, "old": old, "throughput": throughput, "quick": quick}

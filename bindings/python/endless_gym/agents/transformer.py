@@ -267,8 +267,6 @@ class TransformerMemory(Memory):
 
     def step(self, x: Tensor, state: State, first: Tensor) -> tuple[Tensor, Any]:
         assert isinstance(state, EpisodicMemory)
-        if state.fill == state.inputs.shape[2]:
-            state.move_to_front(ROOM)
         if state.keys is None or state.values is None:
             self._project_all(state)
         assert state.keys is not None and state.values is not None
@@ -286,7 +284,11 @@ class TransformerMemory(Memory):
         return x.squeeze(1), (torch.stack(inputs), episode, position)
 
     def remember(self, state: State, news: Any) -> None:
-        assert isinstance(state, EpisodicMemory) and state.keys is not None and state.values is not None
+        assert isinstance(state, EpisodicMemory)
+        if state.fill == state.inputs.shape[2]:
+            state.move_to_front(ROOM)
+            self._project_all(state)
+        assert state.keys is not None and state.values is not None
         inputs, episode, position = news
         column, inputs = state.fill, inputs.detach().float()
         state.inputs[:, :, column] = inputs.squeeze(2)
