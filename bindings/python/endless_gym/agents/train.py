@@ -14,6 +14,7 @@ import json
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -30,8 +31,12 @@ from endless_gym.agents.rollout import Player
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
 
 
-def train(settings: Settings) -> Path:
+def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | None = None) -> Path:
     """Train, from the start or from a run's last checkpoint.
+
+    Args:
+        settings: Of the run.
+        watch: Is told, after each update, its number and the means of the last episodes, and may stop the run.
 
     Returns:
         The run's folder, with `settings.json`, `progress.jsonl`, TensorBoard's files and `checkpoints`.
@@ -100,6 +105,8 @@ def train(settings: Settings) -> Path:
             if settings.time_limit and minutes >= settings.time_limit:
                 stop.requested = True
             if means.get("episode/reward", -float("inf")) >= settings.target_reward:
+                stop.requested = True
+            if watch is not None and watch(update, means):
                 stop.requested = True
             if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
                 state: dict[str, Any] = {
