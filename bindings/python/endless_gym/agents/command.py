@@ -43,7 +43,9 @@ def load_checkpoint(path: Path, device: torch.device | str) -> checkpoint.Checkp
     except (FileNotFoundError, IsADirectoryError, PermissionError):
         raise
     except Exception as error:  # torch.load raises what its parts raise
-        message = f"{path} is not a checkpoint of this version's `endless-train`; give a file of a run's folder `checkpoints`"
+        message = (
+            f"{path} is not a checkpoint of this version's `endless-train`; give a file of a run's folder `checkpoints`"
+        )
         raise ValueError(message) from error
 
 

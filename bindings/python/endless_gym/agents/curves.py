@@ -105,7 +105,9 @@ def evaluated(experiment: Experiment) -> Curve:
     name, _ = metrics.metric(experiment.env)
     steps = np.array(experiment.common_steps(), dtype=np.int64)
     if not steps.size:
-        raise ValueError(f"the runs of {experiment.env}, {experiment.label}, have no checkpoint at the same number of steps")
+        raise ValueError(
+            f"the runs of {experiment.env}, {experiment.label}, have no checkpoint at the same number of steps"
+        )
     scores = experiment.scores(name)
     # Other reset parameters make another task than the paper's; the plot says so.
     options = "".join(f", {option}={value}" for option, value in experiment.options.items())
@@ -171,7 +173,9 @@ def _with(own: Mapping[str, Curve], others: Mapping[str, Curve]) -> dict[str, Cu
 def _put_together(family: str, name: str, curves: Sequence[Curve]) -> Curve:
     steps = sorted(set(curves[0].steps.tolist()).intersection(*(curve.steps.tolist() for curve in curves)))
     if not steps:
-        raise ValueError(f"the runs of {name} have no checkpoint at the same number of steps in all {family} environments")
+        raise ValueError(
+            f"the runs of {name} have no checkpoint at the same number of steps in all {family} environments"
+        )
     runs = min(len(curve.scores) for curve in curves)
     parts = [curve.scores[:runs, np.isin(curve.steps, steps)] / scale(curve.env) for curve in curves]
     at = np.array(steps, dtype=np.int64)

@@ -73,20 +73,19 @@ class Showing:
     def pictures(self, seeds: tuple[int, ...]) -> Iterator[film.Picture]:
         """A picture for the start of each episode and one for each step; the last one stands for a second."""
         settings = self.agent.settings
-        described = spec(settings.env)
         generator = torch.Generator(self.agent.device).manual_seed(self.draws)
         # The film shows frames, whatever the agent observes.
         shown = "rgb" if settings.environment.observation == "rgb" else "rgb+features"
         options = settings.options()
-        with make_vec(settings.env, 1, 1, options=options, autoreset="disabled", observation=shown) as envs:
-            for seed in seeds:
-                yield from self._episode(envs, seed, generator, described.render_fps)
+        for seed in seeds:
+            # Environments keep things from one episode to the next, as the original's do; a fresh one has none.
+            with make_vec(settings.env, 1, 1, options=options, autoreset="disabled", observation=shown) as envs:
+                yield from self._episode(envs, seed, generator)
 
-    def _episode(
-        self, envs: EndlessVectorEnv, seed: int, generator: torch.Generator, hold: int
-    ) -> Iterator[film.Picture]:
+    def _episode(self, envs: EndlessVectorEnv, seed: int, generator: torch.Generator) -> Iterator[film.Picture]:
         settings, memory = self.agent.settings, self.agent.initial_memory(1)
-        keys = observation_shapes(spec(settings.env), settings.environment.observation)
+        described = spec(settings.env)
+        keys = observation_shapes(described, settings.environment.observation)
         observation, _ = envs.reset(seed=[seed])
         reward, length, done = 0.0, 0, False
         self.rewards.append(0.0)
@@ -104,7 +103,7 @@ class Showing:
             text = f"{settings.env}  seed {seed}  step {length}  action {'-'.join(map(str, action[0]))}  reward {reward:.2f}"
             picture = self._picture(envs, observation, text + ("  end" if done else ""))
             yield picture
-        for _ in range(hold):
+        for _ in range(described.render_fps):
             yield picture
 
     @staticmethod

@@ -84,7 +84,18 @@ def _gif(file: Path, pictures: Iterator[Picture], fps: int) -> None:
 def _mp4(file: Path, pictures: Iterator[Picture], fps: int) -> None:
     first = next(pictures)
     height, width, _ = first.shape
-    arguments = [_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    arguments = [
+        _ffmpeg(),
+        "-y",
+        "-loglevel",
+        "error",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{width}x{height}",
+    ]
     arguments += ["-r", str(fps), "-i", "-", "-pix_fmt", "yuv420p", str(file)]
     with subprocess.Popen(arguments, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -109,6 +120,8 @@ def _ffmpeg() -> str:
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise ValueError("MP4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg, or write a .gif") from None
+        raise ValueError(
+            "MP4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg, or write a .gif"
+        ) from None
     program: str = imageio_ffmpeg.get_ffmpeg_exe()
     return program

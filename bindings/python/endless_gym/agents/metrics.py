@@ -81,8 +81,8 @@ def task_progress(spec: Spec, options: Mapping[str, Any], final: Mapping[str, fl
 def _commands(parameters: Mapping[str, Any], final: Mapping[str, float]) -> float:
     """Mortar Mayhem. `commands_completed` is a share, and counts the last command even if it failed; the reward tells.
 
-    Where the number of commands is drawn from several that follow each other, an episode of the larger one that failed at its last
-    command looks like a whole one of the smaller, and counts as that.
+    Where the number of commands is drawn from several that follow each other, an episode of the larger one that failed at its
+    last command looks like a whole one of the smaller, and counts as that.
     """
     share, reward = final["commands_completed"], parameters["reward_command_success"]
     tells = reward > 0 and not parameters["reward_command_failure"] and not parameters["reward_episode_success"]

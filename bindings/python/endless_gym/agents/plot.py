@@ -27,6 +27,7 @@ from endless_gym.agents import command, metrics
 from endless_gym.agents.curves import (
     FAMILIES,
     Curve,
+    Floats,
     aggregate,
     evaluated,
     published,
@@ -62,9 +63,8 @@ class Plots:
 
 def estimates(curve: Curve, spread: Spread) -> list[tuple[float, ...]]:
     """A row for each checkpoint: steps, then centre, low and high, or with `runs` each run's score."""
-    if spread == "runs":
-        columns = list(curve.scores)
-    else:
+    columns: list[Floats] = list(curve.scores)
+    if spread != "runs":
         columns = list(curve.mean() if spread == "std" else curve.interquartile_mean())
     return [
         (int(step), *(float(value) for value in row))
@@ -94,10 +94,14 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
         if spread == "runs":
             for run in range(len(curve.scores)):
                 values = [row[1 + run] for row in rows]
-                axes.plot(steps, values, style, marker=marker, color=f"C{place}", alpha=0.8, label=title if not run else "")
+                axes.plot(
+                    steps, values, style, marker=marker, color=f"C{place}", alpha=0.8, label=title if not run else ""
+                )
         else:
             axes.plot(steps, [row[1] for row in rows], style, marker=marker, color=f"C{place}", label=title)
-            axes.fill_between(steps, [row[2] for row in rows], [row[3] for row in rows], color=f"C{place}", alpha=0.2, lw=0)
+            axes.fill_between(
+                steps, [row[2] for row in rows], [row[3] for row in rows], color=f"C{place}", alpha=0.2, lw=0
+            )
     axes.set(title=name, xlabel="Steps (in millions)", ylabel=axis)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
@@ -110,7 +114,9 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
             writer.writerow(["source", "label", "run", "steps", "score"])
             for curve in curves:
                 for row in estimates(curve, spread):
-                    writer.writerows([curve.source, curve.label, run, row[0], score] for run, score in enumerate(row[1:]))
+                    writer.writerows(
+                        [curve.source, curve.label, run, row[0], score] for run, score in enumerate(row[1:])
+                    )
         else:
             writer.writerow(["source", "label", "steps", "mean" if spread == "std" else "iqm", "low", "high"])
             writer.writerows([curve.source, curve.label, *row] for curve in curves for row in estimates(curve, spread))
@@ -138,7 +144,7 @@ def given_curves(paths: Sequence[Path]) -> list[Curve]:
     return curves
 
 
-def work(given: Plots) -> list[Path]:
+def draw_all(given: Plots) -> list[Path]:
     """Draw all that is wanted.
 
     Returns:
@@ -161,7 +167,9 @@ def work(given: Plots) -> list[Path]:
                 f"{', '.join(FAMILIES[given.aggregate])}"
             )
         if not curves:
-            raise ValueError(f"nothing to draw: the paper has no {', '.join(given.published)} in all {given.aggregate} tasks")
+            raise ValueError(
+                f"nothing to draw: the paper has no {', '.join(given.published)} in all {given.aggregate} tasks"
+            )
         axis = "Task progress" if given.aggregate == "finite" else "Normalised score"
         pictures.append(draw(given.aggregate, axis, _cut(curves, given.max_steps), given.spread, given.out))
     else:
@@ -179,10 +187,14 @@ def work(given: Plots) -> list[Path]:
             if curves:
                 _, axis = metrics.metric(env)
                 pictures.append(draw(env, axis, _cut(curves, given.max_steps), given.spread, given.out))
-    console = Console()
-    for picture in pictures:
-        console.print(f"{picture}, {picture.with_suffix('.csv').name}, {picture.with_suffix('.json').name}", soft_wrap=True)
     return pictures
+
+
+def work(given: Plots) -> None:
+    """Draw, and tell."""
+    console = Console()
+    for picture in draw_all(given):
+        console.print(f"{picture}, with its data in .csv and .json", soft_wrap=True)
 
 
 def _cut(curves: Sequence[Curve], steps: int) -> list[Curve]:
@@ -192,7 +204,7 @@ def _cut(curves: Sequence[Curve], steps: int) -> list[Curve]:
 def main() -> int:
     """The command `endless-plot`."""
     given = tyro.cli(Plots, prog="endless-plot", description=command.description(__doc__), args=sys.argv[1:])
-    return command.run("endless-plot", lambda: work(given) and None)
+    return command.run("endless-plot", lambda: work(given))
 
 
 if __name__ == "__main__":

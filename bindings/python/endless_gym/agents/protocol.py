@@ -55,7 +55,7 @@ class Evaluation:
     engine_threads: int = 0
     """threads that step the environments; 0 for one for each core"""
     json: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
-    """write all results to this file, which `endless-plot` reads; `-` writes them to the standard output, in place of the table"""
+    """write all results to this file, which `endless-plot` reads; `-`: to the standard output, in place of the table"""
     episodes: bool = False
     """write each episode, too"""
 

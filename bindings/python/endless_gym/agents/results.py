@@ -132,7 +132,9 @@ class Experiments:
         return list(self._found.values())
 
 
-def to_json(experiments: Sequence[Experiment], protocol: Mapping[str, Any], with_episodes: bool = False) -> dict[str, Any]:
+def to_json(
+    experiments: Sequence[Experiment], protocol: Mapping[str, Any], with_episodes: bool = False
+) -> dict[str, Any]:
     """Everything that was found, as JSON has it."""
     written = []
     for experiment in experiments:
@@ -159,8 +161,7 @@ def read(file: Path) -> list[Experiment]:
     try:
         written = json.loads(file.read_text())["experiments"]
         return [
-            Experiment(one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]])
-            for one in written
+            Experiment(one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]]) for one in written
         ]
     except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{file} is not a file of `endless-eval --json`") from error

@@ -33,7 +33,8 @@ from endless_gym.agents import checkpoint, command
 from endless_gym.agents.logs import PROGRESS
 from endless_gym.agents.search_space import Choice, Space, single_changes, space, with_choices
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
-from endless_gym.agents.train import train
+from endless_gym.agents.train import choose_device, train
+from endless_gym.specs import spec
 
 STUDY, BEST = "study.db", "best.json"
 #: Attributes of a trial: that it tries one choice by itself, and the folder of the run that it goes on with.
@@ -70,12 +71,14 @@ class Search:
         return Path(self.folder or f"searches/{self.settings.env}/{self.settings.agent}")
 
     def checked(self) -> Search:
-        """This search, once nothing speaks against it.
+        """The search, once nothing speaks against it.
 
         Raises:
             ValueError: A number or a combination is not possible.
         """
         settings = self.settings.checked()
+        spec(settings.env)
+        choose_device(settings.device)
         if self.trials < 0 or self.period < 1 or self.warm_up < 0 or self.startup_trials < 0:
             raise ValueError("--trials, --warm-up and --startup-trials are 0 or more, --period is 1 or more")
         if not 0 < self.percentile <= 100:
@@ -132,7 +135,8 @@ class Trials:
         if self.given.stage != "single":
             begun = sum(_SINGLE not in trial.user_attrs for trial in waiting)
             left += max(0, self.given.trials - combinations - begun)
-        self.console.print(f"{len(finished)} trials are done, {left} are to be run, in {self.folder}; Ctrl-C stops", soft_wrap=True)
+        text = f"{len(finished)} trials are done, {left} are to be run, in {self.folder}; Ctrl-C stops"
+        self.console.print(text, soft_wrap=True)
         if left:
             seconds = self.given.minutes * 60 or None
             self.study.optimize(self.objective, left, timeout=seconds, catch=(torch.cuda.OutOfMemoryError,))
@@ -143,7 +147,6 @@ class Trials:
 
         for trial in self.study.get_trials(states=(TrialState.RUNNING,)):
             self.study.tell(trial.number, state=TrialState.FAIL)
-        known = [(trial.params or trial.system_attrs.get("fixed_params", {})) for trial in self.study.trials]
         goes_on = {trial.user_attrs.get(_GOES_ON) for trial in self.study.trials}
         for trial in self.study.get_trials(states=(TrialState.FAIL,)):
             folder = self.run_folder(trial.number, trial.user_attrs)
@@ -154,8 +157,13 @@ class Trials:
                     attributes[_SINGLE] = trial.user_attrs[_SINGLE]
                 self.study.enqueue_trial(trial.params, user_attrs=attributes)
         if self.given.stage != "combinations":
+            known = {
+                trial.user_attrs.get(_SINGLE)
+                for trial in self.study.trials
+                if trial.state is not TrialState.FAIL or trial.params
+            }
             for number, change in enumerate(single_changes(self.space)):
-                if change not in known:
+                if number not in known:
                     self.study.enqueue_trial(change, user_attrs={_SINGLE: number})
 
     def run_folder(self, number: int, attributes: Mapping[str, Any]) -> Path:
@@ -181,14 +189,13 @@ class Trials:
             self.console.print(f"trial {trial.number} is not possible: {error}", soft_wrap=True)
             raise optuna.TrialPruned from error
 
-        reward, seen, behind = float("nan"), 0, False
-        last = settings.ppo.updates
+        reward: float | None = None
+        seen, last, behind = 0, settings.ppo.updates, False
 
-        def watch(update: int, means: Mapping[str, float]) -> bool:
+        def watch(update: int, means: Mapping[str, Any]) -> bool:
             nonlocal reward, seen, behind
-            seen = update
-            reward = means.get("episode/reward", reward)
-            if update % self.given.period == 0 and reward == reward and update < last:
+            seen, reward = update, means.get("episode/reward", reward)
+            if update % self.given.period == 0 and reward is not None and update < last:
                 trial.report(reward, update)
                 behind = trial.should_prune()
             return behind
@@ -196,7 +203,7 @@ class Trials:
         if (run / checkpoint.FOLDER / checkpoint.LAST).exists():
             settings = replace(settings, resume=str(run))
             for row in map(json.loads, (run / PROGRESS).read_text().splitlines()):
-                watch(row["update"], {"episode/reward": value for value in [row.get("episode/reward")] if value is not None})
+                watch(row["update"], row)
         try:
             if not behind:
                 train(settings, watch)
@@ -208,7 +215,7 @@ class Trials:
             raise optuna.TrialPruned
         if seen < last:
             raise KeyboardInterrupt
-        if reward != reward:
+        if reward is None:
             self.console.print(f"trial {trial.number}: no episode has ended; give more --ppo.updates", soft_wrap=True)
             raise optuna.TrialPruned
         return reward
@@ -233,7 +240,9 @@ class Trials:
         done = self.study.get_trials(states=(TrialState.COMPLETE,))
         done.sort(key=lambda trial: -(trial.value or 0.0))
         pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))
-        drawn = Table(title=f"{len(done)} trials to the end, {pruned} stopped early", title_justify="left", box=box.SIMPLE)
+        drawn = Table(
+            title=f"{len(done)} trials to the end, {pruned} stopped early", title_justify="left", box=box.SIMPLE
+        )
         for name in ("trial", "reward", "what is different"):
             drawn.add_column(name, justify="left" if name == "what is different" else "right")
         for trial in done[:10]:
@@ -243,11 +252,11 @@ class Trials:
             best = to_dict(with_choices(self.given.settings, done[0].params))
             found = {"reward": done[0].value, "trial": done[0].number, "choices": done[0].params, "settings": best}
             (self.folder / BEST).write_text(json.dumps(found, indent=1) + "\n")
-            settings = self.given.settings
+            settings, changed = self.given.settings, self.changed(done[0].params)
             start = f"--env {settings.env} --preset {settings.preset}"
-            start += "" if "agent" in self.space and done[0].params["agent"] != settings.agent else f" --agent {settings.agent}"
+            start += "" if "--agent" in changed else f" --agent {settings.agent}"
             self.console.print(f"the best settings are in {self.folder / BEST}; beside your own flags:", soft_wrap=True)
-            self.console.print(f"endless-train {start} {self.changed(done[0].params)}".rstrip(), soft_wrap=True)
+            self.console.print(f"endless-train {start} {changed}".rstrip(), soft_wrap=True)
 
 
 def work(given: Search) -> None:

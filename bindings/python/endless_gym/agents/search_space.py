@@ -83,8 +83,10 @@ def with_choices(settings: Settings, choices: Mapping[str, Choice]) -> Settings:
     """The settings with other values of some parameters."""
     for name, choice in choices.items():
         group, _, entry = name.rpartition(".")
-        inner = dataclasses.replace(getattr(settings, group), **{entry: choice}) if group else choice
-        settings = dataclasses.replace(settings, **{group or entry: inner})
+        changed: dict[str, Any] = {entry: choice}
+        if group:
+            changed = {group: dataclasses.replace(getattr(settings, group), **changed)}
+        settings = dataclasses.replace(settings, **changed)
     return settings
 
 
