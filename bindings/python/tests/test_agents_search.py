@@ -39,9 +39,9 @@ def test_the_space_is_the_paper_s_table() -> None:
     assert trxl["transformer.initialisation"] == ("xavier", "orthogonal", "kaiming", "tfixup")
     assert "transformer.layers" not in gru
     assert "recurrence.layers" not in trxl
-    # The table has 8 parameters for all with 15 other choices; 4 with 5 for recurrence; 5 with 10 for the Transformer-XL.
-    assert (len(gru), len(single_changes(gru))) == (12, 1 + 15 + 5)
-    assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 15 + 10)
+    # The table has 8 parameters for all with 16 other choices; 4 with 5 for recurrence; 5 with 10 for the Transformer-XL.
+    assert (len(gru), len(single_changes(gru))) == (12, 1 + 16 + 5)
+    assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 16 + 10)
     rebuilt = replace(PRESETS["paper"], ppo=replace(PRESETS["paper"].ppo, reconstruction_coefficient=0.1))
     assert space(rebuilt)["ppo.reconstruction_coefficient"] == (0.1, 0.5, 1.0)
     # Every single choice makes settings that can be trained.

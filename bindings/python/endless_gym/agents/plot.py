@@ -159,11 +159,13 @@ def draw_all(given: Plots) -> list[Path]:
     if given.aggregate != "no":
         theirs = [curve for env in FAMILIES[given.aggregate] for curve in published(env, given.published)]
         curves = aggregate(given.aggregate, [*own, *theirs])
-        wanted = {curve.label for curve in own if curve.env in FAMILIES[given.aggregate]}
-        missing = wanted - {curve.label for curve in curves if curve.source == "evaluated"}
-        if missing:
+        complete = {curve.label for curve in curves if curve.source == "evaluated"}
+        partial = {curve.label for curve in own if curve.env in FAMILIES[given.aggregate]} - complete
+        # An agent with reconstruction may stand in for one without; see `aggregate`.
+        partial = {label for label in partial if label.removesuffix("_rec") not in complete}
+        if partial or (own and not complete):
             raise ValueError(
-                f"{', '.join(sorted(missing))}: the {given.aggregate} plot wants evaluations in all of "
+                f"{', '.join(sorted(partial)) or 'the results'}: the {given.aggregate} plot wants evaluations in all of "
                 f"{', '.join(FAMILIES[given.aggregate])}"
             )
         if not curves:

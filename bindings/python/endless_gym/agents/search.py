@@ -101,7 +101,7 @@ class Trials:
         """
         import optuna
 
-        optuna.logging.set_verbosity(logging.WARNING)
+        optuna.logging.set_verbosity(logging.ERROR)
         self.given, self.console, self.folder = given, console, given.place()
         self.space: Space = space(given.settings, given.parameters)
         self.folder.mkdir(parents=True, exist_ok=True)
