@@ -212,12 +212,10 @@ def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
     )
 
 
-def test_compiled_and_bf16_runs(tmp_path: Path) -> None:
+@pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
+def test_bf16_runs(agent: str, tmp_path: Path) -> None:
     """bfloat16 changes the numbers a little, and what is stored stays float32."""
-    plain, coarse = (
-        train(replace(small(agent, tmp_path / f"{agent}-{bf16}", 1), bf16=bf16))
-        for agent, bf16 in (("trxl", False), ("trxl", True))
-    )
+    plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
     one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
     assert one != two
     assert one == pytest.approx(two, rel=0.2)
