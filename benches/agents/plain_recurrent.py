@@ -130,7 +130,6 @@ def main() -> None:
             pieces += [(env, a, b) for a, b in zip(starts, [*starts[1:], steps], strict=True)]
         longest = max(b - a for _, a, b in pieces)
 
-
         batch = {
             "frames": frames,
             "actions": actions,

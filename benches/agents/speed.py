@@ -87,7 +87,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 ours = [
                     *(sys.executable, "-m", "endless_gym.agents.train", "--env", args.env, "--agent", name),
-                    *(f"--environment.num-envs={args.num_envs}", f"--ppo.steps={args.steps}"),
+                    *(f"--environment.num-envs={args.num_envs}", "--environment.groups=1", f"--ppo.steps={args.steps}"),
                     *(f"--ppo.updates={args.updates}", f"--transformer.window={args.window}", "--device=cpu"),
                     *(f"--threads={args.threads}", f"--environment.num-threads={args.threads}", f"--run={folder}/run"),
                 ]

@@ -290,6 +290,17 @@ def test_weights_that_change_reach_the_cached_tokens() -> None:
     assert_close(evaluated.value, value.flatten()[plan.steps])
 
 
+def test_a_compiled_agent_says_the_same() -> None:
+    agent, observed, done = make("trxl"), observations(STEPS, ENVS), ends(STEPS, ENVS)
+    _, action, _, value = play(agent, agent.initial_memory(ENVS), observed, done)
+    parameters = agent.state_dict().keys()
+    agent.compile_parts()
+    _, again, _, compiled = play(agent, agent.initial_memory(ENVS), observed, done)
+    assert torch.equal(action, again)
+    assert_close(compiled, value)
+    assert agent.state_dict().keys() == parameters
+
+
 def test_shares_are_of_about_the_same_size() -> None:
     sizes = [1, 30, 5, 5, 9, 2, 2, 2, 8, 8, 8, 20]
     parts = shares(sizes, 4, torch.Generator().manual_seed(1))

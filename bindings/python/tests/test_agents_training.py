@@ -21,7 +21,7 @@ from endless_gym.agents.environments import Environments
 from endless_gym.agents.evaluate import evaluate, mean
 from endless_gym.agents.rollout import Player
 from endless_gym.agents.settings import PRESETS, Settings
-from endless_gym.agents.train import main, train
+from endless_gym.agents.train import main, parse, train
 
 GRID = "MortarMayhem-Grid-v0"
 
@@ -183,7 +183,7 @@ def test_evaluation_plays_each_seed_as_often(tmp_path: Path) -> None:
         ("--env NoSuch-v0", "no environment `NoSuch-v0`; there are "),
         (f"--env {GRID} --device nonsense", "no device `nonsense`; give auto, cpu, cuda or cuda:NUMBER"),
         (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs is 0; give 1 or more"),
-        ("--resume nowhere", "no checkpoint nowhere"),
+        ("--resume nowhere", "no run in nowhere; give a folder with settings.json"),
         (f"--env {GRID} --environment.option command_count=[1] colour=1", "colour"),
     ],
 )
@@ -199,6 +199,18 @@ def test_errors_are_one_line(
     assert error.count("\n") == 1
 
 
+def test_a_run_goes_on_with_its_own_settings(tmp_path: Path) -> None:
+    run = train(small("gru", tmp_path / "run", 2))
+    resumed = parse(["--resume", str(run), "--ppo.updates", "3"])
+    assert resumed.ppo == replace(small("gru", run, 2).ppo, updates=3)
+    train(resumed)
+    assert len(progress(run)) == 3
+    with pytest.raises(ValueError, match="began with agent gru, not lstm"):
+        train(parse(["--resume", str(run), "--agent", "lstm"]))
+    with pytest.raises(FileExistsError, match="has a run already"):
+        train(small("gru", run, 2))
+
+
 def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -212,12 +224,10 @@ def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
     )
 
 
-def test_compiled_and_bf16_runs(tmp_path: Path) -> None:
+@pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
+def test_bf16_runs(agent: str, tmp_path: Path) -> None:
     """bfloat16 changes the numbers a little, and what is stored stays float32."""
-    plain, coarse = (
-        train(replace(small(agent, tmp_path / f"{agent}-{bf16}", 1), bf16=bf16))
-        for agent, bf16 in (("trxl", False), ("trxl", True))
-    )
+    plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
     one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
     assert one != two
     assert one == pytest.approx(two, rel=0.2)

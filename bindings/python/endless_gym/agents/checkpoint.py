@@ -98,5 +98,11 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
 
 
 def read_settings(run: str | Path) -> Settings:
-    """The settings of a run."""
+    """The settings of a run.
+
+    Raises:
+        FileNotFoundError: The folder has no run.
+    """
+    if not (Path(run) / SETTINGS).exists():
+        raise FileNotFoundError(f"no run in {run}; give a folder with {SETTINGS}, as endless-train writes it")
     return from_dict(json.loads((Path(run) / SETTINGS).read_text()))

@@ -166,7 +166,7 @@ class Settings:
     run: str = ""
     """the run's folder; empty for runs/ENV/AGENT-SEED-TIME"""
     resume: str = ""
-    """go on with the run in this folder, from its last checkpoint; other flags are ignored, except `--ppo.updates`"""
+    """go on with the run in this folder, from its last checkpoint; its settings are the defaults of the other flags"""
     checkpoint_interval: int = 100
     """updates between two checkpoints; the last update always writes one"""
     keep_checkpoints: bool = False

@@ -41,18 +41,18 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
     Returns:
         The run's folder, with `settings.json`, `progress.jsonl`, TensorBoard's files and `checkpoints`.
     """
-    resumed = None
+    settings, resumed = settings.checked(), None
     if settings.resume:
-        run, updates = Path(settings.resume), settings.ppo.updates
+        run = Path(settings.resume)
         resumed = checkpoint.load(run).state
-        settings = dataclasses.replace(checkpoint.read_settings(run), resume=str(run), time_limit=settings.time_limit)
-        settings = dataclasses.replace(settings, ppo=dataclasses.replace(settings.ppo, updates=updates))
+        same_network(settings, checkpoint.read_settings(run))
     else:
-        settings = settings.checked()
         run = Path(
             settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         )
-        run.mkdir(parents=True, exist_ok=bool(settings.run))
+        if (run / checkpoint.SETTINGS).exists():
+            raise FileExistsError(f"{run} has a run already; go on with --resume {run}, or name another folder")
+        run.mkdir(parents=True, exist_ok=True)
         (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
 
     # Everything random follows from the seed.
@@ -150,6 +150,24 @@ class Interrupt:
         print("\nstopping after this update, with a checkpoint; press Ctrl-C again to stop at once", file=sys.stderr)
 
 
+def same_network(settings: Settings, before: Settings) -> None:
+    """Refuses to go on with another network or other environments than a run began with.
+
+    Raises:
+        ValueError: Something differs.
+    """
+    # Where environments are stepped may change, and all of PPO.
+    had = before.environment
+    place = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
+    settings = dataclasses.replace(settings, environment=place)
+    for name in ("env", "agent", "environment", "model", "recurrence", "transformer"):
+        given, had = getattr(settings, name), getattr(before, name)
+        if given != had:
+            raise ValueError(
+                f"the run to resume began with {name} {had}, not {given}; leave it as it was, or start a run"
+            )
+
+
 def choose_device(name: str) -> torch.device:
     """The device of that name; `auto` is CUDA where there is one.
 
@@ -168,13 +186,18 @@ def choose_device(name: str) -> torch.device:
 
 
 def parse(arguments: list[str]) -> Settings:
-    """Settings from the command line: the preset's, changed by the other flags."""
+    """Settings from the command line: the preset's, or the resumed run's, changed by the other flags."""
     import tyro
 
-    chosen = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    chosen.add_argument("--preset", default="paper")
-    preset = chosen.parse_known_args(arguments)[0].preset
-    defaults = PRESETS.get(preset, PRESETS["paper"])
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default="paper")
+    first.add_argument("--resume", default="")
+    chosen = first.parse_known_args(arguments)[0]
+    if chosen.resume:
+        defaults = dataclasses.replace(checkpoint.read_settings(chosen.resume), time_limit=0.0)
+    else:
+        # tyro tells what presets there are if there is none of that name.
+        defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
     return tyro.cli(Settings, prog="endless-train", description=__doc__, args=arguments, default=defaults)
 
 

@@ -140,8 +140,9 @@ class Block(nn.Module):
         """The stream after this block; as for `Attention.forward`."""
         attended: Tensor = self.attention(self.norm_query(x), keys, values, mask, distance)
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
-        added = self.fc(self.norm_fc(x)).relu()
-        return x + added if self.gate_fc is None else self.gate_fc(x, added)
+        added: Tensor = self.fc(self.norm_fc(x)).relu()
+        out: Tensor = x + added if self.gate_fc is None else self.gate_fc(x, added)
+        return out
 
     def _initialise(self, kind: str, layers: int) -> None:
         for weight in self.parameters():
@@ -217,7 +218,7 @@ class EpisodicMemory(State):
 
 @dataclass
 class TransformerPlan(Plan):
-    """Sequences of C steps each, with the P = window - 1 steps before them.
+    """Sequences of C steps each, with the P steps before them: `window - 1`, or fewer if all episodes are shorter.
 
     Attributes:
         tokens: The cached inputs, (layers, sequences, P + C, width).
@@ -270,11 +271,12 @@ class TransformerMemory(Memory):
         if state.keys is None or state.values is None:
             self._project_all(state)
         assert state.keys is not None and state.values is not None
-        window = slice(state.fill - self.past, state.fill)
         episode = state.running + first.long()
         position = state.next_position.masked_fill(first, 0)
-        mask = (state.episode[:, window] == episode.unsqueeze(1)).unsqueeze(1)  # (n, 1, window - 1)
-        distance = torch.arange(self.past, 0, -1, device=self.device).unsqueeze(0)
+        past = self._needed(position)
+        window = slice(state.fill - past, state.fill)
+        mask = (state.episode[:, window] == episode.unsqueeze(1)).unsqueeze(1)  # (n, 1, past)
+        distance = torch.arange(past, 0, -1, device=self.device).unsqueeze(0)
         x = self.embedding(x).unsqueeze(1)
         inputs = []
         for layer, block in enumerate(self.blocks):
@@ -305,13 +307,16 @@ class TransformerMemory(Memory):
         memories = [state for state in states if isinstance(state, EpisodicMemory)]
         steps, envs = first.shape
         length = min(self.settings.sequence_length, steps)
-        span = self.past + length
-        # Column c of the segment is step c - (window - 1); sequence number s of an environment spans columns sL to sL + span.
-        inputs = torch.cat([memory.inputs for memory in memories], dim=1).unfold(2, span, length)
-        position = torch.cat([memory.position for memory in memories]).unfold(1, span, length)
-        episode = torch.cat([memory.episode for memory in memories]).unfold(1, span, length)
+        position = torch.cat([memory.position for memory in memories])
+        past = self._needed(position[:, self.past :])
+        span, skipped = past + length, self.past - past
+        # Without those that nothing attends to, column c is step c - past; an environment's sequence s spans columns sL to
+        # sL + span.
+        position = position[:, skipped:].unfold(1, span, length)
+        inputs = torch.cat([memory.inputs[:, :, skipped:] for memory in memories], dim=1).unfold(2, span, length)
+        episode = torch.cat([memory.episode[:, skipped:] for memory in memories]).unfold(1, span, length)
         sequences = steps // length
-        ages = torch.arange(self.past, span, device=self.device).unsqueeze(1) - torch.arange(span, device=self.device)
+        ages = torch.arange(past, span, device=self.device).unsqueeze(1) - torch.arange(span, device=self.device)
         band = (ages > 0) & (ages < self.settings.window)
         plans = []
         for chosen in shares([length] * (envs * sequences), minibatches, generator):
@@ -319,7 +324,7 @@ class TransformerMemory(Memory):
             flat = (sequence * length).unsqueeze(1) + torch.arange(length)
             env_, sequence_ = env.to(self.device), sequence.to(self.device)
             episodes = episode[env_, sequence_]
-            mask = band & (episodes[:, self.past :, None] == episodes[:, None, :])
+            mask = band & (episodes[:, past:, None] == episodes[:, None, :])
             plans.append(
                 TransformerPlan(
                     steps=(flat * envs + env.unsqueeze(1)).flatten().to(self.device),
@@ -332,13 +337,17 @@ class TransformerMemory(Memory):
         return plans
 
     def forward(self, x: Tensor, plan: TransformerPlan) -> Tensor:
-        sequences, span = plan.position.shape
-        x = self.embedding(x).unflatten(0, (sequences, span - self.past))
-        position = plan.position[:, self.past :]
+        length, span = plan.distance.shape
+        x = self.embedding(x).unflatten(0, (-1, length))
+        position = plan.position[:, span - length :]
         for block, tokens in zip(self.blocks, plan.tokens, strict=True):
             keys, values = block.keys_and_values(self._placed(tokens, plan.position))
             x = block(self._query(x, position), keys, values, plan.mask, plan.distance)
         return x.flatten(0, 1)
+
+    def _needed(self, position: Tensor) -> int:
+        """How many steps before a query can be of its episode and in its window, at most; 1 at least."""
+        return max(1, min(self.past, int(position.max())))
 
     def _placed(self, tokens: Tensor, position: Tensor) -> Tensor:
         """Tokens (..., width) with the encoding of their positions (...,) added; beyond its table all share the last row."""
