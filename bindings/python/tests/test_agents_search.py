@@ -76,6 +76,8 @@ def test_a_search_from_end_to_end(tmp_path: Path) -> None:
     third.report()
     best = json.loads((tmp_path / "best.json").read_text())
     assert best["reward"] == max(trial.value for trial in third.study.trials)
+    (chosen,) = [trial for trial in best["trials"] if trial["trial"] == best["trial"]]
+    assert chosen["choices"]["ppo.epochs"] == best["settings"]["ppo"]["epochs"]
     # A trial's value is its run's.
     for trial in third.study.trials:
         lines = (tmp_path / f"trial-{trial.number:04d}" / "progress.jsonl").read_text().splitlines()
@@ -84,7 +86,8 @@ def test_a_search_from_end_to_end(tmp_path: Path) -> None:
         Trials(small(tmp_path, parameters=("ppo.minibatches",)), QUIET)
 
 
-def test_a_stopped_trial_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_a_stopped_trial_goes_on(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped after the first trial's first update, a search comes to the same results as one that was not."""
     through = Trials(small(tmp_path / "through", stage="single"), QUIET)
     through.run()
@@ -97,6 +100,8 @@ def test_a_stopped_trial_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(KeyboardInterrupt):
         broken.run()
     assert states(broken) == ["FAIL", "WAITING", "WAITING"]
+    if not with_checkpoint:
+        (tmp_path / "broken" / "trial-0000" / "checkpoints" / "last.pt").unlink()
     monkeypatch.setattr(search, "train", train)
     resumed = Trials(small(tmp_path / "broken", stage="single"), QUIET)
     resumed.run()

@@ -3,6 +3,9 @@
 `endless-train` trains one; `pip install endless-gym[agents]` brings what it needs. From top to bottom: `train` is the loop,
 `settings` what it can be told, `rollout` plays, `ppo` learns with `losses`; `agent` puts `encoders`, a memory (`recurrent`,
 `transformer`, `naive`) and `heads` together; `checkpoint` loads what was trained.
+
+What comes after training: `protocol` is `endless-eval`, over `evaluate`, `metrics`, `statistics` and `results`; `plot` with `curves`
+is `endless-plot`; `enjoy` with `film` is `endless-enjoy`; `search` with `search_space` is `endless-search`.
 """
 
 try:

@@ -25,7 +25,13 @@ def run(name: str, work: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         print(f"{name}: stopped", file=sys.stderr)
         return INTERRUPTED
-    except (ValueError, OSError, ImportError) as error:
+    except ModuleNotFoundError as error:
+        print(
+            f"{name}: {error.name} is not installed; the agents need: pip install 'endless-gym[agents]'",
+            file=sys.stderr,
+        )
+        return 1
+    except (ValueError, OSError) as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     return 0

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -152,7 +153,7 @@ class Trials:
             folder = self.run_folder(trial.number, trial.user_attrs)
             # One that failed by itself, for want of memory, would fail again.
             if str(trial.number) not in goes_on and trial.params and not trial.user_attrs.get("failed"):
-                attributes = {_GOES_ON: str(trial.number), "folder": str(folder)}
+                attributes = {_GOES_ON: str(trial.number), "folder": folder.name}
                 if _SINGLE in trial.user_attrs:
                     attributes[_SINGLE] = trial.user_attrs[_SINGLE]
                 self.study.enqueue_trial(trial.params, user_attrs=attributes)
@@ -168,7 +169,7 @@ class Trials:
 
     def run_folder(self, number: int, attributes: Mapping[str, Any]) -> Path:
         """Of a trial's run; one that goes on has its predecessor's."""
-        return Path(attributes.get("folder", self.folder / f"trial-{number:04d}"))
+        return self.folder / attributes.get("folder", f"trial-{number:04d}")
 
     def objective(self, trial: Any) -> float:
         """Train with a trial's choices.
@@ -204,6 +205,8 @@ class Trials:
             settings = replace(settings, resume=str(run))
             for row in map(json.loads, (run / PROGRESS).read_text().splitlines()):
                 watch(row["update"], row)
+        elif run.exists():
+            shutil.rmtree(run)  # It was stopped before its first checkpoint.
         try:
             if not behind:
                 train(settings, watch)
@@ -234,12 +237,14 @@ class Trials:
         return " ".join(flags)
 
     def report(self) -> None:
-        """Write the best settings to `best.json`, and show the best trials."""
+        """Write the best settings and all trials to `best.json`, and show the best ones; nothing if none is done."""
         from optuna.trial import TrialState
 
         done = self.study.get_trials(states=(TrialState.COMPLETE,))
         done.sort(key=lambda trial: -(trial.value or 0.0))
         pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))
+        if not done:
+            return
         drawn = Table(
             title=f"{len(done)} trials to the end, {pruned} stopped early", title_justify="left", box=box.SIMPLE
         )
@@ -248,15 +253,18 @@ class Trials:
         for trial in done[:10]:
             drawn.add_row(str(trial.number), f"{trial.value:.4f}", self.changed(trial.params) or "nothing")
         self.console.print(drawn)
-        if done:
-            best = to_dict(with_choices(self.given.settings, done[0].params))
-            found = {"reward": done[0].value, "trial": done[0].number, "choices": done[0].params, "settings": best}
-            (self.folder / BEST).write_text(json.dumps(found, indent=1) + "\n")
-            settings, changed = self.given.settings, self.changed(done[0].params)
-            start = f"--env {settings.env} --preset {settings.preset}"
-            start += "" if "--agent" in changed else f" --agent {settings.agent}"
-            self.console.print(f"the best settings are in {self.folder / BEST}; beside your own flags:", soft_wrap=True)
-            self.console.print(f"endless-train {start} {changed}".rstrip(), soft_wrap=True)
+        best = to_dict(with_choices(self.given.settings, done[0].params))
+        trials = [
+            {"trial": trial.number, "state": trial.state.name, "reward": trial.value, "choices": trial.params}
+            for trial in self.study.trials
+        ]
+        found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
+        (self.folder / BEST).write_text(json.dumps(found, indent=1) + "\n")
+        settings, changed = self.given.settings, self.changed(done[0].params)
+        start = f"--env {settings.env} --preset {settings.preset}"
+        start += "" if "--agent" in changed else f" --agent {settings.agent}"
+        self.console.print(f"the best settings are in {self.folder / BEST}; beside your own flags:", soft_wrap=True)
+        self.console.print(f"endless-train {start} {changed}".rstrip(), soft_wrap=True)
 
 
 def work(given: Search) -> None:
