@@ -4,8 +4,8 @@
 `settings` what it can be told, `rollout` plays, `ppo` learns with `losses`; `agent` puts `encoders`, a memory (`recurrent`,
 `transformer`, `naive`) and `heads` together; `checkpoint` loads what was trained.
 
-What comes after training: `protocol` is `endless-eval`, over `evaluate`, `metrics`, `statistics` and `results`; `plot` with `curves`
-is `endless-plot`; `enjoy` with `film` is `endless-enjoy`; `search` with `search_space` is `endless-search`.
+What comes after training: `protocol` is `endless-eval`, over `evaluate`, `metrics`, `statistics` and `results`; `plot` with
+`curves` is `endless-plot`; `enjoy` with `film` is `endless-enjoy`; `search` with `search_space` is `endless-search`.
 """
 
 try:

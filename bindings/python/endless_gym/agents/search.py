@@ -169,7 +169,8 @@ class Trials:
 
     def run_folder(self, number: int, attributes: Mapping[str, Any]) -> Path:
         """Of a trial's run; one that goes on has its predecessor's."""
-        return self.folder / attributes.get("folder", f"trial-{number:04d}")
+        name: str = attributes.get("folder", f"trial-{number:04d}")
+        return self.folder / name
 
     def objective(self, trial: Any) -> float:
         """Train with a trial's choices.
