@@ -28,6 +28,14 @@ def test_bootstrap_draws_each_task_s_runs_by_themselves() -> None:
     """Tasks of different difficulty, runs without any spread: there is nothing to be unsure of."""
     assert stratified_bootstrap([[0, 10], [0, 10], [0, 10], [0, 10]]) == (5.0, 5.0)
 
+    # The tasks favour different runs: drawn together, 0 and 2 would always make up for each other.
+    assert stratified_bootstrap([[0, 2], [2, 0]]) == (0.0, 2.0)
+
+
+def test_bootstrap_is_of_the_interquartile_mean() -> None:
+    """Three or more of four draws are the one success, 5 in 100 times; the middle half is then 1, the mean at most 3/4."""
+    assert stratified_bootstrap([0, 0, 0, 1]) == (0.0, 1.0)
+
 
 def test_bootstrap_follows_from_its_seed() -> None:
     scores = np.random.default_rng(1).normal(size=(5, 3))
