@@ -159,17 +159,17 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Reset a group without waiting for it; `recv` returns its first observations with rewards of 0."""
         self._backend.send_reset(group, seed)
 
-    def snapshot(self, env: int) -> bytes:
-        """The whole state of one environment, for `restore`. Only for environments in this process."""
-        return self._backend.pool().snapshot(env)
+    def snapshot(self, env: int, group: int = 0) -> bytes:
+        """The whole state of one environment of a group, for `restore`. Only for environments in this process."""
+        return self._backend.pool(group).snapshot(env)
 
-    def restore(self, snapshots: Mapping[int, bytes]) -> tuple[Any, dict[str, Any]]:
+    def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
         """Put environments into the states of snapshots, also of other environments of the same id. Only in this process.
 
         Returns:
-            The observations and the info of all environments.
+            The observations and the info of all environments of the group.
         """
-        pool = self._backend.pool()
+        pool = self._backend.pool(group)
         for env, snapshot in snapshots.items():
             pool.restore(env, snapshot)
         return self._start_of(pool.observe())
@@ -283,7 +283,7 @@ class _Backend:
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
         raise NotImplementedError
 
-    def pool(self) -> _native.Pool:
+    def pool(self, group: int = 0) -> _native.Pool:
         raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
 
     def reconnect(self, timeout: float) -> None:
@@ -326,8 +326,8 @@ class _InProcess(_Backend):
         group = next(iter(self._sent)) if group is None else group
         return group, self._sent.pop(group)()
 
-    def pool(self) -> _native.Pool:
-        return self._group(0)
+    def pool(self, group: int = 0) -> _native.Pool:
+        return self._group(group)
 
     def close(self) -> None:
         self._pools, self._sent = [], {}

@@ -1,0 +1,133 @@
+"""Memory matters, in minutes: agents with and without memory on small tasks, evaluated on levels that they have not seen.
+
+    python learning.py --task one-command --agents gru trxl none --seeds 1 2 3
+    python learning.py --plot
+
+Each run is one `endless-train` with the preset `quick`, one thread and the flags below, and stops at the task's reward
+or at the limit of minutes; an agent without memory gets as many updates as the slowest of the others took. Then it plays 50 seeds
+from 200,000 three times each. The results of a task are kept in `learning/TASK.json`, with the commands and the curves; `--plot`
+draws all that there are.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+from endless_gym.agents import checkpoint
+from endless_gym.agents.evaluate import evaluate, mean
+from endless_gym.agents.settings import Settings
+from endless_gym.agents.train import parse, train
+
+FOLDER = Path(__file__).parent / "learning"
+#: Flags, minutes at most, the reward of training at which a run stops, and what the reward can be at most.
+TASKS = {
+    "one-command": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[1]", 15, 0.097, 0.1),
+    "two-commands": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[2]", 30, 0.19, 0.2),
+    "three-commands": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[3]", 30, 0.28, 0.3),
+    "mystery-path-grid-with-cues": (
+        "--env MysteryPath-Grid-v0 --environment.option show_origin=true show_goal=true reward_path_progress=0.1",
+        30,
+        1.6,
+        None,
+    ),
+    "endless-mystery-path": ("--env Endless-MysteryPath-v0", 30, 2.0, None),
+}
+
+
+def run(flags: list[str], folder: Path) -> dict:
+    """Trains, evaluates, and tells how it went."""
+    start = time.perf_counter()
+    settings: Settings = parse(flags)
+    done = checkpoint.load(train(dataclasses.replace(settings, run=str(folder))))
+    minutes = (time.perf_counter() - start) / 60
+    rows = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+    results = evaluate(done.agent, num_threads=1)
+    return {
+        "command": f"endless-train {' '.join(flags)}",
+        "agent": settings.agent,
+        "seed": settings.seed,
+        "updates": done.update,
+        "steps": rows[-1]["steps"],
+        "minutes": round(minutes, 2),
+        "load_average": round(os.getloadavg()[0], 1),
+        "evaluation_reward": mean(results),
+        "evaluation": {name: mean(results, name) for name in results[0] if name != "seed"},
+        "curve": [[row["steps"], round(row["episode/reward"], 5)] for row in rows if "episode/reward" in row],
+    }
+
+
+def plot() -> None:
+    """Draws each task's curves beside its evaluations."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    colours = {"gru": "tab:green", "trxl": "tab:blue", "lstm": "tab:olive", "none": "tab:red", "stack": "tab:orange"}
+    for file in sorted(FOLDER.glob("*.json")):
+        data = json.loads(file.read_text())
+        figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), width_ratios=[3, 1], sharey=True)
+        agents = sorted({row["agent"] for row in data["runs"]})
+        for place, agent in enumerate(agents):
+            rows = [row for row in data["runs"] if row["agent"] == agent]
+            for number, row in enumerate(rows):
+                steps, rewards = zip(*row["curve"], strict=True)
+                label = agent if number == 0 else None
+                left.plot(
+                    [step / 1000 for step in steps], rewards, color=colours.get(agent, "grey"), lw=1.2, label=label
+                )
+            heights = [row["evaluation_reward"] for row in rows]
+            right.scatter([place] * len(rows), heights, color=colours.get(agent, "grey"), zorder=3)
+        left.set(xlabel="thousand steps", ylabel="mean reward of 100 episodes", title=f"{data['task']}: training")
+        right.set(
+            title="50 unseen seeds", xticks=range(len(agents)), xticklabels=agents, xlim=(-0.5, len(agents) - 0.5)
+        )
+        for axes in (left, right):
+            axes.grid(alpha=0.3)
+            if data["best_reward"]:
+                axes.axhline(data["best_reward"], color="black", lw=0.8, ls="--")
+        left.legend()
+        figure.tight_layout()
+        figure.savefig(file.with_suffix(".png"), dpi=110)
+        pyplot.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=TASKS)
+    parser.add_argument("--agents", nargs="+", default=["gru", "none"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--plot", action="store_true")
+    args = parser.parse_args()
+    FOLDER.mkdir(exist_ok=True)
+    if args.task:
+        flags, minutes, target, best = TASKS[args.task]
+        file = FOLDER / f"{args.task}.json"
+        data = {"task": args.task, "best_reward": best, "conditions": "one thread for each run", "runs": []}
+        data = json.loads(file.read_text()) if file.exists() else data
+        for agent in sorted(args.agents, key=lambda agent: agent == "none"):
+            for seed in args.seeds:
+                given = f"{flags} --agent {agent} --seed {seed} --preset quick --threads 1 --environment.num-threads 1"
+                given += f" --time-limit {minutes} --target-reward {target}"
+                others = [row["updates"] for row in data["runs"] if row["agent"] != "none"]
+                if agent == "none" and others:
+                    given += f" --ppo.updates {max(others)}"
+                with tempfile.TemporaryDirectory() as folder:
+                    row = run(given.split(), Path(folder) / "run")
+                kept = [old for old in data["runs"] if (old["agent"], old["seed"]) != (agent, seed)]
+                data["runs"] = [*kept, row]
+                file.write_text(json.dumps(data, indent=1) + "\n")
+                print(
+                    f"{args.task} {agent} {seed}: {row['evaluation_reward']:.4f} after {row['minutes']} minutes",
+                    flush=True,
+                )
+    if args.plot:
+        plot()
+
+
+if __name__ == "__main__":
+    main()

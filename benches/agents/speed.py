@@ -1,0 +1,132 @@
+"""Steps per second of training, end to end, on the CPU: `endless-train` beside CleanRL's ppo_trxl and a plain recurrent PPO.
+
+    python speed.py --original PYTHON --cleanrl FOLDER
+
+PYTHON has the original (memory-gym 1.0.2), torch, and what CleanRL's ppo_trxl needs; FOLDER is CleanRL's folder `ppo_trxl`. Both
+sides have the same number of environments, steps, minibatches, epochs, window and threads, run in turns, and are measured between
+the ends of their first and their last update: in seconds, and in seconds of CPU time of all their processes, which other work
+on the machine disturbs less. CleanRL's network lacks the 512-wide hidden layers of the two heads that `endless-train` has.
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+
+def cpu_seconds(session: int) -> float:
+    """CPU time of all living processes of a session."""
+    ticks = 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue  # it has just ended
+        if int(fields[3]) == session:
+            ticks += sum(map(int, fields[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def timed(command: list[str], threads: int, pattern: str, folder: str) -> list[tuple[float, float]]:
+    """Runs a command, and returns the time and the CPU time at which it printed each line that matches."""
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "SDL_VIDEODRIVER": "dummy", "PYTHONUNBUFFERED": "1"}
+    if command[0] != sys.executable:
+        environment.pop("PYTHONPATH", None)
+    times = []
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+        cwd=folder,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if re.search(pattern, line):
+                times.append((time.perf_counter(), cpu_seconds(process.pid)))
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with status {process.returncode}")
+    return times
+
+
+def rate(times: list[tuple[float, float]], batch: int) -> tuple[float, float]:
+    """Steps per second and per second of CPU time, after the first update, which warms up."""
+    (first, first_cpu), (last, last_cpu) = times[0], times[-1]
+    steps = batch * (len(times) - 1)
+    return steps / (last - first), steps / (last_cpu - first_cpu)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--original", required=True)
+    parser.add_argument("--cleanrl", default="")
+    parser.add_argument("--env", default="Endless-MortarMayhem-v0")
+    parser.add_argument("--num-envs", type=int, default=8)
+    parser.add_argument("--steps", type=int, default=128)
+    parser.add_argument("--window", type=int, default=256)
+    parser.add_argument("--updates", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--output", type=Path)
+    args = parser.parse_args()
+    batch, rows = args.num_envs * args.steps, []
+    for name in ("trxl", "gru") if args.cleanrl else ("gru",):
+        sides: dict[str, list[tuple[float, float]]] = {"endless": [], "other": []}
+        shares: dict[str, float] = {}
+        for _ in range(args.rounds):
+            with tempfile.TemporaryDirectory() as folder:
+                ours = [
+                    *(sys.executable, "-m", "endless_gym.agents.train", "--env", args.env, "--agent", name),
+                    *(f"--environment.num-envs={args.num_envs}", "--environment.groups=1", f"--ppo.steps={args.steps}"),
+                    *(f"--ppo.updates={args.updates}", f"--transformer.window={args.window}", "--device=cpu"),
+                    *(f"--threads={args.threads}", f"--environment.num-threads={args.threads}", f"--run={folder}/run"),
+                ]
+                sides["endless"].append(rate(timed(ours, args.threads, r"steps/s|/s  ", folder), batch))
+                lines = Path(f"{folder}/run/progress.jsonl").read_text().splitlines()
+                progress = [json.loads(line) for line in lines][1:]
+                spent = {
+                    key[8:]: sum(row[key] for row in progress) for key in progress[0] if key.startswith("seconds/")
+                }
+                shares = {key: seconds / sum(spent.values()) for key, seconds in spent.items()}
+                if name == "trxl":
+                    other = [
+                        *(args.original, str(Path(args.cleanrl).resolve() / "ppo_trxl.py"), "--env-id", args.env),
+                        *(f"--num-envs={args.num_envs}", f"--num-steps={args.steps}", "--no-cuda"),
+                        *(f"--total-timesteps={batch * args.updates}", f"--trxl-memory-length={args.window}"),
+                    ]
+                    pattern = r"SPS="
+                else:
+                    other = [
+                        *(args.original, str(HERE / "plain_recurrent.py"), "--env", args.env),
+                        *(f"--num-envs={args.num_envs}", f"--steps={args.steps}", f"--updates={args.updates}"),
+                        f"--threads={args.threads}",
+                    ]
+                    pattern = r"steps="
+                sides["other"].append(rate(timed(other, args.threads, pattern, folder), batch))
+        against = "CleanRL ppo_trxl" if name == "trxl" else "plain recurrent PPO"
+        row = {"agent": name, "against": against, "rounds": sides, "shares_of_time": shares, "load": os.getloadavg()[0]}
+        for column, unit in enumerate(("second", "CPU second")):
+            one, two = (statistics.median(pair[column] for pair in sides[side]) for side in ("endless", "other"))
+            row[f"steps per {unit}"] = {"endless-train": one, "other": two, "times": one / two}
+            print(f"{name}: {one:.1f} steps per {unit}, {against} {two:.1f}: {one / two:.1f} times", flush=True)
+        print(f"{name}: " + ", ".join(f"{key} {share:.1%}" for key, share in shares.items()), flush=True)
+        rows.append(row)
+    if args.output:
+        settings = {
+            key: str(value) for key, value in vars(args).items() if key not in ("original", "cleanrl", "output")
+        }
+        args.output.write_text(json.dumps({"settings": settings, "results": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""What a run writes down: a line on the terminal for each update, TensorBoard's files, and `progress.jsonl`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from endless_gym.agents.settings import Settings, to_dict
+
+PROGRESS = "progress.jsonl"
+#: Episodes that means are taken over.
+RECENT = 100
+
+
+class Logger:
+    """Writes the measures of each update."""
+
+    def __init__(self, run: Path, settings: Settings, update: int = 0) -> None:
+        """Open the logs of a run; what an earlier process wrote beyond `update` is cut off."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.console = Console(highlight=False)
+        self._updates = settings.ppo.updates
+        progress = run / PROGRESS
+        if progress.exists():
+            lines = [line for line in progress.read_text().splitlines() if json.loads(line)["update"] <= update]
+            progress.write_text("".join(f"{line}\n" for line in lines))
+        self._progress = progress.open("a")
+        self._board: Any = SummaryWriter(str(run), purge_step=update + 1 if update else None)  # type: ignore[no-untyped-call]
+        rows = "\n".join(f"|{name}|{value}|" for name, value in _flat(to_dict(settings)))
+        self._board.add_text("settings", f"|setting|value|\n|-|-|\n{rows}", update)
+        self._wandb: Any = _weights_and_biases(run, settings, self.console) if settings.wandb else None
+
+    def update(self, measures: dict[str, Any], seconds: dict[str, float]) -> None:
+        """Write down an update: its measures, and where its seconds went."""
+        row = measures | {f"seconds/{name}": value for name, value in seconds.items()}
+        self._progress.write(json.dumps({k: None if _is_nan(v) else v for k, v in row.items()}) + "\n")
+        self._progress.flush()
+        step = measures["update"]
+        for name, value in row.items():
+            if name not in ("update", "steps"):
+                self._board.add_scalar(name if "/" in name else f"learning/{name}", value, step)
+        self._board.add_scalar("steps", measures["steps"], step)
+        if self._wandb is not None:
+            self._wandb.log(row, step=step)
+        total = sum(seconds.values()) or 1.0
+        shares = " ".join(f"{name} {value / total:4.0%}" for name, value in seconds.items())
+        reward = measures.get("episode/reward")
+        played = (
+            "no episode has ended yet"
+            if reward is None
+            else (f"reward {reward:.4f} length {measures['episode/length']:.1f}")
+        )
+        self.console.print(
+            f"[bold]{step:>5}[/]/{self._updates} {measures['steps']:>11,} steps {measures['steps_per_second']:>8,.0f}/s  "
+            f"[green]{played}[/]  loss {measures['loss']:.4f} entropy {measures['entropy']:.3f}  [dim]{shares}[/]",
+            soft_wrap=True,
+        )
+
+    def say(self, text: str) -> None:
+        """Tell the user something."""
+        self.console.print(text, soft_wrap=True)
+
+    def close(self) -> None:
+        """Close all files."""
+        self._progress.close()
+        self._board.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+class Episodes:
+    """The infos of the last episodes that ended."""
+
+    def __init__(self, infos: Iterable[dict[str, float]] = ()) -> None:
+        self.recent: deque[dict[str, float]] = deque(infos, maxlen=RECENT)
+
+    def add(self, infos: Iterable[dict[str, float]]) -> None:
+        """Take in the infos of more episodes."""
+        self.recent.extend(infos)
+
+    def means(self) -> dict[str, float]:
+        """The mean of each entry, as `episode/NAME`; empty if no episode has ended."""
+        if not self.recent:
+            return {}
+        return {f"episode/{key}": sum(info[key] for info in self.recent) / len(self.recent) for key in self.recent[0]}
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
+    try:
+        import wandb
+    except ImportError:
+        console.print("Weights & Biases is not installed; logging without it (pip install wandb)")
+        return None
+    return wandb.init(project="endless-gym", name=run.name, dir=str(run), config=to_dict(settings), resume="allow")

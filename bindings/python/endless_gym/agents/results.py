@@ -1,0 +1,167 @@
+"""What an evaluation has found: the episodes of runs' checkpoints, summed up, in files that `endless-plot` reads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endless_gym.agents import metrics
+from endless_gym.agents.settings import Settings, to_dict
+from endless_gym.agents.statistics import Summary, summarise
+
+#: Settings that tell runs of one experiment apart, or change nothing of what is learned.
+_OF_THE_RUN = (
+    "seed",
+    "run",
+    "resume",
+    "device",
+    "threads",
+    "compile",
+    "checkpoint_interval",
+    "keep_checkpoints",
+    "time_limit",
+    "target_reward",
+    "wandb",
+)
+
+
+@dataclass
+class Run:
+    """One run's checkpoints.
+
+    Attributes:
+        run: Its name, such as its folder.
+        seed: Of its training.
+        steps: Environment steps that each checkpoint has learned from, in order.
+        metrics: Means over the episodes of each checkpoint, by name.
+        episodes: The infos of each checkpoint's episodes, if they are kept.
+    """
+
+    run: str
+    seed: int
+    steps: list[int] = field(default_factory=list)
+    metrics: dict[str, list[float]] = field(default_factory=dict)
+    episodes: list[list[dict[str, float]]] = field(default_factory=list)
+
+    def add(self, steps: int, episodes: Sequence[Mapping[str, float]]) -> None:
+        """Take in a checkpoint's episodes."""
+        self.steps.append(steps)
+        self.episodes.append([dict(episode) for episode in episodes])
+        for name in episodes[0]:
+            if name != "seed":
+                mean = sum(episode[name] for episode in episodes) / len(episodes)
+                self.metrics.setdefault(name, []).append(mean)
+
+
+@dataclass
+class Experiment:
+    """Runs that differ in nothing but their seeds.
+
+    Attributes:
+        env: Environment id.
+        label: What plots and tables call it, such as `gru_rec`.
+        options: Reset parameters.
+        runs: Its runs.
+    """
+
+    env: str
+    label: str
+    options: dict[str, Any] = field(default_factory=dict)
+    runs: list[Run] = field(default_factory=list)
+
+    def common_steps(self) -> list[int]:
+        """Steps at which every run has a checkpoint."""
+        steps = set(self.runs[0].steps).intersection(*(run.steps for run in self.runs))
+        return sorted(steps)
+
+    def scores(self, metric: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """The metric's means, float64 (runs, common steps)."""
+        steps = self.common_steps()
+        return np.array([[run.metrics[metric][run.steps.index(step)] for step in steps] for run in self.runs])
+
+    def summaries(self, metric: str) -> list[tuple[int, Summary, str]]:
+        """Steps, estimates, and what they are over: the runs; or of a single run, its episodes."""
+        if len(self.runs) > 1:
+            columns = self.scores(metric).T
+            over = f"{len(self.runs)} runs"
+            return [(step, summarise(column), over) for step, column in zip(self.common_steps(), columns, strict=True)]
+        (run,) = self.runs
+        return [
+            (step, summarise([episode[metric] for episode in episodes]), f"{len(episodes)} episodes")
+            for step, episodes in zip(run.steps, run.episodes, strict=True)
+        ]
+
+
+def label(settings: Settings) -> str:
+    """The agent's name with its additions, as the published curves have it."""
+    additions = {
+        "_gt": settings.ppo.ground_truth_coefficient,
+        "_qpos": settings.transformer.query_encoding and settings.agent in ("trxl", "gtrxl"),
+        "_rec": settings.ppo.reconstruction_coefficient,
+    }
+    return settings.agent + "".join(name for name, value in additions.items() if value)
+
+
+class Experiments:
+    """Sorts runs into experiments by their settings."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, Experiment] = {}
+
+    def of(self, settings: Settings) -> Experiment:
+        """The experiment that a run with these settings belongs to."""
+        values = {name: value for name, value in to_dict(settings).items() if name not in _OF_THE_RUN}
+        values["preset"] = ""
+        # Runs of any length are of one experiment.
+        values["ppo"] = {name: value for name, value in values["ppo"].items() if name != "updates"}
+        key = json.dumps(values, sort_keys=True)
+        if key not in self._found:
+            name, taken = label(settings), [one.label for one in self.all() if one.env == settings.env]
+            number = sum(other == name or other.startswith(f"{name} (") for other in taken)
+            options = settings.options()
+            self._found[key] = Experiment(settings.env, f"{name} ({number + 1})" if number else name, options)
+        return self._found[key]
+
+    def all(self) -> list[Experiment]:
+        """All experiments, in the order in which they came."""
+        return list(self._found.values())
+
+
+def to_json(
+    experiments: Sequence[Experiment], protocol: Mapping[str, Any], with_episodes: bool = False
+) -> dict[str, Any]:
+    """Everything that was found, as JSON has it."""
+    written = []
+    for experiment in experiments:
+        values = asdict(experiment)
+        if not with_episodes:
+            for run in values["runs"]:
+                del run["episodes"]
+        name, _ = metrics.metric(experiment.env)
+        values["metric"] = name
+        values["summary"] = [
+            {"steps": step, "over": over, **summary.to_dict()} for step, summary, over in experiment.summaries(name)
+        ]
+        written.append(values)
+    return {"protocol": dict(protocol), "experiments": written}
+
+
+def read(file: Path) -> list[Experiment]:
+    """The experiments of a file that `endless-eval --json` wrote.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is something else.
+    """
+    try:
+        written = json.loads(file.read_text())["experiments"]
+        return [
+            Experiment(one["env"], one["label"], one["options"], [Run(**run) for run in one["runs"]]) for one in written
+        ]
+    except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{file} is not a file of `endless-eval --json`") from error

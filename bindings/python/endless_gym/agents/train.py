@@ -1,0 +1,215 @@
+"""`endless-train`: train an agent.
+
+```console
+endless-train --env Endless-MortarMayhem-v0 --agent gru
+endless-train --env MortarMayhem-Grid-v0 --environment.option command_count=[1] --agent trxl --preset quick
+```
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+
+from endless_gym.agents import checkpoint
+from endless_gym.agents.agent import make_agent
+from endless_gym.agents.clock import Clock
+from endless_gym.agents.environments import Environments
+from endless_gym.agents.logs import Episodes, Logger
+from endless_gym.agents.ppo import learn
+from endless_gym.agents.rollout import Player
+from endless_gym.agents.settings import PRESETS, Settings, to_dict
+
+
+def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | None = None) -> Path:
+    """Train, from the start or from a run's last checkpoint.
+
+    Args:
+        settings: Of the run.
+        watch: Is told, after each update, its number and the means of the last episodes, and may stop the run.
+
+    Returns:
+        The run's folder, with `settings.json`, `progress.jsonl`, TensorBoard's files and `checkpoints`.
+    """
+    settings, resumed = settings.checked(), None
+    if settings.resume:
+        run = Path(settings.resume)
+        resumed = checkpoint.load(run).state
+        same_network(settings, checkpoint.read_settings(run))
+    else:
+        run = Path(
+            settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+        )
+        if (run / checkpoint.SETTINGS).exists():
+            raise FileExistsError(f"{run} has a run already; go on with --resume {run}, or name another folder")
+        run.mkdir(parents=True, exist_ok=True)
+        (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
+
+    # Everything random follows from the seed.
+    device = choose_device(settings.device)
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    torch.manual_seed(settings.seed)
+    generators = {
+        "actions": torch.Generator(device).manual_seed(settings.seed),
+        "minibatches": torch.Generator().manual_seed(settings.seed),
+    }
+
+    ppo, started, stop = settings.ppo, time.monotonic(), Interrupt()
+    with Environments(settings) as environments, stop:
+        agent = make_agent(settings, environments.spec, device)
+        if settings.compile:
+            agent.compile_parts()
+        optimizer = torch.optim.AdamW(agent.parameters(), lr=ppo.learning_rate)
+        player = Player(agent, environments, ppo.steps, generators["actions"])
+        episodes, update = Episodes(), 0
+        if resumed is not None:
+            update = resumed["update"]
+            agent.load_state_dict(resumed["model"])
+            optimizer.load_state_dict(resumed["optimizer"])
+            for name, generator in generators.items():
+                generator.set_state(resumed["generators"][name])
+            episodes.add(resumed["episodes"])
+        logger = Logger(run, settings, update)
+        if resumed is not None and not player.load(resumed["player"]):
+            logger.say("the environments were in another process: new episodes start")
+        logger.say(
+            f"{settings.env}: {settings.agent} with {agent.num_parameters:,} parameters on {device}, in {run}; Ctrl-C stops it"
+        )
+
+        clock = Clock(torch.cuda.synchronize if device.type == "cuda" else None)
+        while update < ppo.updates and not stop.requested:
+            start = time.perf_counter()
+            segment, ended = player.play(clock)
+            with clock.measure("learning"):
+                states = [memory.state for memory in player.memories]
+                measures = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"])
+            update += 1
+            episodes.add(ended)
+            means = episodes.means()
+            rate = environments.groups * environments.per_group * ppo.steps / (time.perf_counter() - start)
+            steps = update * environments.groups * environments.per_group * ppo.steps
+            logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | measures, clock.take())
+
+            minutes = (time.monotonic() - started) / 60
+            if settings.time_limit and minutes >= settings.time_limit:
+                stop.requested = True
+            if means.get("episode/reward", -float("inf")) >= settings.target_reward:
+                stop.requested = True
+            if watch is not None and watch(update, means):
+                stop.requested = True
+            if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
+                state: dict[str, Any] = {
+                    "settings": to_dict(settings),
+                    "update": update,
+                    "model": agent.state_dict(),
+                    "optimizer": optimizer.state_dict(),
+                    "generators": {name: generator.get_state() for name, generator in generators.items()},
+                    "player": player.state(),
+                    "episodes": list(episodes.recent),
+                }
+                checkpoint.save(run, state, settings.keep_checkpoints)
+        logger.say(f"{update} of {ppo.updates} updates are done; go on with: endless-train --resume {run}")
+        logger.close()
+    return run
+
+
+class Interrupt:
+    """Lets an update finish when Ctrl-C is pressed; pressed again, it interrupts at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: Any = None
+
+    def __enter__(self) -> Interrupt:
+        try:
+            self._before = signal.signal(signal.SIGINT, self._on_signal)
+        except ValueError:  # Only the main thread may; others are not interrupted.
+            self._before = None
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        print("\nstopping after this update, with a checkpoint; press Ctrl-C again to stop at once", file=sys.stderr)
+
+
+def same_network(settings: Settings, before: Settings) -> None:
+    """Refuses to go on with another network or other environments than a run began with.
+
+    Raises:
+        ValueError: Something differs.
+    """
+    # Where environments are stepped may change, and all of PPO.
+    had = before.environment
+    place = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
+    settings = dataclasses.replace(settings, environment=place)
+    for name in ("env", "agent", "environment", "model", "recurrence", "transformer"):
+        given, had = getattr(settings, name), getattr(before, name)
+        if given != had:
+            raise ValueError(
+                f"the run to resume began with {name} {had}, not {given}; leave it as it was, or start a run"
+            )
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of that name; `auto` is CUDA where there is one.
+
+    Raises:
+        ValueError: There is no such device.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"no device `{name}`; give auto, cpu, cuda or cuda:NUMBER") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; give cpu or auto")
+    return device
+
+
+def parse(arguments: list[str]) -> Settings:
+    """Settings from the command line: the preset's, or the resumed run's, changed by the other flags."""
+    import tyro
+
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default="paper")
+    first.add_argument("--resume", default="")
+    chosen = first.parse_known_args(arguments)[0]
+    if chosen.resume:
+        defaults = dataclasses.replace(checkpoint.read_settings(chosen.resume), time_limit=0.0)
+    else:
+        # tyro tells what presets there are if there is none of that name.
+        defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
+    return tyro.cli(Settings, prog="endless-train", description=__doc__, args=arguments, default=defaults)
+
+
+def main() -> int:
+    """The command `endless-train`."""
+    try:
+        train(parse(sys.argv[1:]))
+    except (ValueError, FileNotFoundError, FileExistsError) as error:
+        print(f"endless-train: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

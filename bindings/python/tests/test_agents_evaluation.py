@@ -1,0 +1,190 @@
+"""The paper's protocol: its metrics from known infos, and its numbers from checkpoints."""
+
+import json
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from agents_helpers import settings
+from rich.console import Console
+
+from endless_gym.agents import protocol
+from endless_gym.agents.evaluate import evaluate
+from endless_gym.agents.metrics import metric, path_length, task_progress
+from endless_gym.agents.protocol import Evaluation, evaluate_runs, find
+from endless_gym.agents.results import read, to_json
+from endless_gym.agents.train import train
+from endless_gym.env import Env
+from endless_gym.specs import spec
+
+GRID = "MortarMayhem-Grid-v0"
+
+#: Tiles to reach in the paths of the evaluation's seeds, from the best rewards of the paper's agents in the published episodes.
+PATHS = [8, 9, 9, 12, 9, 10, 8, 7, 12, 9, 10, 10, 10, 10, 11, 9, 9, 8, 9, 10, 8, 9, 8, 9, 8]
+PATHS += [12, 7, 9, 11, 7, 11, 12, 9, 9, 8, 10, 11, 7, 10, 9, 6, 6, 10, 7, 9, 10, 11, 11, 7, 11]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of one experiment and one of another, with two checkpoints each."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, agent, seed in (("a", "gru", 1), ("b", "gru", 2), ("c", "none", 1)):
+        given = settings(agent, env=GRID, seed=seed, run=str(folder / name), checkpoint_interval=1, threads=1)
+        environment = replace(given.environment, num_envs=4, option=("command_count=[2]",))
+        ppo = replace(given.ppo, steps=8, minibatches=1, updates=2)
+        train(replace(given, environment=environment, ppo=ppo, keep_checkpoints=True))
+    return folder
+
+
+def small(*paths: Path, **changes: object) -> Evaluation:
+    return replace(Evaluation(paths), seeds=5, threads=1, engine_threads=1, **changes)
+
+
+@pytest.mark.parametrize(
+    ("env", "options", "final", "path", "expected"),
+    [
+        ("MortarMayhem-v0", {}, {"reward": 0.3, "commands_completed": 0.3, "success": 0}, 0, 0.3),
+        # The last command failed, but the infos count it.
+        ("MortarMayhem-v0", {}, {"reward": 0.9, "commands_completed": 1.0, "success": 1}, 0, 0.9),
+        ("MortarMayhem-v0", {}, {"reward": 1.0, "commands_completed": 1.0, "success": 1}, 0, 1.0),
+        (GRID, {"command_count": [1]}, {"reward": 0.0, "commands_completed": 1.0, "success": 1}, 0, 0.0),
+        (GRID, {"command_count": [2, 4]}, {"reward": 0.3, "commands_completed": 1.0, "success": 1}, 0, 0.75),
+        # Such a reward does not tell.
+        (GRID, {"reward_episode_success": 1}, {"reward": 1.9, "commands_completed": 1.0, "success": 1}, 0, 1.0),
+        ("MysteryPath-v0", {}, {"reward": 0.4, "success": 0}, 8, 0.5),
+        ("MysteryPath-v0", {}, {"reward": 1.7, "success": 1}, 8, 1.0),
+        ("MysteryPath-Grid-v0", {}, {"reward": 1.0, "success": 1}, 8, 1.0),
+        ("MysteryPath-Grid-v0", {}, {"reward": 0.0, "success": 0}, 8, 0.0),
+        ("SearingSpotlights-v0", {}, {"coins_collected": 1, "success": 0}, 0, 0.5),
+        ("SearingSpotlights-v0", {}, {"coins_collected": 1, "success": 1}, 0, 1.0),
+        ("SearingSpotlights-v0", {"num_coins": [4]}, {"coins_collected": 1, "success": 0}, 0, 0.125),
+        ("Endless-MysteryPath-v0", {}, {"reward": 0.4, "tiles_visited": 4}, 0, None),
+    ],
+)
+def test_task_progress(
+    env: str, options: dict[str, object], final: dict[str, float], path: int, expected: float | None
+) -> None:
+    progress = task_progress(spec(env), options, final, path)
+    assert progress == (expected if expected is None else pytest.approx(expected))
+
+
+def test_metrics_of_the_paper() -> None:
+    assert metric("Endless-MortarMayhem-v0") == ("commands_completed", "Commands")
+    assert metric("Endless-MysteryPath-v0") == ("tiles_visited", "Tiles")
+    assert metric("Endless-SearingSpotlights-v0") == ("coins_collected", "Coins")
+    assert metric("MysteryPath-v0")[0] == "task_progress"
+
+
+def test_paths_are_as_long_as_the_published_episodes_say() -> None:
+    env = Env("MysteryPath-v0", render_mode="debug_rgb_array")
+    lengths = []
+    for seed in range(200_000, 200_050):
+        env.reset(seed=seed)
+        lengths.append(path_length(env.render()))
+    assert lengths == PATHS
+
+
+def test_progress_on_a_path_is_that_of_its_length() -> None:
+    """Untrained, an agent reaches a tile or two: each is one part of the path, for each seed its own."""
+    agent = settings(
+        "none", env="MysteryPath-v0", environment=replace(settings("none").environment, option=("max_steps=60",))
+    )
+    from endless_gym.agents.agent import make_agent
+
+    results = evaluate(make_agent(agent, spec("MysteryPath-v0")), range(200_000, 200_010), 2, num_threads=1)
+    for result in results:
+        path = PATHS[int(result["seed"]) - 200_000]
+        assert result["task_progress"] == pytest.approx(round(result["reward"] / 0.1) / path)
+    assert any(result["task_progress"] > 0 for result in results)
+
+
+def test_runs_and_checkpoints_are_found(runs: Path) -> None:
+    assert [run.name for run, _ in find((runs,), False)] == ["a", "b", "c"]
+    assert [file.name for _, files in find((runs / "a",), False) for file in files] == [
+        "update-000001.pt",
+        "update-000002.pt",
+    ]
+    assert find((runs / "a" / "checkpoints",), True) == [(runs / "a", [runs / "a" / "checkpoints" / "last.pt"])]
+    file = runs / "b" / "checkpoints" / "update-000001.pt"
+    assert find((file,), False) == [(runs / "b", [file])]
+
+
+def test_each_seed_is_played_as_often_and_the_numbers_are_the_same_again(runs: Path) -> None:
+    quiet = Console(quiet=True)
+    once = evaluate_runs(small(runs), quiet)
+    assert [(one.label, len(one.runs), one.common_steps()) for one in once] == [
+        ("gru", 2, [32, 64]),
+        ("none", 1, [32, 64]),
+    ]
+    for run in once[0].runs:
+        for episodes in run.episodes:
+            assert Counter(episode["seed"] for episode in episodes) == dict.fromkeys(range(200_000, 200_005), 3)
+    again = evaluate_runs(small(runs), quiet)
+    assert to_json(again, {}, True) == to_json(once, {}, True)
+    other = evaluate_runs(small(runs, draws=1), quiet)
+    assert to_json(other, {}, True) != to_json(once, {}, True)
+
+
+def test_progress_is_told_for_each_episode(runs: Path) -> None:
+    told: list[int] = []
+    agent = protocol.command.load_checkpoint(runs / "a", "cpu").agent
+    evaluate(agent, range(200_000, 200_004), 2, num_threads=1, ended=told.append)
+    assert sum(told) == 8
+    assert min(told) > 0
+
+
+def test_results_are_written_and_read(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "results.json"
+    protocol.work(small(runs, json=str(file), episodes=True))
+    table = capsys.readouterr().out
+    written = json.loads(file.read_text())
+    assert written["protocol"] == {"first_seed": 200_000, "seeds": 5, "repetitions": 3, "draws": 0, "greedy": False}
+    gru, none = written["experiments"]
+    means = []
+    for run in gru["runs"]:
+        scores = [episode["reward"] / 0.2 for episode in run["episodes"][-1]]
+        means.append(sum(scores) / 15)
+        assert run["metrics"]["task_progress"][-1] == pytest.approx(means[-1])
+    last = gru["summary"][-1]
+    assert (last["steps"], last["over"], last["mean"]) == (64, "2 runs", pytest.approx(sum(means) / 2))
+    assert last["std"] == pytest.approx(abs(means[0] - means[1]) / 2)
+    assert f"{last['mean']:.4f}" in table
+    assert none["summary"][-1]["over"] == "15 episodes"
+    assert to_json(read(file), written["protocol"], True) == written
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "nothing to evaluate; give a checkpoint"),
+        ("nowhere", "no file or folder nowhere; give a checkpoint"),
+        (".", "no checkpoint in .; give a run's folder"),
+        ("text.pt", "text.pt is not a checkpoint of this version's `endless-train`"),
+        ("text.pt --seeds 0", "0 seeds, 3 times each: give 1 or more of both"),
+        ("text.pt --json none/results.json", "no folder none to write none/results.json to; make it first"),
+        ("text.pt --device nonsense", "no device `nonsense`"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.pt").write_text("not a checkpoint\n")
+    monkeypatch.setattr(sys, "argv", ["endless-eval", *arguments.split()])
+    assert protocol.main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith("endless-eval: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_ctrl_c_stops_cleanly(runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*arguments: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(protocol, "evaluate", interrupted)
+    monkeypatch.setattr(sys, "argv", ["endless-eval", str(runs)])
+    assert protocol.main() == 130
+    assert capsys.readouterr().err == "endless-eval: stopped\n"

@@ -1,0 +1,244 @@
+"""The network: its size, its heads, its options and presets."""
+
+import math
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from agents_helpers import BRANCHES, make, settings, transformer
+
+from endless_gym import spec
+from endless_gym.agents.agent import Agent, make_agent
+from endless_gym.agents.encoders import AtariEncoder
+from endless_gym.agents.heads import PolicyHead, ReconstructionHead
+from endless_gym.agents.memory import Plan
+from endless_gym.agents.settings import PRESETS, Recurrence, Settings, Transformer, from_dict, to_dict
+from endless_gym.agents.transformer import Block, Gate
+
+PAPER = PRESETS["paper"]
+
+
+@pytest.mark.parametrize(
+    ("agent", "changes", "count"),
+    [
+        ("gru", {}, 4_049_575),
+        ("gru", {"recurrence": Recurrence(hidden_size=384)}, 2_713_255),
+        ("trxl", {}, 2_803_111),
+        # Full heads: three matrices of 384 x 384 for three of 96 x 96, in three blocks.
+        ("trxl", {"transformer": Transformer(shared_heads=False)}, 2_803_111 + 9 * (384**2 - 96**2)),
+        ("trxl", {"transformer": Transformer(positional_encoding="learned")}, 2_803_111 + 2048 * 384),
+        # One more matrix of a head's size and two biases in each block.
+        ("trxl", {"transformer": Transformer(positional_encoding="relative")}, 2_803_111 + 3 * (96**2 + 2 * 384)),
+        # Two gates of six matrices and a bias in each block.
+        ("gtrxl", {}, 2_803_111 + 3 * 2 * (6 * 384**2 + 384)),
+        # An LSTM has four where a GRU has three.
+        ("lstm", {}, 4_049_575 + 2 * 512 * 512 + 2 * 512),
+        # As the GRU agent, without embedding and GRU: the body takes the 3136 outputs of the convolutions.
+        ("none", {}, 4_049_575 - 1_606_144 - 1_575_936 + (3136 - 512) * 512),
+    ],
+)
+def test_numbers_of_parameters(agent: str, changes: dict, count: int) -> None:
+    made = make_agent(replace(PAPER, agent=agent, **changes), spec("Endless-MortarMayhem-v0"))
+    assert spec("MortarMayhem-v0").branches == (3, 3)
+    made = Agent(replace(PAPER, agent=agent, **changes), {"visual_observation": (84, 84, 3)}, (3, 3))
+    assert made.num_parameters == count
+
+
+def test_paper_is_the_paper_s_table() -> None:
+    """Hyperparameters of the column `Final`."""
+    ppo, recurrence, trxl = PAPER.ppo, PAPER.recurrence, PAPER.transformer
+    assert PAPER.environment.num_envs == 32
+    assert ppo.steps == 512
+    assert ppo.steps * PAPER.environment.num_envs == 16_384
+    assert (ppo.gamma, ppo.gae_lambda, ppo.epochs, ppo.minibatches) == (0.995, 0.95, 3, 8)
+    assert ppo.advantage_normalisation == "none"
+    assert (ppo.clip_range, ppo.value_coefficient) == (0.1, 0.5)
+    assert (ppo.learning_rate, ppo.final_learning_rate) == (2.75e-4, 1.0e-5)
+    assert (ppo.entropy_coefficient, ppo.final_entropy_coefficient) == (1.0e-4, 1.0e-6)
+    assert ppo.max_gradient_norm == 0.25
+    assert ppo.decay_updates * 16_384 == 163_840_000
+    assert asdict(recurrence) == {
+        "hidden_size": 512,
+        "layers": 1,
+        "residual": False,
+        "embedding": True,
+        "sequence_length": 512,
+    }
+    assert (trxl.layers, trxl.width, trxl.heads, trxl.window) == (3, 384, 4, 256)
+    assert (trxl.initialisation, trxl.positional_encoding) == ("xavier", "absolute")
+    assert (PAPER.positions(), replace(PAPER, env="MortarMayhem-v0").positions()) == (2048, 512)
+
+
+def test_old_differs_in_its_column_alone() -> None:
+    old = PRESETS["old"]
+    assert (old.ppo.gamma, old.ppo.clip_range, old.ppo.value_coefficient) == (0.99, 0.2, 0.25)
+    assert (old.ppo.learning_rate, old.ppo.final_learning_rate) == (3.0e-4, 1.0e-4)
+    assert (old.ppo.final_entropy_coefficient, old.ppo.max_gradient_norm) == (1.0e-5, 0.5)
+    assert old.ppo.advantage_normalisation == "minibatch"
+    assert not old.recurrence.embedding
+    names = (
+        "gamma advantage_normalisation clip_range value_coefficient learning_rate final_learning_rate "
+        "final_entropy_coefficient max_gradient_norm"
+    )
+    same = {name: getattr(PAPER.ppo, name) for name in names.split()}
+    assert replace(old.ppo, **same) == PAPER.ppo
+    assert replace(old, preset="paper", ppo=PAPER.ppo, recurrence=PAPER.recurrence) == PAPER
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_settings_travel_as_json(name: str) -> None:
+    given = replace(PRESETS[name], environment=replace(PAPER.environment, option=("command_count=[2]",)))
+    assert from_dict(to_dict(given)) == given.checked()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": replace(PAPER.environment, num_envs=31)}, "31 environments do not divide into 2 groups"),
+        ({"environment": replace(PAPER.environment, option=("a",))}, "`a`: give NAME=VALUE"),
+        ({"environment": replace(PAPER.environment, option=("a=x",))}, "`a=x`: give NAME=VALUE"),
+        ({"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100)}, "100 steps do not divide into sequences of 64"),
+        ({"transformer": Transformer(window=1)}, "a window of 1 has no past"),
+        ({"transformer": Transformer(width=100, heads=3)}, "multiple of twice the 3 heads"),
+        ({"transformer": Transformer(query_encoding=True, positional_encoding="relative")}, "not relative"),
+        ({"ppo": replace(PAPER.ppo, epochs=0)}, "--ppo.epochs is 0; give 1 or more"),
+    ],
+)
+def test_impossible_settings_are_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(PAPER, **changes).checked()
+
+
+def test_options_are_json() -> None:
+    given = replace(PAPER, environment=replace(PAPER.environment, option=("a=[1, 2]", "b=true", "c=False", "d=0.5")))
+    assert given.options() == {"a": [1, 2], "b": True, "c": False, "d": 0.5}
+
+
+def test_heads_that_cannot_be() -> None:
+    with pytest.raises(ValueError, match="no ground truth"):
+        make("gru", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
+    with pytest.raises(ValueError, match="no frames"):
+        make("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
+
+
+def test_atari_encoder_sees_frames_as_they_are() -> None:
+    """Against the convolutions of frames that were made float and transposed by hand."""
+    encoder, frames = AtariEncoder(3), torch.randint(0, 256, (2, 84, 84, 3), dtype=torch.uint8)
+    x = torch.zeros(2, 3, 84, 84)
+    for channel in range(3):
+        x[:, channel] = frames[:, :, :, channel].float() / 255
+    for layer in encoder.convolutions:
+        x = layer(x)
+    assert x.shape == (2, 3136)
+    torch.testing.assert_close(encoder(frames), x, rtol=1e-4, atol=1e-5)
+
+
+def test_policy_starts_nearly_uniform_and_draws_what_it_says() -> None:
+    agent = make("none")
+    memory, rows = agent.initial_memory(20_000), torch.randn(1, 6).expand(20_000, 6)
+    acted = agent.act({"features": rows}, memory, torch.Generator().manual_seed(0))
+    for branch, choices in enumerate(BRANCHES):
+        for choice in range(choices):
+            drawn = acted.action[:, branch] == choice
+            expected = float(acted.log_prob[drawn][0, branch].exp())
+            # Five standard deviations.
+            assert abs(float(drawn.float().mean()) - expected) < 5 * math.sqrt(expected * (1 - expected) / 20_000)
+    greedy = agent.act({"features": rows}, agent.initial_memory(20_000), greedy=True)
+    assert (greedy.log_prob >= acted.log_prob).all()
+    fresh = PolicyHead(64, 64, (3, 3))(torch.randn(100, 64))
+    assert all((logits.softmax(-1) - 1 / 3).abs().max() < 0.15 for logits in fresh)
+
+
+def test_reconstruction_from_the_memory_s_output() -> None:
+    """The head's gradient reaches the memory; the frame has the observation's shape."""
+    given = settings("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
+    given = replace(given, environment=replace(given.environment, observation="rgb"))
+    agent = Agent(given, {"visual_observation": (84, 84, 3)}, BRANCHES)
+    memory, frames = agent.initial_memory(2), torch.randint(0, 256, (2, 84, 84, 3), dtype=torch.uint8)
+    agent.memory.begin_segment(memory.state, 1)
+    agent.act({"visual_observation": frames}, memory)
+    (plan,) = agent.memory.plan([memory.state], torch.ones(1, 2, dtype=torch.bool), 1, torch.Generator())
+    evaluated = agent.evaluate({"visual_observation": frames[plan.steps]}, plan)
+    assert evaluated.frame.shape == (2, 3, 84, 84)
+    evaluated.frame.sum().backward()
+    assert agent.memory.recurrent.weight_ih_l0.grad.abs().sum() > 0
+    assert agent.body[0].weight.grad is None
+
+
+def test_transposed_convolutions_undo_the_shapes() -> None:
+    """Layer by layer the Atari encoder's shapes, backwards."""
+    x, shapes = torch.randn(1, 32), []
+    for layer in ReconstructionHead(32, 4).layers:
+        x = layer(x)
+        shapes.append(tuple(x.shape[1:]))
+    assert shapes[2] == (64, 7, 7)
+    assert [shapes[i] for i in (3, 5, 7)] == [(64, 9, 9), (32, 20, 20), (4, 84, 84)]
+
+
+def test_ground_truth_head_reads_the_memory() -> None:
+    given = settings("trxl", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
+    agent = Agent(given, {"features": (6,)}, BRANCHES, ground_truth=2)
+    layers = agent.ground_truth.layers
+    assert (layers[0].in_features, layers[2].out_features) == (16, 2)
+    plan = Plan(torch.arange(3))
+    assert make("none").evaluate({"features": torch.randn(3, 6)}, plan).ground_truth is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "bound"),
+    [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))],
+)
+def test_uniform_initialisations(kind: str, bound: float) -> None:
+    """All weights of a block lie within the bound, and come near it; T-Fixup scales three of the matrices."""
+    block = Block(Transformer(layers=3, width=64, heads=4, shared_heads=False, initialisation=kind))
+    scaled = ("values", "fc_out", "fc.")
+    for name, weight in block.named_parameters():
+        if weight.dim() < 2:
+            continue
+        factor = 0.67 * 3**-0.25 if kind == "tfixup" and any(part in name for part in scaled) else 1.0
+        assert 0.98 * bound * factor < float(weight.abs().max()) <= bound * factor, name
+
+
+def test_orthogonal_initialisation() -> None:
+    block = Block(Transformer(width=64, heads=4, shared_heads=False, initialisation="orthogonal"))
+    for weight in (block.fc.weight, block.attention.queries.weight):
+        torch.testing.assert_close(weight @ weight.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("bias", [0.0, 2.0])
+def test_gate_with_silent_weights(bias: float) -> None:
+    """With weights 0 the candidate is 0, and the stream is scaled by 1 - sigmoid(-bias): nearer to the identity with 2."""
+    gate, x = Gate(8, bias), torch.randn(5, 8)
+    for layer in (gate.from_x, gate.from_y, gate.from_reset):
+        layer.weight.data.zero_()
+    torch.testing.assert_close(gate(x, torch.randn(5, 8)), x * (1 - 1 / (1 + math.exp(bias))))
+
+
+def test_table_is_reversed_and_concatenated() -> None:
+    """Row p is the encoding of `positions - 1 - p`: the sines of all frequencies first, then the cosines."""
+    agent = make("trxl", **transformer(positions=10))
+    table = agent.memory.table
+    assert table.shape == (10, 16)
+    torch.testing.assert_close(table[9], torch.tensor([0.0] * 8 + [1.0] * 8))
+    assert float(table[6, 1]) == pytest.approx(math.sin(3 / 10_000 ** (2 / 16)), abs=1e-6)
+    assert float(table[6, 9]) == pytest.approx(math.cos(3 / 10_000 ** (2 / 16)), abs=1e-6)
+
+
+def test_every_setting_is_documented() -> None:
+    """tyro reads a field's help from the string below it."""
+    import contextlib
+    import io
+
+    from endless_gym.agents.train import parse
+
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), pytest.raises(SystemExit):
+        parse(["--help"])
+    text = " ".join(printed.getvalue().replace("│", " ").split())
+    for flag in ("--env", "--agent", "--ppo.learning-rate", "--transformer.window", "--recurrence.sequence-length"):
+        assert flag in text
+    assert "(default: 0.000275)" in text
+    assert parse(["--preset", "old"]) == PRESETS["old"]
+    changed = parse(["--preset", "old", "--agent", "lstm", "--ppo.gamma", "0.9"])
+    assert changed == replace(PRESETS["old"], agent="lstm", ppo=replace(PRESETS["old"].ppo, gamma=0.9))
+    assert isinstance(changed, Settings)

@@ -1,0 +1,260 @@
+"""Whole runs: they resume exactly, stop cleanly, and learn; memory matters."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from agents_helpers import settings
+
+from endless_gym.agents import checkpoint
+from endless_gym.agents.agent import make_agent
+from endless_gym.agents.clock import Clock
+from endless_gym.agents.environments import Environments
+from endless_gym.agents.evaluate import evaluate, mean
+from endless_gym.agents.rollout import Player
+from endless_gym.agents.settings import PRESETS, Settings
+from endless_gym.agents.train import main, parse, train
+
+GRID = "MortarMayhem-Grid-v0"
+
+
+def small(agent: str, run: Path, updates: int = 4, **environment: Any) -> Settings:
+    given = settings(agent, env=GRID, run=str(run), checkpoint_interval=2, threads=1)
+    return replace(
+        given,
+        environment=replace(given.environment, num_envs=8, option=("command_count=[1, 2]",), **environment),
+        ppo=replace(given.ppo, steps=16, minibatches=2, updates=updates),
+    )
+
+
+def progress(run: Path) -> list[dict[str, Any]]:
+    """The measures of all updates, without the times that they took."""
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if not k.startswith("seconds/") and k != "steps_per_second"} for row in rows]
+
+
+def same(one: Any, two: Any) -> bool:
+    """Whether two checkpoints' contents are equal, to the last bit."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, two)
+    if isinstance(one, dict):
+        return one.keys() == two.keys() and all(same(one[key], two[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(two) and all(map(same, one, two))
+    return bool(one == two)
+
+
+@pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
+def test_nothing_has_changed_before_the_first_step_of_learning(agent: str, tmp_path: Path) -> None:
+    """What the network says of two played segments is what it said while it played them."""
+    given = small(agent, tmp_path)
+    with Environments(given) as environments:
+        torch.manual_seed(1)
+        made = make_agent(given, environments.spec)
+        player = Player(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+        for _ in range(2):
+            segment, _ = player.play(Clock())
+            flat, states = segment.flat(), [memory.state for memory in player.memories]
+            for plan in made.memory.plan(states, segment.first, 2, torch.Generator().manual_seed(1)):
+                evaluated = made.evaluate({key: part[plan.steps] for key, part in flat.observation.items()}, plan)
+                log_prob = evaluated.log_prob(flat.action[plan.steps])
+                torch.testing.assert_close(log_prob, flat.log_prob[plan.steps], rtol=1e-5, atol=1e-5)
+                torch.testing.assert_close(evaluated.value, flat.value[plan.steps], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
+def test_a_resumed_run_is_the_run_that_never_stopped(agent: str, tmp_path: Path) -> None:
+    through = train(small(agent, tmp_path / "through", 4))
+    halved = train(small(agent, tmp_path / "halved", 2))
+    train(replace(small(agent, tmp_path, 4), resume=str(halved)))
+    assert len(progress(through)) == 4
+    assert progress(halved) == progress(through)
+    one, two = (checkpoint.load(run).state for run in (through, halved))
+    for part in ("update", "model", "optimizer", "generators", "player", "episodes"):
+        assert same(one[part], two[part]), part
+
+
+def test_resumed_from_frames_with_all_heads(tmp_path: Path) -> None:
+    def given(run: Path, updates: int) -> Settings:
+        made = small("gru", run, updates)
+        return replace(
+            made,
+            env="Endless-MortarMayhem-v0",
+            environment=replace(made.environment, option=(), observation="rgb"),
+            ppo=replace(made.ppo, reconstruction_coefficient=0.1, ground_truth_coefficient=0.1),
+        )
+
+    through = train(given(tmp_path / "through", 2))
+    halved = train(given(tmp_path / "halved", 1))
+    train(replace(given(tmp_path, 2), resume=str(halved)))
+    assert progress(halved) == progress(through)
+    assert {"reconstruction_loss", "ground_truth_loss"} <= progress(through)[0].keys()
+    assert same(checkpoint.load(through).state["model"], checkpoint.load(halved).state["model"])
+
+
+def test_what_is_written_beyond_the_checkpoint_is_written_anew(tmp_path: Path) -> None:
+    """A run that was killed between two checkpoints goes on from the last one."""
+    run = train(small("gru", tmp_path / "run", 2))
+    expected = progress(train(small("gru", tmp_path / "through", 4)))
+    with (run / "progress.jsonl").open("a") as file:
+        file.write(json.dumps({"update": 3, "loss": 1.0}) + "\n")
+    train(replace(small("gru", tmp_path, 4), resume=str(run)))
+    assert progress(run) == expected
+
+
+def test_groups_and_threads_change_nothing_that_is_random(tmp_path: Path) -> None:
+    """The engine's threads do not change a run; its process and this process give the same one."""
+    runs = {
+        "one": train(small("gru", tmp_path / "one", 3)),
+        "threads": train(small("gru", tmp_path / "threads", 3, num_threads=3)),
+        "process": train(small("gru", tmp_path / "process", 3, engine="process")),
+    }
+    assert progress(runs["one"]) == progress(runs["threads"]) == progress(runs["process"])
+
+
+def test_in_a_process_a_resumed_run_starts_new_episodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = train(small("gru", tmp_path / "run", 2, engine="process"))
+    train(replace(small("gru", tmp_path, 4), resume=str(run)))
+    assert "new episodes start" in capsys.readouterr().out
+    assert [row["update"] for row in progress(run)] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("engine", ["thread", "process"])
+def test_ctrl_c_writes_a_checkpoint_and_leaves_nothing(engine: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    before = set(os.listdir("/dev/shm"))
+    arguments = f"--env {GRID} --agent gru --preset quick --run {run} --threads 1 --environment.engine {engine}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "endless_gym.agents.train", *arguments.split()],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    end = time.monotonic() + 120
+    while not (run / "progress.jsonl").exists() or not (run / "progress.jsonl").read_text():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, output
+    assert "stopping after this update" in output
+    done = checkpoint.load(run).update
+    assert 1 <= done < 2000
+    assert f"{done} of 2000 updates are done" in output
+    assert len(progress(run)) == done
+    assert {name for name in set(os.listdir("/dev/shm")) - before if "endless" in name} == set()
+
+
+def test_checkpoints_are_kept_and_act(tmp_path: Path) -> None:
+    given = replace(small("trxl", tmp_path / "run", 4), keep_checkpoints=True)
+    run = train(given)
+    assert [file.name for file in checkpoint.files(run)] == ["update-000002.pt", "update-000004.pt"]
+    loaded = checkpoint.load(checkpoint.files(run)[0])
+    assert (loaded.update, loaded.settings) == (2, given)
+    assert same(checkpoint.load(run).agent.state_dict(), checkpoint.load(checkpoint.files(run)[1]).agent.state_dict())
+    memory = loaded.agent.initial_memory(3)
+    acted = loaded.agent.act(torch.zeros(3, 17).numpy(), memory)
+    assert acted.action.shape == (3, 1)
+
+
+def test_evaluation_plays_each_seed_as_often(tmp_path: Path) -> None:
+    agent = checkpoint.load(train(small("gru", tmp_path / "run", 1))).agent
+    results = evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
+    assert [result["seed"] for result in results] == list(range(200_000, 200_007)) * 3
+    assert all(result["length"] > 0 for result in results)
+    assert mean(results) == pytest.approx(sum(result["reward"] for result in results) / 21)
+    # Draws differ between the repetitions of a seed; the seed of the draws makes them the same again.
+    assert results == evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
+    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, draws=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--env NoSuch-v0", "no environment `NoSuch-v0`; there are "),
+        (f"--env {GRID} --device nonsense", "no device `nonsense`; give auto, cpu, cuda or cuda:NUMBER"),
+        (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs is 0; give 1 or more"),
+        ("--resume nowhere", "no run in nowhere; give a folder with settings.json"),
+        (f"--env {GRID} --environment.option command_count=[1] colour=1", "colour"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["endless-train", *arguments.split()])
+    assert main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith("endless-train: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_run_goes_on_with_its_own_settings(tmp_path: Path) -> None:
+    run = train(small("gru", tmp_path / "run", 2))
+    resumed = parse(["--resume", str(run), "--ppo.updates", "3"])
+    assert resumed.ppo == replace(small("gru", run, 2).ppo, updates=3)
+    train(resumed)
+    assert len(progress(run)) == 3
+    with pytest.raises(ValueError, match="began with agent gru, not lstm"):
+        train(parse(["--resume", str(run), "--agent", "lstm"]))
+    with pytest.raises(FileExistsError, match="has a run already"):
+        train(small("gru", run, 2))
+
+
+def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = train(small("gru", tmp_path / "run", 2))
+    board = EventAccumulator(str(run))
+    board.Reload()
+    losses = [event.value for event in board.Scalars("learning/policy_loss")]
+    assert losses == pytest.approx([row["policy_loss"] for row in progress(run)], rel=1e-5)
+    assert {"episode/reward", "seconds/stepping", "seconds/inference", "seconds/learning"} <= set(
+        board.Tags()["scalars"]
+    )
+
+
+@pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
+def test_bf16_runs(agent: str, tmp_path: Path) -> None:
+    """bfloat16 changes the numbers a little, and what is stored stays float32."""
+    plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
+    one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
+    assert one != two
+    assert one == pytest.approx(two, rel=0.2)
+    assert all(tensor.dtype == torch.float32 for tensor in checkpoint.load(coarse).agent.state_dict().values())
+
+
+def one_command(agent: str, run: Path, **changes: Any) -> Settings:
+    quick = PRESETS["quick"]
+    return replace(
+        quick,
+        env=GRID,
+        agent=agent,
+        run=str(run),
+        threads=1,
+        target_reward=0.097,
+        environment=replace(quick.environment, option=("command_count=[1]",)),
+        ppo=replace(quick.ppo, updates=200),
+        **changes,
+    )
+
+
+@pytest.mark.timeout(600)
+def test_memory_matters(tmp_path: Path) -> None:
+    """One command that is shown and then gone: the GRU learns to follow it; without memory nothing can."""
+    gru = checkpoint.load(train(one_command("gru", tmp_path / "gru")))
+    assert mean(evaluate(gru.agent, num_threads=1)) >= 0.085
+    updates = gru.update
+    given = one_command("none", tmp_path / "none")
+    none = checkpoint.load(train(replace(given, ppo=replace(given.ppo, updates=updates))))
+    assert mean(evaluate(none.agent, num_threads=1)) < 0.04
