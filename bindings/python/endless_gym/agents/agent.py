@@ -30,7 +30,7 @@ from endless_gym.agents.recurrent import RecurrentMemory
 from endless_gym.agents.settings import Settings
 from endless_gym.agents.transformer import TransformerMemory
 from endless_gym.interop import torch_view
-from endless_gym.specs import Spec
+from endless_gym.specs import Frames, Spec
 
 
 @dataclass
@@ -264,7 +264,7 @@ class Agent(nn.Module):
 
 def observation_shapes(spec: Spec, observation: str) -> dict[str, tuple[int, ...]]:
     """Shapes of one environment's observation by key; `observation` is `rgb` or `features`."""
-    space = spec.observation_space(observation == "rgb", observation == "features")
+    space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
     if not isinstance(space, spaces.Dict):
         space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
     return {key: tuple(part.shape or ()) for key, part in space.items()}
