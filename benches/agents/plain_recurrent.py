@@ -88,6 +88,7 @@ def main() -> None:
     for _ in range(n):
         here, there = multiprocessing.Pipe()
         multiprocessing.Process(target=worker, args=(there, args.env), daemon=True).start()
+        there.close()  # so that a worker's end is seen
         pipes.append(here)
 
     def reset(env: int) -> np.ndarray:

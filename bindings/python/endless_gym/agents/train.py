@@ -191,7 +191,8 @@ def parse(arguments: list[str]) -> Settings:
     else:
         # tyro tells what presets there are if there is none of that name.
         defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
-    return tyro.cli(Settings, prog="endless-train", description=__doc__, args=arguments, default=defaults)
+    description = "Train one of the paper's agents with PPO: endless-train --env Endless-MortarMayhem-v0 --agent gru"
+    return tyro.cli(Settings, prog="endless-train", description=description, args=arguments, default=defaults)
 
 
 def main() -> int:
