@@ -99,7 +99,8 @@ def train(settings: Settings) -> Path:
             minutes = (time.monotonic() - started) / 60
             if settings.time_limit and minutes >= settings.time_limit:
                 stop.requested = True
-            if means.get("episode/reward", -float("inf")) >= settings.target_reward:
+            reward, target = means.get("episode/reward"), settings.target_reward
+            if reward is not None and target is not None and reward >= target:
                 stop.requested = True
             if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
                 state: dict[str, Any] = {
