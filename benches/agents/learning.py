@@ -26,6 +26,12 @@ FOLDER = Path(__file__).parent / "learning"
 #: Flags, minutes at most, the reward of training at which a run stops, and what the reward can be at most.
 TASKS = {
     "one-command": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[1]", 15, 0.097, 0.1),
+    "one-command-pixels": (
+        "--env MortarMayhem-Grid-v0 --environment.option command_count=[1] --environment.observation rgb",
+        30,
+        0.097,
+        0.1,
+    ),
     "two-commands": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[2]", 30, 0.19, 0.2),
     "three-commands": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[3]", 30, 0.28, 0.3),
     "mystery-path-grid-with-cues": (

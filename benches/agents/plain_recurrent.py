@@ -84,10 +84,12 @@ def main() -> None:
     n, steps, branches = args.num_envs, args.steps, [int(choices) for choices in args.branches.split(",")]
     agent = Agent(branches, 512)
     optimizer = torch.optim.AdamW(agent.parameters(), lr=2.75e-4)
-    pipes = []
+    pipes, processes = [], []
     for _ in range(n):
         here, there = multiprocessing.Pipe()
-        multiprocessing.Process(target=worker, args=(there, args.env), daemon=True).start()
+        processes.append(multiprocessing.Process(target=worker, args=(there, args.env), daemon=True))
+        processes[-1].start()
+        there.close()  # so that a worker's end is seen
         pipes.append(here)
 
     def reset(env: int) -> np.ndarray:
@@ -159,6 +161,8 @@ def main() -> None:
                 nn.utils.clip_grad_norm_(agent.parameters(), 0.25)
                 optimizer.step()
         print(f"steps={(update + 1) * n * steps}", flush=True)
+    for process in processes:
+        process.kill()
 
 
 if __name__ == "__main__":

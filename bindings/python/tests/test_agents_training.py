@@ -14,6 +14,7 @@ import pytest
 import torch
 from agents_helpers import settings
 
+from endless_gym import spec
 from endless_gym.agents import checkpoint
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
@@ -98,6 +99,28 @@ def test_resumed_from_frames_with_all_heads(tmp_path: Path) -> None:
     assert progress(halved) == progress(through)
     assert {"reconstruction_loss", "ground_truth_loss"} <= progress(through)[0].keys()
     assert same(checkpoint.load(through).state["model"], checkpoint.load(halved).state["model"])
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        "--env MortarMayhemB-Grid-v0 --agent gru --environment.observation rgb",
+        "--env MortarMayhemB-v0 --agent stack --environment.observation rgb --model.stack 2",
+        "--env MortarMayhemB-v0 --agent trxl",
+        "--env MysteryPath-Grid-v0 --agent gtrxl --transformer.gate-bias 2",
+        "--env Endless-SearingSpotlights-v0 --agent trxl --ppo.ground-truth-coefficient 0.1",
+        "--env Endless-MysteryPath-v0 --agent position",
+    ],
+)
+def test_observations_and_actions_of_all_kinds(flags: str, tmp_path: Path) -> None:
+    """Frames, features, vectors beside both; one branch and two; an update changes each head that there is."""
+    small_run = "--preset quick --environment.num-envs 4 --ppo.steps 32 --ppo.updates 1 --threads 1"
+    given = parse([*flags.split(), *small_run.split(), "--run", str(tmp_path / "run"), "--ppo.learning-rate", "0.01"])
+    torch.manual_seed(given.seed)
+    before = make_agent(given, spec(given.env)).state_dict()
+    after = checkpoint.load(train(given)).agent.state_dict()
+    assert before.keys() == after.keys()
+    assert all(not torch.equal(before[name], after[name]) for name in before if name.endswith("weight"))
 
 
 def test_what_is_written_beyond_the_checkpoint_is_written_anew(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def table(experiment: Experiment) -> Table:
     rows = [(first, *row) for row in experiment.summaries(first)]
     title = f"{experiment.env}, {experiment.label}, over {rows[0][-1]}{options}"
     drawn = Table(title=title, title_justify="left", box=box.SIMPLE)
-    for name in ("steps", "metric", "mean", "std", "IQM", "its 95 % interval"):
+    for name in ("steps", "metric", "mean", "std", "IQM", "95 % interval"):
         drawn.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]

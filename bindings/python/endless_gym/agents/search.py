@@ -86,7 +86,7 @@ class Search:
             raise ValueError(f"--percentile is {self.percentile}; give more than 0 and at most 100")
         if settings.run or settings.resume:
             raise ValueError("a search names its runs itself; give --folder in place of --run and --resume")
-        if settings.time_limit or settings.target_reward != float("inf"):
+        if settings.time_limit or settings.target_reward is not None:
             raise ValueError("trials are compared at the same updates; drop --time-limit and --target-reward")
         return self
 

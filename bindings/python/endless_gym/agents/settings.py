@@ -173,7 +173,7 @@ class Settings:
     """keep one file for each checkpoint, for evaluation, and not the last one only"""
     time_limit: float = 0.0
     """minutes after which training stops, with a checkpoint; 0 for none"""
-    target_reward: float = float("inf")
+    target_reward: float | None = None
     """stop when the mean reward of the last 100 episodes is at least this"""
     wandb: bool = False
     """log to Weights & Biases, too, if it is installed"""

@@ -104,7 +104,8 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             minutes = (time.monotonic() - started) / 60
             if settings.time_limit and minutes >= settings.time_limit:
                 stop.requested = True
-            if means.get("episode/reward", -float("inf")) >= settings.target_reward:
+            reward, target = means.get("episode/reward"), settings.target_reward
+            if reward is not None and target is not None and reward >= target:
                 stop.requested = True
             if watch is not None and watch(update, means):
                 stop.requested = True
@@ -198,7 +199,8 @@ def parse(arguments: list[str]) -> Settings:
     else:
         # tyro tells what presets there are if there is none of that name.
         defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
-    return tyro.cli(Settings, prog="endless-train", description=__doc__, args=arguments, default=defaults)
+    description = "Train one of the paper's agents with PPO: endless-train --env Endless-MortarMayhem-v0 --agent gru"
+    return tyro.cli(Settings, prog="endless-train", description=description, args=arguments, default=defaults)
 
 
 def main() -> int:

@@ -292,7 +292,7 @@ class TransformerMemory(Memory):
             self._project_all(state)
         assert state.keys is not None and state.values is not None
         inputs, episode, position = news
-        column, inputs = state.fill, inputs.detach().float()
+        column, inputs = state.fill, inputs.float()
         state.inputs[:, :, column] = inputs.squeeze(2)
         state.episode[:, column], state.position[:, column] = episode, position
         state.running, state.next_position = episode, position + 1
