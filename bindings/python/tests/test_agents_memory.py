@@ -92,12 +92,11 @@ def test_no_leak_while_acting(name: str) -> None:
     assert differs[6:10, 1].all()
 
 
-@pytest.mark.parametrize("name", REMEMBERING)
+# Stacks are made while acting: learning takes them as they are.
+@pytest.mark.parametrize("name", [name for name in REMEMBERING if KINDS[name][0] != "stack"])
 def test_no_leak_while_learning(name: str) -> None:
     """The gradient of one step's value with regard to all observations: in its own episode, not after it, and its own."""
     kind, changes = KINDS[name]
-    if kind == "stack":
-        pytest.skip("stacks are made while acting")
     agent = make(kind, **changes)
     memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
     done[9, 1] = True
