@@ -1,0 +1,55 @@
+//! What a step paints, by id: bytes and cache lines, the traffic that bounds many environments. `cargo bench --bench painted`.
+
+mod actions;
+
+use std::sync::Arc;
+
+use endless_gym::envs::mortar_mayhem::MortarMayhem;
+use endless_gym::envs::mystery_path::MysteryPath;
+use endless_gym::envs::searing_spotlights::SearingSpotlights;
+use endless_gym::envs::{self, Environment, Family, ResetParameters, SCREEN, Spec};
+use endless_gym::random::Generator;
+use endless_gym::raster::Sketch;
+use serde_json::Map;
+
+use actions::Actions;
+
+const STEPS: usize = 30_000;
+const LINE: usize = 64;
+
+fn measure<E: Environment>(spec: &'static Spec, variant: E::Variant) {
+    let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
+    let assets = Arc::new(E::assets(variant, &parameters));
+    let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1));
+    env.reset(&assets, &mut random);
+    let (mut actions, mut sketch, mut shown) = (Actions::new(spec, 1), Sketch::new(SCREEN, SCREEN), env.scene());
+    let (mut bytes, mut lines) = (0, 0);
+    for _ in 0..STEPS {
+        if env.step(actions.next(), &mut random).terminated {
+            env.reset(&assets, &mut random);
+        }
+        let scene = env.scene();
+        if shown != scene {
+            E::repaint(&assets, &shown, &scene, &mut sketch.canvas());
+            sketch.for_each_run(|x, rows, _| {
+                let (start, end) = ((x * SCREEN + rows.start) * 3, (x * SCREEN + rows.end) * 3);
+                bytes += end - start;
+                lines += (end - 1) / LINE - start / LINE + 1;
+            });
+        }
+        shown = scene;
+    }
+    let mean = |sum: usize| sum as f64 / STEPS as f64;
+    println!("{:30} {:8.0} {:12.0} {:14}", spec.id, mean(bytes), mean(lines), size_of::<E::Scene>());
+}
+
+fn main() {
+    println!("{:30} {:>8} {:>12} {:>14}", "a step of", "bytes", "cache lines", "bytes noted");
+    for spec in envs::specs() {
+        match spec.family {
+            Family::MortarMayhem(variant) => measure::<MortarMayhem>(spec, variant),
+            Family::MysteryPath(variant) => measure::<MysteryPath>(spec, variant),
+            Family::SearingSpotlights(variant) => measure::<SearingSpotlights>(spec, variant),
+        }
+    }
+}
