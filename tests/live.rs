@@ -136,15 +136,13 @@ fn compare(id: &str) {
     let spec = envs::spec(id).unwrap();
     let asked: Option<usize> = std::env::var("ENDLESS_LIVE_STEPS").ok().map(|text| text.parse().unwrap());
     let wanted = asked.unwrap_or(1500);
-    let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
-    let mut runner = match asked {
-        Some(_) => TestRunner::new(config),
-        None => TestRunner::new_with_rng(config, TestRng::deterministic_rng(RngAlgorithm::ChaCha)),
-    };
+    let mut seeds = SmallRng::seed_from_u64(asked.map_or(0, |_| rand::random()));
     let original = std::cell::RefCell::new(Original::start());
     let (steps, raised) = (std::cell::Cell::new(0), std::cell::Cell::new(0));
     while steps.get() < wanted {
-        runner
+        let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
+        let random = TestRng::from_seed(RngAlgorithm::ChaCha, &seeds.random::<[u8; 32]>());
+        TestRunner::new_with_rng(config, random)
             .run(&case(spec), |case| {
                 let answer = original.borrow_mut().play(&play(spec, &case));
                 if answer.get("error").is_some() {
