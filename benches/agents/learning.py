@@ -103,6 +103,7 @@ def plot() -> None:
 
 
 def main() -> None:
+    """Measures, and writes down."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--agents", nargs="+", default=["gru", "none"])

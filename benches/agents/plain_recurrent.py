@@ -10,6 +10,7 @@ It needs the original (memory-gym 1.0.2) and torch; it prints a line for each up
 import argparse
 import multiprocessing
 import os
+from multiprocessing.connection import Connection
 
 import numpy as np
 import torch
@@ -18,14 +19,14 @@ from torch import nn
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 
-def worker(pipe, env_id: str) -> None:
+def worker(pipe: Connection, env_id: str) -> None:
     """Steps one environment whenever it is told to."""
     import gymnasium
     import memory_gym  # noqa: F401
 
     env = gymnasium.make(env_id, disable_env_checker=True, render_mode="debug_rgb_array")
 
-    def frame(observation) -> np.ndarray:
+    def frame(observation: np.ndarray) -> np.ndarray:
         return (observation / 255.0).astype(np.float32).transpose(2, 0, 1)
 
     while True:
@@ -37,7 +38,7 @@ def worker(pipe, env_id: str) -> None:
             pipe.send((frame(observation), reward, done or truncated))
 
 
-def padded(data, pieces: list[tuple[int, int, int]]) -> torch.Tensor:
+def padded(data: np.ndarray | torch.Tensor, pieces: list[tuple[int, int, int]]) -> torch.Tensor:
     """Pieces (environment, first step, step after the last) of data (n, steps, ...), all as long as the longest."""
     data, longest = torch.as_tensor(data), max(b - a for _, a, b in pieces)
     out = torch.zeros((len(pieces), longest, *data.shape[2:]), dtype=data.dtype)
@@ -61,7 +62,10 @@ class Agent(nn.Module):
         self.branches = nn.ModuleList(nn.Linear(512, choices) for choices in branches)
         self.value = nn.Sequential(nn.Linear(hidden, 512), nn.ReLU(), nn.Linear(512, 1))
 
-    def forward(self, frames, hidden, length: int):
+    def forward(
+        self, frames: torch.Tensor, hidden: torch.Tensor, length: int
+    ) -> tuple[list[torch.distributions.Categorical], torch.Tensor, torch.Tensor]:
+        """Distributions of the branches, values and hidden states of sequences of `length` frames each."""
         x = self.cnn(frames)
         x, hidden = self.gru(x.view(-1, length, x.shape[-1]), hidden)
         x = self.body(x.flatten(0, 1))
@@ -71,6 +75,7 @@ class Agent(nn.Module):
 
 
 def main() -> None:
+    """Trains, and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="Endless-MortarMayhem-v0")
     parser.add_argument("--num-envs", type=int, default=8)

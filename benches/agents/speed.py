@@ -67,6 +67,7 @@ def rate(times: list[tuple[float, float]], batch: int) -> tuple[float, float]:
 
 
 def main() -> None:
+    """Measures, and writes down."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--original", required=True)
     parser.add_argument("--cleanrl", default="")
