@@ -15,7 +15,8 @@ use super::error::ServiceError;
 use super::node::Ipc;
 
 const SPIN: Duration = Duration::from_micros(3);
-const YIELD: Duration = Duration::from_micros(50);
+/// As long as a Python trainer takes between two steps, so that the engine is awake when it asks for the next.
+const YIELD: Duration = Duration::from_micros(200);
 
 /// Calls `poll` until it yields something or `timeout` has passed; sleeps on `listener` in between. An interrupting signal
 /// counts as a time-out.
