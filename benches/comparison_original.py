@@ -1,4 +1,4 @@
-"""Steps the original for `python_comparison.py`, which starts it.
+"""Steps the original for `comparison.py`, which starts it.
 
 A JSON object on each line of the input asks for one measurement, a line with steps per second answers it.
 """

@@ -50,7 +50,7 @@ impl Sketch {
                 let start = rest.trailing_zeros() as usize;
                 let end = start + (rest >> start).trailing_ones() as usize;
                 run(x, start..end, &column[start..end]);
-                rest = rest.checked_shr(end as u32).unwrap_or(0).checked_shl(end as u32).unwrap_or(0);
+                rest &= u128::MAX.checked_shl(end as u32).unwrap_or(0);
             }
         }
     }
