@@ -84,6 +84,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         ]
         self._truth = self._index.get("ground_truth")
         self._steps = [self._index[name] for name in ("reward", "terminated", "truncated")]
+        self._ends = [self._index[name] for name in ("episode_return", "episode_length", "info")]
+        self._integers = [is_integer for _, is_integer in described.info]
         self._same_step = autoreset is AutoresetMode.SAME_STEP
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.flags.writeable = False
@@ -233,22 +235,21 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         arrays = self._copied(arrays)
         reward, terminated, truncated = (arrays[place] for place in self._steps)
         info = self._info(arrays)
-        if terminated.any():
-            self._add_ends(info, arrays, terminated)
+        self._add_ends(info, arrays, terminated)
         return self._observation(arrays, self._observed), reward, terminated, truncated, info
 
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
-        """Adds what is told of episodes that this step ended."""
-        returns = np.where(ended, arrays[self._index["episode_return"]], 0.0)
-        lengths = np.where(ended, arrays[self._index["episode_length"]], 0)
+        """Adds what is told of episodes that this step ended, if it ended any."""
+        told = (arrays[place] for place in self._ends)
+        seconds = time.perf_counter() - self._start
+        ends = _native.ended_episodes(ended, *told, self._integers, seconds)
+        if ends is None:
+            return
+        returns, lengths, times, columns = ends
         final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
-        for column, (name, is_integer) in enumerate(self._described.info):
-            values = arrays[self._index["info"]][:, column]
-            final[name] = values.astype(np.int64) if is_integer else values.copy()
-            final[f"_{name}"] = ended
-        seconds = np.where(ended, time.perf_counter() - self._start, 0.0)
-        info["episode"] = {"r": returns, "l": lengths, "t": seconds}
-        info["_episode"] = ended
+        for (name, _), column in zip(self._described.info, columns, strict=True):
+            final[name], final[f"_{name}"] = column, ended
+        info["episode"], info["_episode"] = {"r": returns, "l": lengths, "t": times}, ended
         if not self._same_step:
             info.update(final)
             return

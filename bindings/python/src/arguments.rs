@@ -3,7 +3,7 @@
 use endless_gym::batch::Frames;
 use endless_gym::pool::{Autoreset, Options, ResetRequest, Seeding};
 use endless_gym::raster::PixelFormat;
-use numpy::{PyArrayMethods, PyReadonlyArrayDyn};
+use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use serde_json::{Map, Value as Json};
@@ -12,9 +12,9 @@ use serde_json::{Map, Value as Json};
 pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
     to.clear();
     if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i64>>() {
-        to.extend(array.as_array().iter().map(|action| clamp(*action)));
+        append(&array, to, clamp);
     } else if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i32>>() {
-        to.extend(array.as_array().iter());
+        append(&array, to, |action| action);
     } else if let Ok(list) = given.extract::<Vec<i64>>() {
         to.extend(list.into_iter().map(clamp));
     } else {
@@ -27,9 +27,17 @@ pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
             return Err(PyTypeError::new_err(format!("actions are integers; {shown} given")));
         }
         let array = array.call_method1("astype", ("int64",))?.cast_into::<numpy::PyArrayDyn<i64>>()?;
-        to.extend(array.readonly().as_array().iter().map(|action| clamp(*action)));
+        append(&array.readonly(), to, clamp);
     }
     Ok(())
+}
+
+/// Appends the numbers in the order of the array's indices, whatever their order in memory.
+fn append<T: Element + Copy>(array: &PyReadonlyArrayDyn<'_, T>, to: &mut Vec<i32>, convert: impl Fn(T) -> i32) {
+    match array.as_array().as_slice() {
+        Some(numbers) => to.extend(numbers.iter().map(|number| convert(*number))),
+        None => to.extend(array.as_array().iter().map(|number| convert(*number))),
+    }
 }
 
 /// What does not fit an i32 is as far out of range as what is just outside.

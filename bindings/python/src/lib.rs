@@ -6,6 +6,7 @@ mod arguments;
 mod arrays;
 mod connection;
 mod dlpack;
+mod ends;
 mod errors;
 mod pool;
 mod single;
@@ -41,6 +42,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;
     module.add_function(wrap_pyfunction!(dlpack::dlpack, module)?)?;
+    module.add_function(wrap_pyfunction!(ends::ended_episodes, module)?)?;
     module.add_function(wrap_pyfunction!(endless, module)?)?;
     module.add_function(wrap_pyfunction!(specs, module)?)
 }

@@ -1,6 +1,6 @@
 //! Environments of one family in a row, stepped slice by slice.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use serde_json::{Map, Value as Json};
 
@@ -8,6 +8,7 @@ use super::history::History;
 use super::seeding::Seeds;
 use super::shown::{self, Drawing, Shown, WrongFrame};
 use super::snapshot::{Saved, SnapshotError};
+use super::threads::{Threads, lock};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
 use crate::envs::{Environment, ParameterError, ResetParameters, Spec, view};
@@ -124,11 +125,16 @@ fn write_if_present<T>(row: &mut [T], write: impl FnOnce(&mut [T])) {
     }
 }
 
+/// Environments that one thread steps in one go: few, so that none waits long for one whose environments have much to do.
+const ENVS_IN_PIECE: usize = 32;
+
+/// Fewer environments than these are stepped by the calling thread: they are done before others have come.
+const ENVS_FOR_THREADS: usize = 128;
+
 /// How a batch is to be written.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Work {
-    /// Contiguous slices that may be written at the same time.
-    pub slices: usize,
+pub(super) struct Work<'a> {
+    pub threads: &'a Threads,
     /// Where is noted what the frames of the batch show.
     pub slot: usize,
     pub drawing: Drawing,
@@ -137,10 +143,16 @@ pub(super) struct Work {
 /// Environments in a row, whatever their family: one virtual call for a whole batch.
 pub(super) trait Lanes: Send + Sync {
     /// Steps all environments.
-    fn step(&mut self, work: Work, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) -> Result<(), WrongFrame>;
+    fn step(
+        &mut self,
+        work: Work<'_>,
+        autoreset: Autoreset,
+        actions: &[i32],
+        out: BatchMut<'_>,
+    ) -> Result<(), WrongFrame>;
 
     /// Resets environments as `request` says and writes every environment's row.
-    fn reset(&mut self, work: Work, request: ResetRequest<'_>, out: BatchMut<'_>) -> Result<(), WrongFrame>;
+    fn reset(&mut self, work: Work<'_>, request: ResetRequest<'_>, out: BatchMut<'_>) -> Result<(), WrongFrame>;
 
     /// Gives the environments that `request` resets other reset parameters, from their next episode on.
     fn set_options(&mut self, request: ResetRequest<'_>, options: &Options) -> Result<(), ParameterError>;
@@ -193,7 +205,7 @@ impl<E: Environment> FamilyLanes<E> {
     /// Writes all rows: `play` writes everything but the frame of the row that it gets, with the environment's number.
     fn write(
         &mut self,
-        work: Work,
+        work: Work<'_>,
         out: BatchMut<'_>,
         play: impl Fn(usize, &mut Lane<E>, &mut BatchMut<'_>, usize) + Sync,
     ) -> Result<(), WrongFrame> {
@@ -202,7 +214,7 @@ impl<E: Environment> FamilyLanes<E> {
         }
         let (stack, shown) = (self.stack, &mut self.shown[work.slot]);
         let whole = Slice { first: 0, lanes: &mut self.lanes, shown, stack, out };
-        whole.divide(work.slices, &|slice| {
+        whole.share(work.threads, |slice| {
             let Slice { first, lanes, shown, mut out, .. } = slice;
             for (row, (lane, shown)) in lanes.iter_mut().zip(shown.chunks_exact_mut(stack)).enumerate() {
                 play(first + row, lane, &mut out, row);
@@ -227,14 +239,20 @@ impl<E: Environment> FamilyLanes<E> {
 }
 
 impl<E: Environment> Lanes for FamilyLanes<E> {
-    fn step(&mut self, work: Work, autoreset: Autoreset, actions: &[i32], out: BatchMut<'_>) -> Result<(), WrongFrame> {
+    fn step(
+        &mut self,
+        work: Work<'_>,
+        autoreset: Autoreset,
+        actions: &[i32],
+        out: BatchMut<'_>,
+    ) -> Result<(), WrongFrame> {
         let branches = self.spec.action_space.branches().len();
         self.write(work, out, |env, lane, out, row| {
             lane.step(autoreset, work.drawing, &actions[env * branches..][..branches], out, row);
         })
     }
 
-    fn reset(&mut self, work: Work, request: ResetRequest<'_>, out: BatchMut<'_>) -> Result<(), WrongFrame> {
+    fn reset(&mut self, work: Work<'_>, request: ResetRequest<'_>, out: BatchMut<'_>) -> Result<(), WrongFrame> {
         self.write(work, out, |env, lane, out, row| {
             match request {
                 ResetRequest::All => lane.start_episode(None),
@@ -314,24 +332,60 @@ struct Slice<'a, E: Environment> {
 }
 
 impl<E: Environment> Slice<'_, E> {
-    /// Divides everything alike into contiguous slices and has `work` done on each, at the same time where threads are free.
-    fn divide(
+    /// Has `work` done on all of it, piece by piece, by all threads that come. The caller takes pieces from the front and workers
+    /// from the back, so that the memory of an environment mostly stays with the core that touched it last.
+    fn share(
         self,
-        slices: usize,
-        work: &(impl Fn(Slice<'_, E>) -> Result<(), WrongFrame> + Sync),
+        threads: &Threads,
+        work: impl Fn(Slice<'_, E>) -> Result<(), WrongFrame> + Sync,
     ) -> Result<(), WrongFrame> {
-        if slices <= 1 {
+        if threads.count() == 1 || self.lanes.len() < ENVS_FOR_THREADS {
             return work(self);
         }
-        let left = slices / 2;
-        let middle = self.lanes.len() * left / slices;
-        let (left_lanes, right_lanes) = self.lanes.split_at_mut(middle);
-        let (left_shown, right_shown) = self.shown.split_at_mut(middle * self.stack);
-        let (left_out, right_out) = self.out.split_at(middle);
+        let rest = Mutex::new((Some(self), Ok(())));
+        threads.run(&|thread| {
+            loop {
+                let piece = {
+                    let (rest, _) = &mut *lock(&rest);
+                    rest.take().map(|whole| {
+                        let (piece, others) = whole.piece(thread == 0);
+                        *rest = others;
+                        piece
+                    })
+                };
+                let Some(piece) = piece else { return };
+                if let Err(wrong) = work(piece) {
+                    lock(&rest).1 = Err(wrong);
+                }
+            }
+        });
+        rest.into_inner().unwrap_or_else(PoisonError::into_inner).1
+    }
+
+    /// The first or last few environments, and those that are left, if there are.
+    fn piece(self, from_front: bool) -> (Self, Option<Self>) {
+        let num_envs = self.lanes.len();
+        if num_envs <= ENVS_IN_PIECE {
+            return (self, None);
+        }
+        if from_front {
+            let (piece, others) = self.split_at(ENVS_IN_PIECE);
+            (piece, Some(others))
+        } else {
+            let (others, piece) = self.split_at(num_envs - ENVS_IN_PIECE);
+            (piece, Some(others))
+        }
+    }
+
+    /// Divides everything before environment `middle`.
+    fn split_at(self, middle: usize) -> (Self, Self) {
         let (first, stack) = (self.first, self.stack);
-        let one = Slice { first, lanes: left_lanes, shown: left_shown, stack, out: left_out };
-        let other = Slice { first: first + middle, lanes: right_lanes, shown: right_shown, stack, out: right_out };
-        let (one, other) = rayon::join(|| one.divide(left, work), || other.divide(slices - left, work));
-        one.and(other)
+        let (left_lanes, right_lanes) = self.lanes.split_at_mut(middle);
+        let (left_shown, right_shown) = self.shown.split_at_mut(middle * stack);
+        let (left_out, right_out) = self.out.split_at(middle);
+        (
+            Slice { first, lanes: left_lanes, shown: left_shown, stack, out: left_out },
+            Slice { first: first + middle, lanes: right_lanes, shown: right_shown, stack, out: right_out },
+        )
     }
 }

@@ -6,6 +6,7 @@ mod lanes;
 mod seeding;
 mod shown;
 mod snapshot;
+mod threads;
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -28,15 +29,10 @@ use seeding::Seeds;
 use shown::Drawing;
 pub use shown::WrongFrame;
 pub use snapshot::{SNAPSHOT_VERSION, SnapshotError};
+pub use threads::Threads;
 
 /// Most environments in one pool.
 pub const MAX_ENVS: usize = 1 << 20;
-
-/// Environments that one thread steps in one go.
-const ENVS_IN_SLICE: usize = 32;
-
-/// Fewer environments than these are stepped by the calling thread: they are done before others have woken up.
-const ENVS_FOR_THREADS: usize = 128;
 
 /// When an episode that ended gives way to the next one. The names are Gymnasium's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -104,39 +100,6 @@ impl PoolConfig {
             check_drawing: false,
             first_env: 0,
             total_envs: num_envs,
-        }
-    }
-}
-
-/// Worker threads that step environments. Several pools may share them.
-#[derive(Clone, Debug)]
-pub struct Threads(Option<Arc<rayon::ThreadPool>>);
-
-impl Threads {
-    /// `count` threads; 0 stands for one for each core. One thread is the caller's own.
-    pub fn new(count: usize) -> Result<Self, PoolError> {
-        let count = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
-        if count == 1 {
-            return Ok(Threads(None));
-        }
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(count)
-            .thread_name(|i| format!("endless-worker-{i}"))
-            .build()
-            .map(|pool| Threads(Some(Arc::new(pool))))
-            .map_err(|source| PoolError::Threads { count, source })
-    }
-
-    /// Threads that step environments at the same time.
-    pub fn count(&self) -> usize {
-        self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
-    }
-
-    /// Has work done that divides itself into `slices`.
-    fn run<T: Send>(&self, slices: usize, work: impl FnOnce() -> T + Send) -> T {
-        match &self.0 {
-            Some(pool) if slices > 1 => pool.install(work),
-            _ => work(),
         }
     }
 }
@@ -282,7 +245,7 @@ impl Pool {
     fn write(
         &mut self,
         batch: &mut [Block],
-        write: impl FnOnce(&mut dyn Lanes, Work, BatchMut<'_>) -> Result<(), WrongFrame> + Send,
+        write: impl FnOnce(&mut dyn Lanes, Work<'_>, BatchMut<'_>) -> Result<(), WrongFrame>,
     ) -> Result<(), PoolError> {
         let (given, needed) = (batch.len(), self.layout.blocks());
         if given < needed {
@@ -290,10 +253,9 @@ impl Pool {
         }
         let buffer = self.buffers.begin(&self.layout, batch);
         let drawing = Drawing { known: buffer.known, format: self.format, check: self.check_drawing };
-        let work = Work { slices: self.slices(), slot: buffer.slot, drawing };
+        let work = Work { threads: &self.threads, slot: buffer.slot, drawing };
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
-        let lanes = &mut *self.lanes;
-        self.threads.run(work.slices, || write(lanes, work, out))?;
+        write(&mut *self.lanes, work, out)?;
         self.buffers.finish(buffer, &self.layout, batch);
         Ok(())
     }
@@ -336,12 +298,6 @@ impl Pool {
             _ => self.lanes.ground_truth_view(env, out),
         }
         Ok(())
-    }
-
-    /// Several slices for each thread, so that none waits long for one whose environments have much to do.
-    fn slices(&self) -> usize {
-        let num_envs = self.layout.num_envs();
-        if self.threads.count() == 1 || num_envs < ENVS_FOR_THREADS { 1 } else { num_envs.div_ceil(ENVS_IN_SLICE) }
     }
 }
 
@@ -422,7 +378,7 @@ pub enum PoolError {
     #[error("the range of seeds {start}..{end} is empty or ends above 2^63 - 1")]
     SeedRange { start: u64, end: u64 },
     #[error("cannot start {count} threads: {source}")]
-    Threads { count: usize, source: rayon::ThreadPoolBuildError },
+    Threads { count: usize, source: std::io::Error },
     #[error("step before the first reset; reset all environments once")]
     NotReset,
     #[error("{given} action numbers for {num_envs} environments of {branches} branches; give {}", num_envs * branches)]
