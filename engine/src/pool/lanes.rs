@@ -126,10 +126,10 @@ fn write_if_present<T>(row: &mut [T], write: impl FnOnce(&mut [T])) {
 }
 
 /// Environments that one thread steps in one go: few, so that none waits long for one whose environments have much to do.
-const ENVS_IN_PIECE: usize = 32;
+const ENVS_IN_PIECE: usize = 16;
 
 /// Fewer environments than these are stepped by the calling thread: they are done before others have come.
-const ENVS_FOR_THREADS: usize = 128;
+const ENVS_FOR_THREADS: usize = 64;
 
 /// How a batch is to be written.
 #[derive(Clone, Copy, Debug)]

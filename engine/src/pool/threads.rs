@@ -13,10 +13,10 @@ use std::time::{Duration, Instant};
 
 use super::PoolError;
 
-/// A worker looks for the next call without pause for so long, then lets others run in between, and then sleeps. The sum is what
-/// a trainer in Python takes between two steps.
+/// A worker looks for the next call without pause for so long, lets others run in between for as long as most trainers take
+/// between two steps, and then sleeps.
 const SPIN: Duration = Duration::from_micros(3);
-const YIELD: Duration = Duration::from_micros(200);
+const YIELD: Duration = Duration::from_millis(3);
 
 /// Threads that step environments. Several pools may share them; they then take turns.
 #[derive(Clone, Debug)]

@@ -15,8 +15,9 @@ use super::error::ServiceError;
 use super::node::Ipc;
 
 const SPIN: Duration = Duration::from_micros(3);
-/// As long as a Python trainer takes between two steps, so that the engine is awake when it asks for the next.
-const YIELD: Duration = Duration::from_micros(200);
+/// As long as most trainers take between two steps, and most engines for one. Waking a sleeper takes up to half a millisecond on a
+/// virtual machine, in which the other side may fall asleep in turn.
+const YIELD: Duration = Duration::from_millis(3);
 
 /// Calls `poll` until it yields something or `timeout` has passed; sleeps on `listener` in between. An interrupting signal
 /// counts as a time-out.
