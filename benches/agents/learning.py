@@ -3,7 +3,7 @@
     python learning.py --task one-command --agents gru trxl none --seeds 1 2 3
     python learning.py --plot
 
-Each run is one `endless-train` with the preset `quick`, one thread and the flags below, and stops at the task's reward
+Each run is one `endless-train` with the preset `quick` and the flags below, and stops at the task's reward
 or at the limit of minutes; an agent without memory gets as many updates as the slowest of the others took. Then it plays 50 seeds
 from 200,000 three times each. The results of a task are kept in `learning/TASK.json`, with the commands and the curves; `--plot`
 draws all that there are.
@@ -108,17 +108,18 @@ def main() -> None:
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--agents", nargs="+", default=["gru", "none"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--threads", type=int, default=1, help="PyTorch's, for each run (default: %(default)s)")
     parser.add_argument("--plot", action="store_true")
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     if args.task:
         flags, minutes, target, best = TASKS[args.task]
         file = FOLDER / f"{args.task}.json"
-        data = {"task": args.task, "best_reward": best, "conditions": "one thread for each run", "runs": []}
+        data = {"task": args.task, "best_reward": best, "runs": []}
         data = json.loads(file.read_text()) if file.exists() else data
         for agent in sorted(args.agents, key=lambda agent: agent == "none"):
             for seed in args.seeds:
-                given = f"{flags} --agent {agent} --seed {seed} --preset quick --threads 1 --environment.num-threads 1"
+                given = f"{flags} --agent {agent} --seed {seed} --preset quick --threads {args.threads} --environment.num-threads 1"
                 given += f" --time-limit {minutes} --target-reward {target}"
                 others = [row["updates"] for row in data["runs"] if row["agent"] != "none"]
                 if agent == "none" and others:

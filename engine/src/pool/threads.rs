@@ -54,12 +54,15 @@ struct Workers {
     turn: Mutex<()>,
 }
 
+/// What is called with a thread's number. It lives as long as the call lasts.
+type Work = &'static (dyn Fn(usize) + Sync);
+
 #[derive(Default)]
 struct Shared {
     /// Goes up with each call.
     call: AtomicU64,
     /// What workers may join in, while a call lasts.
-    open: Mutex<Option<&'static (dyn Fn(usize) + Sync)>>,
+    open: Mutex<Option<Work>>,
     /// Workers that have joined in and are not done.
     inside: AtomicUsize,
     panic: Mutex<Option<Box<dyn Any + Send>>>,
@@ -88,10 +91,9 @@ impl Workers {
         let _turn = lock(&self.turn);
         // SAFETY: only the lifetime changes. Workers find the reference in `open` alone and count themselves as inside before
         // they let go of its lock; `Call` closes it and waits until none is inside before this function returns or unwinds.
-        let endless = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), &'static (dyn Fn(usize) + Sync)>(work) };
+        let endless = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Work>(work) };
         let call = Call(&self.shared);
-        *lock(&self.shared.open) = Some(endless);
-        self.shared.call.fetch_add(1, Ordering::SeqCst);
+        self.shared.open(endless);
         self.threads.iter().for_each(Thread::unpark);
         work(0);
         drop(call);
@@ -132,7 +134,9 @@ impl Shared {
             if self.stop.load(Ordering::SeqCst) {
                 return;
             }
-            let Some(work) = self.join() else { continue };
+            // By now it may be the call after.
+            let Some((call, work)) = self.join() else { continue };
+            last = call;
             if let Err(panic) = catch_unwind(AssertUnwindSafe(|| work(number))) {
                 *lock(&self.panic) = Some(panic);
             }
@@ -156,11 +160,19 @@ impl Shared {
         }
     }
 
-    /// The work of the call that is open, if one still is; the worker then is inside.
-    fn join(&self) -> Option<&'static (dyn Fn(usize) + Sync)> {
+    /// Lets workers join in.
+    fn open(&self, work: Work) {
+        let mut open = lock(&self.open);
+        *open = Some(work);
+        self.call.fetch_add(1, Ordering::SeqCst);
+    }
+
+    /// The number and the work of the call that is open, if one still is; the worker then is inside.
+    fn join(&self) -> Option<(u64, Work)> {
         let open = lock(&self.open);
-        open.inspect(|_| {
+        open.map(|work| {
             self.inside.fetch_add(1, Ordering::Relaxed);
+            (self.call.load(Ordering::SeqCst), work)
         })
     }
 }
