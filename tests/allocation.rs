@@ -40,21 +40,21 @@ static ALLOCATOR: Counting = Counting;
 /// One test, since others at the same time would be counted too.
 #[test]
 fn steps_and_resets_allocate_nothing() {
-    const NUM_ENVS: usize = 16;
     for spec in envs::specs() {
-        for autoreset in [Autoreset::NextStep, Autoreset::SameStep] {
+        // As few as one thread steps, and enough for two.
+        for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
             let config = PoolConfig {
                 seeding: Seeding::Range { start: 0, end: 100_000, seed: Some(1) },
                 autoreset,
                 final_observation: true,
                 features: true,
-                ..PoolConfig::new(spec.id, NUM_ENVS)
+                ..PoolConfig::new(spec.id, num_envs)
             };
-            let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+            let mut pool = Pool::new(&config, &Threads::new(threads).unwrap()).unwrap();
             let mut buffers = [zeroed(pool.layout().blocks()), zeroed(pool.layout().blocks())];
             let mut random = SmallRng::seed_from_u64(1);
             let branches = spec.action_space.branches();
-            let mut actions = vec![0; NUM_ENVS * branches.len()];
+            let mut actions = vec![0; num_envs * branches.len()];
             let mut play = |steps: usize| {
                 for step in 0..steps {
                     let buffer = &mut buffers[step % 2];

@@ -119,7 +119,8 @@ def main() -> None:
         data = json.loads(file.read_text()) if file.exists() else data
         for agent in sorted(args.agents, key=lambda agent: agent == "none"):
             for seed in args.seeds:
-                given = f"{flags} --agent {agent} --seed {seed} --preset quick --threads {args.threads} --environment.num-threads 1"
+                given = f"{flags} --agent {agent} --seed {seed} --preset quick"
+                given += f" --threads {args.threads} --environment.num-threads 1"
                 given += f" --time-limit {minutes} --target-reward {target}"
                 others = [row["updates"] for row in data["runs"] if row["agent"] != "none"]
                 if agent == "none" and others:

@@ -27,7 +27,7 @@ class Pool:
         *,
         first_env: int,
         total_envs: int,
-        num_threads: int,
+        threads: Threads,
         options: str,
         autoreset: str,
         seed: int | None,
@@ -44,6 +44,9 @@ class Pool:
     def snapshot(self, env: int) -> bytes: ...
     def restore(self, env: int, snapshot: bytes) -> None: ...
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]: ...
+
+class Threads:
+    def __init__(self, count: int) -> None: ...
 
 class Single:
     def __init__(self, id: str, options: str) -> None: ...

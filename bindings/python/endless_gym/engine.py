@@ -19,7 +19,7 @@ from endless_gym.vector import AutoresetMode, EndlessVectorEnv, Options, autores
 _numbers = count()
 
 #: In a process group of its own, so that Ctrl-C reaches this process alone, which then ends the engine. Not in a session of its
-#: own where Python can do without: Linux divides processor time among sessions, and the engine would wait a fifth of its time.
+#: own where Python can do without: Linux divides processor time among sessions first, and a step then took a third longer.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 

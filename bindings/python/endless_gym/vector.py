@@ -416,12 +416,13 @@ def make_vec(
     """
     described, mode = spec(id), autoreset_mode(autoreset)
     frames, features = contents(observation, frames)
-    # Groups count their environments through, as an engine does.
+    # As in an engine, groups share their threads and count their environments through.
+    threads = _native.Threads(num_threads or 0)
     pools = [
         _native.Pool(
             described.id,
             num_envs,
-            num_threads=num_threads or 0,
+            threads=threads,
             options=_pool_options(options, group * num_envs, num_envs, groups),
             autoreset=_name(mode),
             first_env=group * num_envs,

@@ -38,6 +38,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
     module.add_class::<pool::Pool>()?;
+    module.add_class::<pool::Threads>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use endless_gym::batch::{Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
-use endless_gym::pool::{self as engine, PoolConfig, Threads};
+use endless_gym::pool::{self as engine, PoolConfig};
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
@@ -24,6 +24,18 @@ impl Owner for Lent {
     }
 }
 
+/// Threads that step environments: that many, or one for each core if 0. Several pools may share them.
+#[pyclass(frozen, module = "endless_gym._native")]
+pub struct Threads(engine::Threads);
+
+#[pymethods]
+impl Threads {
+    #[new]
+    fn new(count: usize) -> PyResult<Self> {
+        engine::Threads::new(count).map(Threads).map_err(errors::pool)
+    }
+}
+
 /// Environments of one id in lockstep, and the batches that they write.
 ///
 /// A batch whose arrays are still held is left alone: the pool writes into another one, and makes a new one where all are held.
@@ -38,14 +50,14 @@ pub struct Pool {
 #[pymethods]
 impl Pool {
     #[new]
-    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, num_threads, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
+    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, threads, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         id: &str,
         num_envs: usize,
         first_env: usize,
         total_envs: usize,
-        num_threads: usize,
+        threads: &Threads,
         options: &str,
         autoreset: &str,
         seed: Option<u64>,
@@ -66,8 +78,7 @@ impl Pool {
             total_envs,
             ..PoolConfig::new(id, num_envs)
         };
-        let threads = Threads::new(num_threads).map_err(errors::pool)?;
-        let pool = engine::Pool::new(&config, &threads).map_err(errors::pool)?;
+        let pool = engine::Pool::new(&config, &threads.0).map_err(errors::pool)?;
         Ok(Pool { pool, batches: Vec::new(), actions: Vec::new(), process: std::process::id() })
     }
 

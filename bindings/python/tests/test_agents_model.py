@@ -9,7 +9,7 @@ from agents_helpers import BRANCHES, make, settings, transformer
 
 from endless_gym import spec
 from endless_gym.agents.agent import Agent, make_agent
-from endless_gym.agents.encoders import CACHED, AtariEncoder
+from endless_gym.agents.encoders import FRAMES_IN_PIECE, AtariEncoder
 from endless_gym.agents.heads import PolicyHead, ReconstructionHead
 from endless_gym.agents.memory import Plan
 from endless_gym.agents.settings import PRESETS, Recurrence, Settings, Transformer, from_dict, to_dict
@@ -123,13 +123,13 @@ def test_heads_that_cannot_be() -> None:
 
 def test_atari_encoder_sees_frames_as_they_are() -> None:
     """Against the convolutions of frames that were made float and transposed by hand."""
-    encoder, frames = AtariEncoder(3), torch.randint(0, 256, (CACHED + 2, 84, 84, 3), dtype=torch.uint8)
+    encoder, frames = AtariEncoder(3), torch.randint(0, 256, (FRAMES_IN_PIECE + 2, 84, 84, 3), dtype=torch.uint8)
     x = torch.zeros(len(frames), 3, 84, 84)
     for channel in range(3):
         x[:, channel] = frames[:, :, :, channel].float() / 255
     for layer in encoder.convolutions:
         x = layer(x)
-    assert x.shape == (CACHED + 2, 3136)
+    assert x.shape == (FRAMES_IN_PIECE + 2, 3136)
     torch.testing.assert_close(encoder(frames), x, rtol=1e-4, atol=1e-5)
 
 

@@ -88,15 +88,17 @@ def test_other_threads_run_while_one_waits() -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_forked_child_does_no_harm() -> None:
-    with endless_gym.serve(ID, 4) as envs, endless_gym.make_vec(ID, 4, num_threads=2) as inside:
+    with endless_gym.serve(ID, 4) as envs, endless_gym.make_vec(ID, 64, num_threads=2) as inside:
+        many = np.zeros((64, 2), dtype=np.int64)
         envs.reset()
         inside.reset()
+        inside.step(many)
         child = os.fork()
         if child == 0:
             refused = 0
-            for those in (envs, inside):
+            for those, actions in ((envs, ACTIONS), (inside, many)):
                 try:
-                    those.step(ACTIONS)
+                    those.step(actions)
                 except RuntimeError:
                     refused += 1
             del envs, inside
@@ -104,7 +106,7 @@ def test_a_forked_child_does_no_harm() -> None:
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
         for _ in range(10):
             envs.step(ACTIONS)
-            inside.step(ACTIONS)
+            inside.step(many)
 
 
 def test_reconnecting_to_an_engine_that_was_started_again() -> None:

@@ -342,24 +342,27 @@ impl<E: Environment> Slice<'_, E> {
         if threads.count() == 1 || self.lanes.len() < ENVS_FOR_THREADS {
             return work(self);
         }
-        let rest = Mutex::new((Some(self), Ok(())));
-        threads.run(&|thread| {
-            loop {
-                let piece = {
-                    let (rest, _) = &mut *lock(&rest);
-                    rest.take().map(|whole| {
-                        let (piece, others) = whole.piece(thread == 0);
-                        *rest = others;
-                        piece
-                    })
-                };
-                let Some(piece) = piece else { return };
-                if let Err(wrong) = work(piece) {
-                    lock(&rest).1 = Err(wrong);
+        let helpers = self.lanes.len().div_ceil(ENVS_IN_PIECE) - 1;
+        let rest = Mutex::new(Some(self));
+        let outcome = Mutex::new(Ok(()));
+        threads.run(helpers, &|thread| {
+            while let Some(piece) = Self::take_piece(&rest, thread == 0) {
+                let Err(wrong) = work(piece) else { continue };
+                let mut outcome = lock(&outcome);
+                if outcome.as_ref().err().is_none_or(|known: &WrongFrame| wrong.env < known.env) {
+                    *outcome = Err(wrong);
                 }
             }
         });
-        rest.into_inner().unwrap_or_else(PoisonError::into_inner).1
+        outcome.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes a piece of what is left.
+    fn take_piece(rest: &Mutex<Option<Self>>, from_front: bool) -> Option<Self> {
+        let mut rest = lock(rest);
+        let (piece, others) = rest.take()?.piece(from_front);
+        *rest = others;
+        Some(piece)
     }
 
     /// The first or last few environments, and those that are left, if there are.

@@ -1,4 +1,4 @@
-//! Many environments of one id, stepped in lockstep by worker threads.
+//! Many environments of one id, stepped in lockstep by the calling thread and workers.
 
 mod buffers;
 mod history;
@@ -241,7 +241,7 @@ impl Pool {
         self.write(batch, |lanes, work, out| lanes.step(work, autoreset, actions, out))
     }
 
-    /// Has a batch written, by as many threads as there are.
+    /// Has a batch written.
     fn write(
         &mut self,
         batch: &mut [Block],

@@ -36,12 +36,12 @@ impl Threads {
         1 + self.0.as_ref().map_or(0, |workers| workers.threads.len())
     }
 
-    /// Calls `work` with 0 in this thread and, at the same time, with 1, 2, ... in those workers that are awake in time; returns
-    /// when all calls have. A panic in any of them goes on here.
-    pub(super) fn run(&self, work: &(dyn Fn(usize) + Sync)) {
+    /// Calls `work` with 0 in this thread and, at the same time, with 1 to `helpers` at most in those workers that are awake in
+    /// time; returns when all calls have. A panic in any of them goes on here.
+    pub(super) fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
         match &self.0 {
-            None => work(0),
-            Some(workers) => workers.run(work),
+            Some(workers) if helpers > 0 => workers.run(helpers, work),
+            _ => work(0),
         }
     }
 }
@@ -55,15 +55,17 @@ struct Workers {
 }
 
 /// What is called with a thread's number. It lives as long as the call lasts.
-type Work = &'static (dyn Fn(usize) + Sync);
+type Task = &'static (dyn Fn(usize) + Sync);
 
 #[derive(Default)]
 struct Shared {
-    /// Goes up with each call.
+    /// Goes up when a call opens and when it closes: odd while workers may join.
     call: AtomicU64,
-    /// What workers may join in, while a call lasts.
-    open: Mutex<Option<Work>>,
-    /// Workers that have joined in and are not done.
+    /// The last worker that may join.
+    helpers: AtomicUsize,
+    /// What workers join in.
+    open: Mutex<Option<Task>>,
+    /// Workers that have joined and are not done.
     inside: AtomicUsize,
     panic: Mutex<Option<Box<dyn Any + Send>>>,
     stop: AtomicBool,
@@ -87,14 +89,13 @@ impl Workers {
         Ok(workers)
     }
 
-    fn run(&self, work: &(dyn Fn(usize) + Sync)) {
+    fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
         let _turn = lock(&self.turn);
         // SAFETY: only the lifetime changes. Workers find the reference in `open` alone and count themselves as inside before
         // they let go of its lock; `Call` closes it and waits until none is inside before this function returns or unwinds.
-        let endless = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Work>(work) };
-        let call = Call(&self.shared);
-        self.shared.open(endless);
-        self.threads.iter().for_each(Thread::unpark);
+        let task = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Task>(work) };
+        let call = Call::open(&self.shared, task, helpers);
+        self.threads.iter().take(helpers).for_each(Thread::unpark);
         work(0);
         drop(call);
         if let Some(panic) = lock(&self.shared.panic).take() {
@@ -107,7 +108,6 @@ impl Workers {
 impl Drop for Workers {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::SeqCst);
-        self.shared.call.fetch_add(1, Ordering::SeqCst);
         self.threads.iter().for_each(Thread::unpark);
     }
 }
@@ -115,8 +115,20 @@ impl Drop for Workers {
 /// A call that workers may join until it is dropped.
 struct Call<'a>(&'a Shared);
 
+impl<'a> Call<'a> {
+    fn open(shared: &'a Shared, task: Task, helpers: usize) -> Self {
+        // Left where the caller of an earlier call panicked too.
+        *lock(&shared.panic) = None;
+        shared.helpers.store(helpers, Ordering::SeqCst);
+        *lock(&shared.open) = Some(task);
+        shared.call.fetch_add(1, Ordering::SeqCst);
+        Call(shared)
+    }
+}
+
 impl Drop for Call<'_> {
     fn drop(&mut self) {
+        self.0.call.fetch_add(1, Ordering::SeqCst);
         *lock(&self.0.open) = None;
         let start = Instant::now();
         while self.0.inside.load(Ordering::Acquire) > 0 {
@@ -125,55 +137,55 @@ impl Drop for Call<'_> {
     }
 }
 
+/// A worker that has joined a call.
+struct Inside<'a>(&'a Shared);
+
+impl Drop for Inside<'_> {
+    fn drop(&mut self) {
+        self.0.inside.fetch_sub(1, Ordering::Release);
+    }
+}
+
 impl Shared {
     /// What a worker does.
     fn serve(&self, number: usize) {
-        let mut last = 0;
-        loop {
-            last = self.next_call(last);
-            if self.stop.load(Ordering::SeqCst) {
-                return;
-            }
-            // By now it may be the call after.
-            let Some((call, work)) = self.join() else { continue };
+        let (mut last, mut since) = (0, Instant::now());
+        while let Some(call) = self.next_call(last, since) {
             last = call;
-            if let Err(panic) = catch_unwind(AssertUnwindSafe(|| work(number))) {
+            if number > self.helpers.load(Ordering::SeqCst) {
+                continue;
+            }
+            since = Instant::now();
+            let Some((task, _inside)) = self.join(call) else { continue };
+            if let Err(panic) = catch_unwind(AssertUnwindSafe(|| task(number))) {
                 *lock(&self.panic) = Some(panic);
             }
-            self.inside.fetch_sub(1, Ordering::Release);
         }
     }
 
-    /// Waits for a call after number `last`, and returns its number.
-    fn next_call(&self, last: u64) -> u64 {
-        let start = Instant::now();
-        loop {
+    /// Waits for a call after number `last`, and returns its number; `None` when there will be no more. How long it stays awake
+    /// is counted from `since`, when the worker last was wanted.
+    fn next_call(&self, last: u64, since: Instant) -> Option<u64> {
+        while !self.stop.load(Ordering::SeqCst) {
             let call = self.call.load(Ordering::SeqCst);
-            if call != last {
-                return call;
+            if call % 2 == 1 && call != last {
+                return Some(call);
             }
-            match start.elapsed() {
+            match since.elapsed() {
                 waited if waited < SPIN => std::hint::spin_loop(),
                 waited if waited < YIELD => thread::yield_now(),
                 _ => thread::park(),
             }
         }
+        None
     }
 
-    /// Lets workers join in.
-    fn open(&self, work: Work) {
-        let mut open = lock(&self.open);
-        *open = Some(work);
-        self.call.fetch_add(1, Ordering::SeqCst);
-    }
-
-    /// The number and the work of the call that is open, if one still is; the worker then is inside.
-    fn join(&self) -> Option<(u64, Work)> {
+    /// The task of a call, if it still is open; the worker then is inside.
+    fn join(&self, call: u64) -> Option<(Task, Inside<'_>)> {
         let open = lock(&self.open);
-        open.map(|work| {
-            self.inside.fetch_add(1, Ordering::Relaxed);
-            (self.call.load(Ordering::SeqCst), work)
-        })
+        let task = open.filter(|_| self.call.load(Ordering::SeqCst) == call)?;
+        self.inside.fetch_add(1, Ordering::Relaxed);
+        Some((task, Inside(self)))
     }
 }
 
@@ -190,12 +202,11 @@ mod tests {
     #[test]
     fn workers_join_in_and_all_is_done_when_it_returns() {
         let threads = Threads::new(4).unwrap();
-        let mut joined = HashSet::new();
         for round in 0..2_000 {
             let left = Mutex::new((0..64).collect::<Vec<usize>>());
             let done = Mutex::new(Vec::new());
             let callers = Mutex::new(Vec::new());
-            threads.run(&|number| {
+            threads.run(2, &|number| {
                 lock(&callers).push(number);
                 while let Some(next) = { lock(&left).pop() } {
                     std::hint::black_box((0..500).sum::<usize>());
@@ -208,10 +219,8 @@ mod tests {
             let callers = callers.into_inner().unwrap();
             assert_eq!(callers.iter().collect::<HashSet<_>>().len(), callers.len(), "{callers:?}");
             assert!(callers.contains(&0), "{callers:?}");
-            joined.extend(callers);
+            assert!(callers.iter().all(|number| *number < 3), "{callers:?}");
         }
-        assert!(joined.len() > 1, "no worker ever came");
-        assert!(joined.iter().all(|number| *number < 4));
     }
 
     #[test]
@@ -220,7 +229,7 @@ mod tests {
         for _ in 0..5 {
             thread::sleep(YIELD * 20);
             let came = AtomicBool::new(false);
-            threads.run(&|number| match number {
+            threads.run(1, &|number| match number {
                 0 => {
                     let start = Instant::now();
                     while !came.load(Ordering::SeqCst) && start.elapsed() < Duration::from_secs(30) {
@@ -242,7 +251,7 @@ mod tests {
                 scope.spawn(|| {
                     for _ in 0..500 {
                         let mine = AtomicUsize::new(0);
-                        threads.run(&|number| {
+                        threads.run(2, &|number| {
                             mine.fetch_add(1 + number, Ordering::Relaxed);
                         });
                         total.fetch_add(usize::from((1..=6).contains(&mine.into_inner())), Ordering::Relaxed);
@@ -256,22 +265,23 @@ mod tests {
     #[test]
     fn a_panic_reaches_the_caller_and_the_next_call_works() {
         let threads = Threads::new(2).unwrap();
-        for culprit in [0, 1] {
+        for culprits in [vec![0], vec![1], vec![0, 1]] {
             let here = AtomicBool::new(false);
+            let start = Instant::now();
             let outcome = catch_unwind(AssertUnwindSafe(|| {
-                threads.run(&|number| {
+                threads.run(1, &|number| {
                     here.fetch_or(number == 1, Ordering::SeqCst);
-                    while !here.load(Ordering::SeqCst) {
+                    while !here.load(Ordering::SeqCst) && start.elapsed() < Duration::from_secs(30) {
                         thread::yield_now();
                     }
-                    assert!(number != culprit, "by {number}");
+                    assert!(!culprits.contains(&number), "by {number}");
                 });
             }));
             let panic = outcome.unwrap_err();
-            assert_eq!(panic.downcast_ref::<String>(), Some(&format!("by {culprit}")));
+            assert_eq!(panic.downcast_ref::<String>(), Some(&format!("by {}", culprits[0])));
         }
         let calls = AtomicUsize::new(0);
-        threads.run(&|_| {
+        threads.run(1, &|_| {
             calls.fetch_add(1, Ordering::Relaxed);
         });
         assert!(calls.into_inner() >= 1);

@@ -184,12 +184,12 @@ impl Engine {
 
     /// Serves until `stop` is set, which takes effect within a tenth of a second.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<Summary, ServiceError> {
-        let mut cleaned = Instant::now();
+        let (mut answered, mut cleaned) = (Instant::now(), Instant::now());
         let mut next = 0;
         while !stop.load(Ordering::Relaxed) {
             let Engine { groups, to_engine, .. } = self;
             // Groups take turns in being looked at first, so that none starves.
-            let message = wait(to_engine, IDLE, || {
+            let message = wait(to_engine, IDLE, answered, || {
                 let (first, last) = groups.split_at(next);
                 let in_turn = last.iter().zip(next..).chain(first.iter().zip(0..));
                 for (group, number) in in_turn {
@@ -203,6 +203,7 @@ impl Engine {
                 Some((group, sample)) => {
                     next = (group + 1) % self.groups.len();
                     self.answer(group, sample)?;
+                    answered = Instant::now();
                 }
                 None if cleaned.elapsed() >= CLEANUP_EVERY => {
                     self.node.clean();

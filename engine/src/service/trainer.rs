@@ -61,6 +61,8 @@ pub struct Trainer {
     request: u64,
     /// The message that each group has not answered yet.
     pending: Vec<Option<u64>>,
+    /// When the last message was sent.
+    sent: Instant,
 }
 
 /// Ports to one engine, for the time that it runs.
@@ -80,7 +82,8 @@ impl Trainer {
         let pending = vec![None; specification.groups];
         let specification = Arc::new(specification);
         let trainer = rand::random();
-        Ok(Trainer { config: config.clone(), specification, link: Here::new(link), trainer, request: 0, pending })
+        let (config, link, sent) = (config.clone(), Here::new(link), Instant::now());
+        Ok(Trainer { config, specification, link, trainer, request: 0, pending, sent })
     }
 
     /// Connects to an engine of the same name that was started in place of the one that is lost, waiting for it up to
@@ -192,7 +195,7 @@ impl Trainer {
         loop {
             let left = timeout.saturating_sub(start.elapsed());
             let (link, pending) = (&*self.link, &self.pending);
-            let answer = wait(&link.to_trainer, left.min(QUIET), || {
+            let answer = wait(&link.to_trainer, left.min(QUIET), self.sent, || {
                 for group in groups.clone() {
                     let Some(request) = pending[group] else { continue };
                     // What is in the buffer may be the answer to an earlier trainer.
@@ -254,6 +257,7 @@ impl Trainer {
         }
         ports::notify(&self.link.to_engine, group);
         self.pending[group] = Some(self.request);
+        self.sent = Instant::now();
         Ok(())
     }
 

@@ -19,11 +19,13 @@ const SPIN: Duration = Duration::from_micros(3);
 /// virtual machine, in which the other side may fall asleep in turn.
 const YIELD: Duration = Duration::from_millis(3);
 
-/// Calls `poll` until it yields something or `timeout` has passed; sleeps on `listener` in between. An interrupting signal
-/// counts as a time-out.
+/// Calls `poll` until it yields something or `timeout` has passed; sleeps on `listener` in between. How long it stays awake is
+/// counted from `since`, when there last was a message, so that one who waits in vain again and again sleeps. An interrupting
+/// signal counts as a time-out.
 pub(super) fn wait<T>(
     listener: &Listener<Ipc>,
     timeout: Duration,
+    since: Instant,
     mut poll: impl FnMut() -> Result<Option<T>, ServiceError>,
 ) -> Result<Option<T>, ServiceError> {
     let start = Instant::now();
@@ -35,16 +37,14 @@ pub(super) fn wait<T>(
         if waited >= timeout {
             return Ok(None);
         }
-        if waited < SPIN {
-            std::hint::spin_loop();
-        } else if waited < YIELD {
-            std::thread::yield_now();
-        } else {
-            match listener.timed_wait(|_| {}, timeout - waited) {
+        match since.elapsed() {
+            quiet if quiet < SPIN => std::hint::spin_loop(),
+            quiet if quiet < YIELD => std::thread::yield_now(),
+            _ => match listener.timed_wait(|_| {}, timeout - waited) {
                 Ok(_) => {}
                 Err(ListenerWaitError::InterruptSignal) => return poll(),
                 Err(e) => return Err(ServiceError::middleware("cannot wait for the other side")(e.to_string())),
-            }
+            },
         }
     }
 }

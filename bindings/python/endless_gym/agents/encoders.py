@@ -30,7 +30,7 @@ def orthogonal(layer: Layer, gain: float = math.sqrt(2)) -> Layer:
 
 #: Frames that a processor convolves at a time: what lies between two layers then stays in its cache, which saves a quarter of the
 #: time.
-CACHED = 128
+FRAMES_IN_PIECE = 128
 
 
 class AtariEncoder(nn.Module):
@@ -48,11 +48,12 @@ class AtariEncoder(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> Tensor:
+        if frames.device.type == "cpu" and len(frames) > FRAMES_IN_PIECE and not torch.compiler.is_compiling():
+            return torch.cat([self(piece) for piece in frames.split(FRAMES_IN_PIECE)])
         # The permuted view of frames with their channels last is PyTorch's channels_last format: nothing is copied but the
         # conversion to float.
-        pieces = frames.split(CACHED) if frames.device.type == "cpu" else [frames]
-        encoded = [self.convolutions(piece.permute(0, 3, 1, 2).float() / 255.0) for piece in pieces]
-        return torch.cat(encoded)
+        x: Tensor = self.convolutions(frames.permute(0, 3, 1, 2).float() / 255.0)
+        return x
 
 
 class Encoder(nn.Module):
