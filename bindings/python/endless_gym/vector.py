@@ -240,9 +240,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
         """Adds what is told of episodes that this step ended, if it ended any."""
-        told = (arrays[place] for place in self._ends)
+        returns, lengths, infos = (arrays[place] for place in self._ends)
         seconds = time.perf_counter() - self._start
-        ends = _native.ended_episodes(ended, *told, self._integers, seconds)
+        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers, seconds)
         if ends is None:
             return
         returns, lengths, times, columns = ends
