@@ -2,7 +2,7 @@
 //! those that go on.
 //!
 //! Nearly every step of a thousand environments ends an episode somewhere, so this is made here in one pass. With numpy it took
-//! as long as a tenth of the step.
+//! up to a tenth of the step.
 
 use numpy::{Element, PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;

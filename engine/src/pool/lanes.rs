@@ -1,4 +1,4 @@
-//! Environments of one family in a row, stepped slice by slice.
+//! Environments of one family in a row, stepped piece by piece.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

@@ -155,11 +155,12 @@ impl Shared {
             if number > self.helpers.load(Ordering::SeqCst) {
                 continue;
             }
-            since = Instant::now();
-            let Some((task, _inside)) = self.join(call) else { continue };
-            if let Err(panic) = catch_unwind(AssertUnwindSafe(|| task(number))) {
+            if let Some((task, _inside)) = self.join(call)
+                && let Err(panic) = catch_unwind(AssertUnwindSafe(|| task(number)))
+            {
                 *lock(&self.panic) = Some(panic);
             }
+            since = Instant::now();
         }
     }
 
@@ -200,7 +201,7 @@ mod tests {
     use std::collections::HashSet;
 
     #[test]
-    fn workers_join_in_and_all_is_done_when_it_returns() {
+    fn all_is_done_when_it_returns_and_no_thread_comes_twice() {
         let threads = Threads::new(4).unwrap();
         for round in 0..2_000 {
             let left = Mutex::new((0..64).collect::<Vec<usize>>());
