@@ -18,13 +18,14 @@ pub struct ActionHeader {
     pub trainer: u64,
     pub request: u64,
     pub seed: u64,
-    pub options: u64,
+    pub env: u64,
+    pub bytes: u64,
 }
 
 impl ActionHeader {
     pub fn reset_all(specification: &Specification) -> Self {
         let (layout_version, epoch) = (LAYOUT_VERSION, specification.epoch);
-        ActionHeader { layout_version, kind: 2, epoch, trainer: 42, request: 1, seed: 0, options: 0 }
+        ActionHeader { layout_version, kind: 2, epoch, trainer: 42, request: 1, seed: 0, env: 0, bytes: 0 }
     }
 }
 
@@ -41,6 +42,7 @@ pub struct ObservationHeader {
     status: u32,
     text_length: u32,
     text: [u8; 192],
+    snapshot: u64,
 }
 
 #[derive(Clone, Copy, Debug, ZeroCopySend)]

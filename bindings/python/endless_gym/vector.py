@@ -162,23 +162,30 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._backend.send_reset(group, seed)
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
-        """The whole state of one environment of a group, for `restore`. Only for environments in this process."""
-        return self._backend.pool(group).snapshot(env)
+        """The whole state of one environment of a group, for `restore`, also of environments elsewhere.
+
+        Raises:
+            ValueError: There is no such environment, or it has not been reset.
+        """
+        return self._backend.snapshot(group, env)
 
     def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
-        """Put environments into the states of snapshots, also of other environments of the same id. Only in this process.
+        """Put environments into the states of snapshots, also of other environments of the same id. Reset them all once before.
 
         Returns:
             The observations and the info of all environments of the group.
+
+        Raises:
+            ValueError: There is no such environment, or what was given is no snapshot of that id.
         """
-        pool = self._backend.pool(group)
         for env, snapshot in snapshots.items():
-            pool.restore(env, snapshot)
-        return self._start_of(pool.observe())
+            self._backend.restore(group, env, snapshot)
+        # A reset of none shows what they look like now.
+        return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
         """What the original's `render()` shows a person, uint8 (336, 336, 3). Only for environments in this process."""
-        return self._backend.pool().ground_truth_view(env)
+        return self._backend.ground_truth_view(env)
 
     def reconnect(self, timeout: float = 30.0) -> None:
         """Go on with an engine that was started in place of a lost one; `reset` it then."""
@@ -284,7 +291,13 @@ class _Backend:
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
         raise NotImplementedError
 
-    def pool(self, group: int = 0) -> _native.Pool:
+    def snapshot(self, group: int, env: int) -> bytes:
+        raise NotImplementedError
+
+    def restore(self, group: int, env: int, snapshot: bytes) -> None:
+        raise NotImplementedError
+
+    def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
         raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
 
     def reconnect(self, timeout: float) -> None:
@@ -327,8 +340,14 @@ class _InProcess(_Backend):
         group = next(iter(self._sent)) if group is None else group
         return group, self._sent.pop(group)()
 
-    def pool(self, group: int = 0) -> _native.Pool:
-        return self._group(group)
+    def snapshot(self, group: int, env: int) -> bytes:
+        return self._group(group).snapshot(env)
+
+    def restore(self, group: int, env: int, snapshot: bytes) -> None:
+        self._group(group).restore(env, snapshot)
+
+    def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
+        return self._group(0).ground_truth_view(env)
 
     def close(self) -> None:
         self._pools, self._sent = [], {}
@@ -367,6 +386,12 @@ class _Remote(_Backend):
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
         return self._connected().receive(group, self._timeout)
+
+    def snapshot(self, group: int, env: int) -> bytes:
+        return self._connected().snapshot(group, env, self._timeout)
+
+    def restore(self, group: int, env: int, snapshot: bytes) -> None:
+        self._connected().restore(group, env, snapshot, self._timeout)
 
     def reconnect(self, timeout: float) -> None:
         self._connected().reconnect(timeout)

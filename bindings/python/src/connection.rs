@@ -6,7 +6,7 @@ use endless_gym::batch::Block;
 use endless_gym::service::{ConnectConfig, Namespace, Received, ServiceError, Trainer, engines};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use pyo3::types::PyTuple;
+use pyo3::types::{PyBytes, PyTuple};
 
 use crate::arguments::{self, Reset};
 use crate::arrays::{self, Owner};
@@ -77,30 +77,31 @@ impl Connection {
         group: Option<usize>,
         timeout: f64,
     ) -> PyResult<(usize, Bound<'py, PyTuple>)> {
-        self.check_process()?;
-        let (timeout, start) = (seconds(timeout)?, Instant::now());
-        let trainer = &mut self.trainer;
-        let received = loop {
-            let slice = timeout.saturating_sub(start.elapsed()).min(SIGNALS_EVERY);
-            let received = py.detach(|| match group {
-                Some(group) => trainer.receive(group, slice),
-                None => trainer.receive_any(slice),
-            });
-            match received {
-                Ok(received) => break received,
-                Err(ServiceError::TimedOut { service, .. }) => {
-                    py.check_signals()?;
-                    if start.elapsed() >= timeout {
-                        return Err(errors::service(ServiceError::TimedOut { service, waited: timeout }));
-                    }
-                }
-                Err(error) => return Err(errors::service(error)),
-            }
-        };
+        let received = self.wait(py, timeout, |trainer, slice| match group {
+            Some(group) => trainer.receive(group, slice),
+            None => trainer.receive_any(slice),
+        })?;
         let group = received.group();
         let lent = Bound::new(py, Lent(received))?;
         let arrays = arrays::sections(&lent, lent.get().0.batch().layout())?;
         Ok((group, arrays))
+    }
+
+    /// The state of one environment of a group.
+    fn snapshot<'py>(
+        &mut self,
+        py: Python<'py>,
+        group: usize,
+        env: usize,
+        timeout: f64,
+    ) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.wait(py, timeout, |trainer, slice| trainer.snapshot(group, env, slice))?;
+        Ok(PyBytes::new(py, &bytes))
+    }
+
+    /// Puts one environment of a group into the state of a snapshot.
+    fn restore(&mut self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8], timeout: f64) -> PyResult<()> {
+        self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
     /// Goes on with an engine of the same name that was started in place of a lost one.
@@ -112,6 +113,31 @@ impl Connection {
 }
 
 impl Connection {
+    /// Waits for an answer, without the interpreter, and looks for signals meanwhile.
+    fn wait<T: Send>(
+        &mut self,
+        py: Python<'_>,
+        timeout: f64,
+        mut answer: impl FnMut(&mut Trainer, Duration) -> Result<T, ServiceError> + Send,
+    ) -> PyResult<T> {
+        self.check_process()?;
+        let (timeout, start) = (seconds(timeout)?, Instant::now());
+        let trainer = &mut self.trainer;
+        loop {
+            let slice = timeout.saturating_sub(start.elapsed()).min(SIGNALS_EVERY);
+            match py.detach(|| answer(trainer, slice)) {
+                Ok(answer) => return Ok(answer),
+                Err(ServiceError::TimedOut { service, .. }) => {
+                    py.check_signals()?;
+                    if start.elapsed() >= timeout {
+                        return Err(errors::service(ServiceError::TimedOut { service, waited: timeout }));
+                    }
+                }
+                Err(error) => return Err(errors::service(error)),
+            }
+        }
+    }
+
     fn check_process(&self) -> PyResult<()> {
         if self.process == std::process::id() {
             return Ok(());

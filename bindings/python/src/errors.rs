@@ -50,6 +50,7 @@ pub fn service(error: ServiceError) -> PyErr {
         | E::ActionRange { .. }
         | E::ResetCount { .. }
         | E::OptionsTooLong { .. }
+        | E::SnapshotTooLong { .. }
         | E::Rejected { .. } => PyValueError::new_err(text),
         E::Root { .. } => PyOSError::new_err(text),
         _ => PyRuntimeError::new_err(text),

@@ -106,11 +106,6 @@ impl Pool {
         arrays
     }
 
-    /// The arrays as a reset of none leaves them.
-    fn observe<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
-        self.write(py, engine::Pool::observe)
-    }
-
     fn snapshot<'py>(&self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyBytes>> {
         let bytes = self.pool.snapshot(env).map_err(errors::snapshot)?;
         Ok(PyBytes::new(py, &bytes))

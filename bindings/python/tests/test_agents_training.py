@@ -143,11 +143,13 @@ def test_groups_and_threads_change_nothing_that_is_random(tmp_path: Path) -> Non
     assert progress(runs["one"]) == progress(runs["threads"]) == progress(runs["process"])
 
 
-def test_in_a_process_a_resumed_run_starts_new_episodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = train(small("gru", tmp_path / "run", 2, engine="process"))
-    train(replace(small("gru", tmp_path, 4), resume=str(run)))
-    assert "new episodes start" in capsys.readouterr().out
-    assert [row["update"] for row in progress(run)] == [1, 2, 3, 4]
+@pytest.mark.parametrize("engines", [("process", "process"), ("process", "thread"), ("thread", "process")])
+def test_a_run_resumes_exactly_wherever_its_environments_are(engines: tuple[str, str], tmp_path: Path) -> None:
+    through = train(small("gru", tmp_path / "through", 4))
+    run = train(small("gru", tmp_path / "run", 2, engine=engines[0]))
+    train(replace(small("gru", tmp_path, 4, engine=engines[1]), resume=str(run)))
+    assert progress(run) == progress(through)
+    assert same(checkpoint.load(run).state["player"], checkpoint.load(through).state["player"])
 
 
 @pytest.mark.parametrize("engine", ["thread", "process"])

@@ -34,7 +34,7 @@ pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use frames::{Frames, MAX_STACK};
 pub use layout::{Dtype, Element, Layout, Section};
 pub(crate) use stamp::Stamp;
-pub use view::{Batch, BatchMut, Contents, OPTIONS_BYTES, RowsMut, action_layout, batch_layout};
+pub use view::{Batch, BatchMut, Contents, OPTIONS_BYTES, RowsMut, SNAPSHOT_BYTES, action_layout, batch_layout};
 
 /// Version of the sections' meaning and of the messages that carry batches. A trainer refuses an engine of another version.
-pub const LAYOUT_VERSION: u32 = 2;
+pub const LAYOUT_VERSION: u32 = 3;

@@ -62,17 +62,23 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, contents: Contents) -> Layout 
 /// Longest text of reset parameters in a message.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
 
+/// Longest snapshot in a message. A snapshot holds less than a kilobyte beside its reset parameters.
+pub const SNAPSHOT_BYTES: usize = 2 * OPTIONS_BYTES;
+
 /// The layout of the message that a trainer sends: `action` int32 (branches,) for a step; `reset` uint8 () and `seed` uint64 ()
 /// for a reset, where `reset` is 0 (leave alone), 1 (start the next episode) or 2 (start an episode with `seed`); `options` for a
-/// reset with other reset parameters, JSON text that runs on over the rows, at least [`OPTIONS_BYTES`] in all.
+/// reset with other reset parameters, JSON text that runs on over the rows, at least [`OPTIONS_BYTES`] in all; `snapshot` for an
+/// environment that is to go on from one, likewise.
 pub fn action_layout(spec: &Spec, num_envs: usize) -> Layout {
+    let over_rows = |bytes: usize| vec![bytes.div_ceil(num_envs.max(1))];
     Layout::new(
         num_envs,
         [
             ("action", Dtype::Int32, vec![spec.action_space.branches().len()]),
             ("reset", Dtype::Uint8, vec![]),
             ("seed", Dtype::Uint64, vec![]),
-            ("options", Dtype::Uint8, vec![OPTIONS_BYTES.div_ceil(num_envs.max(1))]),
+            ("options", Dtype::Uint8, over_rows(OPTIONS_BYTES)),
+            ("snapshot", Dtype::Uint8, over_rows(SNAPSHOT_BYTES)),
         ],
     )
 }

@@ -17,7 +17,7 @@ use super::ports::{self, ActionSubscriber, Limits, Names, ObservationPublisher, 
 use super::preflight::Resident;
 use super::specification::{self, Published, Specification};
 use super::wait::wait;
-use crate::batch::{Block, LAYOUT_VERSION, Layout, action_layout};
+use crate::batch::{Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, action_layout, blocks_for};
 use crate::pool::{Options, Pool, PoolConfig, PoolError, ResetRequest, Threads};
 
 /// Most groups that an engine serves.
@@ -140,14 +140,21 @@ struct Group {
     actions: ActionSubscriber,
     observations: ObservationPublisher,
     memory: Resident,
-    /// Actions, flags and seeds of the current message, copied so that nobody can change them after they were checked.
+    /// What the current message holds, copied so that nobody can change it after it was checked.
     action: Vec<i32>,
     reset: Vec<u8>,
     seed: Vec<u64>,
+    snapshot: Vec<u8>,
     options: Option<Map<String, Json>>,
     /// The trainer that last reset all environments.
     trainer: Option<u64>,
     step: u64,
+}
+
+/// What a message is answered with.
+enum Answer {
+    Batch { env_steps: usize },
+    Snapshot { bytes: usize },
 }
 
 impl Engine {
@@ -160,7 +167,7 @@ impl Engine {
             config.pools()?.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<_, _>>()?;
         let specification = specify(config, &pools[0]);
         let limits = specification.limits();
-        let blocks = specification.batch.blocks();
+        let blocks = chunk_blocks(&specification.batch);
         Resident::check_available(blocks, limits.resident() * config.groups)?;
         let names = Names::new(&config.service, specification.epoch);
         let services = Services { node: &node, names, open: Open::Create };
@@ -228,18 +235,20 @@ impl Engine {
         drop(sample);
         let mut batch = group
             .observations
-            .loan_slice_uninit(self.specification.batch.blocks())
+            .loan_slice_uninit(chunk_blocks(&self.specification.batch))
             .map_err(|e| ServiceError::middleware("cannot lend a batch")(e.to_string()))?;
         group.memory.admit(batch.payload_mut())?;
         // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
         // fresh shared memory, and what a recycled chunk held before is a batch.
         let mut batch = unsafe { batch.assume_init() };
         let outcome = taken.and_then(|kind| group.carry_out(kind, &request, batch.payload_mut()));
-        let step = group.step + u64::from(outcome.is_ok());
+        let step = group.step + u64::from(matches!(outcome, Ok(Answer::Batch { .. })));
         let header = batch.user_header_mut();
         *header = ObservationHeader::answering(&request, number, self.specification.epoch, step);
-        if let Err((reason, message)) = &outcome {
-            header.reject(*reason, message);
+        match &outcome {
+            Ok(Answer::Batch { .. }) => {}
+            Ok(Answer::Snapshot { bytes }) => header.hold_snapshot(*bytes),
+            Err((reason, message)) => header.reject(*reason, message),
         }
         // A trainer that dies just now must not take the engine with it.
         let receivers = batch.send().unwrap_or_else(|e| {
@@ -250,10 +259,11 @@ impl Engine {
         group.step = step;
         self.summary.undelivered += u64::from(receivers == 0);
         match outcome {
-            Ok(kind) => {
+            Ok(Answer::Batch { env_steps }) => {
                 self.summary.batches += 1;
-                self.summary.env_steps += if kind == Kind::Step { self.specification.num_envs as u64 } else { 0 };
+                self.summary.env_steps += env_steps as u64;
             }
+            Ok(Answer::Snapshot { .. }) => {}
             Err(_) => self.summary.rejected += 1,
         }
         Ok(())
@@ -268,13 +278,24 @@ impl Group {
             .create()
             .map_err(|e| ServiceError::middleware("cannot create a subscriber")(e.to_string()))?;
         let service = services.observations(number, limits)?;
-        let publisher = ports::publisher(&service, pool.layout().blocks(), CHUNKS_AT_START);
+        let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), CHUNKS_AT_START);
         let (observations, memory) = publisher.map_err(|e| match e {
             PortError::Other(e) => e,
             PortError::Taken => ServiceError::middleware("cannot create a publisher")("it exists already".to_owned()),
         })?;
-        let (action, reset, seed) = (Vec::new(), Vec::new(), Vec::new());
-        Ok(Group { pool, actions, observations, memory, action, reset, seed, options: None, trainer: None, step: 0 })
+        Ok(Group {
+            pool,
+            actions,
+            observations,
+            memory,
+            action: Vec::new(),
+            reset: Vec::new(),
+            seed: Vec::new(),
+            snapshot: Vec::new(),
+            options: None,
+            trainer: None,
+            step: 0,
+        })
     }
 
     fn poll(&self) -> Result<Option<Sample<Ipc, [Block], ActionHeader>>, ServiceError> {
@@ -307,18 +328,18 @@ impl Group {
                 copy(&mut self.reset, layout.read(payload, "reset"));
                 copy(&mut self.seed, layout.read(payload, "seed"));
             }
-            Kind::ResetAll | Kind::ResetSeed => {}
+            Kind::Restore => copy(&mut self.snapshot, start(layout.read(payload, "snapshot"), header.bytes)),
+            Kind::ResetAll | Kind::ResetSeed | Kind::Snapshot => {}
         }
-        self.options = match (kind, header.options as usize) {
-            (Kind::Step, _) | (_, 0) => None,
-            (_, length) => {
-                let text = layout.read::<u8>(payload, "options").get(..length).unwrap_or_default();
-                let options = serde_json::from_slice(text);
+        self.options = match kind {
+            Kind::ResetAll | Kind::ResetSeed | Kind::ResetEach if header.bytes > 0 => {
+                let options = serde_json::from_slice(start(layout.read(payload, "options"), header.bytes));
                 Some(options.map_err(|e| (Rejection::Options, format!("its reset parameters cannot be read: {e}")))?)
             }
+            _ => None,
         };
         let starts_all = match kind {
-            Kind::Step => false,
+            Kind::Step | Kind::Snapshot | Kind::Restore => false,
             Kind::ResetEach => !self.reset.contains(&0),
             Kind::ResetAll | Kind::ResetSeed => true,
         };
@@ -329,16 +350,23 @@ impl Group {
         Ok(kind)
     }
 
-    /// Steps or resets, writing into `batch`.
+    /// Does what the message asks for, and writes the answer into `payload`.
     fn carry_out(
         &mut self,
         kind: Kind,
         header: &ActionHeader,
-        batch: &mut [Block],
-    ) -> Result<Kind, (Rejection, String)> {
-        let options = self.options.as_ref();
+        payload: &mut [Block],
+    ) -> Result<Answer, (Rejection, String)> {
+        let (options, env) = (self.options.as_ref(), header.env as usize);
+        let batch_blocks = self.pool.layout().blocks();
+        let batch = &mut payload[..batch_blocks];
         let done = match kind {
             Kind::Step => self.pool.step(&self.action, batch),
+            Kind::Snapshot => return self.answer_snapshot(env, payload),
+            Kind::Restore => {
+                let done = self.pool.restore(env, &self.snapshot).map(|()| Answer::Snapshot { bytes: 0 });
+                return done.map_err(|e| (Rejection::Snapshot, e.to_string()));
+            }
             Kind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
             Kind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
             Kind::ResetEach => {
@@ -348,8 +376,31 @@ impl Group {
         };
         done.map_err(|e| (Rejection::Pool, e.to_string()))?;
         self.trainer = Some(header.trainer);
-        Ok(kind)
+        Ok(Answer::Batch { env_steps: if kind == Kind::Step { self.pool.layout().num_envs() } else { 0 } })
     }
+
+    /// Writes an environment's snapshot over whatever batch was in `payload`.
+    fn answer_snapshot(&self, env: usize, payload: &mut [Block]) -> Result<Answer, (Rejection, String)> {
+        let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
+        if snapshot.len() > SNAPSHOT_BYTES {
+            let given = snapshot.len();
+            let text = format!("the snapshot has {given} bytes, a message takes {SNAPSHOT_BYTES}; shorten its options");
+            return Err((Rejection::Snapshot, text));
+        }
+        self.pool.layout().forget_frames(payload);
+        bytemuck::cast_slice_mut(payload)[..snapshot.len()].copy_from_slice(&snapshot);
+        Ok(Answer::Snapshot { bytes: snapshot.len() })
+    }
+}
+
+/// Blocks of a chunk that can hold a batch as well as a snapshot.
+fn chunk_blocks(batch: &Layout) -> usize {
+    batch.blocks().max(blocks_for(SNAPSHOT_BYTES))
+}
+
+/// The first `length` numbers, or none where there are not as many.
+fn start<T>(numbers: &[T], length: u64) -> &[T] {
+    usize::try_from(length).ok().and_then(|length| numbers.get(..length)).unwrap_or_default()
 }
 
 fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {

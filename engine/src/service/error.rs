@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use crate::batch::{LAYOUT_VERSION, OPTIONS_BYTES};
+use crate::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use crate::pool::PoolError;
 
 /// Version of this package, as a message names it.
@@ -68,6 +68,8 @@ pub enum ServiceError {
         "reset parameters of {given} bytes as JSON; a message takes {OPTIONS_BYTES}, so give lists with fewer items"
     )]
     OptionsTooLong { given: usize },
+    #[error("a snapshot of {given} bytes; a message takes {SNAPSHOT_BYTES}, and no engine gives longer ones")]
+    SnapshotTooLong { given: usize },
     #[error("group {group} still owes the answer to the last message; receive it before the next reset or step")]
     AnswerPending { group: usize },
     #[error("nothing was sent to group {group}; reset or step it before receiving")]
@@ -114,16 +116,19 @@ pub enum Rejection {
     Pool,
     /// The reset parameters are no JSON object.
     Options,
+    /// A snapshot cannot be taken or gone on from.
+    Snapshot,
 }
 
 impl Rejection {
-    const ALL: [Rejection; 6] = [
+    const ALL: [Rejection; 7] = [
         Rejection::Version,
         Rejection::Kind,
         Rejection::Payload,
         Rejection::NotReset,
         Rejection::Pool,
         Rejection::Options,
+        Rejection::Snapshot,
     ];
 
     /// The status in a header: 0 is for batches.

@@ -1,4 +1,4 @@
-//! The headers of the messages between trainer and engine. Their payload is a batch: `[Block]`.
+//! The headers of the messages between trainer and engine. Their payload is `[Block]`: actions or a batch.
 
 use iceoryx2::prelude::ZeroCopySend;
 
@@ -23,10 +23,15 @@ pub(super) enum Kind {
     ResetSeed,
     /// Episodes as the payload's `reset` and `seed` say.
     ResetEach,
+    /// The state of environment `env`, for its snapshot.
+    Snapshot,
+    /// Environment `env` goes on from the payload's `snapshot`.
+    Restore,
 }
 
 impl Kind {
-    const ALL: [Kind; 4] = [Kind::Step, Kind::ResetAll, Kind::ResetSeed, Kind::ResetEach];
+    const ALL: [Kind; 6] =
+        [Kind::Step, Kind::ResetAll, Kind::ResetSeed, Kind::ResetEach, Kind::Snapshot, Kind::Restore];
 
     /// The number in the header; 0 is none of them.
     pub(super) fn code(self) -> u32 {
@@ -35,6 +40,11 @@ impl Kind {
 
     pub(super) fn from_code(code: u32) -> Option<Self> {
         Kind::ALL.into_iter().find(|kind| kind.code() == code)
+    }
+
+    /// Whether the answer is a batch, and not a snapshot.
+    pub(super) fn yields_batch(self) -> bool {
+        !matches!(self, Kind::Snapshot | Kind::Restore)
     }
 }
 
@@ -54,20 +64,22 @@ pub(super) struct ActionHeader {
     pub request: u64,
     /// First seed of a [`Kind::ResetSeed`].
     pub seed: u64,
-    /// Bytes of the JSON text in the payload's `options`, for a reset with other reset parameters. 0: with the same.
-    pub options: u64,
-}
-
-impl ActionHeader {
-    pub(super) fn new(kind: Kind, epoch: u64, trainer: u64, request: u64, seed: u64) -> Self {
-        ActionHeader { layout_version: LAYOUT_VERSION, kind: kind.code(), epoch, trainer, request, seed, options: 0 }
-    }
+    /// Environment of a [`Kind::Snapshot`] or a [`Kind::Restore`].
+    pub env: u64,
+    /// Bytes of the payload's `options` (JSON text, for a reset with other reset parameters; 0: with the same) or `snapshot`.
+    pub bytes: u64,
 }
 
 /// Bytes of the text in an [`ObservationHeader`].
 const TEXT_BYTES: usize = 192;
 
-/// Header of a batch from the engine, or of a rejection.
+/// The status of an answer that holds a batch.
+const BATCH: u32 = 0;
+
+/// The status of an answer whose payload starts with a snapshot. All others are rejections.
+const SNAPSHOT: u32 = u32::MAX;
+
+/// Header of a batch from the engine, of a snapshot, or of a rejection.
 #[derive(Clone, Copy, Debug, ZeroCopySend)]
 #[type_name("endless_gym::ObservationHeader")]
 #[repr(C)]
@@ -80,10 +92,12 @@ pub(super) struct ObservationHeader {
     /// Trainer and number of the message that this answers.
     pub trainer: u64,
     pub request: u64,
-    /// 0 for a batch, else a [`Rejection`]; the payload of a rejection means nothing.
-    pub status: u32,
+    /// [`BATCH`], [`SNAPSHOT`] or a [`Rejection`], whose payload means nothing.
+    status: u32,
     text_length: u32,
     text: [u8; TEXT_BYTES],
+    /// Bytes of a snapshot; none answer a [`Kind::Restore`].
+    snapshot: u64,
 }
 
 impl Default for ObservationHeader {
@@ -95,9 +109,10 @@ impl Default for ObservationHeader {
             step: 0,
             trainer: 0,
             request: 0,
-            status: 0,
+            status: BATCH,
             text_length: 0,
             text: [0; TEXT_BYTES],
+            snapshot: 0,
         }
     }
 }
@@ -107,6 +122,20 @@ impl ObservationHeader {
     pub(super) fn answering(request: &ActionHeader, group: usize, epoch: u64, step: u64) -> Self {
         let (trainer, request) = (request.trainer, request.request);
         ObservationHeader { group: group as u32, epoch, step, trainer, request, ..ObservationHeader::default() }
+    }
+
+    /// Makes a snapshot of that many bytes the answer.
+    pub(super) fn hold_snapshot(&mut self, bytes: usize) {
+        (self.status, self.snapshot) = (SNAPSHOT, bytes as u64);
+    }
+
+    pub(super) fn is_batch(&self) -> bool {
+        self.status == BATCH
+    }
+
+    /// Bytes of the snapshot, if the answer is one.
+    pub(super) fn snapshot(&self) -> Option<usize> {
+        (self.status == SNAPSHOT).then_some(self.snapshot as usize)
     }
 
     /// Turns the answer into a rejection.
@@ -122,7 +151,8 @@ impl ObservationHeader {
     pub(super) fn rejection(&self) -> Option<(Rejection, String)> {
         let text = self.text.get(..self.text_length as usize).unwrap_or_default();
         let message = String::from_utf8_lossy(text).into_owned();
-        (self.status != 0).then(|| (Rejection::from_status(self.status).unwrap_or(Rejection::Kind), message))
+        let rejected = self.status != BATCH && self.status != SNAPSHOT;
+        rejected.then(|| (Rejection::from_status(self.status).unwrap_or(Rejection::Kind), message))
     }
 }
 

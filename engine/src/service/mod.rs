@@ -22,14 +22,15 @@
 //!
 //! | header | fields |
 //! | --- | --- |
-//! | action | layout version, kind (step, reset all, reset from a seed, reset each), epoch, trainer, request, seed |
-//! | observation | layout version, group, epoch, step, trainer and request that it answers, status, text of a rejection |
+//! | action | layout version, kind (step, reset all, reset from a seed, reset each, snapshot, restore), epoch, trainer, request, seed, environment, bytes of options or of a snapshot |
+//! | observation | layout version, group, epoch, step, trainer and request that it answers, status, text of a rejection, bytes of a snapshot |
 //!
 //! # Protocol
 //!
 //! | situation | what happens |
 //! | --- | --- |
-//! | a message arrives | it is answered by exactly one batch or one rejection of the same group; a rejection moves no environment |
+//! | a message arrives | it is answered by exactly one batch, snapshot or rejection of the same group; a rejection moves no environment |
+//! | a trainer asks for a snapshot, or to restore one | the answer holds its bytes, or none, in place of a batch; observers never see it |
 //! | a group owes an answer | its trainer may not send to it again; other groups are not concerned |
 //! | a trainer is new | it resets all environments of a group before it steps them |
 //! | a second trainer | is refused: `act` takes one publisher |

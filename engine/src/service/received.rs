@@ -72,7 +72,13 @@ impl Received {
     }
 
     pub(super) fn is_batch(&self) -> bool {
-        self.sample.user_header().status == 0
+        self.sample.user_header().is_batch()
+    }
+
+    /// The snapshot, if it is one and not a batch.
+    pub(super) fn snapshot(&self) -> Option<&[u8]> {
+        let bytes = self.sample.user_header().snapshot()?;
+        bytemuck::cast_slice(self.sample.payload()).get(..bytes)
     }
 }
 

@@ -17,7 +17,7 @@ use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Names, Open, PortErro
 use super::received::{ObservationPort, Received};
 use super::specification::{self, Specification};
 use super::wait::wait;
-use crate::batch::{Block, OPTIONS_BYTES};
+use crate::batch::{Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use crate::pool::ResetRequest;
 
 /// How long a trainer hears nothing before it looks whether the engine still lives.
@@ -60,9 +60,17 @@ pub struct Trainer {
     trainer: u64,
     request: u64,
     /// The message that each group has not answered yet.
-    pending: Vec<Option<u64>>,
+    pending: Vec<Option<Pending>>,
     /// When the last message was sent.
     sent: Instant,
+}
+
+/// A message that is to be answered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Pending {
+    request: u64,
+    kind: Kind,
+    env: usize,
 }
 
 /// Ports to one engine, for the time that it runs.
@@ -131,13 +139,13 @@ impl Trainer {
             Ok(options.len())
         };
         match request {
-            ResetRequest::All => self.post(group, Kind::ResetAll, 0, write_options),
-            ResetRequest::Seed(first) => self.post(group, Kind::ResetSeed, first, write_options),
+            ResetRequest::All => self.post(group, Kind::ResetAll, 0, 0, write_options),
+            ResetRequest::Seed(first) => self.post(group, Kind::ResetSeed, first, 0, write_options),
             ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
                 let given = if reset.len() == num_envs { seed.len() } else { reset.len() };
                 Err(ServiceError::ResetCount { given, num_envs })
             }
-            ResetRequest::Each { reset, seed } => self.post(group, Kind::ResetEach, 0, |message| {
+            ResetRequest::Each { reset, seed } => self.post(group, Kind::ResetEach, 0, 0, |message| {
                 specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
                 specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
                 write_options(message)
@@ -163,7 +171,7 @@ impl Trainer {
     /// step's actions or zeros.
     pub fn send_with(&mut self, group: usize, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
-        self.post(group, Kind::Step, 0, |message| {
+        self.post(group, Kind::Step, 0, 0, |message| {
             let actions = specification.action.write::<i32>(message, "action");
             fill(actions);
             check_actions(&specification, actions).map(|()| 0)
@@ -176,28 +184,86 @@ impl Trainer {
     /// that is dead is noticed within half a second.
     pub fn receive(&mut self, group: usize, timeout: Duration) -> Result<Received, ServiceError> {
         self.check_group(group)?;
-        if self.pending[group].is_none() {
+        if !self.owes_batch(group) {
             return Err(ServiceError::NothingSent { group });
         }
-        self.receive_from(group..group + 1, timeout)
+        self.receive_from(group..group + 1, true, timeout)
     }
 
     /// The answer of whichever group has it first. [`Received::group`] tells which.
     pub fn receive_any(&mut self, timeout: Duration) -> Result<Received, ServiceError> {
-        if self.pending.iter().all(Option::is_none) {
+        if !(0..self.pending.len()).any(|group| self.owes_batch(group)) {
             return Err(ServiceError::NothingSent { group: 0 });
         }
-        self.receive_from(0..self.pending.len(), timeout)
+        self.receive_from(0..self.pending.len(), true, timeout)
     }
 
-    fn receive_from(&mut self, groups: std::ops::Range<usize>, timeout: Duration) -> Result<Received, ServiceError> {
+    /// The whole state of an environment of a group, for [`restore`](Trainer::restore) and
+    /// [`Pool::restore`](crate::pool::Pool::restore). The group must owe no answer, and must have been reset by this trainer.
+    ///
+    /// After [`ServiceError::TimedOut`] the same call goes on waiting, and so for `restore`.
+    pub fn snapshot(&mut self, group: usize, env: usize, timeout: Duration) -> Result<Vec<u8>, ServiceError> {
+        self.ask(group, Kind::Snapshot, env, timeout, |_| Ok(0))
+    }
+
+    /// Puts an environment of a group into the state of a snapshot; see [`Pool::restore`](crate::pool::Pool::restore). A reset of
+    /// no environment ([`ResetRequest::Each`]) then shows what it looks like.
+    pub fn restore(
+        &mut self,
+        group: usize,
+        env: usize,
+        snapshot: &[u8],
+        timeout: Duration,
+    ) -> Result<(), ServiceError> {
+        let given = snapshot.len();
+        if given > SNAPSHOT_BYTES {
+            return Err(ServiceError::SnapshotTooLong { given });
+        }
+        let specification = Arc::clone(&self.specification);
+        let write = |message: &mut [Block]| {
+            specification.action.write::<u8>(message, "snapshot")[..given].copy_from_slice(snapshot);
+            Ok(given)
+        };
+        self.ask(group, Kind::Restore, env, timeout, write).map(|_| ())
+    }
+
+    /// Posts a message that is not answered by a batch, unless it is already, and waits for the answer.
+    fn ask(
+        &mut self,
+        group: usize,
+        kind: Kind,
+        env: usize,
+        timeout: Duration,
+        write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
+    ) -> Result<Vec<u8>, ServiceError> {
+        self.check_group(group)?;
+        if !self.pending[group].is_some_and(|pending| (pending.kind, pending.env) == (kind, env)) {
+            self.post(group, kind, 0, env, write)?;
+        }
+        let received = self.receive_from(group..group + 1, false, timeout)?;
+        let incompatible = || ServiceError::IncompatibleTypes { service: self.config.service.clone() };
+        received.snapshot().map(<[u8]>::to_vec).ok_or_else(incompatible)
+    }
+
+    fn owes_batch(&self, group: usize) -> bool {
+        self.pending[group].is_some_and(|pending| pending.kind.yields_batch())
+    }
+
+    /// The first answer that one of `groups` owes, of those that are batches or of those that are not.
+    fn receive_from(
+        &mut self,
+        groups: std::ops::Range<usize>,
+        batches: bool,
+        timeout: Duration,
+    ) -> Result<Received, ServiceError> {
         let start = Instant::now();
         loop {
             let left = timeout.saturating_sub(start.elapsed());
             let (link, pending) = (&*self.link, &self.pending);
             let answer = wait(&link.to_trainer, left.min(QUIET), self.sent, || {
                 for group in groups.clone() {
-                    let Some(request) = pending[group] else { continue };
+                    let due = pending[group].filter(|pending| pending.kind.yields_batch() == batches);
+                    let Some(Pending { request, .. }) = due else { continue };
                     // What is in the buffer may be the answer to an earlier trainer.
                     while let Some(received) = link.observations[group].receive(&self.specification)? {
                         if received.answers(self.trainer, request) {
@@ -228,12 +294,13 @@ impl Trainer {
         Err(ServiceError::NoSuchGroup { service, given: group, groups })
     }
 
-    /// Writes a message in shared memory and sends it. `write` says how long the options are that it wrote.
+    /// Writes a message in shared memory and sends it. `write` says how many bytes of options or of a snapshot it wrote.
     fn post(
         &mut self,
         group: usize,
         kind: Kind,
         seed: u64,
+        env: usize,
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<(), ServiceError> {
         self.check_group(group)?;
@@ -247,16 +314,24 @@ impl Trainer {
         // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
         // fresh shared memory, and what a recycled chunk held before is a message.
         let mut message = unsafe { message.assume_init() };
-        let options = write(message.payload_mut())? as u64;
+        let bytes = write(message.payload_mut())? as u64;
         self.request += 1;
-        let header = ActionHeader::new(kind, self.specification.epoch, self.trainer, self.request, seed);
-        *message.user_header_mut() = ActionHeader { options, ..header };
+        *message.user_header_mut() = ActionHeader {
+            layout_version: LAYOUT_VERSION,
+            kind: kind.code(),
+            epoch: self.specification.epoch,
+            trainer: self.trainer,
+            request: self.request,
+            seed,
+            env: env as u64,
+            bytes,
+        };
         let receivers = message.send().map_err(|e| failed(e.to_string()))?;
         if receivers == 0 && !self.link.node.is_alive(self.link.engine) {
             return Err(self.lost());
         }
         ports::notify(&self.link.to_engine, group);
-        self.pending[group] = Some(self.request);
+        self.pending[group] = Some(Pending { request: self.request, kind, env });
         self.sent = Instant::now();
         Ok(())
     }

@@ -44,7 +44,7 @@ class Environments:
         wanted = settings.environment
         self.spec: Spec = spec(settings.env)
         self.groups, self.per_group = wanted.groups, wanted.num_envs // wanted.groups
-        self.in_process = wanted.engine == "thread"
+        in_process = wanted.engine == "thread"
         arguments: dict[str, Any] = {
             "num_envs": self.per_group,
             "num_threads": wanted.num_threads or None,
@@ -55,9 +55,9 @@ class Environments:
             "autoreset": "same_step",
             "observation": wanted.observation,
         }
-        self._envs: EndlessVectorEnv = (make_vec if self.in_process else serve)(settings.env, **arguments)
+        self._envs: EndlessVectorEnv = (make_vec if in_process else serve)(settings.env, **arguments)
         # In this process a group steps in a thread, which needs no interpreter while it does.
-        self._thread = ThreadPoolExecutor(1, "environments") if self.in_process else None
+        self._thread = ThreadPoolExecutor(1, "environments") if in_process else None
         self._results: dict[int, Future[Any]] = {}
 
     def reset(self, group: int) -> Received:
@@ -83,10 +83,8 @@ class Environments:
             episodes = [{key: float(value[env]) for key, value in final.items()} for env in np.flatnonzero(done)]
         return Received(observation, reward, done, info.get("ground_truth"), episodes)
 
-    def snapshots(self) -> list[list[bytes]] | None:
-        """The states of all environments of each group; None if they are in another process."""
-        if not self.in_process:
-            return None
+    def snapshots(self) -> list[list[bytes]]:
+        """The states of all environments of each group."""
         return [[self._envs.snapshot(env, group) for env in range(self.per_group)] for group in range(self.groups)]
 
     def restore(self, snapshots: list[list[bytes]]) -> list[Received]:

@@ -126,18 +126,11 @@ class Player:
             "environments": self.environments.snapshots(),
         }
 
-    def load(self, state: dict[str, Any]) -> bool:
-        """Go on where `state` was taken.
-
-        Returns:
-            Whether the environments go on, too; if they were in another process, new episodes have started.
-        """
-        if state["environments"] is None or not self.environments.in_process:
-            return False
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on where `state` was taken."""
         self.current = self.environments.restore(state["environments"])
         for memory, tensors in zip(self.memories, state["memories"], strict=True):
             memory.load(tensors)
-        return True
 
     def _act(self, group: int, step: int) -> Any:
         columns, memory, current, segment = (

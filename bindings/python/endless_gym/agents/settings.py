@@ -33,8 +33,7 @@ class Environment:
     groups: int = 2
     """groups of environments; one is stepped while the agent decides for another"""
     engine: Literal["thread", "process"] = "thread"
-    """`thread`: environments in this process, and checkpoints resume a run exactly. `process`: in an engine's process, over
-    shared memory; a resumed run then starts new episodes"""
+    """`thread`: environments in this process. `process`: in an engine's process, over shared memory"""
     num_threads: int = 0
     """the engine's threads; 0 for one for each core"""
 

@@ -80,9 +80,8 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             for name, generator in generators.items():
                 generator.set_state(resumed["generators"][name])
             episodes.add(resumed["episodes"])
+            player.load(resumed["player"])
         logger = Logger(run, settings, update)
-        if resumed is not None and not player.load(resumed["player"]):
-            logger.say("the environments were in another process: new episodes start")
         logger.say(
             f"{settings.env}: {settings.agent} with {agent.num_parameters:,} parameters on {device}, in {run}; Ctrl-C stops it"
         )
