@@ -249,6 +249,20 @@ def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
     )
 
 
+def test_weights_and_biases_has_them_too_under_one_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Written by the real library, without its server; a run that resumes is the same one there."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    run = train(replace(small("gru", tmp_path / "run", 1), wandb=True))
+    train(replace(small("gru", tmp_path, 2), wandb=True, resume=str(run)))
+    (id,) = {file.stem.removeprefix("run-") for file in run.glob("wandb/offline-run-*/run-*.wandb")}
+    assert id == (run / "wandb-id.txt").read_text()
+    written = b"".join(file.read_bytes() for file in run.glob("wandb/offline-run-*/run-*.wandb"))
+    for row in progress(run):
+        assert json.dumps(row["policy_loss"]).encode() in written
+    assert b"episode/reward" in written and b"decay_updates" in written
+
+
 @pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
 def test_bf16_runs(agent: str, tmp_path: Path) -> None:
     """bfloat16 changes the numbers a little, and what is stored stays float32."""

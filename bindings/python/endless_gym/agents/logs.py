@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import secrets
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
@@ -110,4 +111,12 @@ def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
     except ImportError:
         console.print("Weights & Biases is not installed; logging without it (pip install wandb)")
         return None
-    return wandb.init(project="endless-gym", name=run.name, dir=str(run), config=to_dict(settings), resume="allow")
+    # A run that resumes goes on there under the same id.
+    kept = run / "wandb-id.txt"
+    if not kept.exists():
+        kept.write_text(secrets.token_hex(4))
+    given: dict[str, Any] = {"id": kept.read_text(), "name": run.name, "dir": str(run), "config": to_dict(settings)}
+    try:
+        return wandb.init(project="endless-gym", resume="allow", **given)
+    except wandb.Error as error:
+        raise ValueError(f"Weights & Biases: {error} Or keep its log on this machine: WANDB_MODE=offline") from None
