@@ -65,14 +65,7 @@ class Env(gymnasium.Env[Any, Any]):
     @property
     def max_episode_steps(self) -> int:
         """Steps after which an episode ends, by the current reset parameters; -1 for none. As in the original."""
-        parameters = self.reset_params
-        if "max_steps" in parameters:
-            return int(parameters["max_steps"])
-        # Mortar Mayhem: clue and execution of the most commands at their slowest.
-        longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
-        clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
-        execution = longest["explosion_duration"] + longest["explosion_delay"]
-        return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
+        return self._spec.max_episode_steps(self.reset_params)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

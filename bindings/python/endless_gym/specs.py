@@ -95,6 +95,17 @@ class Spec:
             parts["vector_observation"] = spaces.Box(0, 1, (self.vector_observation,), np.float32)
         return spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
 
+    def max_episode_steps(self, options: Mapping[str, Any]) -> int:
+        """Steps after which an episode with these reset parameters ends; -1 for none. As in the original."""
+        parameters = {**self.reset_parameters, **options}
+        if "max_steps" in parameters:
+            return int(parameters["max_steps"])
+        # Mortar Mayhem: clue and execution of the most commands at their slowest.
+        longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
+        clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
+        execution = longest["explosion_duration"] + longest["explosion_delay"]
+        return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
+
     def ground_truth_space(self) -> gymnasium.Space[Any] | None:
         """The original's space of `info["ground_truth"]`."""
         if not self.ground_truth:

@@ -103,6 +103,7 @@ def test_progress_on_a_path_is_that_of_its_length() -> None:
 def test_runs_and_checkpoints_are_found(runs: Path) -> None:
     assert [run.name for run, _ in find((runs,), False)] == ["a", "b", "c"]
     assert [file.name for _, files in find((runs / "a",), False) for file in files] == [
+        "update-000000.pt",
         "update-000001.pt",
         "update-000002.pt",
     ]
@@ -115,8 +116,8 @@ def test_each_seed_is_played_as_often_and_the_numbers_are_the_same_again(runs: P
     quiet = Console(quiet=True)
     once = evaluate_runs(small(runs), quiet)
     assert [(one.label, len(one.runs), one.common_steps()) for one in once] == [
-        ("gru", 2, [32, 64]),
-        ("none", 1, [32, 64]),
+        ("gru_16", 2, [0, 32, 64]),
+        ("ppo", 1, [0, 32, 64]),
     ]
     for run in once[0].runs:
         for episodes in run.episodes:

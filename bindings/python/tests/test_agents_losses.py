@@ -9,10 +9,11 @@ from agents_helpers import BRANCHES, ends, make, observations, play, settings
 
 from endless_gym.agents import losses
 from endless_gym.agents.agent import Agent, Evaluated
+from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.memory import Plan
 from endless_gym.agents.ppo import decayed, learn, minibatch_loss
 from endless_gym.agents.rollout import Segment
-from endless_gym.agents.settings import PPO
+from endless_gym.agents.settings import PPO, Environment
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -207,6 +208,30 @@ def test_minibatch_loss_is_the_paper_s_sum(kind: str, normalisation: str) -> Non
     assert float(loss) == pytest.approx(total / len(chosen), abs=1e-4)
     assert 0 < float(parts["clip_fraction"]) < 1
     assert float(parts["kl_divergence"]) > 0
+
+
+def test_reconstruction_is_a_term_of_the_loss() -> None:
+    """What the loss has more with the coefficient is its multiple of the mean binary cross entropy, pixel by pixel."""
+    shapes, frames = {FRAME: (84, 84, 3)}, torch.randint(0, 256, (4, 84, 84, 3), dtype=torch.uint8)
+    given = settings("none")
+    given = replace(
+        given, ppo=replace(given.ppo, reconstruction_coefficient=0.1), environment=Environment(observation="rgb")
+    )
+    torch.manual_seed(3)
+    agent, numbers = Agent(given, shapes, BRANCHES), torch.zeros(4)
+    action, done = torch.zeros(4, 2, dtype=torch.long), torch.zeros(4, dtype=torch.bool)
+    segment = Segment({FRAME: frames}, done, action, torch.zeros(4, 2), numbers, numbers, done, None, torch.zeros(1))
+    terms = []
+    for coefficient in (0.1, 0.0):
+        ppo = replace(given.ppo, reconstruction_coefficient=coefficient)
+        loss, parts = minibatch_loss(agent, segment, Plan(torch.arange(4)), numbers, numbers, ppo, 0.05)
+        terms.append(float(loss))
+    evaluated = agent.evaluate({FRAME: frames}, Plan(torch.arange(4)))
+    p = torch.sigmoid(evaluated.frame.detach().double())
+    target = frames.permute(0, 3, 1, 2).double() / 255.0
+    entropy = float(-(target * p.log() + (1 - target) * (1 - p).log()).mean())
+    assert float(parts["reconstruction_loss"]) == pytest.approx(entropy, rel=1e-4)
+    assert terms[0] - terms[1] == pytest.approx(0.1 * entropy, rel=1e-3)
 
 
 def test_learning_is_adamw_on_clipped_gradients() -> None:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 import torch
 from agents_helpers import BRANCHES, make, settings, transformer
@@ -10,10 +11,10 @@ from agents_helpers import BRANCHES, make, settings, transformer
 from endless_gym import spec
 from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.encoders import FRAMES_IN_PIECE, AtariEncoder
-from endless_gym.agents.heads import PolicyHead, ReconstructionHead
+from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym.agents.memory import Plan
 from endless_gym.agents.settings import PRESETS, Recurrence, Settings, Transformer, from_dict, to_dict
-from endless_gym.agents.transformer import Block, Gate
+from endless_gym.agents.transformer import Block, Gate, TransformerMemory
 
 PAPER = PRESETS["paper"]
 
@@ -64,9 +65,43 @@ def test_paper_is_the_paper_s_table() -> None:
         "embedding": True,
         "sequence_length": 512,
     }
-    assert (trxl.layers, trxl.width, trxl.heads, trxl.window) == (3, 384, 4, 256)
+    assert (trxl.layers, trxl.width, trxl.heads) == (3, 384, 4)
     assert (trxl.initialisation, trxl.positional_encoding) == ("xavier", "absolute")
-    assert (PAPER.positions(), replace(PAPER, env="MortarMayhem-v0").positions()) == (2048, 512)
+
+
+@pytest.mark.parametrize(
+    ("env", "option", "window", "positions"),
+    [
+        ("Endless-MortarMayhem-v0", (), 256, 2048),
+        ("Endless-MysteryPath-v0", (), 256, 2048),
+        ("Endless-SearingSpotlights-v0", (), 256, 2048),
+        # A window of 256, or of the longest episode; 274 steps and the one that ends it.
+        ("MortarMayhem-v0", (), 275, 275),
+        ("MortarMayhem-v0", ("command_count=[2, 1]",), 51, 51),
+        ("MysteryPath-v0", (), 512, 512),
+        ("MysteryPath-Grid-v0", (), 128, 128),
+        ("SearingSpotlights-v0", ("max_steps=100",), 100, 100),
+        ("SearingSpotlights-v0", ("max_steps=-1",), 256, 2048),
+    ],
+)
+def test_window_and_positions_follow_the_longest_episode(
+    env: str, option: tuple[str, ...], window: int, positions: int
+) -> None:
+    given = replace(PAPER, env=env, agent="trxl", environment=replace(PAPER.environment, option=option)).checked()
+    assert (given.window(), given.positions()) == (window, positions)
+    memory = make_agent(given, spec(env)).memory
+    assert isinstance(memory, TransformerMemory)
+    assert (memory.past, memory.positions) == (window - 1, positions)
+    fixed = replace(given, transformer=replace(given.transformer, window=9, positions=11))
+    assert (fixed.window(), fixed.positions()) == (9, 11)
+
+
+def test_throughput_sees_as_many_steps_in_many_more_environments() -> None:
+    given = PRESETS["throughput"]
+    assert (given.environment.num_envs, given.ppo.steps) == (512, 32)
+    assert given.environment.num_envs * given.ppo.steps == PAPER.environment.num_envs * PAPER.ppo.steps
+    assert given.recurrence.sequence_length == given.transformer.sequence_length == given.ppo.steps
+    assert replace(given.ppo, steps=PAPER.ppo.steps) == PAPER.ppo
 
 
 def test_old_differs_in_its_column_alone() -> None:
@@ -102,6 +137,10 @@ def test_settings_travel_as_json(name: str) -> None:
         ({"transformer": Transformer(width=100, heads=3)}, "multiple of twice the 3 heads"),
         ({"transformer": Transformer(query_encoding=True, positional_encoding="relative")}, "not relative"),
         ({"ppo": replace(PAPER.ppo, epochs=0)}, "--ppo.epochs is 0; give 1 or more"),
+        ({"ppo": replace(PAPER.ppo, decay_updates=0)}, "--ppo.decay-updates is 0; give 1 or more"),
+        ({"transformer": Transformer(width=0)}, "--transformer.width is 0; give 1 or more"),
+        ({"threads": -1}, "--threads is -1; give 0 or more"),
+        ({"env": "Nothing-v0"}, "no environment `Nothing-v0`"),
     ],
 )
 def test_impossible_settings_are_refused(changes: dict, message: str) -> None:
@@ -163,6 +202,49 @@ def test_reconstruction_from_the_memory_s_output() -> None:
     evaluated.frame.sum().backward()
     assert agent.memory.recurrent.weight_ih_l0.grad.abs().sum() > 0
     assert agent.body[0].weight.grad is None
+
+
+def test_heads_are_one_hidden_layer_and_one_of_outputs() -> None:
+    """Against products and sums, number by number."""
+
+    def row(layer: torch.nn.Linear, x: list[float]) -> list[float]:
+        weights, biases = layer.weight.tolist(), layer.bias.tolist()
+        return [sum(w * v for w, v in zip(ws, x, strict=True)) + b for ws, b in zip(weights, biases, strict=True)]
+
+    torch.manual_seed(2)
+    x = torch.randn(3, 5)
+    policy, value, truth = PolicyHead(5, 4, BRANCHES), ValueHead(5, 4, 0.5), GroundTruthHead(5, 4, 2)
+    for head in (policy, value, truth):
+        for parameter in head.parameters():
+            parameter.data.normal_()
+    outputs = [torch.cat(policy(x), 1), value(x).unsqueeze(1), truth(x)]
+    layers = [(policy.hidden[0], [*policy.branches])] + [(head.layers[0], [head.layers[2]]) for head in (value, truth)]
+    for output, (hidden, last) in zip(outputs, layers, strict=True):
+        for given, found in zip(x.tolist(), output.tolist(), strict=True):
+            middle = [max(0.0, v) for v in row(hidden, given)]
+            assert found == pytest.approx([v for layer in last for v in row(layer, middle)], rel=1e-4, abs=1e-5)
+
+
+def test_reconstruction_head_spreads_each_cell_with_its_kernel() -> None:
+    """Against a loop that adds kernels up, with numpy, in float64."""
+    torch.manual_seed(2)
+    head = ReconstructionHead(5, 3)
+    for parameter in head.parameters():
+        parameter.data.normal_(std=0.1)
+    given = torch.randn(2, 5)
+    linear, *convolutions = (layer for layer in head.layers if hasattr(layer, "weight"))
+    for x, found in zip(given, head(given).detach().numpy(), strict=True):
+        weight, bias = linear.weight.detach().numpy().astype(float), linear.bias.detach().numpy()
+        frame = np.maximum(weight @ x.numpy() + bias, 0.0).reshape(64, 7, 7)
+        for layer in convolutions:
+            kernel, stride = layer.weight.detach().numpy().astype(float), layer.stride[0]
+            size = (frame.shape[1] - 1) * stride + kernel.shape[2]
+            out = np.zeros((kernel.shape[1], size, size)) + layer.bias.detach().numpy()[:, None, None]
+            for i, j in np.ndindex(frame.shape[1:]):
+                cell = np.tensordot(frame[:, i, j], kernel, 1)
+                out[:, i * stride : i * stride + kernel.shape[2], j * stride : j * stride + kernel.shape[3]] += cell
+            frame = out if layer is convolutions[-1] else np.maximum(out, 0.0)
+        np.testing.assert_allclose(found, frame, rtol=1e-3, atol=1e-3)
 
 
 def test_transposed_convolutions_undo_the_shapes() -> None:

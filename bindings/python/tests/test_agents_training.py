@@ -10,11 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from agents_helpers import settings
 
-from endless_gym import spec
+from endless_gym import make_vec, spec
 from endless_gym.agents import checkpoint
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
@@ -22,7 +23,7 @@ from endless_gym.agents.environments import Environments
 from endless_gym.agents.evaluate import evaluate, mean
 from endless_gym.agents.rollout import Player
 from endless_gym.agents.settings import PRESETS, Settings
-from endless_gym.agents.train import main, parse, train
+from endless_gym.agents.train import go_on_drawing, main, parse, same_network, train
 
 GRID = "MortarMayhem-Grid-v0"
 
@@ -128,7 +129,7 @@ def test_what_is_written_beyond_the_checkpoint_is_written_anew(tmp_path: Path) -
     run = train(small("gru", tmp_path / "run", 2))
     expected = progress(train(small("gru", tmp_path / "through", 4)))
     with (run / "progress.jsonl").open("a") as file:
-        file.write(json.dumps({"update": 3, "loss": 1.0}) + "\n")
+        file.write(json.dumps({"update": 3, "loss": 1.0}) + '\n{"update": 4, "lo')
     train(replace(small("gru", tmp_path, 4), resume=str(run)))
     assert progress(run) == expected
 
@@ -182,13 +183,72 @@ def test_ctrl_c_writes_a_checkpoint_and_leaves_nothing(engine: str, tmp_path: Pa
 def test_checkpoints_are_kept_and_act(tmp_path: Path) -> None:
     given = replace(small("trxl", tmp_path / "run", 4), keep_checkpoints=True)
     run = train(given)
-    assert [file.name for file in checkpoint.files(run)] == ["update-000002.pt", "update-000004.pt"]
-    loaded = checkpoint.load(checkpoint.files(run)[0])
-    assert (loaded.update, loaded.settings) == (2, given)
-    assert same(checkpoint.load(run).agent.state_dict(), checkpoint.load(checkpoint.files(run)[1]).agent.state_dict())
+    files = checkpoint.files(run)
+    assert [file.name for file in files] == ["update-000000.pt", "update-000002.pt", "update-000004.pt"]
+    loaded = checkpoint.load(files[1])
+    assert (loaded.update, loaded.steps, loaded.settings) == (2, 2 * 8 * 16, given)
+    assert same(checkpoint.load(run).agent.state_dict(), checkpoint.load(files[2]).agent.state_dict())
     memory = loaded.agent.initial_memory(3)
     acted = loaded.agent.act(torch.zeros(3, 17).numpy(), memory)
     assert acted.action.shape == (3, 1)
+
+
+def test_a_run_that_has_not_learned_yet_can_go_on(tmp_path: Path) -> None:
+    """As after Ctrl-C in its first update."""
+    run = train(replace(small("gru", tmp_path / "run", 2), time_limit=1e-9, keep_checkpoints=True))
+    assert len(progress(run)) == 1
+    (run / "checkpoints" / "last.pt").unlink()
+    os.link(run / "checkpoints" / "update-000000.pt", run / "checkpoints" / "last.pt")
+    train(parse(["--resume", str(run)]))
+    assert progress(run) == progress(train(small("gru", tmp_path / "through", 2)))
+
+
+def test_a_generator_of_another_kind_of_device_starts_anew() -> None:
+    """A state of CUDA's generator has 16 bytes."""
+    one, two = torch.Generator(), torch.Generator()
+    go_on_drawing(one, torch.zeros(16, dtype=torch.uint8), 5)
+    assert torch.equal(torch.rand(3, generator=one), torch.rand(3, generator=two.manual_seed(5)))
+    go_on_drawing(one, two.get_state(), 6)
+    assert torch.equal(torch.rand(3, generator=one), torch.rand(3, generator=two))
+
+
+def test_a_target_is_of_a_hundred_episodes(tmp_path: Path) -> None:
+    run = train(replace(small("none", tmp_path / "run", 40), target_reward=-1.0))
+    ended = len(checkpoint.load(run).state["episodes"])
+    assert ended == 100 and 1 < len(progress(run)) < 40
+
+
+@pytest.mark.parametrize("engine", ["thread", "process"])
+def test_a_segment_is_what_the_environments_did(engine: str, tmp_path: Path) -> None:
+    """Each array of two segments, against environments that are stepped one group at a time in a plain loop."""
+    given = small("none", tmp_path, engine=engine)
+    ppo = replace(given.ppo, ground_truth_coefficient=0.1)
+    given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))
+    plain = make_vec(
+        given.env, 4, 1, seed=1, seeds=range(100_000), groups=2, autoreset="same_step", observation="features"
+    )
+    now = [plain.reset(group=group) for group in range(2)]
+    first = [np.ones(4, np.bool_) for _ in range(2)]
+    with Environments(given) as environments:
+        player = Player(make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1))
+        for _ in range(4):
+            segment, episodes = player.play(Clock())
+            ended = []
+            for step in range(16):
+                for group, columns in enumerate((slice(0, 4), slice(4, 8))):
+                    observation, info = now[group]
+                    np.testing.assert_array_equal(segment.observation["features"][step, columns], observation)
+                    truth = torch.from_numpy(info["ground_truth"]).float()
+                    assert torch.equal(segment.ground_truth[step, columns], truth)
+                    np.testing.assert_array_equal(segment.first[step, columns], first[group])
+                    plain.send(segment.action[step, columns].numpy(), group)
+                    observation, reward, terminated, truncated, info = plain.recv(group)
+                    now[group], first[group] = (observation, info), terminated | truncated
+                    np.testing.assert_array_equal(segment.reward[step, columns], reward.astype(np.float32))
+                    np.testing.assert_array_equal(segment.done[step, columns], first[group])
+                    ended += [float(info["final_info"]["reward"][env]) for env in np.flatnonzero(first[group])]
+            assert sorted(episode["reward"] for episode in episodes) == sorted(ended)
+        assert segment.done.any()
 
 
 def test_evaluation_plays_each_seed_as_often(tmp_path: Path) -> None:
@@ -230,6 +290,13 @@ def test_a_run_goes_on_with_its_own_settings(tmp_path: Path) -> None:
     assert resumed.ppo == replace(small("gru", run, 2).ppo, updates=3)
     train(resumed)
     assert len(progress(run)) == 3
+    # What was changed holds from then on; steps that were played stay played.
+    again = parse(["--resume", str(run)])
+    assert again.ppo == resumed.ppo
+    train(replace(again, ppo=replace(again.ppo, updates=4, steps=32)))
+    assert [row["steps"] for row in progress(run)] == [128, 256, 384, 384 + 256]
+    with pytest.raises(ValueError, match=r"reconstruction-coefficient 0 adds or takes away a head.* began with 0\.1"):
+        same_network(again, replace(again, ppo=replace(again.ppo, reconstruction_coefficient=0.1)))
     with pytest.raises(ValueError, match="began with agent gru, not lstm"):
         train(parse(["--resume", str(run), "--agent", "lstm"]))
     with pytest.raises(FileExistsError, match="has a run already"):

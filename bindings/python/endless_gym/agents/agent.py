@@ -132,15 +132,14 @@ class Agent(nn.Module):
         super().__init__()
         self.settings, self.device = settings, torch.device(device)
         self.branches = tuple(branches)
-        transformer = settings.transformer
-        if settings.agent == "gtrxl":
-            transformer = dataclasses.replace(transformer, gating=True)
         self.observer = make_observer(settings, shapes, self.device)
         self.encoder = Encoder(self.observer.shapes, settings.model.vector_width)
         self.memory: Memory
         if settings.agent == "gru" or settings.agent == "lstm":
             self.memory = RecurrentMemory(settings.agent, self.encoder.width, settings.recurrence, self.device)
         elif settings.agent == "trxl" or settings.agent == "gtrxl":
+            gating = settings.transformer.gating or settings.agent == "gtrxl"
+            transformer = dataclasses.replace(settings.transformer, window=settings.window(), gating=gating)
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
@@ -246,7 +245,7 @@ class Agent(nn.Module):
         if not isinstance(observation, Mapping):
             observation = {next(iter(self._keys())): observation}
         return {
-            key: value if isinstance(value, Tensor) else torch_view(value).to(self.device, non_blocking=True)
+            key: (value if isinstance(value, Tensor) else torch_view(value)).to(self.device, non_blocking=True)
             for key, value in observation.items()
         }
 

@@ -34,12 +34,14 @@ class Checkpoint:
         settings: Of the run.
         agent: With the checkpoint's weights.
         update: Updates that the agent has learned from.
+        steps: Steps of environments that these updates saw.
         state: All that was saved; see `save`.
     """
 
     settings: Settings
     agent: Agent
     update: int
+    steps: int
     state: dict[str, Any]
 
 
@@ -48,7 +50,7 @@ def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
 
     Args:
         run: The run's folder.
-        state: `settings` as a dict, `update`, `model`, and for going on `optimizer`, `generators`, `player`, `episodes`.
+        state: `settings` as a dict, `update`, `steps`, `model`, and for going on `optimizer`, `generators`, `player`, `episodes`.
         keep: Keep it under the update's number, too.
 
     Returns:
@@ -94,7 +96,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     agent = make_agent(settings, spec(settings.env), device)
     agent.load_state_dict(state["model"])
     agent.eval()
-    return Checkpoint(settings, agent, state["update"], state)
+    return Checkpoint(settings, agent, state["update"], state["steps"], state)
 
 
 def read_settings(run: str | Path) -> Settings:

@@ -14,7 +14,7 @@ from endless_gym.agents import checkpoint
 INTERRUPTED = 130
 
 
-def run(name: str, work: Callable[[], None]) -> int:
+def run(name: str, work: Callable[[], object]) -> int:
     """Run a command's work; what the user can put right becomes one line.
 
     Returns:

@@ -30,7 +30,7 @@ class Logger:
         self._updates = settings.ppo.updates
         progress = run / PROGRESS
         if progress.exists():
-            lines = [line for line in progress.read_text().splitlines() if json.loads(line)["update"] <= update]
+            lines = [line for line in progress.read_text().splitlines() if _is_of(line, update)]
             progress.write_text("".join(f"{line}\n" for line in lines))
         self._progress = progress.open("a")
         self._board: Any = SummaryWriter(str(run), purge_step=update + 1 if update else None)  # type: ignore[no-untyped-call]
@@ -86,6 +86,10 @@ class Episodes:
         """Take in the infos of more episodes."""
         self.recent.extend(infos)
 
+    def is_full(self) -> bool:
+        """Whether as many have ended as are kept."""
+        return len(self.recent) == RECENT
+
     def means(self) -> dict[str, float]:
         """The mean of each entry, as `episode/NAME`; empty if no episode has ended."""
         if not self.recent:
@@ -99,6 +103,14 @@ def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]
             yield from _flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
+
+
+def _is_of(line: str, update: int) -> bool:
+    """Whether a line of the progress is of that update or an earlier one; a killed process may have written half of its last."""
+    try:
+        return bool(json.loads(line)["update"] <= update)
+    except json.JSONDecodeError:
+        return False
 
 
 def _is_nan(value: Any) -> bool:

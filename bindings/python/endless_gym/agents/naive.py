@@ -113,8 +113,8 @@ class Positioned(Observer):
 
 def grey(frames: Tensor) -> Tensor:
     """Luminance of frames uint8 (..., 3) as uint8 (..., 1), in whole numbers: 0.299 red, 0.587 green, 0.114 blue."""
-    weights = torch.tensor([4899, 9617, 1868], dtype=torch.int32, device=frames.device)
-    return (((frames.int() * weights).sum(-1, keepdim=True) + 8192) >> 14).to(torch.uint8)
+    red, green, blue = frames.int().unbind(-1)
+    return ((4899 * red + 9617 * green + 1868 * blue + 8192) >> 14).to(torch.uint8).unsqueeze(-1)
 
 
 def make_observer(settings: Settings, shapes: Shapes, device: torch.device) -> Observer:

@@ -116,7 +116,7 @@ def evaluate_runs(given: Evaluation, console: Console) -> list[Experiment]:
                     greedy=given.greedy,
                     ended=lambda number: bar.advance(episodes, number),
                 )
-                run.add(loaded.update * settings.environment.num_envs * settings.ppo.steps, results)
+                run.add(loaded.steps, results)
                 bar.advance(checkpoints)
     return experiments.all()
 

@@ -26,13 +26,14 @@ class RecurrentState(State):
     Attributes:
         hidden: (parts, layers, n, hidden size); a GRU's state has one part, an LSTM's two: hidden and cell state.
         starts: The hidden states before steps 0, L, 2L, ... of the segment, for sequences of length L.
-        time: Steps of the segment so far.
+        time: Steps since the segment began.
+        steps: Steps of the segment; 0 where nothing is recorded.
     """
 
     def __init__(self, hidden: Tensor) -> None:
         self.hidden = hidden
         self.starts: list[Tensor] = []
-        self.time = 0
+        self.time = self.steps = 0
 
     def tensors(self) -> dict[str, Any]:
         return {"hidden": self.hidden}
@@ -87,20 +88,20 @@ class RecurrentMemory(Memory):
 
     def begin_segment(self, state: State, steps: int) -> None:
         assert isinstance(state, RecurrentState)
-        del steps
-        state.starts, state.time = [], 0
+        state.starts, state.time, state.steps = [], 0, steps
 
     def step(self, x: Tensor, state: State, first: Tensor) -> tuple[Tensor, Tensor]:
         assert isinstance(state, RecurrentState)
         hidden = state.hidden.masked_fill(first[:, None], 0.0)
-        x = self._embedded(x)
-        y, after = self.recurrent(x.unsqueeze(0), self._split(hidden))
+        x = self._embedded(x).float()
+        with self._precisely():
+            y, after = self.recurrent(x.unsqueeze(0), self._split(hidden))
         y = y.squeeze(0)
         return y + x if self.settings.residual else y, self._joined(after)
 
     def remember(self, state: State, news: Tensor) -> None:
         assert isinstance(state, RecurrentState)
-        if state.time % self.settings.sequence_length == 0:
+        if state.time < state.steps and state.time % self.settings.sequence_length == 0:
             state.starts.append(state.hidden)
         # A new tensor each time, never written into: the states of sequences' starts stay as they were.
         state.hidden, state.time = news.float(), state.time + 1
@@ -134,10 +135,15 @@ class RecurrentMemory(Memory):
         return plans
 
     def forward(self, x: Tensor, plan: RecurrentPlan) -> Tensor:
-        x = self._embedded(x)
-        packed, _ = self.recurrent(PackedSequence(x, plan.batch_sizes), self._split(plan.start.to(x.dtype)))
+        x = self._embedded(x).float()
+        with self._precisely():
+            packed, _ = self.recurrent(PackedSequence(x, plan.batch_sizes), self._split(plan.start))
         y: Tensor = packed.data
         return y + x if self.settings.residual else y
+
+    def _precisely(self) -> torch.autocast:
+        """In float32: PyTorch would give cuDNN's layers float16 where bfloat16 is asked for."""
+        return torch.autocast(self.device.type, enabled=False)
 
     def _embedded(self, x: Tensor) -> Tensor:
         if self.embedding is not None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from endless_gym.agents import metrics
-from endless_gym.agents.settings import Settings, to_dict
+from endless_gym.agents.settings import Recurrence, Settings, to_dict
 from endless_gym.agents.statistics import Summary, summarise
 
 #: Settings that tell runs of one experiment apart, or change nothing of what is learned.
@@ -99,12 +99,18 @@ class Experiment:
 
 def label(settings: Settings) -> str:
     """The agent's name with its additions, as the published curves have it."""
+    agents = {"none": "ppo", "stack": f"{settings.model.stack}stack", "position": "pos_enc"}
+    name = agents.get(settings.agent, settings.agent)
+    if settings.agent == "gtrxl":
+        name += f"_b{settings.transformer.gate_bias:g}"
+    if settings.agent in ("gru", "lstm") and settings.recurrence.hidden_size != Recurrence().hidden_size:
+        name += f"_{settings.recurrence.hidden_size}"
     additions = {
         "_gt": settings.ppo.ground_truth_coefficient,
         "_qpos": settings.transformer.query_encoding and settings.agent in ("trxl", "gtrxl"),
         "_rec": settings.ppo.reconstruction_coefficient,
     }
-    return settings.agent + "".join(name for name, value in additions.items() if value)
+    return name + "".join(addition for addition, value in additions.items() if value)
 
 
 class Experiments:
@@ -117,6 +123,8 @@ class Experiments:
         """The experiment that a run with these settings belongs to."""
         values = {name: value for name, value in to_dict(settings).items() if name not in _OF_THE_RUN}
         values["preset"] = ""
+        # Where environments are stepped changes nothing.
+        values["environment"] = {**values["environment"], "engine": "", "num_threads": 0}
         # Runs of any length are of one experiment.
         values["ppo"] = {name: value for name, value in values["ppo"].items() if name != "updates"}
         key = json.dumps(values, sort_keys=True)

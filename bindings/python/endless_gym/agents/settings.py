@@ -11,13 +11,13 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from endless_gym.specs import spec
+
 AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
 PresetName = Literal["paper", "old", "throughput", "quick"]
 
 #: The seeds that training draws an episode's seed from. Evaluation uses seeds from 200,000 on: levels that no training has seen.
 TRAINING_SEEDS = range(100_000)
-#: Ids with this prefix have no last step; their positional encoding is longer.
-ENDLESS = "Endless-"
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,14 @@ class Transformer:
     """size of the vectors between the blocks"""
     heads: int = 4
     """attention heads"""
-    window: int = 256
-    """length of the sliding memory window: the current step and those before it that it can attend to"""
+    window: int = 0
+    """length of the sliding memory window: the current step and those before it that it can attend to; 0 for the longest episode,
+    and 256 in endless environments, as in the paper"""
     positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
     """how attention knows the time of a memory"""
     positions: int = 0
-    """rows of the absolute or learned encoding's table; 0 for 512, and 2048 in endless environments, as in the paper"""
+    """rows of the absolute or learned encoding's table; 0 for the longest episode, and 2048 in endless environments, as in the
+    paper"""
     query_encoding: bool = False
     """add the absolute or learned encoding of the current step to the queries, too"""
     shared_heads: bool = True
@@ -91,7 +93,7 @@ class Model:
     vector_width: int = 128
     """units of the encoder of vectors (features, vector observations, positions)"""
     body_width: int = 0
-    """units of the layer after the memory; 0 for the memory's width"""
+    """units of the layer after the memory; 0 for the memory's width, and without a memory for `recurrence.hidden-size`"""
     head_width: int = 512
     """units of the hidden layer of the policy's and the value's head"""
     value_gain: float = 1.0
@@ -202,17 +204,19 @@ class Settings:
         return options
 
     def checked(self) -> Settings:
-        """These settings, once nothing speaks against them.
+        """These settings with the environment's own id, once nothing speaks against them.
 
         Raises:
             ValueError: A number or a combination is not possible; the message says which, and what to do.
         """
         self.options()
+        described = spec(self.env)
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
         positive = {
             "environment.num-envs": environment.num_envs,
             "environment.groups": environment.groups,
             "ppo.updates": ppo.updates,
+            "ppo.decay-updates": ppo.decay_updates,
             "ppo.steps": ppo.steps,
             "ppo.epochs": ppo.epochs,
             "ppo.minibatches": ppo.minibatches,
@@ -221,19 +225,31 @@ class Settings:
             "recurrence.sequence-length": self.recurrence.sequence_length,
             "transformer.layers": transformer.layers,
             "transformer.heads": transformer.heads,
+            "transformer.width": transformer.width,
             "transformer.sequence-length": transformer.sequence_length,
             "model.stack": self.model.stack,
+            "model.vector-width": self.model.vector_width,
+            "model.head-width": self.model.head_width,
             "checkpoint-interval": self.checkpoint_interval,
         }
         for name, number in positive.items():
             if number < 1:
                 raise ValueError(f"--{name} is {number}; give 1 or more")
+        for name, number in {
+            "threads": self.threads,
+            "environment.num-threads": environment.num_threads,
+            "model.body-width": self.model.body_width,
+            "transformer.positions": transformer.positions,
+            "transformer.window": transformer.window,
+        }.items():
+            if number < 0:
+                raise ValueError(f"--{name} is {number}; give 0 or more")
         if environment.num_envs % environment.groups:
             raise ValueError(
                 f"{environment.num_envs} environments do not divide into {environment.groups} groups of one size; "
                 "change --environment.num-envs or --environment.groups"
             )
-        if transformer.window < 2:
+        if transformer.window == 1:
             raise ValueError(f"--transformer.window is {transformer.window}; a window of 1 has no past, give 2 or more")
         if transformer.width % (2 * transformer.heads):
             raise ValueError(
@@ -250,11 +266,19 @@ class Settings:
             raise ValueError(
                 f"--transformer.query-encoding needs an absolute or learned encoding, not {transformer.positional_encoding}"
             )
-        return self
+        return dataclasses.replace(self, env=described.id)
 
     def positions(self) -> int:
         """Rows of the positional encoding's table."""
-        return self.transformer.positions or (2048 if self.env.startswith(ENDLESS) else 512)
+        return self.transformer.positions or self._longest_episode() or 2048
+
+    def window(self) -> int:
+        """Length of the memory window."""
+        return self.transformer.window or self._longest_episode() or 256
+
+    def _longest_episode(self) -> int:
+        """Steps; 0 if there is no limit."""
+        return max(0, spec(self.env).max_episode_steps(self.options()))
 
 
 def _replace(settings: Settings, **groups: dict[str, Any]) -> Settings:
@@ -304,7 +328,7 @@ def _presets() -> dict[str, Settings]:
             "max_gradient_norm": 0.5,
         },
         recurrence={"hidden_size": 128, "sequence_length": 64},
-        transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
+        transformer={"layers": 2, "width": 64, "window": 64, "positions": 512, "sequence_length": 32},
         model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
     )
     return {"paper": paper, "old": old, "throughput": throughput, "quick": quick}

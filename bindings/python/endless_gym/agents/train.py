@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-from endless_gym.agents import checkpoint
+from endless_gym.agents import checkpoint, command
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
@@ -46,6 +46,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         run = Path(settings.resume)
         resumed = checkpoint.load(run).state
         same_network(settings, checkpoint.read_settings(run))
+        settings = dataclasses.replace(settings, resume="", run=str(run))
     else:
         run = Path(
             settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -53,7 +54,8 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         if (run / checkpoint.SETTINGS).exists():
             raise FileExistsError(f"{run} has a run already; go on with --resume {run}, or name another folder")
         run.mkdir(parents=True, exist_ok=True)
-        (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
+    # What was changed to go on holds from now on.
+    (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
 
     # Everything random follows from the seed.
     device = choose_device(settings.device)
@@ -72,53 +74,60 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             agent.compile_parts()
         optimizer = torch.optim.AdamW(agent.parameters(), lr=ppo.learning_rate)
         player = Player(agent, environments, ppo.steps, generators["actions"])
-        episodes, update = Episodes(), 0
+        episodes, update, steps = Episodes(), 0, 0
         if resumed is not None:
-            update = resumed["update"]
+            update, steps = resumed["update"], resumed["steps"]
             agent.load_state_dict(resumed["model"])
             optimizer.load_state_dict(resumed["optimizer"])
             for name, generator in generators.items():
-                generator.set_state(resumed["generators"][name])
+                go_on_drawing(generator, resumed["generators"][name], settings.seed + update)
             episodes.add(resumed["episodes"])
             player.load(resumed["player"])
+
+        def save() -> None:
+            state: dict[str, Any] = {
+                "settings": to_dict(settings),
+                "update": update,
+                "steps": steps,
+                "model": agent.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "generators": {name: generator.get_state() for name, generator in generators.items()},
+                "player": player.state(),
+                "episodes": list(episodes.recent),
+            }
+            checkpoint.save(run, state, settings.keep_checkpoints)
+
+        if resumed is None:
+            save()
         logger = Logger(run, settings, update)
         logger.say(
             f"{settings.env}: {settings.agent} with {agent.num_parameters:,} parameters on {device}, in {run}; Ctrl-C stops it"
         )
 
-        clock = Clock(torch.cuda.synchronize if device.type == "cuda" else None)
+        clock = Clock((lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None)
         while update < ppo.updates and not stop.requested:
             start = time.perf_counter()
             segment, ended = player.play(clock)
             with clock.measure("learning"):
                 states = [memory.state for memory in player.memories]
                 measures = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"])
-            update += 1
+            new_steps = environments.groups * environments.per_group * ppo.steps
+            update, steps = update + 1, steps + new_steps
             episodes.add(ended)
             means = episodes.means()
-            rate = environments.groups * environments.per_group * ppo.steps / (time.perf_counter() - start)
-            steps = update * environments.groups * environments.per_group * ppo.steps
+            rate = new_steps / (time.perf_counter() - start)
             logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | measures, clock.take())
 
             minutes = (time.monotonic() - started) / 60
             if settings.time_limit and minutes >= settings.time_limit:
                 stop.requested = True
             reward, target = means.get("episode/reward"), settings.target_reward
-            if reward is not None and target is not None and reward >= target:
+            if reward is not None and target is not None and episodes.is_full() and reward >= target:
                 stop.requested = True
             if watch is not None and watch(update, means):
                 stop.requested = True
             if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
-                state: dict[str, Any] = {
-                    "settings": to_dict(settings),
-                    "update": update,
-                    "model": agent.state_dict(),
-                    "optimizer": optimizer.state_dict(),
-                    "generators": {name: generator.get_state() for name, generator in generators.items()},
-                    "player": player.state(),
-                    "episodes": list(episodes.recent),
-                }
-                checkpoint.save(run, state, settings.keep_checkpoints)
+                save()
         logger.say(f"{update} of {ppo.updates} updates are done; go on with: endless-train --resume {run}")
         logger.close()
     return run
@@ -156,7 +165,7 @@ def same_network(settings: Settings, before: Settings) -> None:
     Raises:
         ValueError: Something differs.
     """
-    # Where environments are stepped may change, and all of PPO.
+    # Where environments are stepped may change, and all of PPO but the losses that have a head of their own.
     had = before.environment
     place = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
     settings = dataclasses.replace(settings, environment=place)
@@ -166,6 +175,21 @@ def same_network(settings: Settings, before: Settings) -> None:
             raise ValueError(
                 f"the run to resume began with {name} {had}, not {given}; leave it as it was, or start a run"
             )
+    for name in ("reconstruction", "ground_truth"):
+        wants, has = (getattr(each.ppo, f"{name}_coefficient") for each in (settings, before))
+        if bool(wants) != bool(has):
+            raise ValueError(
+                f"--ppo.{name.replace('_', '-')}-coefficient {wants:g} adds or takes away a head, and the run to resume began "
+                f"with {has:g}; leave it as it was, or start a run"
+            )
+
+
+def go_on_drawing(generator: torch.Generator, state: torch.Tensor, seed: int) -> None:
+    """Puts a generator into a checkpoint's state; one of another kind of device starts anew with `seed`."""
+    if state.shape == generator.get_state().shape:
+        generator.set_state(state)
+    else:
+        generator.manual_seed(seed)
 
 
 def choose_device(name: str) -> torch.device:
@@ -180,8 +204,11 @@ def choose_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError:
         raise ValueError(f"no device `{name}`; give auto, cpu, cuda or cuda:NUMBER") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; give cpu or auto")
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; give cpu or auto")
+        if (device.index or 0) >= torch.cuda.device_count():
+            raise ValueError(f"device `{name}`: there are cuda:0 to cuda:{torch.cuda.device_count() - 1}")
     return device
 
 
@@ -204,12 +231,7 @@ def parse(arguments: list[str]) -> Settings:
 
 def main() -> int:
     """The command `endless-train`."""
-    try:
-        train(parse(sys.argv[1:]))
-    except (ValueError, FileNotFoundError, FileExistsError) as error:
-        print(f"endless-train: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return command.run("endless-train", lambda: train(parse(sys.argv[1:])))
 
 
 if __name__ == "__main__":

@@ -74,7 +74,10 @@ class Attention(nn.Module):
             distance: How many steps a token is older than a query, int64 (queries, tokens).
         """
         queries = self.project(self.queries, x)
-        allowed = mask.unsqueeze(1)
+        # What a softmax over nothing is, and its gradient, is each kernel's choice: a query that may attend to no token attends
+        # to all of them, and its sum is taken away below.
+        nothing = ~mask.any(-1, keepdim=True)
+        allowed = (mask | nothing).unsqueeze(1)
         if not self.relative:
             summed = functional.scaled_dot_product_attention(queries, keys, values, allowed, scale=self.scale)
         else:
@@ -87,8 +90,7 @@ class Attention(nn.Module):
             bias = (scores.gather(-1, chosen) * self.scale).masked_fill(~allowed, float("-inf"))
             content = queries + self.content_bias
             summed = functional.scaled_dot_product_attention(content, keys, values, bias, scale=self.scale)
-        # No token may be attended to at an episode's first step, and what its softmax is then is the library's choice.
-        summed = summed.masked_fill(~allowed.any(-1, keepdim=True), 0.0)
+        summed = summed.masked_fill(nothing.unsqueeze(1), 0.0)
         out: Tensor = self.fc_out(summed.transpose(1, 2).flatten(-2))
         return out
 

@@ -1,0 +1,196 @@
+"""A device that is not the processor, on a machine that has no other: what agents do on CUDA can be tried on it.
+
+Its tensors hold those of the processor that they stand for. As on CUDA, an operation that is given tensors of both devices is
+an error, and so is a look into them without a copy. Run as a program, this trains on it and on the processor, and prints what
+came of both:
+
+    python other_device.py FOLDER FLAGS_AS_JSON ...
+"""
+
+import contextlib
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils import backend_registration
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+NAME = "elsewhere"
+
+
+class There(torch.Tensor):
+    """A tensor of the device."""
+
+    @staticmethod
+    def __new__(cls, here: torch.Tensor) -> "There":
+        shape, strides, offset = here.size(), here.stride(), here.storage_offset()
+        made = torch.Tensor._make_wrapper_subclass(
+            cls, shape, strides=strides, storage_offset=offset, dtype=here.dtype, device=torch.device(NAME, 0)
+        )
+        made.here = here
+        return made
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @classmethod
+    def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return computed(operation, args, kwargs or {})
+
+
+class Device(TorchDispatchMode):
+    """Has tensors of the device made where they are asked for."""
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return computed(operation, args, kwargs or {})
+
+
+def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    name = operation.overloadpacket.__name__
+    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+    there = [tensor for tensor in tensors if isinstance(tensor, There)]
+    # Numbers may be anywhere, and copies go from one device to the other.
+    here = [tensor for tensor in tensors if not isinstance(tensor, There) and tensor.dim()]
+    if there and here and name not in ("_to_copy", "copy_"):
+        shapes = [[tuple(tensor.shape) for tensor in some] for some in (there, here)]
+        raise RuntimeError(f"{name} is given tensors of two devices: {shapes[0]} and {shapes[1]}")
+    asked = kwargs.get("device")
+    if asked is not None:
+        kwargs = kwargs | {"device": torch.device("cpu")}
+    own = CELLS.get(name, operation)
+    args_here, kwargs_here = tree_map_only(There, lambda tensor: tensor.here, (args, kwargs))
+    out = own(*args_here, **kwargs_here)
+    is_there = torch.device(asked).type == NAME if asked is not None else bool(there)
+    if name == "copy_":
+        is_there = isinstance(args[0], There)
+    if not is_there or name == "_local_scalar_dense":
+        return out
+    out = tree_map_only(torch.Tensor, There, out)
+    return out if name in CELLS else return_and_correct_aliasing(operation, args, kwargs, out)
+
+
+def lstm_cell(x: Any, h: Any, cell: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
+    """What PyTorch computes in one piece on other devices."""
+    gates = x + h if bias_x is None else x + h + bias_x + bias_h
+    into, forget, new, out = gates.chunk(4, 1)
+    into, forget, new, out = into.sigmoid(), forget.sigmoid(), new.tanh(), out.sigmoid()
+    after = forget * cell + into * new
+    return out * after.tanh(), after, torch.cat([into, forget, new, out], 1)
+
+
+def lstm_cell_backward(grad_h: Any, grad_c: Any, before: Any, after: Any, kept: Any, has_bias: bool) -> Any:
+    into, forget, new, out = kept.chunk(4, 1)
+    to_h = torch.zeros_like(before) if grad_h is None else grad_h
+    to_c = to_h * out * (1 - after.tanh() ** 2) + (0 if grad_c is None else grad_c)
+    gates = torch.cat(
+        [
+            to_c * new * into * (1 - into),
+            to_c * before * forget * (1 - forget),
+            to_c * into * (1 - new * new),
+            to_h * after.tanh() * out * (1 - out),
+        ],
+        1,
+    )
+    return gates, to_c * forget, gates.sum(0) if has_bias else None
+
+
+def gru_cell(x: Any, h: Any, hidden: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
+    """As `lstm_cell`."""
+    x, h = (x, h) if bias_x is None else (x + bias_x, h + bias_h)
+    (reset_x, update_x, new_x), (reset_h, update_h, new_h) = x.chunk(3, 1), h.chunk(3, 1)
+    reset, update = (reset_x + reset_h).sigmoid(), (update_x + update_h).sigmoid()
+    new = (new_x + reset * new_h).tanh()
+    return new + update * (hidden - new), torch.cat([reset, update, new, hidden, new_h], 1)
+
+
+def gru_cell_backward(grad: Any, kept: Any, has_bias: bool) -> Any:
+    reset, update, new, hidden, new_h = kept.chunk(5, 1)
+    to_new = grad * (1 - update) * (1 - new * new)
+    to_update = grad * (hidden - new) * update * (1 - update)
+    to_reset = to_new * new_h * reset * (1 - reset)
+    to_x = torch.cat([to_reset, to_update, to_new], 1)
+    to_h = torch.cat([to_reset, to_update, to_new * reset], 1)
+    return to_x, to_h, grad * update, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
+
+
+CELLS = {
+    "_thnn_fused_gru_cell": gru_cell,
+    "_thnn_fused_gru_cell_backward": gru_cell_backward,
+    "_thnn_fused_lstm_cell": lstm_cell,
+    "_thnn_fused_lstm_cell_backward_impl": lstm_cell_backward,
+    # Attention without kernels of a device's own.
+    "_fused_sdp_choice": lambda *args, **kwargs: 0,
+}
+
+
+class Module(backend_registration._DummyBackendModule):
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.bfloat16]
+
+
+class Generator(torch.Generator):
+    """Draws the same numbers, whatever the device."""
+
+    def __new__(cls, device: Any = "cpu") -> torch.Generator:
+        return super().__new__(cls, "cpu")
+
+
+def register() -> None:
+    """Tell PyTorch of the device, for good, before it first computes a gradient."""
+    backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=Module())
+
+
+@contextlib.contextmanager
+def device() -> Iterator[None]:
+    """The device can be used."""
+    generator, save, to = torch.Generator, torch.save, torch.nn.Module.to
+    torch.Generator = Generator
+
+    def moved(module: torch.nn.Module, *args: Any, **kwargs: Any) -> torch.nn.Module:
+        """With other parameters in place of the module's, whose class is another."""
+        torch.__future__.set_swap_module_params_on_conversion(True)
+        to(module, *args, **kwargs)
+        torch.__future__.set_swap_module_params_on_conversion(False)
+        return module
+
+    torch.nn.Module.to = moved
+    # Files hold tensors of the processor, as map_location makes them of CUDA's.
+    torch.save = lambda state, file: save(tree_map_only(There, lambda tensor: tensor.here.clone(), state), file)
+    try:
+        with Device():
+            yield
+    finally:
+        torch.Generator, torch.save, torch.nn.Module.to = generator, save, to
+
+
+def main() -> None:
+    from endless_gym.agents import checkpoint
+    from endless_gym.agents.evaluate import evaluate
+    from endless_gym.agents.train import parse, train
+
+    register()
+    folder = Path(sys.argv[1])
+    results = []
+    for number, flags in enumerate(map(json.loads, sys.argv[2:])):
+        both = {}
+        for name in ("cpu", NAME):
+            settings = replace(parse(flags), device=name, run=str(folder / f"{number}-{name}"))
+            with device() if name == NAME else contextlib.nullcontext():
+                run = train(settings)
+                # Once more, from the checkpoint.
+                settings = replace(
+                    settings, resume=str(run), ppo=replace(settings.ppo, updates=settings.ppo.updates + 1)
+                )
+                rows = [json.loads(line) for line in (train(settings) / "progress.jsonl").read_text().splitlines()]
+                episodes = evaluate(checkpoint.load(run, name).agent, range(2), 1, num_threads=1)
+            both[name] = {"rows": rows, "episodes": episodes}
+        results.append(both)
+    print(json.dumps(results))
+
+
+if __name__ == "__main__":
+    main()

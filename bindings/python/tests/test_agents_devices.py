@@ -1,0 +1,77 @@
+"""Agents on a device that is not the processor: everything is where it belongs, and the numbers are the same."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import other_device
+import pytest
+
+SMALL = (
+    "--preset quick --environment.num-envs 2 --ppo.steps 16 --ppo.updates 1 --ppo.epochs 1 "
+    "--ppo.minibatches 2 --threads 1 --environment.num-threads 1 --recurrence.hidden-size 16 --transformer.width 16 "
+    "--transformer.window 8 --transformer.sequence-length 8"
+)
+HEADS = "--environment.observation rgb --ppo.reconstruction-coefficient 0.1 --ppo.ground-truth-coefficient 0.1"
+FLAGS = {
+    "gru": f"--env Endless-MortarMayhem-v0 --agent gru {HEADS}",
+    "trxl": "--env Endless-MysteryPath-v0 --agent trxl --ppo.ground-truth-coefficient 0.1",
+    "lstm": "--env MortarMayhemB-Grid-v0 --agent lstm --recurrence.layers 2",
+    "none": "--env MortarMayhemB-Grid-v0 --agent none --ppo.advantage-normalisation minibatch",
+    "gtrxl": "--env MortarMayhemB-Grid-v0 --agent gtrxl --transformer.positional-encoding relative",
+    "learned": "--env MortarMayhemB-v0 --agent trxl --transformer.positional-encoding learned --transformer.query-encoding",
+    "stack": "--env MortarMayhemB-Grid-v0 --agent stack --environment.observation rgb --model.stack 2",
+    "position": "--env MortarMayhemB-Grid-v0 --agent position --ppo.advantage-normalisation batch",
+}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the program printed, in a process of its own, since PyTorch knows a device for good."""
+    given = [json.dumps([*flags.split(), *SMALL.split()]) for flags in FLAGS.values()]
+    command = [sys.executable, other_device.__file__, str(tmp_path_factory.mktemp("runs")), *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return dict(zip(FLAGS, json.loads(done.stdout.splitlines()[-1]), strict=True))
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", FLAGS)
+def test_a_run_elsewhere_is_the_run_on_the_processor(results: dict[str, Any], name: str) -> None:
+    """Training, a checkpoint, going on from it, evaluation."""
+    here, there = results[name]["cpu"], results[name][other_device.NAME]
+    assert [row["update"] for row in there["rows"]] == [1, 2]
+    for one, other in zip(here["rows"], there["rows"], strict=True):
+        timed = {key for key in one if key.startswith("seconds/")} | {"steps_per_second"}
+        assert other.keys() == one.keys()
+        for key in one.keys() - timed:
+            assert other[key] == pytest.approx(one[key], rel=1e-3, abs=1e-5), key
+    assert there["episodes"] == here["episodes"]
+
+
+def test_the_stand_in_refuses_what_cuda_refuses() -> None:
+    program = f"""
+import sys
+
+sys.path.append({str(Path(__file__).parent)!r})
+import torch
+from other_device import NAME, device, register
+
+register()
+with device():
+    layer, here = torch.nn.Linear(2, 2).to(NAME), torch.ones(3, 2)
+    assert layer(here.to(NAME)).device.type == NAME and layer(here.to(NAME)).cpu().device.type == "cpu"
+    for wrong in (lambda: layer(here), lambda: here.to(NAME) + here, lambda: here.to(NAME).numpy()):
+        try:
+            wrong()
+        except (RuntimeError, TypeError) as error:
+            print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0 and len(lines) == 3, done.stderr
+    assert "addmm is given tensors of two devices" in lines[0]
+    assert "add is given tensors of two devices" in lines[1]
+    assert "numpy" in lines[2]
