@@ -2,11 +2,12 @@
 
 mod service_support;
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use endless_gym::batch::{Block, SNAPSHOT_BYTES, zeroed};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
-use endless_gym::service::{Rejection, ServiceError, Trainer};
+use endless_gym::pool::{Options, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::foreign::{ActionHeader, Foreign};
 use service_support::{ID, Place, play_role};
@@ -131,10 +132,55 @@ fn one_that_is_late_is_waited_for_by_the_same_call() {
     let pid = Pid::from_raw(engine.id() as i32).unwrap();
     kill_process(pid, Signal::STOP).unwrap();
     std::thread::sleep(Duration::from_millis(50));
-    assert!(matches!(trainer.snapshot(0, 1, Duration::from_millis(100)), Err(ServiceError::TimedOut { .. })));
-    assert!(matches!(trainer.snapshot(0, 2, SECONDS), Err(ServiceError::AnswerPending { group: 0 })));
+    let short = Duration::from_millis(100);
+    assert!(matches!(trainer.snapshot(0, 1, short), Err(ServiceError::TimedOut { .. })));
     assert!(matches!(trainer.receive(0, SECONDS), Err(ServiceError::NothingSent { group: 0 })));
     kill_process(pid, Signal::CONT).unwrap();
     assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingSent { .. })));
     assert_eq!(trainer.snapshot(0, 1, SECONDS).unwrap(), expected);
+
+    // Another call takes its place: an environment, a snapshot, a step.
+    let other = trainer.snapshot(0, 2, SECONDS).unwrap();
+    kill_process(pid, Signal::STOP).unwrap();
+    std::thread::sleep(Duration::from_millis(50));
+    assert!(matches!(trainer.snapshot(0, 1, short), Err(ServiceError::TimedOut { .. })));
+    assert!(matches!(trainer.restore(0, 0, &expected, short), Err(ServiceError::TimedOut { .. })));
+    assert!(matches!(trainer.restore(0, 0, &other, short), Err(ServiceError::TimedOut { .. })));
+    kill_process(pid, Signal::CONT).unwrap();
+    trainer.restore(0, 0, &other, SECONDS).unwrap();
+    assert_eq!(trainer.snapshot(0, 0, SECONDS).unwrap(), other);
+    kill_process(pid, Signal::STOP).unwrap();
+    std::thread::sleep(Duration::from_millis(50));
+    assert!(matches!(trainer.snapshot(0, 1, short), Err(ServiceError::TimedOut { .. })));
+    let actions = actions(&trainer, 0);
+    trainer.send(0, &actions).unwrap();
+    assert!(matches!(trainer.snapshot(0, 1, SECONDS), Err(ServiceError::AnswerPending { group: 0 })));
+    kill_process(pid, Signal::CONT).unwrap();
+    assert_eq!(trainer.receive(0, SECONDS).unwrap().batch().episode_length(), [1; NUM_ENVS]);
+}
+
+#[test]
+fn the_longest_fit() {
+    let place = Place::new();
+    let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
+    let options = Options::Shared(options.as_object().unwrap().clone());
+    let pool = PoolConfig { options, features: true, frames: None, ..PoolConfig::new("SearingSpotlights-v0", 1) };
+    let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+    let mut engine = Engine::new(&EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| engine.run(&stop).unwrap());
+        let mut trainer = place.trainer("gym").unwrap();
+        reset(&mut trainer, 1);
+        let mut longest = 0;
+        for _ in 0..100 {
+            trainer.send(0, &[1, 2]).unwrap();
+            trainer.receive(0, SECONDS).unwrap();
+            let snapshot = trainer.snapshot(0, 0, SECONDS).unwrap();
+            trainer.restore(0, 0, &snapshot, SECONDS).unwrap();
+            longest = longest.max(snapshot.len());
+        }
+        assert!((80_000..SNAPSHOT_BYTES).contains(&longest), "{longest}");
+        stop.store(true, Ordering::Relaxed);
+    });
 }

@@ -6,7 +6,7 @@
 Each run is one `endless-train` with the preset `quick` and the flags below, and stops at the task's reward
 or at the limit of minutes; an agent without memory gets as many updates as the slowest of the others took. Then it plays 50 seeds
 from 200,000 three times each. The results of a task are kept in `learning/TASK.json`, with the commands and the curves; `--plot`
-draws all that there are.
+draws all that there are, and sums them up in `learning/README.md`.
 """
 
 import argparse
@@ -102,6 +102,34 @@ def plot() -> None:
         pyplot.close(figure)
 
 
+def report() -> None:
+    """Writes a table of all runs, with the pictures."""
+    lines = [
+        "# Memory matters, in minutes",
+        "",
+        "Agents with and without memory on small tasks, from feature observations where the name does not say pixels. Each run",
+        "is one command, on one core or two of a shared machine; the reward is the mean over 50 levels that no training has",
+        "seen, three times each. An agent without memory learned from as many updates as the slowest of the others.",
+        "Written by `learning.py --plot` from the files beside it, which have the curves and the commands.",
+    ]
+    for task in TASKS:
+        file = FOLDER / f"{task}.json"
+        if not file.exists():
+            continue
+        data = json.loads(file.read_text())
+        best = f", of {data['best_reward']} at most" if data["best_reward"] else ""
+        lines += ["", f"## {task}", "", f"    {data['runs'][0]['command']}", ""]
+        lines += [
+            f"| agent | seed | steps | minutes | reward on unseen levels{best} |",
+            "| --- | --- | --- | --- | --- |",
+        ]
+        for row in sorted(data["runs"], key=lambda row: (row["agent"] == "none", row["agent"], row["seed"])):
+            reward = f"{row['evaluation_reward']:.3f}"
+            lines.append(f"| {row['agent']} | {row['seed']} | {row['steps']:,} | {row['minutes']:.1f} | {reward} |")
+        lines += ["", f"![curves]({task}.png)"]
+    (FOLDER / "README.md").write_text("\n".join(lines) + "\n")
+
+
 def main() -> None:
     """Measures, and writes down."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -136,6 +164,7 @@ def main() -> None:
                 )
     if args.plot:
         plot()
+        report()
 
 
 if __name__ == "__main__":

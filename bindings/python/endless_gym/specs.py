@@ -96,15 +96,25 @@ class Spec:
         return spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
 
     def max_episode_steps(self, options: Mapping[str, Any]) -> int:
-        """Steps after which an episode with these reset parameters ends; -1 for none. As in the original."""
+        """Steps after which an episode with these reset parameters ends; -1 for none. As in the original.
+
+        Raises:
+            ValueError: A reset parameter has no value of its kind.
+        """
         parameters = {**self.reset_parameters, **options}
-        if "max_steps" in parameters:
-            return int(parameters["max_steps"])
-        # Mortar Mayhem: clue and execution of the most commands at their slowest.
-        longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
-        clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
-        execution = longest["explosion_duration"] + longest["explosion_delay"]
-        return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
+        try:
+            if "max_steps" in parameters:
+                return int(parameters["max_steps"])
+            # Mortar Mayhem: clue and execution of the most commands at their slowest.
+            longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
+            clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
+            execution = longest["explosion_duration"] + longest["explosion_delay"]
+            return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
+        except (KeyError, OverflowError, TypeError, ValueError):
+            raise ValueError(
+                f"no episode's length follows from {dict(options)}: `max_steps` is a number, and what tells of commands and "
+                "explosions is a list of numbers"
+            ) from None
 
     def ground_truth_space(self) -> gymnasium.Space[Any] | None:
         """The original's space of `info["ground_truth"]`."""

@@ -165,9 +165,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """The whole state of one environment of a group, for `restore`, also of environments elsewhere.
 
         Raises:
-            ValueError: There is no such environment, or it has not been reset.
+            ValueError: There is no such environment.
+            RuntimeError: It has not been reset, or the group's `send` was not received yet.
         """
-        return self._backend.snapshot(group, env)
+        return self._backend.snapshot(group, self._env(env))
 
     def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
         """Put environments into the states of snapshots, also of other environments of the same id. Reset them all once before.
@@ -176,10 +177,11 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             The observations and the info of all environments of the group.
 
         Raises:
-            ValueError: There is no such environment, or what was given is no snapshot of that id.
+            ValueError: There is no such environment, or what was given is no snapshot of that id. Those before it are restored.
+            RuntimeError: As for `snapshot`.
         """
         for env, snapshot in snapshots.items():
-            self._backend.restore(group, env, snapshot)
+            self._backend.restore(group, self._env(env), snapshot)
         # A reset of none shows what they look like now.
         return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
@@ -200,6 +202,11 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _env(self, given: int) -> int:
+        if not 0 <= given < self.num_envs:
+            raise ValueError(f"there is no environment {given}; a group has 0 to {self.num_envs - 1}")
+        return given
 
     def _request(self, seed: int | Sequence[int | None] | None, mask: Any) -> _native.Reset | None:
         if mask is None and (seed is None or isinstance(seed, (int, np.integer))):
@@ -330,8 +337,7 @@ class _InProcess(_Backend):
         self._send(group, lambda: pool.reset(seed))
 
     def _send(self, group: int, work: Any) -> None:
-        if group in self._sent:
-            raise RuntimeError(f"group {group} still owes the answer to the last message; `recv` it first")
+        self._received(group)
         self._sent[group] = work
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
@@ -341,16 +347,22 @@ class _InProcess(_Backend):
         return group, self._sent.pop(group)()
 
     def snapshot(self, group: int, env: int) -> bytes:
-        return self._group(group).snapshot(env)
+        return self._received(group).snapshot(env)
 
     def restore(self, group: int, env: int, snapshot: bytes) -> None:
-        self._group(group).restore(env, snapshot)
+        self._received(group).restore(env, snapshot)
 
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
         return self._group(0).ground_truth_view(env)
 
     def close(self) -> None:
         self._pools, self._sent = [], {}
+
+    def _received(self, group: int) -> _native.Pool:
+        """The group's pool, which owes nothing."""
+        if group in self._sent:
+            raise RuntimeError(f"group {group} still owes the answer to the last message; `recv` it first")
+        return self._group(group)
 
     def _group(self, group: int) -> _native.Pool:
         if not self._pools:

@@ -1,7 +1,7 @@
 //! The engine's errors as Python's exceptions.
 
 use endless_gym::pool::{PoolError, SnapshotError};
-use endless_gym::service::ServiceError;
+use endless_gym::service::{Rejection, ServiceError};
 use pyo3::create_exception;
 use pyo3::exceptions::{PyBufferError, PyConnectionError, PyOSError, PyRuntimeError, PyTimeoutError, PyValueError};
 use pyo3::prelude::*;
@@ -27,7 +27,11 @@ pub fn pool(error: PoolError) -> PyErr {
 
 /// The exception for a snapshot that cannot be taken or used.
 pub fn snapshot(error: SnapshotError) -> PyErr {
-    PyValueError::new_err(error.to_string())
+    let text = error.to_string();
+    match error {
+        SnapshotError::NotReset => PyRuntimeError::new_err(text),
+        _ => PyValueError::new_err(text),
+    }
 }
 
 /// The exception for an error of the service.
@@ -43,6 +47,7 @@ pub fn service(error: ServiceError) -> PyErr {
         E::UnknownEngine { .. } | E::TrainerExists { .. } | E::TooManyObservers { .. } => {
             PyConnectionError::new_err(text)
         }
+        E::Rejected { reason: Rejection::NotReset, .. } => PyRuntimeError::new_err(text),
         E::TimedOut { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
         | E::NoSuchGroup { .. }

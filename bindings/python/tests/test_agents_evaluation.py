@@ -10,12 +10,13 @@ import pytest
 from agents_helpers import settings
 from rich.console import Console
 
+from endless_gym import agents
 from endless_gym.agents import protocol
 from endless_gym.agents.evaluate import evaluate
 from endless_gym.agents.metrics import metric, path_length, task_progress
 from endless_gym.agents.protocol import Evaluation, evaluate_runs, find
-from endless_gym.agents.results import read, to_json
-from endless_gym.agents.train import train
+from endless_gym.agents.results import label, read, to_json
+from endless_gym.agents.train import parse, train
 from endless_gym.env import Env
 from endless_gym.specs import spec
 
@@ -98,6 +99,29 @@ def test_progress_on_a_path_is_that_of_its_length() -> None:
         path = PATHS[int(result["seed"]) - 200_000]
         assert result["task_progress"] == pytest.approx(round(result["reward"] / 0.1) / path)
     assert any(result["task_progress"] > 0 for result in results)
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("--agent gru", "gru"),
+        ("--agent gru --recurrence.hidden-size 384", "gru_384"),
+        ("--agent gru --ppo.reconstruction-coefficient 0.1", "gru_rec"),
+        ("--agent lstm", "lstm"),
+        ("--agent none", "ppo"),
+        ("--agent stack --model.stack 16", "16stack"),
+        ("--agent position", "pos_enc"),
+        ("--agent gtrxl --transformer.gate-bias 2 --ppo.reconstruction-coefficient 0.1", "gtrxl_b2_rec"),
+        ("--agent gtrxl", "gtrxl_b0"),
+        ("--agent trxl --transformer.query-encoding", "trxl_qpos"),
+        ("--agent trxl --ppo.ground-truth-coefficient 0.1", "trxl_gt"),
+        ("--agent trxl --transformer.positional-encoding learned", "trxl_learned"),
+    ],
+)
+def test_agents_are_called_as_in_the_published_results(flags: str, expected: str) -> None:
+    assert label(parse(flags.split())) == expected
+    published = json.loads((Path(agents.__file__).parent / "published.json").read_text())
+    assert any(expected.replace("_learned", "_lr_learned") in curves for curves in published["curves"].values())
 
 
 def test_runs_and_checkpoints_are_found(runs: Path) -> None:

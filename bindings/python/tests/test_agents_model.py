@@ -82,6 +82,7 @@ def test_paper_is_the_paper_s_table() -> None:
         ("MysteryPath-Grid-v0", (), 128, 128),
         ("SearingSpotlights-v0", ("max_steps=100",), 100, 100),
         ("SearingSpotlights-v0", ("max_steps=-1",), 256, 2048),
+        ("Endless-MysteryPath-v0", ("max_steps=5000",), 256, 2048),
     ],
 )
 def test_window_and_positions_follow_the_longest_episode(
@@ -141,6 +142,10 @@ def test_settings_travel_as_json(name: str) -> None:
         ({"transformer": Transformer(width=0)}, "--transformer.width is 0; give 1 or more"),
         ({"threads": -1}, "--threads is -1; give 0 or more"),
         ({"env": "Nothing-v0"}, "no environment `Nothing-v0`"),
+        (
+            {"env": "MortarMayhem-v0", "environment": replace(PAPER.environment, option=("command_count=3",))},
+            "no episode's length follows from {'command_count': 3}",
+        ),
     ],
 )
 def test_impossible_settings_are_refused(changes: dict, message: str) -> None:

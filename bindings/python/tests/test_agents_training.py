@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from agents_helpers import settings
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from endless_gym import make_vec, spec
 from endless_gym.agents import checkpoint
@@ -201,6 +202,9 @@ def test_a_run_that_has_not_learned_yet_can_go_on(tmp_path: Path) -> None:
     os.link(run / "checkpoints" / "update-000000.pt", run / "checkpoints" / "last.pt")
     train(parse(["--resume", str(run)]))
     assert progress(run) == progress(train(small("gru", tmp_path / "through", 2)))
+    board = EventAccumulator(str(run))
+    board.Reload()
+    assert [event.step for event in board.Scalars("steps")] == [1, 2]
 
 
 def test_a_generator_of_another_kind_of_device_starts_anew() -> None:
@@ -270,6 +274,7 @@ def test_evaluation_plays_each_seed_as_often(tmp_path: Path) -> None:
         (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs is 0; give 1 or more"),
         ("--resume nowhere", "no run in nowhere; give a folder with settings.json"),
         (f"--env {GRID} --environment.option command_count=[1] colour=1", "colour"),
+        (f"--env {GRID} --environment.option colour=1 --environment.engine process", "colour"),
     ],
 )
 def test_errors_are_one_line(
@@ -282,6 +287,7 @@ def test_errors_are_one_line(
     assert error.startswith("endless-train: ")
     assert message in error
     assert error.count("\n") == 1
+    assert not list(tmp_path.rglob("settings.json")), "the same folder can be given again"
 
 
 def test_a_run_goes_on_with_its_own_settings(tmp_path: Path) -> None:
@@ -299,13 +305,14 @@ def test_a_run_goes_on_with_its_own_settings(tmp_path: Path) -> None:
         same_network(again, replace(again, ppo=replace(again.ppo, reconstruction_coefficient=0.1)))
     with pytest.raises(ValueError, match="began with agent gru, not lstm"):
         train(parse(["--resume", str(run), "--agent", "lstm"]))
+    with pytest.raises(ValueError, match="began with seed 1, not 2"):
+        train(parse(["--resume", str(run), "--seed", "2"]))
+    assert parse(["--resume", str(run)]).ppo.steps == 32
     with pytest.raises(FileExistsError, match="has a run already"):
         train(small("gru", run, 2))
 
 
 def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     run = train(small("gru", tmp_path / "run", 2))
     board = EventAccumulator(str(run))
     board.Reload()

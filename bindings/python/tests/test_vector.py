@@ -68,8 +68,19 @@ def test_snapshots_go_on_identically_here_and_elsewhere(where, elsewhere) -> Non
         assert shown.shape == one[0].shape
         with pytest.raises(ValueError, match="no snapshot"):
             others.restore({0: b"whatever"})
-        with pytest.raises(ValueError, match="environment"):
-            others.snapshot(3)
+        for env in (3, -1):
+            with pytest.raises(ValueError, match=f"no environment {env}"):
+                others.snapshot(env)
+            with pytest.raises(ValueError, match=f"no environment {env}"):
+                others.restore({env: snapshots[0]})
+        others.send(np.zeros((3, 2), np.int64), 1)
+        with pytest.raises(RuntimeError, match="still owes the answer"):
+            others.snapshot(0, group=1)
+        with pytest.raises(RuntimeError, match="still owes the answer"):
+            others.restore({0: snapshots[0]}, group=1)
+        others.recv(1)
+    with made(where, ID, 1) as envs, pytest.raises(RuntimeError, match="reset"):
+        envs.snapshot(0)
 
 
 def compare(given: object, wanted: object, path: str = "") -> None:

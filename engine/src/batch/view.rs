@@ -62,8 +62,9 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, contents: Contents) -> Layout 
 /// Longest text of reset parameters in a message.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
 
-/// Longest snapshot in a message. A snapshot holds less than a kilobyte beside its reset parameters.
-pub const SNAPSHOT_BYTES: usize = 2 * OPTIONS_BYTES;
+/// Longest snapshot in a message. Most hold less than a kilobyte beside their reset parameters; with all the spotlights that
+/// reset parameters can ask for it is some 160.
+pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 
 /// The layout of the message that a trainer sends: `action` int32 (branches,) for a step; `reset` uint8 () and `seed` uint64 ()
 /// for a reset, where `reset` is 0 (leave alone), 1 (start the next episode) or 2 (start an episode with `seed`); `options` for a

@@ -257,9 +257,9 @@ impl Engine {
         });
         ports::notify(&self.to_trainer, number);
         group.step = step;
-        self.summary.undelivered += u64::from(receivers == 0);
         match outcome {
             Ok(Answer::Batch { env_steps }) => {
+                self.summary.undelivered += u64::from(receivers == 0);
                 self.summary.batches += 1;
                 self.summary.env_steps += env_steps as u64;
             }
@@ -384,7 +384,9 @@ impl Group {
         let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
         if snapshot.len() > SNAPSHOT_BYTES {
             let given = snapshot.len();
-            let text = format!("the snapshot has {given} bytes, a message takes {SNAPSHOT_BYTES}; shorten its options");
+            let text = format!(
+                "the snapshot has {given} bytes, a message takes {SNAPSHOT_BYTES}; its reset parameters have long lists, shorten them"
+            );
             return Err((Rejection::Snapshot, text));
         }
         self.pool.layout().forget_frames(payload);

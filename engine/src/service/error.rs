@@ -68,7 +68,7 @@ pub enum ServiceError {
         "reset parameters of {given} bytes as JSON; a message takes {OPTIONS_BYTES}, so give lists with fewer items"
     )]
     OptionsTooLong { given: usize },
-    #[error("a snapshot of {given} bytes; a message takes {SNAPSHOT_BYTES}, and no engine gives longer ones")]
+    #[error("a snapshot of {given} bytes; a message to an engine takes {SNAPSHOT_BYTES}, so restore it in a pool")]
     SnapshotTooLong { given: usize },
     #[error("group {group} still owes the answer to the last message; receive it before the next reset or step")]
     AnswerPending { group: usize },

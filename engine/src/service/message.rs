@@ -1,4 +1,4 @@
-//! The headers of the messages between trainer and engine. Their payload is `[Block]`: actions or a batch.
+//! The headers of the messages between trainer and engine. Their payload is `[Block]`: actions, a batch or a snapshot.
 
 use iceoryx2::prelude::ZeroCopySend;
 

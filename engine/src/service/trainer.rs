@@ -66,11 +66,28 @@ pub struct Trainer {
 }
 
 /// A message that is to be answered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug)]
 struct Pending {
     request: u64,
+    asked: Asked,
+}
+
+/// What a message asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Asked {
     kind: Kind,
+    /// First seed of a [`Kind::ResetSeed`].
+    seed: u64,
+    /// Environment of a [`Kind::Snapshot`] or a [`Kind::Restore`].
     env: usize,
+    /// Checksum of a [`Kind::Restore`]'s snapshot.
+    snapshot: u32,
+}
+
+impl Asked {
+    fn of(kind: Kind) -> Self {
+        Asked { kind, seed: 0, env: 0, snapshot: 0 }
+    }
 }
 
 /// Ports to one engine, for the time that it runs.
@@ -139,13 +156,13 @@ impl Trainer {
             Ok(options.len())
         };
         match request {
-            ResetRequest::All => self.post(group, Kind::ResetAll, 0, 0, write_options),
-            ResetRequest::Seed(first) => self.post(group, Kind::ResetSeed, first, 0, write_options),
+            ResetRequest::All => self.post(group, Asked::of(Kind::ResetAll), write_options),
+            ResetRequest::Seed(seed) => self.post(group, Asked { seed, ..Asked::of(Kind::ResetSeed) }, write_options),
             ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
                 let given = if reset.len() == num_envs { seed.len() } else { reset.len() };
                 Err(ServiceError::ResetCount { given, num_envs })
             }
-            ResetRequest::Each { reset, seed } => self.post(group, Kind::ResetEach, 0, 0, |message| {
+            ResetRequest::Each { reset, seed } => self.post(group, Asked::of(Kind::ResetEach), |message| {
                 specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
                 specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
                 write_options(message)
@@ -171,7 +188,7 @@ impl Trainer {
     /// step's actions or zeros.
     pub fn send_with(&mut self, group: usize, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
-        self.post(group, Kind::Step, 0, 0, |message| {
+        self.post(group, Asked::of(Kind::Step), |message| {
             let actions = specification.action.write::<i32>(message, "action");
             fill(actions);
             check_actions(&specification, actions).map(|()| 0)
@@ -201,13 +218,14 @@ impl Trainer {
     /// The whole state of an environment of a group, for [`restore`](Trainer::restore) and
     /// [`Pool::restore`](crate::pool::Pool::restore). The group must owe no answer, and must have been reset by this trainer.
     ///
-    /// After [`ServiceError::TimedOut`] the same call goes on waiting, and so for `restore`.
+    /// After [`ServiceError::TimedOut`] the same call goes on waiting, and any other takes its place; so for `restore`.
     pub fn snapshot(&mut self, group: usize, env: usize, timeout: Duration) -> Result<Vec<u8>, ServiceError> {
-        self.ask(group, Kind::Snapshot, env, timeout, |_| Ok(0))
+        self.ask(group, Asked { env, ..Asked::of(Kind::Snapshot) }, timeout, |_| Ok(0))
     }
 
     /// Puts an environment of a group into the state of a snapshot; see [`Pool::restore`](crate::pool::Pool::restore). A reset of
-    /// no environment ([`ResetRequest::Each`]) then shows what it looks like.
+    /// no environment ([`ResetRequest::Each`]) then shows what it looks like. After [`ServiceError::TimedOut`] the engine may still
+    /// do it, before anything that it is asked for later.
     pub fn restore(
         &mut self,
         group: usize,
@@ -224,21 +242,21 @@ impl Trainer {
             specification.action.write::<u8>(message, "snapshot")[..given].copy_from_slice(snapshot);
             Ok(given)
         };
-        self.ask(group, Kind::Restore, env, timeout, write).map(|_| ())
+        let asked = Asked { env, snapshot: crc32fast::hash(snapshot), ..Asked::of(Kind::Restore) };
+        self.ask(group, asked, timeout, write).map(|_| ())
     }
 
     /// Posts a message that is not answered by a batch, unless it is already, and waits for the answer.
     fn ask(
         &mut self,
         group: usize,
-        kind: Kind,
-        env: usize,
+        asked: Asked,
         timeout: Duration,
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<Vec<u8>, ServiceError> {
         self.check_group(group)?;
-        if !self.pending[group].is_some_and(|pending| (pending.kind, pending.env) == (kind, env)) {
-            self.post(group, kind, 0, env, write)?;
+        if self.pending[group].is_none_or(|pending| pending.asked != asked) {
+            self.post(group, asked, write)?;
         }
         let received = self.receive_from(group..group + 1, false, timeout)?;
         let incompatible = || ServiceError::IncompatibleTypes { service: self.config.service.clone() };
@@ -246,7 +264,7 @@ impl Trainer {
     }
 
     fn owes_batch(&self, group: usize) -> bool {
-        self.pending[group].is_some_and(|pending| pending.kind.yields_batch())
+        self.pending[group].is_some_and(|pending| pending.asked.kind.yields_batch())
     }
 
     /// The first answer that one of `groups` owes, of those that are batches or of those that are not.
@@ -262,7 +280,7 @@ impl Trainer {
             let (link, pending) = (&*self.link, &self.pending);
             let answer = wait(&link.to_trainer, left.min(QUIET), self.sent, || {
                 for group in groups.clone() {
-                    let due = pending[group].filter(|pending| pending.kind.yields_batch() == batches);
+                    let due = pending[group].filter(|pending| pending.asked.kind.yields_batch() == batches);
                     let Some(Pending { request, .. }) = due else { continue };
                     // What is in the buffer may be the answer to an earlier trainer.
                     while let Some(received) = link.observations[group].receive(&self.specification)? {
@@ -298,13 +316,11 @@ impl Trainer {
     fn post(
         &mut self,
         group: usize,
-        kind: Kind,
-        seed: u64,
-        env: usize,
+        asked: Asked,
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<(), ServiceError> {
         self.check_group(group)?;
-        if self.pending[group].is_some() {
+        if self.owes_batch(group) {
             return Err(ServiceError::AnswerPending { group });
         }
         let failed = ServiceError::middleware("cannot send a message");
@@ -318,12 +334,12 @@ impl Trainer {
         self.request += 1;
         *message.user_header_mut() = ActionHeader {
             layout_version: LAYOUT_VERSION,
-            kind: kind.code(),
+            kind: asked.kind.code(),
             epoch: self.specification.epoch,
             trainer: self.trainer,
             request: self.request,
-            seed,
-            env: env as u64,
+            seed: asked.seed,
+            env: asked.env as u64,
             bytes,
         };
         let receivers = message.send().map_err(|e| failed(e.to_string()))?;
@@ -331,7 +347,7 @@ impl Trainer {
             return Err(self.lost());
         }
         ports::notify(&self.link.to_engine, group);
-        self.pending[group] = Some(Pending { request: self.request, kind, env });
+        self.pending[group] = Some(Pending { request: self.request, asked });
         self.sent = Instant::now();
         Ok(())
     }

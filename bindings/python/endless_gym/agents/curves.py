@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym.agents import metrics
-from endless_gym.agents.logs import PROGRESS
+from endless_gym.agents.logs import PROGRESS, read_progress
 from endless_gym.agents.results import Experiment, label
 from endless_gym.agents.settings import from_dict
 from endless_gym.agents.statistics import interquartile_mean, stratified_bootstrap
@@ -124,8 +124,7 @@ def training(run: Path) -> Curve:
     if not (run / PROGRESS).exists():
         raise FileNotFoundError(f"no {PROGRESS} in {run}; give a run's folder, or a file of `endless-eval --json`")
     settings = from_dict(json.loads((run / "settings.json").read_text()))
-    rows = [json.loads(line) for line in (run / PROGRESS).read_text().splitlines()]
-    rows = [row for row in rows if row.get("episode/reward") is not None]
+    rows = [row for row in read_progress(run) if row.get("episode/reward") is not None]
     if not rows:
         raise ValueError(f"in {run} no episode has ended yet; train longer")
     steps = np.array([row["steps"] for row in rows], dtype=np.int64)

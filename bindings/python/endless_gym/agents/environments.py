@@ -55,7 +55,10 @@ class Environments:
             "autoreset": "same_step",
             "observation": wanted.observation,
         }
-        self._envs: EndlessVectorEnv = (make_vec if in_process else serve)(settings.env, **arguments)
+        try:
+            self._envs: EndlessVectorEnv = (make_vec if in_process else serve)(settings.env, **arguments)
+        except RuntimeError as error:  # An engine that cannot start says why.
+            raise ValueError(str(error)) from error
         # In this process a group steps in a thread, which needs no interpreter while it does.
         self._thread = ThreadPoolExecutor(1, "environments") if in_process else None
         self._results: dict[int, Future[Any]] = {}

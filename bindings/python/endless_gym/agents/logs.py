@@ -30,10 +30,10 @@ class Logger:
         self._updates = settings.ppo.updates
         progress = run / PROGRESS
         if progress.exists():
-            lines = [line for line in progress.read_text().splitlines() if _is_of(line, update)]
-            progress.write_text("".join(f"{line}\n" for line in lines))
+            kept = [row for row in read_progress(run) if row["update"] <= update]
+            progress.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
         self._progress = progress.open("a")
-        self._board: Any = SummaryWriter(str(run), purge_step=update + 1 if update else None)  # type: ignore[no-untyped-call]
+        self._board: Any = SummaryWriter(str(run), purge_step=update + 1)  # type: ignore[no-untyped-call]
         rows = "\n".join(f"|{name}|{value}|" for name, value in _flat(to_dict(settings)))
         self._board.add_text("settings", f"|setting|value|\n|-|-|\n{rows}", update)
         self._wandb: Any = _weights_and_biases(run, settings, self.console) if settings.wandb else None
@@ -97,20 +97,23 @@ class Episodes:
         return {f"episode/{key}": sum(info[key] for info in self.recent) / len(self.recent) for key in self.recent[0]}
 
 
+def read_progress(run: Path) -> list[dict[str, Any]]:
+    """What a run has written down of each update; a last line of which a killed process has written half does not count."""
+    rows = []
+    for line in (run / PROGRESS).read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
 def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
-
-
-def _is_of(line: str, update: int) -> bool:
-    """Whether a line of the progress is of that update or an earlier one; a killed process may have written half of its last."""
-    try:
-        return bool(json.loads(line)["update"] <= update)
-    except json.JSONDecodeError:
-        return False
 
 
 def _is_nan(value: Any) -> bool:

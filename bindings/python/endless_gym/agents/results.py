@@ -98,7 +98,8 @@ class Experiment:
 
 
 def label(settings: Settings) -> str:
-    """The agent's name with its additions, as the published curves have it."""
+    """The agent's name with its additions, as the published curves have it; their `_lr` is a learning rate of its own."""
+    trxl = settings.agent in ("trxl", "gtrxl")
     agents = {"none": "ppo", "stack": f"{settings.model.stack}stack", "position": "pos_enc"}
     name = agents.get(settings.agent, settings.agent)
     if settings.agent == "gtrxl":
@@ -107,7 +108,9 @@ def label(settings: Settings) -> str:
         name += f"_{settings.recurrence.hidden_size}"
     additions = {
         "_gt": settings.ppo.ground_truth_coefficient,
-        "_qpos": settings.transformer.query_encoding and settings.agent in ("trxl", "gtrxl"),
+        "_qpos": trxl and settings.transformer.query_encoding,
+        "_learned": trxl and settings.transformer.positional_encoding == "learned",
+        "_relative": trxl and settings.transformer.positional_encoding == "relative",
         "_rec": settings.ppo.reconstruction_coefficient,
     }
     return name + "".join(addition for addition, value in additions.items() if value)

@@ -31,11 +31,10 @@ from rich.console import Console
 from rich.table import Table
 
 from endless_gym.agents import checkpoint, command
-from endless_gym.agents.logs import PROGRESS
+from endless_gym.agents.logs import read_progress
 from endless_gym.agents.search_space import Choice, Space, single_changes, space, with_choices
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
 from endless_gym.agents.train import choose_device, train
-from endless_gym.specs import spec
 
 STUDY, BEST = "study.db", "best.json"
 #: Attributes of a trial: that it tries one choice by itself, and the folder of the run that it goes on with.
@@ -78,7 +77,6 @@ class Search:
             ValueError: A number or a combination is not possible.
         """
         settings = self.settings.checked()
-        spec(settings.env)
         choose_device(settings.device)
         if self.trials < 0 or self.period < 1 or self.warm_up < 0 or self.startup_trials < 0:
             raise ValueError("--trials, --warm-up and --startup-trials are 0 or more, --period is 1 or more")
@@ -204,7 +202,7 @@ class Trials:
 
         if (run / checkpoint.FOLDER / checkpoint.LAST).exists():
             settings = replace(settings, resume=str(run))
-            for row in map(json.loads, (run / PROGRESS).read_text().splitlines()):
+            for row in read_progress(run):
                 watch(row["update"], row)
         elif run.exists():
             shutil.rmtree(run)  # It was stopped before its first checkpoint.

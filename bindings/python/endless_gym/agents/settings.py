@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from endless_gym.agents.metrics import is_finite
 from endless_gym.specs import spec
 
 AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
@@ -209,8 +210,8 @@ class Settings:
         Raises:
             ValueError: A number or a combination is not possible; the message says which, and what to do.
         """
-        self.options()
         described = spec(self.env)
+        described.max_episode_steps(self.options())
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
         positive = {
             "environment.num-envs": environment.num_envs,
@@ -274,11 +275,11 @@ class Settings:
 
     def window(self) -> int:
         """Length of the memory window."""
-        return self.transformer.window or self._longest_episode() or 256
+        return self.transformer.window or max(2, self._longest_episode() or 256)
 
     def _longest_episode(self) -> int:
-        """Steps; 0 if there is no limit."""
-        return max(0, spec(self.env).max_episode_steps(self.options()))
+        """Steps; 0 in endless environments, and where there is no limit."""
+        return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
 
 
 def _replace(settings: Settings, **groups: dict[str, Any]) -> Settings:
@@ -328,7 +329,7 @@ def _presets() -> dict[str, Settings]:
             "max_gradient_norm": 0.5,
         },
         recurrence={"hidden_size": 128, "sequence_length": 64},
-        transformer={"layers": 2, "width": 64, "window": 64, "positions": 512, "sequence_length": 32},
+        transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
         model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
     )
     return {"paper": paper, "old": old, "throughput": throughput, "quick": quick}

@@ -44,7 +44,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
     settings, resumed = settings.checked(), None
     if settings.resume:
         run = Path(settings.resume)
-        resumed = checkpoint.load(run).state
+        resumed = command.load_checkpoint(run, "cpu").state
         same_network(settings, checkpoint.read_settings(run))
         settings = dataclasses.replace(settings, resume="", run=str(run))
     else:
@@ -54,8 +54,6 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         if (run / checkpoint.SETTINGS).exists():
             raise FileExistsError(f"{run} has a run already; go on with --resume {run}, or name another folder")
         run.mkdir(parents=True, exist_ok=True)
-    # What was changed to go on holds from now on.
-    (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
 
     # Everything random follows from the seed.
     device = choose_device(settings.device)
@@ -97,9 +95,11 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             }
             checkpoint.save(run, state, settings.keep_checkpoints)
 
+        logger = Logger(run, settings, update)
+        # Now that nothing has failed: what was changed to go on holds from here on.
+        (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
         if resumed is None:
             save()
-        logger = Logger(run, settings, update)
         logger.say(
             f"{settings.env}: {settings.agent} with {agent.num_parameters:,} parameters on {device}, in {run}; Ctrl-C stops it"
         )
@@ -160,7 +160,7 @@ class Interrupt:
 
 
 def same_network(settings: Settings, before: Settings) -> None:
-    """Refuses to go on with another network or other environments than a run began with.
+    """Refuses to go on with another network, other environments or another seed than a run began with.
 
     Raises:
         ValueError: Something differs.
@@ -169,7 +169,7 @@ def same_network(settings: Settings, before: Settings) -> None:
     had = before.environment
     place = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
     settings = dataclasses.replace(settings, environment=place)
-    for name in ("env", "agent", "environment", "model", "recurrence", "transformer"):
+    for name in ("env", "agent", "preset", "seed", "environment", "model", "recurrence", "transformer"):
         given, had = getattr(settings, name), getattr(before, name)
         if given != had:
             raise ValueError(
