@@ -242,7 +242,7 @@ def test_a_segment_is_what_the_environments_did(engine: str, tmp_path: Path) -> 
                 for group, columns in enumerate((slice(0, 4), slice(4, 8))):
                     observation, info = now[group]
                     np.testing.assert_array_equal(segment.observation["features"][step, columns], observation)
-                    truth = torch.from_numpy(info["ground_truth"]).float()
+                    truth = torch.tensor(info["ground_truth"]).float()
                     assert torch.equal(segment.ground_truth[step, columns], truth)
                     np.testing.assert_array_equal(segment.first[step, columns], first[group])
                     plain.send(segment.action[step, columns].numpy(), group)

@@ -31,7 +31,7 @@
 //! | --- | --- |
 //! | a message arrives | it is answered by exactly one batch, snapshot or rejection of the same group; a rejection moves no environment |
 //! | a trainer asks for a snapshot, or to restore one | the answer holds its bytes, or none, in place of a batch; observers pass it over, and may have missed the batch before it |
-//! | a group owes an answer | its trainer may not send to it again; other groups are not concerned |
+//! | a group owes a batch | its trainer may not send to it again; other groups are not concerned |
 //! | a trainer is new | it resets all environments of a group before it steps them |
 //! | a second trainer | is refused: `act` takes one publisher |
 //! | a trainer dies | the engine removes its leftovers when it has nothing to do; the next trainer does so too when it connects |
