@@ -160,7 +160,7 @@ fn one_that_is_late_is_waited_for_by_the_same_call() {
 }
 
 #[test]
-fn the_longest_fit() {
+fn a_thousand_spotlights_fit() {
     let place = Place::new();
     let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
     let options = Options::Shared(options.as_object().unwrap().clone());

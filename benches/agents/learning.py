@@ -66,6 +66,13 @@ def run(flags: list[str], folder: Path) -> dict:
     }
 
 
+def as_json(data: dict) -> str:
+    """JSON with each run on a line of its own."""
+    task, best = json.dumps(data["task"]), json.dumps(data["best_reward"])
+    runs = ",\n".join(json.dumps(run) for run in data["runs"])
+    return f'{{"task": {task}, "best_reward": {best}, "runs": [\n{runs}\n]}}\n'
+
+
 def plot() -> None:
     """Draws each task's curves beside its evaluations."""
     import matplotlib
@@ -109,7 +116,7 @@ def report() -> None:
         "",
         "Agents with and without memory on small tasks, from feature observations where the name does not say pixels. Each run",
         "is one command, on one core or two of a shared machine; the reward is the mean over 50 levels that no training has",
-        "seen, three times each. An agent without memory learned from as many updates as the slowest of those before it.",
+        "seen, three times each. An agent without memory learned from as many updates as the slowest of the others until then.",
         "Written by `learning.py --plot` from the files beside it, which have the curves and the commands.",
     ]
     for task in TASKS:
@@ -157,9 +164,7 @@ def main() -> None:
                     row = run(given.split(), Path(folder) / "run")
                 kept = [old for old in data["runs"] if (old["agent"], old["seed"]) != (agent, seed)]
                 data["runs"] = [*kept, row]
-                runs = ",\n".join(json.dumps(one) for one in data["runs"])
-                head = {name: value for name, value in data.items() if name != "runs"}
-                file.write_text(f'{json.dumps(head)[:-1]}, "runs": [\n{runs}\n]}}\n')
+                file.write_text(as_json(data))
                 print(
                     f"{args.task} {agent} {seed}: {row['evaluation_reward']:.4f} after {row['minutes']} minutes",
                     flush=True,

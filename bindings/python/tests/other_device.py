@@ -61,7 +61,7 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     asked = kwargs.get("device")
     if asked is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    own = CELLS.get(name, operation)
+    own = REPLACED.get(name, operation)
     args_here, kwargs_here = tree_map_only(There, lambda tensor: tensor.here, (args, kwargs))
     out = own(*args_here, **kwargs_here)
     is_there = torch.device(asked).type == NAME if asked is not None else bool(there)
@@ -70,7 +70,7 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if not is_there or name == "_local_scalar_dense":
         return out
     out = tree_map_only(torch.Tensor, There, out)
-    return out if name in CELLS else return_and_correct_aliasing(operation, args, kwargs, out)
+    return out if name in REPLACED else return_and_correct_aliasing(operation, args, kwargs, out)
 
 
 def lstm_cell(x: Any, h: Any, cell: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
@@ -117,7 +117,8 @@ def gru_cell_backward(grad: Any, kept: Any, has_bias: bool) -> Any:
     return to_x, to_h, grad * update, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
 
 
-CELLS = {
+#: Operations that PyTorch asks of other devices only.
+REPLACED = {
     "_thnn_fused_gru_cell": gru_cell,
     "_thnn_fused_gru_cell_backward": gru_cell_backward,
     "_thnn_fused_lstm_cell": lstm_cell,

@@ -46,6 +46,7 @@ def test_a_run_elsewhere_is_the_run_on_the_processor(results: dict[str, Any], na
     for one, other in zip(here["rows"], there["rows"], strict=True):
         timed = {key for key in one if key.startswith("seconds/")} | {"steps_per_second"}
         assert other.keys() == one.keys()
+        # Cells in one piece and attention in several round otherwise than the processor's.
         for key in one.keys() - timed:
             assert other[key] == pytest.approx(one[key], rel=1e-3, abs=1e-5), key
     assert there["episodes"] == here["episodes"]

@@ -224,7 +224,7 @@ def test_a_target_is_of_a_hundred_episodes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("engine", ["thread", "process"])
 def test_a_segment_is_what_the_environments_did(engine: str, tmp_path: Path) -> None:
-    """Each array of two segments, against environments that are stepped one group at a time in a plain loop."""
+    """What four segments hold of the environments, against others that are stepped one group at a time in a plain loop."""
     given = small("none", tmp_path, engine=engine)
     ppo = replace(given.ppo, ground_truth_coefficient=0.1)
     given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))

@@ -62,8 +62,8 @@ pub fn batch_layout(spec: &Spec, num_envs: usize, contents: Contents) -> Layout 
 /// Longest text of reset parameters in a message.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
 
-/// Longest snapshot in a message. Most hold less than a kilobyte beside their reset parameters; with all the spotlights that
-/// reset parameters can ask for it is some 160.
+/// Longest snapshot in a message. Most hold less than a kilobyte beside their reset parameters, one of 1,000 spotlights some 80;
+/// reset parameters can ask for twice as many.
 pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 
 /// The layout of the message that a trainer sends: `action` int32 (branches,) for a step; `reset` uint8 () and `seed` uint64 ()

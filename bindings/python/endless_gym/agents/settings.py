@@ -211,7 +211,7 @@ class Settings:
             ValueError: A number or a combination is not possible; the message says which, and what to do.
         """
         described = spec(self.env)
-        described.max_episode_steps(self.options())
+        described.max_episode_steps(self.options())  # window and positions follow from it, or it says what is wrong
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
         positive = {
             "environment.num-envs": environment.num_envs,
