@@ -2,11 +2,23 @@
 
 use std::time::{Duration, Instant};
 
+use bytemuck::{Pod, Zeroable};
 use endless_gym::batch::{Block, LAYOUT_VERSION};
 use endless_gym::service::{Namespace, Specification};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
+
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(transparent)]
+struct PayloadBlock(Block);
+
+// SAFETY: a block is 64 plain bytes.
+unsafe impl ZeroCopySend for PayloadBlock {
+    unsafe fn type_name() -> &'static str {
+        "endless_gym::Block"
+    }
+}
 
 #[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
 #[type_name("endless_gym::ActionHeader")]
@@ -70,8 +82,8 @@ fn node(namespace: &Namespace) -> Node<ipc::Service> {
 
 /// A trainer that sends what it likes.
 pub struct Foreign {
-    publisher: Publisher<ipc::Service, [Block], ActionHeader>,
-    subscriber: Subscriber<ipc::Service, [Block], ObservationHeader>,
+    publisher: Publisher<ipc::Service, [PayloadBlock], ActionHeader>,
+    subscriber: Subscriber<ipc::Service, [PayloadBlock], ObservationHeader>,
     blocks: usize,
     _node: Node<ipc::Service>,
 }
@@ -84,9 +96,10 @@ impl Foreign {
             ServiceName::new(&name).unwrap()
         };
         let blocks = specification.action.blocks();
-        let act = node.service_builder(&name("act")).publish_subscribe::<[Block]>().user_header::<ActionHeader>();
+        let act =
+            node.service_builder(&name("act")).publish_subscribe::<[PayloadBlock]>().user_header::<ActionHeader>();
         let publisher = act.open().unwrap().publisher_builder().initial_max_slice_len(blocks).create().unwrap();
-        let obs = node.service_builder(&name("obs")).publish_subscribe::<[Block]>().user_header();
+        let obs = node.service_builder(&name("obs")).publish_subscribe::<[PayloadBlock]>().user_header();
         let subscriber = obs.open().unwrap().subscriber_builder().create().unwrap();
         Foreign { publisher, subscriber, blocks, _node: node }
     }
@@ -97,10 +110,10 @@ impl Foreign {
 
     /// Sends a message and returns status and text of the answer, `None` if there is none.
     pub fn ask(&self, header: ActionHeader, blocks: usize, fill: impl FnOnce(&mut [Block])) -> Option<(u32, String)> {
-        let zero = endless_gym::batch::zeroed(blocks);
+        let zero = vec![PayloadBlock::zeroed(); blocks];
         let mut message = self.publisher.loan_slice_uninit(blocks).unwrap().write_from_slice(&zero);
         *message.user_header_mut() = header;
-        fill(message.payload_mut());
+        fill(bytemuck::cast_slice_mut(message.payload_mut()));
         assert_eq!(message.send().unwrap(), 1);
         let start = Instant::now();
         while start.elapsed() < Duration::from_secs(1) {

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use crate::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
-use crate::pool::PoolError;
+use endless_gym_core::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::pool::PoolError;
 
 /// Version of this package, as a message names it.
 pub(super) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -4,9 +4,9 @@ use std::process::{Command, ExitCode};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use crate::batch::{Batch, zeroed};
-use crate::envs::{self, Spec};
-use crate::pool::{Pool, ResetRequest, Threads};
+use endless_gym_core::batch::{Batch, zeroed};
+use endless_gym_core::envs::{self, Spec};
+use endless_gym_core::pool::{Pool, ResetRequest, Threads};
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use crate::trace::{Trace, replay};
+use endless_gym_core::trace::{Trace, replay};
 use rayon::prelude::*;
 use serde_json::json;
 

@@ -1,12 +1,18 @@
 //! The headers of the messages between trainer and engine. Their payload is `[Block]`: actions, a batch or a snapshot.
 
+use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use super::error::Rejection;
-use crate::batch::{Block, LAYOUT_VERSION};
+use endless_gym_core::batch::{Block, LAYOUT_VERSION};
+
+/// A [`Block`] as the payload of a message.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(transparent)]
+pub(super) struct PayloadBlock(Block);
 
 // SAFETY: a block is 64 plain bytes in `repr(C)`, without pointers or handles, alike in every process.
-unsafe impl ZeroCopySend for Block {
+unsafe impl ZeroCopySend for PayloadBlock {
     unsafe fn type_name() -> &'static str {
         "endless_gym::Block"
     }

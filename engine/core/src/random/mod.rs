@@ -51,7 +51,7 @@ mod tests {
     }
 
     fn cases() -> Cases {
-        serde_json::from_str(include_str!("../../../tests/random/cases.json")).unwrap()
+        serde_json::from_str(include_str!("../../tests/random/cases.json")).unwrap()
     }
 
     #[test]

@@ -1,9 +1,9 @@
 //! Options that several commands share.
 
-use crate::batch::Frames;
-use crate::pool::{Autoreset, Options, PoolConfig, Seeding};
-use crate::raster::PixelFormat;
 use clap::ValueEnum;
+use endless_gym_core::batch::Frames;
+use endless_gym_core::pool::{Autoreset, Options, PoolConfig, Seeding};
+use endless_gym_core::raster::PixelFormat;
 use serde_json::{Map, Value as Json};
 
 use super::Failure;

@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use crate::envs::{self, SCREEN, Spec};
+use endless_gym_core::envs::{self, SCREEN, Spec};
 use serde_json::json;
 
 use super::Failure;

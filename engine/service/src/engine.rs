@@ -11,14 +11,14 @@ use serde_json::{Map, Value as Json};
 
 use super::config::{Namespace, check_name};
 use super::error::{PACKAGE_VERSION, Rejection, ServiceError};
-use super::message::{ActionHeader, Kind, ObservationHeader};
+use super::message::{ActionHeader, Kind, ObservationHeader, PayloadBlock};
 use super::node::{Ipc, Member};
 use super::ports::{self, ActionSubscriber, Limits, Names, ObservationPublisher, Open, PortError, Services};
 use super::preflight::Resident;
 use super::specification::{self, Published, Specification};
 use super::wait::wait;
-use crate::batch::{Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, action_layout, blocks_for};
-use crate::pool::{Options, Pool, PoolConfig, PoolError, ResetRequest, Threads};
+use endless_gym_core::batch::{Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, action_layout, blocks_for};
+use endless_gym_core::pool::{Options, Pool, PoolConfig, PoolError, ResetRequest, Threads};
 
 /// Most groups that an engine serves.
 pub const MAX_GROUPS: usize = 64;
@@ -222,7 +222,7 @@ impl Engine {
         Ok(self.summary)
     }
 
-    fn answer(&mut self, number: usize, sample: Sample<Ipc, [Block], ActionHeader>) -> Result<(), ServiceError> {
+    fn answer(&mut self, number: usize, sample: Sample<Ipc, [PayloadBlock], ActionHeader>) -> Result<(), ServiceError> {
         let request = *sample.user_header();
         if request.layout_version == LAYOUT_VERSION && request.epoch != self.specification.epoch {
             tracing::debug!(group = number, "dropped a message of an earlier epoch");
@@ -230,7 +230,7 @@ impl Engine {
             return Ok(());
         }
         let group = &mut self.groups[number];
-        let taken = group.take(&self.specification.action, &request, sample.payload());
+        let taken = group.take(&self.specification.action, &request, bytemuck::cast_slice(sample.payload()));
         // The chunk goes back to the trainer before the step and not after it.
         drop(sample);
         let mut batch = group
@@ -241,7 +241,8 @@ impl Engine {
         // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
         // fresh shared memory, and what a recycled chunk held before is a batch.
         let mut batch = unsafe { batch.assume_init() };
-        let outcome = taken.and_then(|kind| group.carry_out(kind, &request, batch.payload_mut()));
+        let outcome =
+            taken.and_then(|kind| group.carry_out(kind, &request, bytemuck::cast_slice_mut(batch.payload_mut())));
         let step = group.step + u64::from(matches!(outcome, Ok(Answer::Batch { .. })));
         let header = batch.user_header_mut();
         *header = ObservationHeader::answering(&request, number, self.specification.epoch, step);
@@ -298,7 +299,7 @@ impl Group {
         })
     }
 
-    fn poll(&self) -> Result<Option<Sample<Ipc, [Block], ActionHeader>>, ServiceError> {
+    fn poll(&self) -> Result<Option<Sample<Ipc, [PayloadBlock], ActionHeader>>, ServiceError> {
         match self.actions.receive() {
             // A trainer that died while it connected.
             Err(ReceiveError::ConnectionFailure(e)) => {

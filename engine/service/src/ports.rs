@@ -15,18 +15,17 @@ use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use super::error::ServiceError;
-use super::message::{ActionHeader, ObservationHeader};
+use super::message::{ActionHeader, ObservationHeader, PayloadBlock};
 use super::node::{Ipc, Member};
 use super::preflight::Resident;
-use crate::batch::Block;
 
-pub(super) type ActionService = publish_subscribe::PortFactory<Ipc, [Block], ActionHeader>;
-pub(super) type BlockPublisher<H> = Publisher<Ipc, [Block], H>;
+pub(super) type ActionService = publish_subscribe::PortFactory<Ipc, [PayloadBlock], ActionHeader>;
+pub(super) type BlockPublisher<H> = Publisher<Ipc, [PayloadBlock], H>;
 pub(super) type ActionPublisher = BlockPublisher<ActionHeader>;
-pub(super) type ActionSubscriber = Subscriber<Ipc, [Block], ActionHeader>;
-pub(super) type ObservationService = publish_subscribe::PortFactory<Ipc, [Block], ObservationHeader>;
+pub(super) type ActionSubscriber = Subscriber<Ipc, [PayloadBlock], ActionHeader>;
+pub(super) type ObservationService = publish_subscribe::PortFactory<Ipc, [PayloadBlock], ObservationHeader>;
 pub(super) type ObservationPublisher = BlockPublisher<ObservationHeader>;
-pub(super) type ObservationSubscriber = Subscriber<Ipc, [Block], ObservationHeader>;
+pub(super) type ObservationSubscriber = Subscriber<Ipc, [PayloadBlock], ObservationHeader>;
 
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and those about to be refused.
 const MAX_NODES: usize = 64;
@@ -113,7 +112,7 @@ impl Services<'_> {
         let builder = self
             .node
             .service_builder(&self.names.of_epoch(&format!("act/{group}"))?)
-            .publish_subscribe::<[Block]>()
+            .publish_subscribe::<[PayloadBlock]>()
             .user_header::<ActionHeader>()
             .enable_safe_overflow(true)
             .history_size(0)
@@ -130,7 +129,7 @@ impl Services<'_> {
         let builder = self
             .node
             .service_builder(&self.names.of_epoch(&format!("obs/{group}"))?)
-            .publish_subscribe::<[Block]>()
+            .publish_subscribe::<[PayloadBlock]>()
             .user_header::<ObservationHeader>()
             .enable_safe_overflow(true)
             .history_size(0)
@@ -172,7 +171,7 @@ impl Services<'_> {
 /// A publisher of messages of `blocks` blocks. `resident` chunks are brought into memory right away, so that too little of it
 /// is an error here and not a signal later.
 pub(super) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
-    service: &publish_subscribe::PortFactory<Ipc, [Block], H>,
+    service: &publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>,
     blocks: usize,
     resident: usize,
 ) -> Result<(BlockPublisher<H>, Resident), PortError> {
@@ -253,7 +252,7 @@ pub(super) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Opt
 
 /// The node that publishes on a service.
 pub(super) fn publishing_node<H: std::fmt::Debug + ZeroCopySend>(
-    service: &publish_subscribe::PortFactory<Ipc, [Block], H>,
+    service: &publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>,
 ) -> Option<UniqueNodeId> {
     first_node(|found| {
         service.dynamic_config().list_publishers(|details| {

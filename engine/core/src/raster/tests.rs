@@ -45,7 +45,7 @@ struct AlphaSweep {
 }
 
 fn cases() -> Cases {
-    serde_json::from_str(include_str!("../../../tests/raster/cases.json")).unwrap()
+    serde_json::from_str(include_str!("../../tests/raster/cases.json")).unwrap()
 }
 
 fn rgb(color: u32) -> Rgb {

@@ -9,7 +9,8 @@ use rustix::io::Errno;
 use rustix::mm::Advice;
 
 use super::error::ServiceError;
-use crate::batch::{BLOCK_BYTES, Block};
+use super::message::PayloadBlock;
+use endless_gym_core::batch::BLOCK_BYTES;
 
 const PATH: &str = "/dev/shm";
 
@@ -30,7 +31,7 @@ impl Resident {
     }
 
     /// Brings a chunk into memory if it is not known to be there.
-    pub(super) fn admit(&mut self, chunk: &mut [MaybeUninit<Block>]) -> Result<(), ServiceError> {
+    pub(super) fn admit(&mut self, chunk: &mut [MaybeUninit<PayloadBlock>]) -> Result<(), ServiceError> {
         let address = chunk.as_ptr().addr();
         if self.0.contains(&address) {
             return Ok(());
@@ -68,7 +69,7 @@ fn available() -> Option<u64> {
 const PAGES: [usize; 3] = [4 << 10, 16 << 10, 64 << 10];
 
 /// Allocates the pages under `chunk` without changing what is in them.
-fn populate(chunk: &mut [MaybeUninit<Block>]) -> rustix::io::Result<()> {
+fn populate(chunk: &mut [MaybeUninit<PayloadBlock>]) -> rustix::io::Result<()> {
     let start = chunk.as_mut_ptr();
     let mut pages = PAGES.into_iter();
     let mut page = pages.next().unwrap_or(1);
@@ -116,7 +117,7 @@ mod tests {
         let start = unsafe {
             mmap(std::ptr::null_mut(), 2 * page, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0)
         };
-        let start = start.unwrap().cast::<MaybeUninit<Block>>();
+        let start = start.unwrap().cast::<MaybeUninit<PayloadBlock>>();
         let blocks = page / BLOCK_BYTES;
         // SAFETY: both pages are mapped for writing, nothing else uses them, and nobody touches the second.
         let (there, missing) = unsafe { std::slice::from_raw_parts_mut(start, 2 * blocks) }.split_at_mut(blocks);

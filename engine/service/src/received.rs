@@ -9,16 +9,16 @@ use iceoryx2::sample::Sample;
 
 use super::error::ServiceError;
 use super::here::Here;
-use super::message::ObservationHeader;
+use super::message::{ObservationHeader, PayloadBlock};
 use super::node::{Ipc, Member};
 use super::ports::{self, ObservationSubscriber, Services};
 use super::specification::Specification;
-use crate::batch::{Batch, Block};
+use endless_gym_core::batch::{Batch, Block};
 
 /// A group's batch, read where the engine wrote it. The engine writes other batches elsewhere until this one is dropped.
 pub struct Received {
     // The sample goes back before the port that it came through.
-    sample: Here<Sample<Ipc, [Block], ObservationHeader>>,
+    sample: Here<Sample<Ipc, [PayloadBlock], ObservationHeader>>,
     specification: Arc<Specification>,
     // The engine takes back what it lent to a port that is gone, so the port stays for as long as the batch.
     _port: Arc<ObservationPort>,
@@ -31,12 +31,12 @@ unsafe impl Sync for Received {}
 impl Received {
     /// The arrays of the batch.
     pub fn batch(&self) -> Batch<'_> {
-        Batch::new(&self.specification.batch, self.sample.payload())
+        Batch::new(&self.specification.batch, self.blocks())
     }
 
     /// The batch's memory, for readers with arrays of their own.
     pub fn blocks(&self) -> &[Block] {
-        self.sample.payload()
+        bytemuck::cast_slice(self.sample.payload())
     }
 
     /// The group that the batch is of.

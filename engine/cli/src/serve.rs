@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-use crate::pool::{PoolConfig, Threads};
-use crate::service::{Engine, EngineConfig};
+use endless_gym_core::pool::{PoolConfig, Threads};
+use endless_gym_service::{Engine, EngineConfig};
 
 use super::options::{AutoresetMode, EnvironmentArgs, FrameArgs};
 use super::output::{grouped, print};

@@ -17,8 +17,8 @@ use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Names, Open, PortErro
 use super::received::{ObservationPort, Received};
 use super::specification::{self, Specification};
 use super::wait::wait;
-use crate::batch::{Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
-use crate::pool::ResetRequest;
+use endless_gym_core::batch::{Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::pool::ResetRequest;
 
 /// How long a trainer hears nothing before it looks whether the engine still lives.
 const QUIET: Duration = Duration::from_millis(200);
@@ -138,7 +138,7 @@ impl Trainer {
     }
 
     /// As [`reset`](Trainer::reset), with other reset parameters for the environments that start an episode, from then on; see
-    /// [`Pool::reset_with`](crate::pool::Pool::reset_with).
+    /// [`Pool::reset_with`](endless_gym_core::pool::Pool::reset_with).
     pub fn reset_with(
         &mut self,
         group: usize,
@@ -216,14 +216,14 @@ impl Trainer {
     }
 
     /// The whole state of an environment of a group, for [`restore`](Trainer::restore) and
-    /// [`Pool::restore`](crate::pool::Pool::restore). The group must owe no answer, and must have been reset by this trainer.
+    /// [`Pool::restore`](endless_gym_core::pool::Pool::restore). The group must owe no answer, and must have been reset by this trainer.
     ///
     /// After [`ServiceError::TimedOut`] the same call goes on waiting, and any other takes its place; so for `restore`.
     pub fn snapshot(&mut self, group: usize, env: usize, timeout: Duration) -> Result<Vec<u8>, ServiceError> {
         self.ask(group, Asked { env, ..Asked::of(Kind::Snapshot) }, timeout, |_| Ok(0))
     }
 
-    /// Puts an environment of a group into the state of a snapshot; see [`Pool::restore`](crate::pool::Pool::restore). A reset of
+    /// Puts an environment of a group into the state of a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of
     /// no environment ([`ResetRequest::Each`]) then shows what it looks like. After [`ServiceError::TimedOut`] the engine may still
     /// do it, before anything that it is asked for later.
     pub fn restore(
@@ -330,7 +330,7 @@ impl Trainer {
         // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
         // fresh shared memory, and what a recycled chunk held before is a message.
         let mut message = unsafe { message.assume_init() };
-        let bytes = write(message.payload_mut())? as u64;
+        let bytes = write(bytemuck::cast_slice_mut(message.payload_mut()))? as u64;
         self.request += 1;
         *message.user_header_mut() = ActionHeader {
             layout_version: LAYOUT_VERSION,

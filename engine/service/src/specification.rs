@@ -22,9 +22,9 @@ use super::error::{PACKAGE_VERSION, ServiceError};
 use super::node::{Ipc, Member};
 use super::ports::{self, CLEANUP_TIMEOUT, Limits, Names, SPECIFICATION_PREFIX};
 use super::sweep;
-use crate::batch::{Frames, LAYOUT_VERSION, Layout};
-use crate::envs::ActionSpace;
-use crate::pool::Autoreset;
+use endless_gym_core::batch::{Frames, LAYOUT_VERSION, Layout};
+use endless_gym_core::envs::ActionSpace;
+use endless_gym_core::pool::Autoreset;
 
 /// Everything that a trainer or an observer needs to know about an engine.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -4,16 +4,11 @@
 //! environments; [`batch`] says how a step of many environments lies in memory; [`pool`] steps them in lockstep; [`service`]
 //! puts the batches into shared memory, where a trainer reads them.
 
-pub mod batch;
-pub mod cli;
-pub mod envs;
-pub mod pool;
-pub mod random;
-pub mod raster;
-pub mod service;
-pub mod trace;
+pub use endless_gym_cli as cli;
+pub use endless_gym_core::{batch, envs, pool, random, raster, trace};
+pub use endless_gym_service as service;
 
 /// The examples of the README, as tests.
 #[cfg(doctest)]
-#[doc = include_str!("../../README.md")]
+#[doc = include_str!("../README.md")]
 struct Readme;

@@ -7,7 +7,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use crate::service::{ConnectConfig, ServiceError, Trainer};
+use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
 
 use super::Failure;
 

@@ -1,8 +1,8 @@
 //! Players for the demo and the benchmark, and what came of their episodes.
 
-use crate::batch::Batch;
-use crate::envs::{Expert, Spec, expert};
 use clap::ValueEnum;
+use endless_gym_core::batch::Batch;
+use endless_gym_core::envs::{Expert, Spec, expert};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 

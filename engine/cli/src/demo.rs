@@ -4,9 +4,9 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use crate::envs::{self, Family, Spec};
-use crate::pool::ResetRequest;
 use clap::Parser;
+use endless_gym_core::envs::{self, Family, Spec};
+use endless_gym_core::pool::ResetRequest;
 use serde_json::{Map, Value as Json, json};
 
 use super::engine_process::EngineProcess;

@@ -1,0 +1,12 @@
+//! The Memory Gym environments, bit for bit, at memory speed.
+//!
+//! The modules follow the data: [`random`] and [`raster`] serve [`envs`], the rules and pictures of the environments; [`batch`]
+//! describes how one step of many environments lies in memory; [`pool`] steps them in lockstep; [`trace`] replays recorded
+//! episodes of the original.
+
+pub mod batch;
+pub mod envs;
+pub mod pool;
+pub mod random;
+pub mod raster;
+pub mod trace;
