@@ -184,13 +184,13 @@ impl<E: Environment> FamilyLanes<E> {
         spec: &'static Spec,
         variant: E::Variant,
         stack: usize,
-        environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds)>,
+        environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds, Generator)>,
     ) -> Self {
         let lanes = environments
-            .map(|(assets, options, seeds)| Lane {
+            .map(|(assets, options, seeds, random)| Lane {
                 env: E::new(&assets),
                 assets,
-                random: Generator::from_entropy(),
+                random,
                 seeds,
                 episode_return: 0.0,
                 episode_length: 0,

@@ -2,12 +2,11 @@
 
 use std::fmt;
 
-use rand::rngs::SysRng;
-use rand::{Rng, TryRng};
+use rand::Rng;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 
-use super::SeedSequence;
+use super::{EntropyError, SeedSequence, entropy};
 
 /// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
 ///
@@ -36,17 +35,13 @@ impl Generator {
     }
 
     /// An unseeded generator, `Generator(PCG64())`: from 128 bits of the operating system's
-    /// entropy, as Gymnasium takes where a reset brings no seed.
+    /// [`entropy`], as Gymnasium takes where a reset brings no seed.
     ///
-    /// # Panics
+    /// # Errors
     ///
-    /// If the operating system has no entropy to give, as `rand`'s own generators do.
-    // Straight from the system: a generator kept by the process would repeat itself in the
-    // children of a fork, which is how Python starts parallel environments.
-    pub fn from_entropy() -> Self {
-        let mut entropy = [0; size_of::<u128>()];
-        SysRng.try_fill_bytes(&mut entropy).expect("entropy from the operating system");
-        Self::from_seed_sequence(&SeedSequence::from_u128(u128::from_le_bytes(entropy)))
+    /// If there is no entropy; see [`entropy`].
+    pub fn from_entropy() -> Result<Self, EntropyError> {
+        Ok(Self::from_seed_sequence(&SeedSequence::from_u128(entropy()?)))
     }
 
     /// `integers(low, high)`: a uniform whole number of `low..high`, by numpy's `int64` path.

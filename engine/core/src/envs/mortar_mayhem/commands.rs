@@ -133,8 +133,8 @@ impl Clue {
 
     /// Whether its numbers are such that it can be gone through.
     pub fn is_valid(&self) -> bool {
-        const MANY: usize = 1 << 32;
-        [self.first, self.duration, self.delay, self.frame, self.frames].iter().all(|number| *number < MANY)
+        const MANY: u64 = 1 << 32;
+        [self.first, self.duration, self.delay, self.frame, self.frames].iter().all(|number| (*number as u64) < MANY)
             && (self.frames == 0 || self.duration + self.delay > 0)
     }
 
