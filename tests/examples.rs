@@ -3,6 +3,7 @@
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::Once;
 
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -42,11 +43,19 @@ impl Drop for Running {
     }
 }
 
-/// Cargo builds examples beside the tests, in `examples/` of the profile's folder.
+/// The program of an example. Cargo builds all of them for `cargo test`, but none for `cargo test --test examples`.
 fn example(name: &str) -> PathBuf {
+    static BUILT: Once = Once::new();
+    BUILT.call_once(|| {
+        let mut build = Command::new(env!("CARGO"));
+        build.args(["build", "--quiet", "--locked", "--examples"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+        if !cfg!(debug_assertions) {
+            build.arg("--release");
+        }
+        assert!(build.status().unwrap().success());
+    });
     let test = std::env::current_exe().unwrap();
-    let folder = test.parent().and_then(Path::parent).unwrap().join("examples");
-    folder.join(format!("{name}{}", std::env::consts::EXE_SUFFIX))
+    test.parent().and_then(Path::parent).unwrap().join("examples").join(name)
 }
 
 fn printed(name: &str, output: Output) -> String {
