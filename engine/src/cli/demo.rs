@@ -4,7 +4,7 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use crate::envs::{self, Family, Spec};
+use crate::envs::{self, EnvSpec, Family};
 use crate::pool::ResetRequest;
 use clap::Parser;
 use serde_json::{Map, Value as Json, json};
@@ -117,7 +117,7 @@ fn per_second(tally: &Tally, elapsed: Duration) -> f64 {
     tally.steps as f64 / elapsed.as_secs_f64()
 }
 
-fn live(spec: &Spec, tally: &Tally, elapsed: Duration) -> String {
+fn live(spec: &EnvSpec, tally: &Tally, elapsed: Duration) -> String {
     let mut text = format!(
         "{} steps/s, {} episodes, {}",
         grouped(per_second(tally, elapsed)),
@@ -137,7 +137,7 @@ fn live(spec: &Spec, tally: &Tally, elapsed: Duration) -> String {
     text
 }
 
-fn summarise(args: &Args, spec: &Spec, num_envs: usize, tally: &Tally, elapsed: Duration) -> Result<(), Failure> {
+fn summarise(args: &Args, spec: &EnvSpec, num_envs: usize, tally: &Tally, elapsed: Duration) -> Result<(), Failure> {
     let policy = match args.policy {
         Policy::Expert => "expert",
         Policy::Random => "random",

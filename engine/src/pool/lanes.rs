@@ -11,7 +11,7 @@ use super::snapshot::{Saved, SnapshotError};
 use super::threads::{Threads, lock};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
-use crate::envs::{Environment, ParameterError, ResetParameters, Spec, view};
+use crate::envs::{EnvSpec, Environment, ParameterError, ResetParameters, view};
 use crate::random::Generator;
 
 /// One environment with all that belongs to it alone.
@@ -174,14 +174,14 @@ pub(super) struct FamilyLanes<E: Environment> {
     shown: Vec<Vec<Shown<E>>>,
     /// Frames in an observation.
     stack: usize,
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     variant: E::Variant,
 }
 
 impl<E: Environment> FamilyLanes<E> {
     /// Environments with the given assets and seeds, none of them reset yet.
     pub(super) fn new(
-        spec: &'static Spec,
+        spec: &'static EnvSpec,
         variant: E::Variant,
         stack: usize,
         environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds)>,
