@@ -58,7 +58,7 @@ impl<E: Environment> Lane<E> {
         let transition = self.env.step(action, &mut self.random);
         self.history.push(|| self.env.scene());
         self.episode_return += transition.reward;
-        self.episode_length += 1;
+        self.episode_length = self.episode_length.saturating_add(1);
         self.ended = transition.terminated;
         self.write_transition(out, row, transition.reward, transition.terminated);
         if transition.terminated {
