@@ -194,7 +194,7 @@ const FINITE_INFO: &[InfoColumn] = &[
     InfoColumn {
         name: "coins_collected",
         is_integer: false,
-        description: "share of the coins that were collected, 0 to 1; 0 if there were none",
+        description: "share of the coins that were collected, 0 to 1; NaN if the episode had no coins",
     },
     InfoColumn {
         name: "success",

@@ -161,7 +161,8 @@ fn without_coins_the_exit_is_open() {
     let mut info = [f64::NAN; 3];
     environment.info(&mut info);
     assert_eq!((info[0], info[2]), (1.0, 1.0));
-    assert!(info[1].is_nan(), "no share of no coins, as in the original");
+    assert!(info[1].is_nan(), "0 of 0 coins, which is NaN in the original");
+    assert!(FINITE.info[1].description.ends_with("; NaN if the episode had no coins"));
 }
 
 #[test]
