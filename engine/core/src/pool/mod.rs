@@ -20,7 +20,7 @@ use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
-use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
+use crate::envs::{self, EnvSpec, Environment, Family, ParameterError, ResetParameters, UnknownEnvironment};
 use crate::random::EntropyError;
 use crate::raster::PixelFormat;
 use buffers::Buffers;
@@ -128,7 +128,7 @@ impl ResetRequest<'_> {
 
 /// Environments of one id in lockstep.
 pub struct Pool {
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     layout: Layout,
     lanes: Box<dyn Lanes>,
     buffers: Buffers,
@@ -188,7 +188,7 @@ impl Pool {
     }
 
     /// What is fixed about the environment id.
-    pub fn spec(&self) -> &'static Spec {
+    pub fn spec(&self) -> &'static EnvSpec {
         self.spec
     }
 
@@ -306,7 +306,7 @@ impl Pool {
 }
 
 /// Whether `actions` fit `num_envs` environments: the right count, each in its branch's range.
-pub fn check_actions(spec: &Spec, num_envs: usize, actions: &[i32]) -> Result<(), PoolError> {
+pub fn check_actions(spec: &EnvSpec, num_envs: usize, actions: &[i32]) -> Result<(), PoolError> {
     let branches = spec.action_space.branches();
     if actions.len() != num_envs * branches.len() {
         return Err(PoolError::ActionCount { given: actions.len(), num_envs, branches: branches.len() });
@@ -324,7 +324,7 @@ pub fn check_actions(spec: &Spec, num_envs: usize, actions: &[i32]) -> Result<()
 
 /// Makes the environments of one family; those with the same options share their assets.
 fn family_lanes<E: Environment>(
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     variant: E::Variant,
     config: &PoolConfig,
     unseeded: Unseeded,

@@ -13,6 +13,7 @@ use super::{EntropyError, SeedSequence, entropy};
 /// Sources: `numpy/random/_generator.pyx`, `src/distributions/distributions.c` and
 /// `src/pcg64/pcg64.h` (numpy 1.26 and 2.x).
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "UncheckedGenerator")]
 pub struct Generator {
     /// The bit generator, 64 bits a step.
     bits: Pcg64,
@@ -144,6 +145,28 @@ impl Generator {
             self.kept = Some((word >> 32) as u32);
             word as u32
         })
+    }
+}
+
+/// A deserialised generator before the check of its increment.
+#[derive(Deserialize)]
+struct UncheckedGenerator {
+    bits: Pcg64,
+    kept: Option<u32>,
+}
+
+impl TryFrom<UncheckedGenerator> for Generator {
+    type Error = &'static str;
+
+    /// Refuses an even increment. It shortens the period, down to a generator that only gives zeros, on which the rejection
+    /// sampling of [`Generator::integers`] does not end.
+    fn try_from(unchecked: UncheckedGenerator) -> Result<Self, Self::Error> {
+        let UncheckedGenerator { bits, kept } = unchecked;
+        // `from_state` makes the increment odd.
+        if Pcg64::from_state(bits.state(), bits.stream()) != bits {
+            return Err("the increment of PCG64 must be odd");
+        }
+        Ok(Self { bits, kept })
     }
 }
 
