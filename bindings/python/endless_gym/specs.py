@@ -112,8 +112,8 @@ class Spec:
             return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
         except (KeyError, OverflowError, TypeError, ValueError):
             raise ValueError(
-                f"no episode's length follows from {dict(options)}: `max_steps` is a number, and what tells of commands and "
-                "explosions is a list of numbers"
+                f"the reset parameters {dict(options)} determine no episode length: `max_steps` must be a number, and the "
+                "numbers and durations of commands and explosions must be lists of numbers"
             ) from None
 
     def ground_truth_space(self) -> gymnasium.Space[Any] | None:
@@ -138,7 +138,7 @@ def spec(id: str) -> Spec:
     known = all_specs()
     name = id.removeprefix("EndlessGym/")
     if name not in known:
-        raise ValueError(f"no environment `{id}`; there are {', '.join(known)}")
+        raise ValueError(f"unknown environment id `{id}`; available ids: {', '.join(known)}")
     return known[name]
 
 
