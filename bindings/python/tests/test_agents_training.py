@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import wandb
 from agents_helpers import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -333,6 +334,8 @@ def test_weights_and_biases_logs_contain_the_metrics_under_one_id(
     monkeypatch.setenv("WANDB_SILENT", "true")
     run = train(replace(small("gru", tmp_path / "run", 1), wandb=True))
     train(replace(small("gru", tmp_path, 2), wandb=True, resume=str(run)))
+    # `finish` can return before the file is written; the end of the library's process flushes it.
+    wandb.teardown()
     (id,) = {file.stem.removeprefix("run-") for file in run.glob("wandb/offline-run-*/run-*.wandb")}
     assert id == (run / "wandb-id.txt").read_text()
     written = b"".join(file.read_bytes() for file in run.glob("wandb/offline-run-*/run-*.wandb"))
