@@ -148,7 +148,7 @@ def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path
             assert Counter(episode["seed"] for episode in episodes) == dict.fromkeys(range(200_000, 200_005), 3)
     again = evaluate_runs(small(runs), quiet)
     assert to_json(again, {}, True) == to_json(once, {}, True)
-    other = evaluate_runs(small(runs, draws=1), quiet)
+    other = evaluate_runs(small(runs, action_seed=1), quiet)
     assert to_json(other, {}, True) != to_json(once, {}, True)
 
 
@@ -165,7 +165,13 @@ def test_results_round_trip_through_json(runs: Path, tmp_path: Path, capsys: pyt
     protocol.execute(small(runs, json=str(file), episodes=True))
     table = capsys.readouterr().out
     written = json.loads(file.read_text())
-    assert written["protocol"] == {"first_seed": 200_000, "seeds": 5, "repetitions": 3, "draws": 0, "greedy": False}
+    assert written["protocol"] == {
+        "first_seed": 200_000,
+        "seeds": 5,
+        "repetitions": 3,
+        "action_seed": 0,
+        "greedy": False,
+    }
     gru, none = written["experiments"]
     means = []
     for run in gru["runs"]:

@@ -264,9 +264,9 @@ def test_evaluation_plays_each_seed_equally_often(tmp_path: Path) -> None:
     assert [result["seed"] for result in results] == list(range(200_000, 200_007)) * 3
     assert all(result["length"] > 0 for result in results)
     assert mean(results) == pytest.approx(sum(result["reward"] for result in results) / 21)
-    # Sampling differs between the repetitions of a seed, and is reproducible with the same `draws`.
+    # Sampling differs between the repetitions of a seed, and is reproducible with the same `action_seed`.
     assert results == evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
-    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, draws=1)
+    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, action_seed=1)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -31,6 +31,11 @@ from endless_gym.agents.settings import Settings
 from endless_gym.agents.transformer import TransformerMemory
 from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
+
+#: An array or tensor of n environments, (n, ...).
+Array: TypeAlias = NDArray[Any] | Tensor
+#: An observation as a vector environment returns it: an array, or a mapping if the observation space is a dict.
+RawObservation: TypeAlias = Array | Mapping[str, Array]
 
 
 @dataclass
@@ -203,7 +208,7 @@ class Agent(nn.Module):
     @torch.no_grad()
     def act(
         self,
-        observation: Any,
+        observation: RawObservation,
         memory: AgentMemory,
         generator: torch.Generator | None = None,
         greedy: bool = False,
@@ -235,7 +240,7 @@ class Agent(nn.Module):
         return ActOutput(torch.cat(actions, 1), torch.cat(log_probs, 1), value, observed)
 
     @torch.no_grad()
-    def bootstrap_value(self, observation: Any, memory: AgentMemory) -> Tensor:
+    def bootstrap_value(self, observation: RawObservation, memory: AgentMemory) -> Tensor:
         """Value estimates float32 (n,) of an observation, without updating the memory; arguments as for `act`."""
         observed, _ = self.transform.apply(self.to_tensors(observation), memory.transform_state, memory.reset_mask)
         with self._autocast():
@@ -258,7 +263,7 @@ class Agent(nn.Module):
             truth = self.ground_truth(memory_output) if self.ground_truth is not None else None
         return AgentOutput([branch.log_softmax(-1) for branch in logits], value, frame, truth)
 
-    def to_tensors(self, observation: Any) -> Observation:
+    def to_tensors(self, observation: RawObservation) -> Observation:
         """Convert a vector environment's observation to tensors on the agent's device; frames stay uint8."""
         if not isinstance(observation, Mapping):
             key = next(key for key in self.transform.shapes if key != POSITION)

@@ -38,7 +38,7 @@ class EnjoyArguments:
     """seeds of the episodes, which are shown one after the other"""
     out: Path = Path("episode.gif")
     """output file, .gif or .mp4"""
-    draws: int = 0
+    action_seed: int = 0
     """seed of the action sampling"""
     greedy: bool = False
     """take the most likely actions instead of sampling"""
@@ -56,7 +56,7 @@ class EpisodeRecorder:
 
     Attributes:
         agent: The agent that plays.
-        draws: Seed of the action sampling.
+        action_seed: Seed of the action sampling.
         greedy: Take the most likely actions instead of sampling.
         max_steps: Largest number of steps of an episode; 0 for no limit.
         rewards: Sum of rewards of each episode so far.
@@ -64,7 +64,7 @@ class EpisodeRecorder:
     """
 
     agent: Agent
-    draws: int = 0
+    action_seed: int = 0
     greedy: bool = False
     max_steps: int = 0
     rewards: list[float] = field(default_factory=list)
@@ -73,7 +73,7 @@ class EpisodeRecorder:
     def frames(self, seeds: tuple[int, ...]) -> Iterator[video.Frame]:
         """Generate a frame for the start and for each step of the episodes with these seeds; the last frame lasts one second."""
         settings = self.agent.settings
-        generator = torch.Generator(self.agent.device).manual_seed(self.draws)
+        generator = torch.Generator(self.agent.device).manual_seed(self.action_seed)
         # The video shows rgb frames even if the agent observes features.
         shown = "rgb" if settings.environment.observation == "rgb" else "rgb+features"
         options = settings.options()
@@ -120,7 +120,7 @@ def execute(given: EnjoyArguments) -> None:
         raise ValueError("--seeds must contain at least one seed, got none")
     video.check(given.out)
     agent = command.load_checkpoint(given.checkpoint, choose_device(given.device)).agent
-    recorder = EpisodeRecorder(agent, given.draws, given.greedy, given.max_steps)
+    recorder = EpisodeRecorder(agent, given.action_seed, given.greedy, given.max_steps)
     console = Console()
     with Console(stderr=True).status(f"playing {agent.settings.env}"):
         video.write(given.out, recorder.frames(given.seeds), given.fps or spec(agent.settings.env).render_fps)

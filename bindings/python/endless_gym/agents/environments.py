@@ -27,7 +27,7 @@ class StepResult:
         episodes: Final infos of the episodes that have ended, one dict each.
     """
 
-    observation: Any
+    observation: NDArray[Any] | dict[str, NDArray[Any]]
     reward: NDArray[np.float64]
     done: NDArray[np.bool_]
     ground_truth: NDArray[np.float64] | None

@@ -24,7 +24,7 @@ def evaluate(
     repetitions: int = REPETITIONS,
     *,
     num_threads: int | None = None,
-    draws: int = 0,
+    action_seed: int = 0,
     greedy: bool = False,
     ended: Callable[[int], None] | None = None,
 ) -> list[dict[str, float]]:
@@ -35,7 +35,7 @@ def evaluate(
         seeds: Seeds of the episodes.
         repetitions: Episodes per seed.
         num_threads: Threads that step the environments; `None` for one per core.
-        draws: Seed of the generator that samples the actions.
+        action_seed: Seed of the generator that samples the actions.
         greedy: Take the most likely actions instead of sampling.
         ended: Called with the number of episodes that have ended, after each step in which some have.
 
@@ -47,7 +47,7 @@ def evaluate(
     options = settings.options()
     episode_seeds = [seed for _ in range(repetitions) for seed in seeds]
     num_envs = len(episode_seeds)
-    memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(draws)
+    memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)
     results: list[dict[str, float]] = [{} for _ in episode_seeds]
     with make_vec(
         settings.env,

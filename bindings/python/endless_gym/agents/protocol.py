@@ -44,7 +44,7 @@ class EvalArguments:
     """number of seeds"""
     repetitions: int = REPETITIONS
     """episodes per seed"""
-    draws: int = 0
+    action_seed: int = 0
     """seed of the action sampling; the same seed gives the same results"""
     greedy: bool = False
     """take the most likely actions instead of sampling; not the protocol of the paper"""
@@ -137,7 +137,7 @@ def evaluate_runs(given: EvalArguments, console: Console) -> list[Experiment]:
                     seeds,
                     given.repetitions,
                     num_threads=given.engine_threads or None,
-                    draws=given.draws,
+                    action_seed=given.action_seed,
                     greedy=given.greedy,
                     ended=lambda number: bar.advance(episodes, number),
                 )
@@ -169,7 +169,7 @@ def protocol(given: EvalArguments) -> dict[str, Any]:
         "first_seed": given.first_seed,
         "seeds": given.seeds,
         "repetitions": given.repetitions,
-        "draws": given.draws,
+        "action_seed": given.action_seed,
         "greedy": given.greedy,
     }
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from endless_gym.agents.agent import Agent, AgentMemory
@@ -149,7 +151,7 @@ class RolloutCollector:
         for memory, memory_state in zip(self.memories, state_dict["memories"], strict=True):
             memory.load_state_dict(memory_state)
 
-    def _act(self, group: int, step: int) -> Any:
+    def _act(self, group: int, step: int) -> NDArray[np.int64]:
         columns, memory, current, segment = (
             self._columns(group),
             self.memories[group],
@@ -165,7 +167,8 @@ class RolloutCollector:
         segment.action[step, columns] = output.action
         segment.log_prob[step, columns] = output.log_prob
         segment.value[step, columns] = output.value
-        return output.action.cpu().numpy()
+        action: NDArray[np.int64] = output.action.cpu().numpy()
+        return action
 
     def _receive(self, group: int, step: int) -> list[dict[str, float]]:
         columns, result = self._columns(group), self.environments.receive(group)
