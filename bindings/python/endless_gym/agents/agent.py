@@ -58,6 +58,7 @@ class AgentMemory:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything as tensors and numbers by name, for a checkpoint."""
+        # The keys are those of the checkpoint format.
         return {
             "first": self.reset_mask,
             "observer": self.transform_state.tensors,

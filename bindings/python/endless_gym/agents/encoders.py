@@ -42,6 +42,7 @@ class AtariEncoder(nn.Module):
     width = 64 * 7 * 7
 
     def __init__(self, channels: int) -> None:
+        """Make the network for frames with `channels` channels."""
         super().__init__()
         self.convolutions = nn.Sequential(
             *(orthogonal(nn.Conv2d(channels, 32, 8, stride=4)), nn.ReLU()),

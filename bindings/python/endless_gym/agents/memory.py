@@ -148,6 +148,7 @@ class NoMemory(Memory[NoState, None, Minibatch]):
     """The identity: the output is the encoding of the current observation."""
 
     def __init__(self, input_width: int, device: torch.device) -> None:
+        """Make the memory for encoded observations of size `input_width`; `device` is the device of the minibatches."""
         super().__init__()
         self.width = input_width
         self.device = device

@@ -31,6 +31,7 @@ class RecurrentState(MemoryState):
     """
 
     def __init__(self, hidden: Tensor) -> None:
+        """Make a state with the given hidden state, outside a segment."""
         self.hidden = hidden
         self.stored: list[Tensor] = []
         self.time = self.steps = 0

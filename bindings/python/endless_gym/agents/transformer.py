@@ -206,6 +206,7 @@ class TransformerState(MemoryState):
     """
 
     def __init__(self, settings: Transformer, num_envs: int, device: torch.device) -> None:
+        """Make the state of `num_envs` environments before their first step."""
         self.past = settings.window - 1
         self.fill = self.past
         columns = self.past + SPARE_COLUMNS
@@ -234,6 +235,7 @@ class TransformerState(MemoryState):
         self.fill = self.past
 
     def state_dict(self) -> dict[str, Any]:
+        # The keys are those of the checkpoint format.
         return {
             "fill": self.fill,
             "inputs": self.inputs,
