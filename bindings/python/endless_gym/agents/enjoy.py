@@ -114,25 +114,29 @@ class EpisodeRecorder:
         return video.compose(np.asarray(frame)[0], envs.ground_truth_view(0), text)
 
 
-def execute(given: EnjoyArguments) -> None:
+def execute(arguments: EnjoyArguments) -> None:
     """Record the video, and print the reward and length of each episode."""
-    if not given.seeds:
+    if not arguments.seeds:
         raise ValueError("--seeds must contain at least one seed, got none")
-    video.check(given.out)
-    agent = command.load_checkpoint(given.checkpoint, choose_device(given.device)).agent
-    recorder = EpisodeRecorder(agent, given.action_seed, given.greedy, given.max_steps)
+    video.check(arguments.out)
+    agent = command.load_checkpoint(arguments.checkpoint, choose_device(arguments.device)).agent
+    recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
     console = Console()
     with Console(stderr=True).status(f"playing {agent.settings.env}"):
-        video.write(given.out, recorder.frames(given.seeds), given.fps or spec(agent.settings.env).render_fps)
-    for seed, reward, length in zip(given.seeds, recorder.rewards, recorder.lengths, strict=True):
+        video.write(
+            arguments.out, recorder.frames(arguments.seeds), arguments.fps or spec(agent.settings.env).render_fps
+        )
+    for seed, reward, length in zip(arguments.seeds, recorder.rewards, recorder.lengths, strict=True):
         console.print(f"seed {seed}: reward {reward:.2f} in {length} steps")
-    console.print(f"{given.out}", soft_wrap=True)
+    console.print(f"{arguments.out}", soft_wrap=True)
 
 
 def main() -> int:
     """Entry point of the command `endless-enjoy`; returns the exit status."""
-    given = tyro.cli(EnjoyArguments, prog="endless-enjoy", description=command.description(__doc__), args=sys.argv[1:])
-    return command.run("endless-enjoy", lambda: execute(given))
+    arguments = tyro.cli(
+        EnjoyArguments, prog="endless-enjoy", description=command.description(__doc__), args=sys.argv[1:]
+    )
+    return command.run("endless-enjoy", lambda: execute(arguments))
 
 
 if __name__ == "__main__":

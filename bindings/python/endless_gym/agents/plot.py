@@ -153,7 +153,7 @@ def read_curves(paths: Sequence[Path]) -> list[Curve]:
     return curves
 
 
-def draw_all(given: PlotArguments) -> list[Path]:
+def draw_all(arguments: PlotArguments) -> list[Path]:
     """Draw all requested plots.
 
     Returns:
@@ -163,53 +163,59 @@ def draw_all(given: PlotArguments) -> list[Path]:
         FileNotFoundError: A path does not exist.
         ValueError: There are no curves for an environment, or too few for an aggregated plot.
     """
-    own = read_curves(given.paths)
+    own = read_curves(arguments.paths)
     known = published_environments()
-    for env in given.env:
+    for env in arguments.env:
         if env not in known and env not in {curve.env for curve in own}:
             raise ValueError(f"no curves of environment `{env}`; the paper has curves of {', '.join(known)}")
     plots = []
-    if given.aggregate != "no":
-        paper = [curve for env in FAMILIES[given.aggregate] for curve in published(env, given.published)]
-        curves = aggregate(given.aggregate, [*own, *paper])
+    if arguments.aggregate != "no":
+        paper = [curve for env in FAMILIES[arguments.aggregate] for curve in published(env, arguments.published)]
+        curves = aggregate(arguments.aggregate, [*own, *paper])
         complete = {curve.label for curve in curves if curve.source == "evaluated"}
-        partial = {curve.label for curve in own if curve.env in FAMILIES[given.aggregate]} - complete
+        partial = {curve.label for curve in own if curve.env in FAMILIES[arguments.aggregate]} - complete
         # An agent with reconstruction can complete one without; see `aggregate`.
         partial = {label for label in partial if label.removesuffix("_rec") not in complete}
         if partial or (own and not complete):
             raise ValueError(
-                f"{', '.join(sorted(partial)) or 'the results'}: the {given.aggregate} plot needs evaluations in all of "
-                f"{', '.join(FAMILIES[given.aggregate])}"
+                f"{', '.join(sorted(partial)) or 'the results'}: the {arguments.aggregate} plot needs evaluations in all of "
+                f"{', '.join(FAMILIES[arguments.aggregate])}"
             )
         if not curves:
             raise ValueError(
-                f"nothing to plot: no agent among --published ({', '.join(given.published) or 'empty'}) has curves in all "
-                f"{given.aggregate} environments"
+                f"nothing to plot: no agent among --published ({', '.join(arguments.published) or 'empty'}) has curves in all "
+                f"{arguments.aggregate} environments"
             )
-        axis = "Task progress" if given.aggregate == "finite" else "Normalised score"
-        plots.append(draw(given.aggregate, axis, _cut(curves, given.max_steps), given.spread, given.out))
+        axis = "Task progress" if arguments.aggregate == "finite" else "Normalised score"
+        plots.append(
+            draw(arguments.aggregate, axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out)
+        )
     else:
         # Training rewards are not comparable with evaluation metrics, and are drawn in separate plots.
         trained = [curve for curve in own if curve.source == "training"]
         measured = [curve for curve in own if curve.source != "training"]
         for env in dict.fromkeys(curve.env for curve in trained):
-            curves = [curve for curve in trained if curve.env == env and env in (given.env or (env,))]
+            curves = [curve for curve in trained if curve.env == env and env in (arguments.env or (env,))]
             if curves:
                 axis = "Reward of training episodes"
-                plots.append(draw(f"{env}-training", axis, _cut(curves, given.max_steps), given.spread, given.out))
-        envs = given.env or tuple(dict.fromkeys(curve.env for curve in measured)) or (() if trained else tuple(known))
+                plots.append(
+                    draw(f"{env}-training", axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out)
+                )
+        envs = (
+            arguments.env or tuple(dict.fromkeys(curve.env for curve in measured)) or (() if trained else tuple(known))
+        )
         for env in envs:
-            curves = [curve for curve in measured if curve.env == env] + published(env, given.published)
+            curves = [curve for curve in measured if curve.env == env] + published(env, arguments.published)
             if curves:
                 _, axis = metrics.metric(env)
-                plots.append(draw(env, axis, _cut(curves, given.max_steps), given.spread, given.out))
+                plots.append(draw(env, axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out))
     return plots
 
 
-def execute(given: PlotArguments) -> None:
+def execute(arguments: PlotArguments) -> None:
     """Draw all requested plots, and print their paths."""
     console = Console()
-    for plot in draw_all(given):
+    for plot in draw_all(arguments):
         console.print(f"{plot}, with its data in .csv and .json", soft_wrap=True)
 
 
@@ -219,8 +225,10 @@ def _cut(curves: Sequence[Curve], steps: int) -> list[Curve]:
 
 def main() -> int:
     """Entry point of the command `endless-plot`; returns the exit status."""
-    given = tyro.cli(PlotArguments, prog="endless-plot", description=command.description(__doc__), args=sys.argv[1:])
-    return command.run("endless-plot", lambda: execute(given))
+    arguments = tyro.cli(
+        PlotArguments, prog="endless-plot", description=command.description(__doc__), args=sys.argv[1:]
+    )
+    return command.run("endless-plot", lambda: execute(arguments))
 
 
 if __name__ == "__main__":

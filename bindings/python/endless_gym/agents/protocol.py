@@ -81,8 +81,8 @@ def find(paths: tuple[Path, ...], last: bool) -> list[tuple[Path, list[Path]]]:
     for path in (path.parent if path.name == checkpoint.FOLDER else path for path in paths):
         if path.is_file():
             run = path.parent.parent if path.parent.name == checkpoint.FOLDER else path
-            given = found.setdefault(run, [])
-            given += [path] if path not in given else []
+            files = found.setdefault(run, [])
+            files += [path] if path not in files else []
             continue
         if not path.exists():
             raise FileNotFoundError(
@@ -98,11 +98,11 @@ def find(paths: tuple[Path, ...], last: bool) -> list[tuple[Path, list[Path]]]:
     return list(found.items())
 
 
-def evaluate_runs(given: EvalArguments, console: Console) -> list[Experiment]:
+def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment]:
     """Evaluate all checkpoints.
 
     Args:
-        given: The arguments.
+        arguments: The arguments.
         console: Where the progress bar is shown.
 
     Returns:
@@ -112,17 +112,19 @@ def evaluate_runs(given: EvalArguments, console: Console) -> list[Experiment]:
         FileNotFoundError: A path does not exist, or contains no checkpoint.
         ValueError: A number is out of range, a file is not a checkpoint, or the device is not available.
     """
-    if given.seeds < 1 or given.repetitions < 1:
-        raise ValueError(f"--seeds and --repetitions must be 1 or more, got {given.seeds} and {given.repetitions}")
-    runs, device = find(given.paths, given.last), choose_device(given.device)
-    if given.threads:
-        torch.set_num_threads(given.threads)
-    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    if arguments.seeds < 1 or arguments.repetitions < 1:
+        raise ValueError(
+            f"--seeds and --repetitions must be 1 or more, got {arguments.seeds} and {arguments.repetitions}"
+        )
+    runs, device = find(arguments.paths, arguments.last), choose_device(arguments.device)
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     experiments = Experiments()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         checkpoints = bar.add_task("checkpoints", total=sum(len(files) for _, files in runs))
-        episodes = bar.add_task("episodes", total=given.seeds * given.repetitions)
+        episodes = bar.add_task("episodes", total=arguments.seeds * arguments.repetitions)
         for folder, files in runs:
             run: Run | None = None
             for file in files:
@@ -135,10 +137,10 @@ def evaluate_runs(given: EvalArguments, console: Console) -> list[Experiment]:
                 results = evaluate(
                     loaded.agent,
                     seeds,
-                    given.repetitions,
-                    num_threads=given.engine_threads or None,
-                    action_seed=given.action_seed,
-                    greedy=given.greedy,
+                    arguments.repetitions,
+                    num_threads=arguments.engine_threads or None,
+                    action_seed=arguments.action_seed,
+                    greedy=arguments.greedy,
                     ended=lambda number: bar.advance(episodes, number),
                 )
                 run.add(loaded.steps, results)
@@ -163,35 +165,35 @@ def table(experiment: Experiment) -> Table:
     return result
 
 
-def protocol(given: EvalArguments) -> dict[str, Any]:
+def protocol(arguments: EvalArguments) -> dict[str, Any]:
     """The evaluation protocol, for the results file."""
     return {
-        "first_seed": given.first_seed,
-        "seeds": given.seeds,
-        "repetitions": given.repetitions,
-        "action_seed": given.action_seed,
-        "greedy": given.greedy,
+        "first_seed": arguments.first_seed,
+        "seeds": arguments.seeds,
+        "repetitions": arguments.repetitions,
+        "action_seed": arguments.action_seed,
+        "greedy": arguments.greedy,
     }
 
 
-def execute(given: EvalArguments) -> None:
+def execute(arguments: EvalArguments) -> None:
     """Evaluate the checkpoints, and write or print the results."""
-    if given.json not in ("", "-") and not Path(given.json).resolve().parent.is_dir():
-        raise FileNotFoundError(f"cannot write {given.json}: no folder {Path(given.json).parent}")
+    if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
     messages = Console(stderr=True)
-    experiments = evaluate_runs(given, messages)
+    experiments = evaluate_runs(arguments, messages)
     for experiment in experiments:
         if not experiment.common_steps():
             raise ValueError(
                 f"the {len(experiment.runs)} runs of {experiment.env}, {experiment.label}, have no checkpoints at a common "
                 "number of steps; evaluate them separately, or train with the same --checkpoint-interval and --keep-checkpoints"
             )
-    written = to_json(experiments, protocol(given), given.episodes)
-    if given.json == "-":
+    written = to_json(experiments, protocol(arguments), arguments.episodes)
+    if arguments.json == "-":
         print(json.dumps(written, indent=1))
         return
-    if given.json:
-        Path(given.json).write_text(json.dumps(written) + "\n")
+    if arguments.json:
+        Path(arguments.json).write_text(json.dumps(written) + "\n")
     console = Console()
     for experiment in experiments:
         console.print(table(experiment))
@@ -199,8 +201,10 @@ def execute(given: EvalArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-eval`; returns the exit status."""
-    given = tyro.cli(EvalArguments, prog="endless-eval", description=command.description(__doc__), args=sys.argv[1:])
-    return command.run("endless-eval", lambda: execute(given))
+    arguments = tyro.cli(
+        EvalArguments, prog="endless-eval", description=command.description(__doc__), args=sys.argv[1:]
+    )
+    return command.run("endless-eval", lambda: execute(arguments))
 
 
 if __name__ == "__main__":

@@ -100,17 +100,17 @@ class Trials:
     """The trials of a search, stored in an Optuna study.
 
     Attributes:
-        given: The arguments.
+        arguments: The arguments.
         folder: Folder of the search.
         space: The search space.
         study: The Optuna study.
     """
 
-    def __init__(self, given: SearchArguments, console: Console) -> None:
+    def __init__(self, arguments: SearchArguments, console: Console) -> None:
         """Open the study of the folder, or create it.
 
         Args:
-            given: The arguments, validated.
+            arguments: The arguments, validated.
             console: Where messages are printed.
 
         Raises:
@@ -119,8 +119,8 @@ class Trials:
         import optuna
 
         optuna.logging.set_verbosity(logging.ERROR)
-        self.given, self.console, self.folder = given, console, given.directory()
-        self.space: Space = space(given.settings, given.parameters)
+        self.arguments, self.console, self.folder = arguments, console, arguments.directory()
+        self.space: Space = space(arguments.settings, arguments.parameters)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.study = optuna.create_study(
             study_name="search",
@@ -128,17 +128,17 @@ class Trials:
             load_if_exists=True,
             direction="maximize",
             pruner=optuna.pruners.PercentilePruner(
-                given.percentile, n_startup_trials=given.startup_trials, n_warmup_steps=given.warm_up
+                arguments.percentile, n_startup_trials=arguments.startup_trials, n_warmup_steps=arguments.warm_up
             ),
         )
-        initial = json.loads(json.dumps({"settings": to_dict(given.settings), "space": self.space}))
+        initial = json.loads(json.dumps({"settings": to_dict(arguments.settings), "space": self.space}))
         if self.study.user_attrs.setdefault("begun", initial) != initial:
             raise ValueError(
                 f"the search in {self.folder} was started with other settings or parameters; repeat them, or use another --folder"
             )
         self.study.set_user_attr("begun", initial)
         # A restarted search must not repeat the samples of its first part.
-        self.study.sampler = optuna.samplers.TPESampler(seed=given.settings.seed + len(self.study.trials))
+        self.study.sampler = optuna.samplers.TPESampler(seed=arguments.settings.seed + len(self.study.trials))
 
     def run(self) -> None:
         """Run all remaining trials."""
@@ -149,13 +149,13 @@ class Trials:
         combinations = sum(_SINGLE not in trial.user_attrs for trial in finished)
         waiting = [trial for trial in self.study.trials if trial.state is TrialState.WAITING]
         remaining = len(waiting)
-        if self.given.stage != "single":
+        if self.arguments.stage != "single":
             queued = sum(_SINGLE not in trial.user_attrs for trial in waiting)
-            remaining += max(0, self.given.trials - combinations - queued)
+            remaining += max(0, self.arguments.trials - combinations - queued)
         text = f"{len(finished)} trials done, {remaining} remaining, in {self.folder}; Ctrl-C stops the search"
         self.console.print(text, soft_wrap=True)
         if remaining:
-            seconds = self.given.minutes * 60 or None
+            seconds = self.arguments.minutes * 60 or None
             self.study.optimize(self.objective, remaining, timeout=seconds, catch=(torch.cuda.OutOfMemoryError,))
 
     def _enqueue(self) -> None:
@@ -173,7 +173,7 @@ class Trials:
                 if _SINGLE in trial.user_attrs:
                     attributes[_SINGLE] = trial.user_attrs[_SINGLE]
                 self.study.enqueue_trial(trial.params, user_attrs=attributes)
-        if self.given.stage != "combinations":
+        if self.arguments.stage != "combinations":
             known = {
                 trial.user_attrs.get(_SINGLE)
                 for trial in self.study.trials
@@ -205,7 +205,7 @@ class Trials:
 
         choices = {name: trial.suggest_categorical(name, listed) for name, listed in self.space.items()}
         run = self.run_folder(trial.number, trial.user_attrs)
-        settings = replace(with_choices(self.given.settings, choices), run=str(run))
+        settings = replace(with_choices(self.arguments.settings, choices), run=str(run))
         changed = self.changed(choices)
         self.console.print(f"[bold]trial {trial.number}[/]: {changed or 'initial settings'}", soft_wrap=True)
         try:
@@ -220,7 +220,7 @@ class Trials:
         def watch(update: int, means: Mapping[str, Any]) -> bool:
             nonlocal reward, done, pruned
             done, reward = update, means.get("episode/reward", reward)
-            if update % self.given.period == 0 and reward is not None and update < last:
+            if update % self.arguments.period == 0 and reward is not None and update < last:
                 trial.report(reward, update)
                 pruned = trial.should_prune()
             return pruned
@@ -275,14 +275,14 @@ class Trials:
         for trial in done[:10]:
             table.add_row(str(trial.number), f"{trial.value:.4f}", self.changed(trial.params) or "none")
         self.console.print(table)
-        best = to_dict(with_choices(self.given.settings, done[0].params))
+        best = to_dict(with_choices(self.arguments.settings, done[0].params))
         trials = [
             {"trial": trial.number, "state": trial.state.name, "reward": trial.value, "choices": trial.params}
             for trial in self.study.trials
         ]
         found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
         (self.folder / BEST).write_text(json.dumps(found, indent=1) + "\n")
-        settings, changed = self.given.settings, self.changed(done[0].params)
+        settings, changed = self.arguments.settings, self.changed(done[0].params)
         start = f"--env {settings.env} --preset {settings.preset}"
         start += "" if "--agent" in changed else f" --agent {settings.agent}"
         self.console.print(
@@ -291,9 +291,9 @@ class Trials:
         self.console.print(f"endless-train {start} {changed}".rstrip(), soft_wrap=True)
 
 
-def execute(given: SearchArguments) -> None:
+def execute(arguments: SearchArguments) -> None:
     """Run the search, and report the best settings so far, also if it is interrupted."""
-    trials = Trials(given.validated(), Console(highlight=False))
+    trials = Trials(arguments.validated(), Console(highlight=False))
     try:
         trials.run()
     finally:
@@ -312,8 +312,8 @@ def parse(arguments: list[str]) -> SearchArguments:
 
 def main() -> int:
     """Entry point of the command `endless-search`; returns the exit status."""
-    given = parse(sys.argv[1:])
-    return command.run("endless-search", lambda: execute(given))
+    arguments = parse(sys.argv[1:])
+    return command.run("endless-search", lambda: execute(arguments))
 
 
 if __name__ == "__main__":
