@@ -44,7 +44,8 @@ pub struct Parameters {
     pub reward_command_failure: f64,
     /// Reward for executing one command.
     pub reward_command_success: f64,
-    /// `reward_episode_success`, or `reward_new_command_success` of the endless id: reward for executing the whole sequence.
+    /// `reward_episode_success`, or `reward_new_command_success` of the endless id: reward for executing the whole
+    /// sequence.
     pub reward_sequence_success: f64,
 }
 

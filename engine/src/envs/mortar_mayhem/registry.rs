@@ -1,7 +1,7 @@
 //! The ids of Mortar Mayhem, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks few values. The limits here are wide enough for every
-//! use, and narrow enough that no value breaks the rules or needs much memory.
+//! Source: `default_reset_parameters` of the original. The original checks few values. The limits here are wide enough
+//! for every use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
@@ -37,7 +37,7 @@ const COMMAND_SHOW_DELAY: Parameter = Parameter::list(
     MAX_DURATION,
     "Steps between two shown commands. A list to draw from.",
 );
-const EXPLOSION_DURATION: &str = "Steps that the agent has to stay on the commanded tile. A list to draw from.";
+const EXPLOSION_DURATION: &str = "Steps that the agent must stay on the commanded tile. A list to draw from.";
 const EXPLOSION_DELAY: &str = "Steps that the agent has to execute one command. A list to draw from.";
 const VISUAL_FEEDBACK: Parameter =
     Parameter::bool("visual_feedback", true, "Whether the wrong tiles turn red when a command is checked.");

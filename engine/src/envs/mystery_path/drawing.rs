@@ -171,8 +171,8 @@ fn cross_corner((x, y): (i32, i32)) -> (i32, i32) {
 }
 
 impl Assets {
-    /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and walls, or the
-    /// endless id's whole path and stamina.
+    /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and
+    /// walls, or the endless id's whole path and stamina.
     pub(super) fn draw_ground_truth(&self, state: &State, canvas: &mut Canvas<'_>) {
         self.paint_background(state.endless.background(), canvas);
         if self.config.variant == Variant::Endless {
@@ -213,7 +213,8 @@ impl Assets {
         if (0..=SCREEN as i32 - TILE).contains(&left) {
             self.past_tile.blit(canvas, left, top);
         } else {
-            // A border covers the last two pixels of a tile that leaves the screen, so that a clipped picture would differ.
+            // A border covers the last two pixels of a tile that leaves the screen, so that a clipped picture would
+            // differ.
             canvas.draw_rect(WHITE, tile_at(left, top), 0);
             canvas.draw_rect(TILE_BORDER, tile_at(left, top), 1);
         }

@@ -1,7 +1,7 @@
 //! The ids of Mystery Path, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough for every
-//! use, and narrow enough that no value breaks the rules or needs much memory.
+//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough
+//! for every use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
@@ -39,7 +39,7 @@ const CARDINAL_ORIGIN_CHOICE: Parameter = Parameter::list(
     &[0, 1, 2, 3],
     0,
     3,
-    "Side of the screen where the path begins: 0 left, 1 right, 2 top, 3 bottom. A list to draw from.",
+    "Side of the screen where the path starts: 0 left, 1 right, 2 top, 3 bottom. A list to draw from.",
 );
 const SHOW_ORIGIN: Parameter = Parameter::bool("show_origin", false, "Whether the path's first tile is shown.");
 const SHOW_GOAL: Parameter = Parameter::bool("show_goal", false, "Whether the path's last tile is shown.");

@@ -5,8 +5,8 @@
 pub use crate::envs::family::SearingSpotlightsVariant as Variant;
 use crate::envs::parameters::ResetParameters;
 
-/// Largest number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another one
-/// leaves.
+/// Largest number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another
+/// one leaves.
 pub const MAX_SPOTLIGHTS: usize = 1000;
 
 /// Largest radius of a spotlight in pixels: more than the screen's diagonal.
