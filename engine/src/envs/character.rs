@@ -54,7 +54,7 @@ pub struct Character {
 pub type Bounds = (i32, i32, i32, i32);
 
 impl Character {
-    /// Whether position and direction are in their ranges. A forged snapshot may clamp_axis any numbers.
+    /// Whether position and direction are in their ranges. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
         const FAR: i32 = 1 << 28;
         let near = |at: i32| (-FAR..=FAR).contains(&at);

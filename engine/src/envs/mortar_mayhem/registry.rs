@@ -20,8 +20,8 @@ const AGENT_SCALE: Parameter = Parameter::float(
 const AGENT_SPEED: Parameter =
     Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
-const ALLOWED_COMMANDS: &str = "How many of the commands may occur, in the order right, down, left, up, stay, right down, \
-                                right up, left down, left up.";
+const ALLOWED_COMMANDS: &str = "Number of different commands that may occur, from the start of this list: right, down, \
+                                left, up, stay, right down, right up, left down, left up.";
 const COMMAND_COUNT: &str = "Number of commands to execute. A list to draw from.";
 const COMMAND_SHOW_DURATION: Parameter = Parameter::list(
     "command_show_duration",
@@ -38,7 +38,7 @@ const COMMAND_SHOW_DELAY: Parameter = Parameter::list(
     "Steps between two shown commands. A list to draw from.",
 );
 const EXPLOSION_DURATION: &str = "Steps that the agent must stay on the commanded tile. A list to draw from.";
-const EXPLOSION_DELAY: &str = "Steps that the agent has to execute one command. A list to draw from.";
+const EXPLOSION_DELAY: &str = "Steps within which the agent must execute one command. A list to draw from.";
 const VISUAL_FEEDBACK: Parameter =
     Parameter::bool("visual_feedback", true, "Whether the wrong tiles turn red when a command is checked.");
 const REWARD_COMMAND_FAILURE: Parameter =
@@ -115,7 +115,7 @@ const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
     AGENT_SCALE,
     AGENT_SPEED,
     Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
-    Parameter::int("initial_command_count", 1, 1, MAX_COMMANDS, "Commands that are shown at first."),
+    Parameter::int("initial_command_count", 1, 1, MAX_COMMANDS, "Commands at the start of an episode."),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
     Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),

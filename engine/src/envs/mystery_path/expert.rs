@@ -15,7 +15,7 @@ use crate::envs::steering::turn_or_walk;
 /// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so that the frames do not show it.
 const ENDLESS_SPEED: i32 = 3;
 
-/// Probability that one tile of distance is worth.
+/// Penalty for each tile of distance, as a probability.
 const WALK: f64 = 0.01;
 
 /// Prior probability that an unknown tile is on the path: beside the last tile found, and beside others.

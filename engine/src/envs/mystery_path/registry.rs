@@ -90,10 +90,10 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
         5.0,
         -100.0,
         100.0,
-        "Tiles to the left of the agent that are on the screen, held within 0 to 5.5; also, cut to a whole number, how \
-         many columns of the past path are shown.",
+        "Tiles to the left of the agent that are on the screen, limited to 0 to 5.5. Truncated, it is also the number \
+         of columns of the past path that are shown.",
     ),
-    Parameter::int("stamina_level", 20, 1, MAX_STAMINA, "Steps that the agent has to reach the next tile."),
+    Parameter::int("stamina_level", 20, 1, MAX_STAMINA, "Steps within which the agent must reach the next tile."),
     REWARD_FALL_OFF,
     reward_path_progress(0.1),
     Parameter::reward(
@@ -105,7 +105,7 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
 ];
 
 const NUM_FAILS: InfoColumn =
-    InfoColumn { name: "num_fails", is_integer: true, description: "steps that the agent was found off the path" };
+    InfoColumn { name: "num_fails", is_integer: true, description: "steps in which the agent was off the path" };
 
 const FINITE_INFO: &[InfoColumn] = &[
     InfoColumn { name: "success", is_integer: true, description: "1 if the goal was reached, otherwise 0" },
@@ -122,7 +122,7 @@ const ENDLESS_INFO: &[InfoColumn] = &[
     InfoColumn {
         name: "tiles_visited",
         is_integer: true,
-        description: "tiles of the path that the agent was on, without the first",
+        description: "tiles of the path that the agent was on, not counting the first",
     },
 ];
 
@@ -154,7 +154,7 @@ pub const SPECS: &[EnvSpec] = &[
     },
     EnvSpec {
         id: "Endless-MysteryPath-v0",
-        summary: "An invisible path without end; falling off before the farthest point, or twice at one place, ends it",
+        summary: "An invisible path without end; falling off before the farthest point, or twice at one tile, ends it",
         family: Family::MysteryPath(Variant::Endless),
         action_space: ActionSpace::Discrete(4),
         vector_observation: 0,

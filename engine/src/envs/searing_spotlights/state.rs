@@ -31,7 +31,7 @@ pub struct State {
     /// The frame is the first of its episode.
     pub(super) first_frame: bool,
     pub(super) health: f64,
-    /// Red columns of the health bar; more than [`HEALTH_WIDTH`] for negative health.
+    /// Red columns of the health bar; more than [`HEALTH_WIDTH`](super::config::HEALTH_WIDTH) for negative health.
     pub(super) red_columns: u8,
     pub(super) spotlights: Vec<Spotlight>,
     pub(super) spawn_timer: i64,

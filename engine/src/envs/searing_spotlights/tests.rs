@@ -101,7 +101,7 @@ proptest! {
             environment.reset(&assets(spec, options), &mut random);
             for step in 0..=steps {
                 let state = environment.state.clone();
-                prop_assert_eq!(frame(&environment, 0), frame(&environment, 255), "a full draw depends on the canvas before");
+                prop_assert_eq!(frame(&environment, 0), frame(&environment, 255), "must not depend on the canvas");
                 let mut view = Surface::new(SCREEN, SCREEN);
                 environment.draw_ground_truth(&mut view.canvas());
                 prop_assert_eq!(&environment.state, &state, "drawing changed the state");
