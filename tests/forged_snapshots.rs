@@ -1,5 +1,5 @@
-//! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot is refused or can be
-//! played; none panics.
+//! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot is
+//! refused or can be played; none panics.
 
 use ciborium::Value;
 use endless_gym::batch::{Block, zeroed};
@@ -122,7 +122,8 @@ impl Game {
         Some(self.pool.restore(0, &snapshot))
     }
 
-    /// Restores forged content and, if it is not refused, plays it: to the end of the episode or not, and in another episode.
+    /// Restores forged content and, if it is not refused, plays it: to the end of the episode or not, and in another
+    /// episode.
     fn try_to_play(&mut self, content: &Value) -> Outcome {
         match self.restore(content) {
             None => Outcome::NotEncodable,

@@ -217,7 +217,7 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["serve", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["serve", "--option", "arena_sise=3"], "no reset parameter `arena_sise`"),
         (vec!["serve", "--option", "max_steps"], "expected NAME=VALUE"),
-        (vec!["serve", "--option", "agent_speed=fast"], "`agent_speed` is \"fast\", but has to be: number"),
+        (vec!["serve", "--option", "agent_speed=fast"], "`agent_speed` must be a number, 0 to 84, got \"fast\""),
         (vec!["serve", "--env-options", "3"], "expected a JSON object"),
         (vec!["serve", "--num-envs", "2", "--env-options", "{}"], "1 "),
         (vec!["serve", "--num-envs", "0"], "0 environments"),
@@ -225,7 +225,7 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["serve", "--service", "a/b"], "`a/b` cannot name an engine"),
         (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["demo", "--num-envs", "0"], "0 environments"),
-        (vec!["demo", "--option", "arena_size=7"], "`arena_size` is 7, which is out of range"),
+        (vec!["demo", "--option", "arena_size=7"], "`arena_size` must be an integer, 2 to 6, got 7"),
         (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "/no/python: "),
     ] {

@@ -54,14 +54,15 @@ pub struct Character {
 pub type Bounds = (i32, i32, i32, i32);
 
 impl Character {
-    /// Whether position and direction are in their ranges. A forged snapshot may clamp_axis any numbers.
+    /// Whether position and direction are in their ranges. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
         const FAR: i32 = 1 << 28;
         let near = |at: i32| (-FAR..=FAR).contains(&at);
         (0..360).contains(&self.rotation) && self.rotation % 45 == 0 && near(self.position.0) && near(self.position.1)
     }
 
-    /// Turns in the direction of the action, and returns it as a unit vector; (0, 0) for no movement, which turns nothing.
+    /// Turns in the direction of the action, and returns it as a unit vector; (0, 0) for no movement, which turns
+    /// nothing.
     fn turn(&mut self, action: &[i32]) -> [f64; 2] {
         let towards = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
         let (x, y): (f64, f64) = (towards(action[0]), towards(action[1]));
@@ -87,8 +88,8 @@ impl Character {
         (x, y)
     }
 
-    /// Moves by `speed` pixels, truncated to whole pixels on each axis, and keeps `radius` pixels away from the edges of
-    /// `bounds`. Where `bounds` is too small for that, the left and top edges take precedence.
+    /// Moves by `speed` pixels, truncated to whole pixels on each axis, and keeps `radius` pixels away from the edges
+    /// of `bounds`. Where `bounds` is too small for that, the left and top edges take precedence.
     pub fn step_within(&mut self, action: &[i32], speed: f64, radius: i32, bounds: Bounds) {
         self.step(action, speed);
         let (left, top, right, bottom) = bounds;
@@ -97,8 +98,8 @@ impl Character {
         self.position = (clamp_axis(self.position.0, left, right), clamp_axis(self.position.1, top, bottom));
     }
 
-    /// Moves by `speed` pixels, with the new position rounded to whole pixels, and wraps around to the opposite side when more
-    /// than half of the character has left `bounds`.
+    /// Moves by `speed` pixels, with the new position rounded to whole pixels, and wraps around to the opposite side
+    /// when more than half of the character has left `bounds`.
     pub fn step_wrapping(&mut self, action: &[i32], speed: f64, radius: i32, bounds: Bounds) {
         let [x, y] = self.turn(action);
         let (left, top, right, bottom) = bounds;
@@ -116,8 +117,8 @@ impl Character {
         );
     }
 
-    /// Turns left (1), turns right (2) or walks one cell ahead (3) on a grid of `size` x `size` cells; 0 does nothing. Returns
-    /// the new cell; the caller must set the position.
+    /// Turns left (1), turns right (2) or walks one cell ahead (3) on a grid of `size` x `size` cells; 0 does nothing.
+    /// Returns the new cell; the caller must set the position.
     pub fn step_on_grid(&mut self, action: i32, cell: (i32, i32), size: i32) -> (i32, i32) {
         let (mut x, mut y) = cell;
         match (action, self.rotation) {

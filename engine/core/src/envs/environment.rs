@@ -13,9 +13,9 @@ use crate::raster::Canvas;
 
 /// Rules and pictures of one family of environments.
 ///
-/// [`step`](Environment::step) changes the state, [`scene`](Environment::scene) describes what the state looks like, and
-/// [`paint`](Environment::paint) and [`repaint`](Environment::repaint) paint scenes. One object plays many episodes. As in the
-/// original, some of the state is kept from one episode to the next.
+/// [`step`](Environment::step) changes the state, [`scene`](Environment::scene) describes what the state looks like,
+/// and [`paint`](Environment::paint) and [`repaint`](Environment::repaint) paint scenes. One object plays many
+/// episodes. As in the original, some of the state is kept from one episode to the next.
 pub trait Environment: Send + Sync {
     /// What distinguishes the ids of the family.
     type Variant: Copy + Send + Sync;
@@ -26,8 +26,8 @@ pub trait Environment: Send + Sync {
     /// Everything that changes during play; the part of an environment that a snapshot stores.
     type State: Serialize + DeserializeOwned;
 
-    /// What a frame shows, as a small value. Together with the assets it determines every pixel, so that a comparison of two
-    /// scenes finds what has changed.
+    /// What a frame shows, as a small value. Together with the assets it determines every pixel, so that a comparison
+    /// of two scenes finds what has changed.
     type Scene: Clone + PartialEq + Debug + Send + Sync;
 
     /// Creates the shared assets for one set of reset parameters.
@@ -54,7 +54,8 @@ pub trait Environment: Send + Sync {
     /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ.
     fn repaint(assets: &Self::Assets, shown: &Self::Scene, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
-    /// Draws the observation in full. `frame` has [`FRAME_BYTES`](super::FRAME_BYTES) bytes, indexed \[x\]\[y\]\[channel\].
+    /// Draws the observation in full. `frame` has [`FRAME_BYTES`](super::FRAME_BYTES) bytes, indexed
+    /// \[x\]\[y\]\[channel\].
     ///
     /// # Panics
     ///
@@ -63,8 +64,8 @@ pub trait Environment: Send + Sync {
         Self::paint(self.shared(), &self.scene(), &mut Canvas::new(frame, SCREEN, SCREEN));
     }
 
-    /// Draws the original's ground-truth view on a canvas of the observation's size, before the original scales it up. The
-    /// state changes where the original advances an animation with every view.
+    /// Draws the original's ground-truth view on a canvas of the observation's size, before the original scales it up.
+    /// The state changes where the original advances an animation with every view.
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
     /// Writes the vector observation; an environment without one writes nothing.
@@ -86,8 +87,8 @@ pub trait Environment: Send + Sync {
     /// [`InvalidState`] if a number of the state is out of its range. The environment is then unchanged.
     fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
 
-    /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended the
-    /// episode.
+    /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended
+    /// the episode.
     fn info(&self, out: &mut [f64]);
 }
 

@@ -7,7 +7,7 @@ pub trait Expert: Send {
 
     /// Chooses an action. The caller must call it once for each observation, including the first of an episode.
     ///
-    /// `features` and `vector_observation` are as the environment writes them; `action` has one number for each branch of the
-    /// action space.
+    /// `features` and `vector_observation` are as the environment writes them; `action` has one number for each branch
+    /// of the action space.
     fn act(&mut self, features: &[f32], vector_observation: &[f32], action: &mut [i32]);
 }

@@ -1,33 +1,46 @@
-//! Reset parameters: the original's names and defaults, and the check of what a user gives.
+//! Reset parameters: the original's names and defaults, and the validation of given values.
 
 use serde::Serialize;
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
-/// Longest list that a parameter takes.
+/// Largest number of values in a list.
 const MAX_LIST: usize = 4096;
 
 /// Type, default and limits of a reset parameter.
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum ParameterKind {
+    /// A flag.
     Bool {
+        /// The original's default.
         default: bool,
     },
+    /// An integer.
     Int {
+        /// The original's default.
         default: i64,
+        /// Least allowed value.
         min: i64,
+        /// Largest allowed value.
         max: i64,
     },
+    /// A finite number.
     Float {
+        /// The original's default.
         default: f64,
+        /// Least allowed value.
         min: f64,
+        /// Largest allowed value.
         max: f64,
     },
-    /// A list that the environment draws one value from in each episode. Not empty.
+    /// A list of 1 to 4096 integers, from which each episode draws one.
     IntList {
+        /// The original's default.
         default: &'static [i64],
+        /// Least allowed value of an item.
         min: i64,
+        /// Largest allowed value of an item.
         max: i64,
     },
 }
@@ -35,13 +48,16 @@ pub enum ParameterKind {
 /// One reset parameter of an environment.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Parameter {
+    /// The original's name.
     pub name: &'static str,
+    /// Type, default and limits.
     #[serde(flatten)]
     pub kind: ParameterKind,
+    /// Meaning and unit.
     pub description: &'static str,
 }
 
-/// Largest reward that a reset parameter gives, and the smallest with the sign turned.
+/// Largest absolute value of a reward.
 const MAX_REWARD: f64 = 1e6;
 
 impl Parameter {
@@ -60,12 +76,12 @@ impl Parameter {
         Parameter { name, kind: ParameterKind::Float { default, min, max }, description }
     }
 
-    /// A reward or, with a negative number, a punishment.
+    /// A reward of -1e6 to 1e6; negative values are penalties.
     pub const fn reward(name: &'static str, default: f64, description: &'static str) -> Self {
         Parameter::float(name, default, -MAX_REWARD, MAX_REWARD, description)
     }
 
-    /// A list of integers in `min..=max` to draw from.
+    /// A list of integers in `min..=max`, from which each episode draws one.
     pub const fn list(
         name: &'static str,
         default: &'static [i64],
@@ -86,7 +102,7 @@ impl Parameter {
         }
     }
 
-    /// Type and limits in words.
+    /// Type and limits as text, such as `integer, 2 to 6`.
     pub fn allowed(&self) -> String {
         match self.kind {
             ParameterKind::Bool { .. } => "true or false".to_owned(),
@@ -95,6 +111,16 @@ impl Parameter {
             ParameterKind::Float { min, max, .. } => format!("number, {min} to {max}"),
             ParameterKind::IntList { min, max, .. } => format!("list of 1 to {MAX_LIST} integers, {min} to {max}"),
         }
+    }
+
+    /// What a valid value is, for error messages: [`allowed`](Self::allowed) with an article.
+    fn requirement(&self) -> String {
+        let article = match self.kind {
+            ParameterKind::Bool { .. } => "",
+            ParameterKind::Int { .. } => "an ",
+            ParameterKind::Float { .. } | ParameterKind::IntList { .. } => "a ",
+        };
+        format!("{article}{}", self.allowed())
     }
 
     fn default_value(&self) -> Value {
@@ -108,9 +134,9 @@ impl Parameter {
 
     fn parse(&self, given: &Json) -> Result<Value, ParameterError> {
         let wrong_type =
-            || ParameterError::WrongType { name: self.name, value: given.to_string(), allowed: self.allowed() };
+            || ParameterError::WrongType { name: self.name, value: given.to_string(), allowed: self.requirement() };
         let out_of_range =
-            || ParameterError::OutOfRange { name: self.name, value: given.to_string(), allowed: self.allowed() };
+            || ParameterError::OutOfRange { name: self.name, value: given.to_string(), allowed: self.requirement() };
         match self.kind {
             ParameterKind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong_type),
             ParameterKind::Int { min, max, .. } => {
@@ -131,7 +157,7 @@ impl Parameter {
     }
 }
 
-/// An integer, also where it is written as `3.0`.
+/// The integer of a JSON number, which may be written as `3.0`.
 fn integer(given: &Json) -> Option<i64> {
     given.as_i64().or_else(|| given.as_f64().filter(|v| v.fract() == 0.0 && v.abs() < 1e15).map(|v| v as i64))
 }
@@ -144,14 +170,18 @@ enum Value {
     IntList(Vec<i64>),
 }
 
-/// A complete and valid set of reset parameters: the defaults, with what was given in their place.
+/// A complete and valid set of reset parameters: the given values, and the defaults of all others.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResetParameters {
     values: Vec<(&'static str, Value)>,
 }
 
 impl ResetParameters {
-    /// Checks `given` against `parameters` and fills in the defaults.
+    /// Validates `given` against `parameters` and adds the defaults.
+    ///
+    /// # Errors
+    ///
+    /// If a name is unknown, or a value has another type or is out of range.
     pub fn new(
         id: &'static str,
         parameters: &'static [Parameter],
@@ -172,34 +202,58 @@ impl ResetParameters {
         self.values.iter().find(|(n, _)| *n == name).map(|(_, v)| v)
     }
 
-    /// The flag of that name, or `absent` if the environment has none.
+    /// The flag with that name; `absent` if the environment does not have it.
     pub fn bool(&self, name: &str, absent: bool) -> bool {
         if let Some(Value::Bool(value)) = self.value(name) { *value } else { absent }
     }
 
-    /// The integer of that name, or `absent` if the environment has none.
+    /// The integer with that name; `absent` if the environment does not have it.
     pub fn int(&self, name: &str, absent: i64) -> i64 {
         if let Some(Value::Int(value)) = self.value(name) { *value } else { absent }
     }
 
-    /// The number of that name, or `absent` if the environment has none.
+    /// The number with that name; `absent` if the environment does not have it.
     pub fn float(&self, name: &str, absent: f64) -> f64 {
         if let Some(Value::Float(value)) = self.value(name) { *value } else { absent }
     }
 
-    /// The list of that name, empty if the environment has none.
+    /// The list with that name; empty if the environment does not have it.
     pub fn int_list(&self, name: &str) -> Vec<i64> {
         if let Some(Value::IntList(value)) = self.value(name) { value.clone() } else { Vec::new() }
     }
 }
 
-/// A reset parameter that cannot be used.
+/// An invalid reset parameter.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum ParameterError {
+    /// The environment has no reset parameter of that name.
     #[error("{id} has no reset parameter `{name}`; it has {allowed}")]
-    Unknown { id: &'static str, name: String, allowed: String },
-    #[error("reset parameter `{name}` is {value}, but has to be: {allowed}")]
-    WrongType { name: &'static str, value: String, allowed: String },
-    #[error("reset parameter `{name}` is {value}, which is out of range; it has to be: {allowed}")]
-    OutOfRange { name: &'static str, value: String, allowed: String },
+    Unknown {
+        /// The environment's id.
+        id: &'static str,
+        /// The given name.
+        name: String,
+        /// The environment's reset parameters, separated by commas.
+        allowed: String,
+    },
+    /// The value has another type than the parameter.
+    #[error("reset parameter `{name}` must be {allowed}, got {value}")]
+    WrongType {
+        /// The parameter's name.
+        name: &'static str,
+        /// The given value as JSON.
+        value: String,
+        /// Allowed type and range as text.
+        allowed: String,
+    },
+    /// The value has the parameter's type and is out of its range.
+    #[error("reset parameter `{name}` must be {allowed}, got {value}")]
+    OutOfRange {
+        /// The parameter's name.
+        name: &'static str,
+        /// The given value as JSON.
+        value: String,
+        /// Allowed type and range as text.
+        allowed: String,
+    },
 }

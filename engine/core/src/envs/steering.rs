@@ -1,4 +1,4 @@
-//! What scripted experts of several families know about steering.
+//! Steering on a grid, for the scripted experts.
 
 /// Actions on a grid.
 const NOTHING: i32 = 0;
@@ -6,7 +6,7 @@ const LEFT: i32 = 1;
 const RIGHT: i32 = 2;
 const AHEAD: i32 = 3;
 
-/// The grid action that leads over `(x, y)` cells for an agent that faces along the heading, a unit vector.
+/// The grid action for a movement by `(x, y)` cells of an agent with that heading, a unit vector: horizontally first.
 pub fn turn_or_walk([heading_x, heading_y]: [f32; 2], (x, y): (i32, i32)) -> i32 {
     let (wanted_x, wanted_y) = match (x, y) {
         (0, 0) => return NOTHING,

@@ -1,11 +1,11 @@
-//! Vectors as pygame's `Vector2` computes them.
+//! Vector operations with the same rounding as pygame's `Vector2`.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// How far an angle may be from a quarter turn to count as one.
+/// Largest difference in radians between an angle and a quarter turn that counts as one.
 const EPSILON: f64 = 1e-6;
 
-/// `vector.rotate(degrees)`: quarter turns are exact, everything else goes through sine and cosine.
+/// `vector.rotate(degrees)`: exact for quarter turns, by sine and cosine for all other angles.
 pub fn rotate([x, y]: [f64; 2], degrees: f64) -> [f64; 2] {
     let angle = (degrees * PI / 180.0).rem_euclid(TAU);
     if (angle + EPSILON) % FRAC_PI_2 < 2.0 * EPSILON {
@@ -20,7 +20,7 @@ pub fn rotate([x, y]: [f64; 2], degrees: f64) -> [f64; 2] {
     [cos * x - sin * y, sin * x + cos * y]
 }
 
-/// `from.lerp(to, share)`: the point that lies that share (0 to 1) of the way from the one to the other.
+/// `from.lerp(to, share)`: the point at that share (0 to 1) of the line from `from` to `to`.
 pub fn lerp(from: [f64; 2], to: [f64; 2], share: f64) -> [f64; 2] {
     std::array::from_fn(|axis| from[axis] * (1.0 - share) + to[axis] * share)
 }

@@ -1,12 +1,13 @@
-//! Pictures for people: what the original's `render` returns.
+//! The pictures that the original's `render` returns.
 //!
-//! They are indexed \[row\]\[column\]\[channel\], as image libraries want it, while observations are indexed \[x\]\[y\]\[channel\].
+//! They are indexed \[row\]\[column\]\[channel\], as in image libraries, while observations are indexed
+//! \[x\]\[y\]\[channel\].
 
 use super::environment::Environment;
 use super::screen::{FRAME_BYTES, SCREEN};
 use crate::raster::Canvas;
 
-/// How much larger than an observation the ground-truth view is.
+/// Scale of the ground-truth view relative to an observation.
 const SCALE: usize = 4;
 
 /// Width and height of the ground-truth view in pixels.
@@ -15,7 +16,12 @@ pub const VIEW: usize = SCREEN * SCALE;
 /// Bytes of the ground-truth view: 336x336 RGB.
 pub const VIEW_BYTES: usize = VIEW * VIEW * 3;
 
-/// Draws the ground-truth view, the original's `render()` in the mode `debug_rgb_array`, into [`VIEW_BYTES`] bytes.
+/// Draws the ground-truth view, the original's `render()` in the mode `debug_rgb_array`, into the first [`VIEW_BYTES`]
+/// bytes of `out`.
+///
+/// # Panics
+///
+/// If `out` is shorter.
 pub fn ground_truth_view<E: Environment>(env: &mut E, out: &mut [u8]) {
     let mut frame = [0; FRAME_BYTES];
     env.draw_ground_truth(&mut Canvas::new(&mut frame, SCREEN, SCREEN));
@@ -27,7 +33,11 @@ pub fn ground_truth_view<E: Environment>(env: &mut E, out: &mut [u8]) {
     }
 }
 
-/// Turns an observation into the original's `render()` in the mode `rgb_array`; both have [`FRAME_BYTES`] bytes.
+/// Converts an observation to the original's `render()` in the mode `rgb_array`. Both have [`FRAME_BYTES`] bytes.
+///
+/// # Panics
+///
+/// If one of them is shorter.
 pub fn rgb_array(observation: &[u8], out: &mut [u8]) {
     let pixels = observation[..FRAME_BYTES].as_chunks::<3>().0;
     for (index, pixel) in out[..FRAME_BYTES].as_chunks_mut::<3>().0.iter_mut().enumerate() {

@@ -60,7 +60,8 @@ impl Command {
         usize::from(self.0)
     }
 
-    /// Turn of the arrow that shows the command, counterclockwise from right in degrees; `None` is shown as a crossed circle.
+    /// Turn of the arrow that shows the command, counterclockwise from right in degrees; `None` is shown as a crossed
+    /// circle.
     pub fn angle(self) -> Option<i32> {
         PROPERTIES[self.index()].angle
     }

@@ -80,8 +80,8 @@ impl Assets {
         self.commands[command.index()].blit(canvas, x, y);
     }
 
-    /// Draws the original's `_build_debug_surface`, which marks the target and advances the shown commands by one frame with
-    /// every call. `earlier_sprites` are the pictures of an earlier episode's character.
+    /// Draws the original's `_build_debug_surface`, which marks the target and advances the shown commands by one frame
+    /// with every call. `earlier_sprites` are the pictures of an earlier episode's character.
     pub(super) fn draw_ground_truth(
         &self,
         state: &mut State,

@@ -18,7 +18,7 @@ pub const MAX_COMMANDS: i64 = 1000;
 pub struct Parameters {
     /// Steps that an episode may last; not limited if less than 1.
     pub max_steps: i64,
-    /// Size of the agent; 0.25 is a radius of 6 pixels. 0 to [`MAX_AGENT_SCALE`].
+    /// Size of the agent; 0.25 is a radius of 6 pixels. 0 to 4.
     pub agent_scale: f64,
     /// Pixels per step, 0 to 84. Unused on a grid.
     pub agent_speed: f64,
@@ -34,9 +34,9 @@ pub struct Parameters {
     pub command_show_duration: Vec<i64>,
     /// Steps between two shown commands, to draw from; empty if the commands are given.
     pub command_show_delay: Vec<i64>,
-    /// Steps that the tiles burn, to draw from; 1 to [`MAX_DURATION`].
+    /// Steps that the tiles burn, to draw from; 1 to 1000.
     pub explosion_duration: Vec<i64>,
-    /// Steps that the agent has for one command, to draw from; 1 to [`MAX_DURATION`].
+    /// Steps that the agent has for one command, to draw from; 1 to 1000.
     pub explosion_delay: Vec<i64>,
     /// Whether burning tiles are shown.
     pub visual_feedback: bool,
@@ -44,7 +44,8 @@ pub struct Parameters {
     pub reward_command_failure: f64,
     /// Reward for executing one command.
     pub reward_command_success: f64,
-    /// `reward_episode_success`, or `reward_new_command_success` of the endless id: reward for executing the whole sequence.
+    /// `reward_episode_success`, or `reward_new_command_success` of the endless id: reward for executing the whole
+    /// sequence.
     pub reward_sequence_success: f64,
 }
 

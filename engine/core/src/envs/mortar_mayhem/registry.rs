@@ -1,7 +1,7 @@
 //! The ids of Mortar Mayhem, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks few values. The limits here are wide enough for every
-//! use, and narrow enough that no value breaks the rules or needs much memory.
+//! Source: `default_reset_parameters` of the original. The original checks few values. The limits here are wide enough
+//! for every use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
@@ -20,8 +20,8 @@ const AGENT_SCALE: Parameter = Parameter::float(
 const AGENT_SPEED: Parameter =
     Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
-const ALLOWED_COMMANDS: &str = "How many of the commands may occur, in the order right, down, left, up, stay, right down, \
-                                right up, left down, left up.";
+const ALLOWED_COMMANDS: &str = "Number of different commands that may occur, from the start of this list: right, down, \
+                                left, up, stay, right down, right up, left down, left up.";
 const COMMAND_COUNT: &str = "Number of commands to execute. A list to draw from.";
 const COMMAND_SHOW_DURATION: Parameter = Parameter::list(
     "command_show_duration",
@@ -37,8 +37,8 @@ const COMMAND_SHOW_DELAY: Parameter = Parameter::list(
     MAX_DURATION,
     "Steps between two shown commands. A list to draw from.",
 );
-const EXPLOSION_DURATION: &str = "Steps that the agent has to stay on the commanded tile. A list to draw from.";
-const EXPLOSION_DELAY: &str = "Steps that the agent has to execute one command. A list to draw from.";
+const EXPLOSION_DURATION: &str = "Steps that the agent must stay on the commanded tile. A list to draw from.";
+const EXPLOSION_DELAY: &str = "Steps within which the agent must execute one command. A list to draw from.";
 const VISUAL_FEEDBACK: Parameter =
     Parameter::bool("visual_feedback", true, "Whether the wrong tiles turn red when a command is checked.");
 const REWARD_COMMAND_FAILURE: Parameter =
@@ -115,7 +115,7 @@ const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
     AGENT_SCALE,
     AGENT_SPEED,
     Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
-    Parameter::int("initial_command_count", 1, 1, MAX_COMMANDS, "Commands that are shown at first."),
+    Parameter::int("initial_command_count", 1, 1, MAX_COMMANDS, "Commands at the start of an episode."),
     COMMAND_SHOW_DURATION,
     COMMAND_SHOW_DELAY,
     Parameter::list("explosion_duration", &[6], 1, MAX_DURATION, EXPLOSION_DURATION),

@@ -1,7 +1,7 @@
 //! The rules of Mortar Mayhem: one implementation for all five ids.
 //!
-//! Source: `reset` and `step` of the original's `mortar_mayhem*.py` and `endless_mortar_mayhem.py`. The order of the random
-//! draws is part of the rules.
+//! Source: `reset` and `step` of the original's `mortar_mayhem*.py` and `endless_mortar_mayhem.py`. The order of the
+//! random draws is part of the rules.
 
 use super::commands::Command;
 use super::config::Config;
@@ -61,7 +61,8 @@ impl State {
         self.explosion_delay = *random.choice(&parameters.explosion_delay) as u32;
     }
 
-    /// Adds `count` commands that stay within the arena, each drawn from those that are possible where the last one leads.
+    /// Adds `count` commands that stay within the arena, each drawn from those that are possible where the last one
+    /// leads.
     fn add_valid_commands(&mut self, config: &Config, count: i64, random: &mut Generator) {
         let mut at = self.agent_tile;
         for _ in 0..count {
@@ -176,7 +177,8 @@ impl State {
         self.command_steps = 1;
     }
 
-    /// While tiles burn: ends the episode if the agent is on one, and extinguishes them after `explosion_duration` steps.
+    /// While tiles burn: ends the episode if the agent is on one, and extinguishes them after `explosion_duration`
+    /// steps.
     fn burn(&mut self, config: &Config, transition: &mut Transition) {
         if !self.tiles_on {
             self.command_steps += 1;

@@ -20,7 +20,8 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// What a state looks like. `sprites` are the current episode's, `earlier_sprites` those of an earlier episode's character.
+    /// What a state looks like. `sprites` are the current episode's, `earlier_sprites` those of an earlier episode's
+    /// character.
     pub(super) fn new(
         state: &State,
         config: &Config,

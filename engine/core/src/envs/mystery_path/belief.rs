@@ -1,6 +1,7 @@
 //! The expert's belief about a hidden path: the probability that a tile is on it, given what was observed.
 //!
-//! The belief is a set of sample paths from the generator of the rules. Samples that contradict an observation are removed.
+//! The belief is a set of sample paths from the generator of the rules. Samples that contradict an observation are
+//! removed.
 
 use std::sync::OnceLock;
 
@@ -21,7 +22,8 @@ pub struct Belief {
 }
 
 impl Belief {
-    /// All samples that start at `start`: on one grid, and for the endless id with the tile that leads to the next grid.
+    /// All samples that start at `start`: on one grid, and for the endless id with the tile that leads to the next
+    /// grid.
     pub fn new(variant: Variant, start: Tile) -> Self {
         static FINITE: [OnceLock<Vec<TileSet>>; 64] = [const { OnceLock::new() }; 64];
         static ENDLESS: [OnceLock<Vec<TileSet>>; 8] = [const { OnceLock::new() }; 8];

@@ -65,7 +65,7 @@ fn cross() -> Surface {
 fn bordered_tile(color: Rgb) -> Surface {
     let mut surface = Surface::new(TILE as usize, TILE as usize);
     surface.fill(color);
-    surface.draw_rect(TILE_BORDER, tile_at(0, 0), 1);
+    surface.draw_rect(TILE_BORDER, tile_rect(0, 0), 1);
     surface
 }
 
@@ -89,12 +89,12 @@ fn background() -> Vec<u8> {
 }
 
 /// The square of a tile with that top left corner.
-fn tile_at(left: i32, top: i32) -> Rect {
+fn tile_rect(left: i32, top: i32) -> Rect {
     Rect { x: left, y: top, width: TILE, height: TILE }
 }
 
 fn fill_tile(canvas: &mut Canvas<'_>, (x, y): Tile, color: Rgb) {
-    canvas.draw_rect(color, tile_at(x * TILE, y * TILE), 0);
+    canvas.draw_rect(color, tile_rect(x * TILE, y * TILE), 0);
 }
 
 impl Scene {
@@ -126,7 +126,7 @@ impl Scene {
         }
         let mut add_tile = |tile: Option<Tile>| {
             if let Some((x, y)) = tile {
-                damage.add(tile_at(x * TILE, y * TILE));
+                damage.add(tile_rect(x * TILE, y * TILE));
             }
         };
         if self.goal != shown.goal {
@@ -139,7 +139,7 @@ impl Scene {
         }
         if self.past != shown.past {
             let positions = shown.past.positions().chain(self.past.positions());
-            positions.for_each(|(left, top)| damage.add(tile_at(left, top)));
+            positions.for_each(|(left, top)| damage.add(tile_rect(left, top)));
         }
         if self.agent != shown.agent {
             damage.add(assets.character.bounds(&shown.agent));
@@ -171,8 +171,8 @@ fn cross_corner((x, y): (i32, i32)) -> (i32, i32) {
 }
 
 impl Assets {
-    /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and walls, or the
-    /// endless id's whole path and stamina.
+    /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and
+    /// walls, or the endless id's whole path and stamina.
     pub(super) fn draw_ground_truth(&self, state: &State, canvas: &mut Canvas<'_>) {
         self.paint_background(state.endless.background(), canvas);
         if self.config.variant == Variant::Endless {
@@ -213,9 +213,10 @@ impl Assets {
         if (0..=SCREEN as i32 - TILE).contains(&left) {
             self.past_tile.blit(canvas, left, top);
         } else {
-            // A border covers the last two pixels of a tile that leaves the screen, so that a clipped picture would differ.
-            canvas.draw_rect(WHITE, tile_at(left, top), 0);
-            canvas.draw_rect(TILE_BORDER, tile_at(left, top), 1);
+            // A border covers the last two pixels of a tile that leaves the screen, so that a clipped picture would
+            // differ.
+            canvas.draw_rect(WHITE, tile_rect(left, top), 0);
+            canvas.draw_rect(TILE_BORDER, tile_rect(left, top), 1);
         }
     }
 }

@@ -13,7 +13,8 @@ use crate::random::Generator;
 /// Number of paths at the start of an episode.
 const FIRST_SEGMENTS: usize = 3;
 
-/// Direction of the next tile of the path. Where the path leads left, where the agent cannot go, the last direction remains.
+/// Direction of the next tile of the path. Where the path leads left, where the agent cannot go, the last direction
+/// remains.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Direction {
     /// To the next column.
@@ -25,11 +26,12 @@ pub enum Direction {
     Down,
 }
 
-/// State of the endless id beside what it shares with the finite ids. In the finite ids it keeps its default, a screen that does
-/// not scroll.
+/// State of the endless id beside what it shares with the finite ids. In the finite ids it keeps its default, a screen
+/// that does not scroll.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EndlessState {
-    /// Left edge of the screen in pixels of the path's coordinates. Summed step by step, which decides how it is rounded.
+    /// Left edge of the screen in pixels of the path's coordinates. Summed step by step, which decides how it is
+    /// rounded.
     camera: f64,
     /// Pixels that the background has scrolled to the left, less than a tile.
     background: i32,
@@ -167,11 +169,11 @@ impl EndlessState {
         self.direction
     }
 
-    /// The tiles before the last one that the agent was on, backwards until one in the column `depth` columns before the
-    /// agent's neighbour column.
+    /// The tiles before the last one that the agent was on, backwards until one in the column `depth` columns before
+    /// the agent's neighbour column.
     ///
-    /// As in the original, a path that turns back can be cut short, and if the agent is off the path, the columns count from where
-    /// it fell.
+    /// As in the original, a path that turns back can be cut short, and if the agent is off the path, the columns count
+    /// from where it fell.
     pub(super) fn past_path<'a>(
         &self,
         (x, _): Tile,

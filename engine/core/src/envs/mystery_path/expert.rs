@@ -15,7 +15,7 @@ use crate::envs::steering::turn_or_walk;
 /// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so that the frames do not show it.
 const ENDLESS_SPEED: i32 = 3;
 
-/// Probability that one tile of distance is worth.
+/// Penalty for each tile of distance, as a probability.
 const WALK: f64 = 0.01;
 
 /// Prior probability that an unknown tile is on the path: beside the last tile found, and beside others.
@@ -29,14 +29,14 @@ enum Known {
     OffPath,
 }
 
-/// Plays all ids of Mystery Path from the feature observation. It walks to the tile that is most likely on the path. When it falls
-/// off, it remembers the tile, walks back and tries the next best. In the endless id it avoids tiles before the farthest column,
-/// since a fall there ends the episode.
+/// Plays all ids of Mystery Path from the feature observation. It walks to the tile that is most likely on the path.
+/// When it falls off, it remembers the tile, walks back and tries the next best. In the endless id it avoids tiles
+/// before the farthest column, since a fall there ends the episode.
 ///
-/// It needs `visual_feedback`, the default `agent_scale`, and an `agent_speed` of less than a tile; in the endless id the default
-/// speed, since it counts its steps to know its position. It needs no ground truth: only a fall before the farthest column ends an
-/// endless episode, so that every tile at the end of the known path can be tried once. It cannot pass the rare paths that lead back
-/// to the left.
+/// It needs `visual_feedback`, the default `agent_scale`, and an `agent_speed` of less than a tile; in the endless id
+/// the default speed, since it counts its steps to know its position. It needs no ground truth: only a fall before the
+/// farthest column ends an endless episode, so that every tile at the end of the known path can be tried once. It
+/// cannot pass the rare paths that lead back to the left.
 #[derive(Debug)]
 pub struct PathExpert {
     variant: Variant,
@@ -110,7 +110,8 @@ impl PathExpert {
         let prior = match () {
             // The path most likely continues beside the last tile found.
             _ if tile == self.tip => TIP,
-            // If the path has no other continuation, it leads left, where the endless agent cannot go. There may be a detour.
+            // If the path has no other continuation, it leads left, where the endless agent cannot go. There may be a
+            // detour.
             _ if (x, y) == (tip_x - 1, tip_y) && self.reachable(self.tip).all(|next| self.known(next).is_some()) => 1.0,
             _ => ELSEWHERE,
         };

@@ -1,5 +1,5 @@
-//! The feature observation of Mystery Path: what a frame shows, as numbers. It does not contain the path, which the agent must
-//! remember.
+//! The feature observation of Mystery Path: what a frame shows, as numbers. It does not contain the path, which the
+//! agent must remember.
 
 use super::config::{Config, TILE};
 use super::parameters::Variant;
@@ -72,7 +72,10 @@ const ENDLESS: [Column; PAST_PATH + SCREEN_TILES] = {
         column("stamina_shown", "1 if the stamina bar is seen"),
         column("stamina", "green share of the stamina bar; 0 if it is not seen"),
         column("background_shift", "tiles that the background has scrolled to the left; 0 if it is not seen"),
-        column("past_shift", "tiles that column 0 of the past path lies to the left of the screen; 0 if none is seen"),
+        column(
+            "past_shift",
+            "offset in tiles of column 0 of the past path to the left of the screen; 0 if none is seen",
+        ),
     ]);
     let mut tile = 0;
     while tile < SCREEN_TILES {

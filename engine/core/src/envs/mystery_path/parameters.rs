@@ -17,7 +17,7 @@ pub const MAX_STAMINA: i64 = 1_000_000_000;
 pub struct Parameters {
     /// Steps that an episode may last; not limited if less than 1.
     pub max_steps: i64,
-    /// Size of the agent, 0 to [`MAX_AGENT_SCALE`]; 0.25 is a radius of 6 pixels.
+    /// Size of the agent, 0 to 4; 0.25 is a radius of 6 pixels.
     pub agent_scale: f64,
     /// Pixels per step, 0 to 84. Unused on a grid.
     pub agent_speed: f64,
@@ -38,7 +38,7 @@ pub struct Parameters {
     /// Tiles to the left of the endless agent that are on the screen, limited to 0 to 5.5; truncated, the number of
     /// past columns that are shown.
     pub camera_offset_scale: f64,
-    /// Steps that the endless agent has to reach the next tile, at least 1.
+    /// Steps within which the endless agent must reach the next tile, at least 1.
     pub stamina_level: i64,
     /// Reward for reaching the goal.
     pub reward_goal: f64,

@@ -1,9 +1,9 @@
 //! Generation of paths: random walls, then a search for a path around them.
 //!
-//! Source: `Node` and `MysteryPath` of the original's `pygame_assets.py`. The original's A* search deviates from the textbook, and
-//! this one reproduces that together with the order of the random draws: the search expands the first tile of the open list with
-//! a lower score than the list's first tile, the cost of each step is a random number, and a cheaper path to an open tile changes
-//! the tile's parent but not its cost.
+//! Source: `Node` and `MysteryPath` of the original's `pygame_assets.py`. The original's A* search deviates from the
+//! textbook, and this one reproduces that together with the order of the random draws: the search expands the first
+//! tile of the open list with a lower score than the list's first tile, the cost of each step is a random number, and a
+//! cheaper path to an open tile changes the tile's parent but not its cost.
 
 use serde::{Deserialize, Serialize};
 
@@ -25,8 +25,8 @@ pub type Tile = (i32, i32);
 
 /// A set of tiles, column by column: the tile `(x, y)` is the bit `8 x + y`.
 ///
-/// A grid has seven rows. The eighth row is always empty, so that no step leads from one column's end to the next column's start.
-/// The eighth column holds the tile that joins two grids.
+/// A grid has seven rows. The eighth row is always empty, so that no step leads from one column's end to the next
+/// column's start. The eighth column holds the tile that joins two grids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TileSet(u64);
 
@@ -137,8 +137,8 @@ impl Path {
     }
 }
 
-/// Draws the first and the last tile of a path: on the given side of the grid (0 left, 1 right, 2 top, others bottom), and on the
-/// opposite side.
+/// Draws the first and the last tile of a path: on the given side of the grid (0 left, 1 right, 2 top, others bottom),
+/// and on the opposite side.
 pub fn draw_ends(side: i64, random: &mut Generator) -> (Tile, Tile) {
     let first = random.integers(0, i64::from(GRID)) as i32;
     let second = random.integers(0, i64::from(GRID)) as i32;
@@ -151,8 +151,8 @@ pub fn draw_ends(side: i64, random: &mut Generator) -> (Tile, Tile) {
     }
 }
 
-/// Searches for a path around the walls. There always is one: a wall on the border has no inner wall next to it, so that a path
-/// along the border can go around each.
+/// Searches for a path around the walls. There always is one: a wall on the border has no inner wall next to it, so
+/// that a path along the border can go around each.
 fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Path {
     const NOWHERE: u8 = u8::MAX;
     let (start, end, goal) = (index(start), index(end), end);

@@ -1,7 +1,7 @@
 //! The ids of Mystery Path, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough for every
-//! use, and narrow enough that no value breaks the rules or needs much memory.
+//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough
+//! for every use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
@@ -39,7 +39,7 @@ const CARDINAL_ORIGIN_CHOICE: Parameter = Parameter::list(
     &[0, 1, 2, 3],
     0,
     3,
-    "Side of the screen where the path begins: 0 left, 1 right, 2 top, 3 bottom. A list to draw from.",
+    "Side of the screen where the path starts: 0 left, 1 right, 2 top, 3 bottom. A list to draw from.",
 );
 const SHOW_ORIGIN: Parameter = Parameter::bool("show_origin", false, "Whether the path's first tile is shown.");
 const SHOW_GOAL: Parameter = Parameter::bool("show_goal", false, "Whether the path's last tile is shown.");
@@ -90,10 +90,10 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
         5.0,
         -100.0,
         100.0,
-        "Tiles to the left of the agent that are on the screen, held within 0 to 5.5; also, cut to a whole number, how \
-         many columns of the past path are shown.",
+        "Tiles to the left of the agent that are on the screen, limited to 0 to 5.5. Truncated, it is also the number \
+         of columns of the past path that are shown.",
     ),
-    Parameter::int("stamina_level", 20, 1, MAX_STAMINA, "Steps that the agent has to reach the next tile."),
+    Parameter::int("stamina_level", 20, 1, MAX_STAMINA, "Steps within which the agent must reach the next tile."),
     REWARD_FALL_OFF,
     reward_path_progress(0.1),
     Parameter::reward(
@@ -105,7 +105,7 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
 ];
 
 const NUM_FAILS: InfoColumn =
-    InfoColumn { name: "num_fails", is_integer: true, description: "steps that the agent was found off the path" };
+    InfoColumn { name: "num_fails", is_integer: true, description: "steps in which the agent was off the path" };
 
 const FINITE_INFO: &[InfoColumn] = &[
     InfoColumn { name: "success", is_integer: true, description: "1 if the goal was reached, otherwise 0" },
@@ -122,7 +122,7 @@ const ENDLESS_INFO: &[InfoColumn] = &[
     InfoColumn {
         name: "tiles_visited",
         is_integer: true,
-        description: "tiles of the path that the agent was on, without the first",
+        description: "tiles of the path that the agent was on, not counting the first",
     },
 ];
 
@@ -154,7 +154,7 @@ pub const SPECS: &[EnvSpec] = &[
     },
     EnvSpec {
         id: "Endless-MysteryPath-v0",
-        summary: "An invisible path without end; falling off before the farthest point, or twice at one place, ends it",
+        summary: "An invisible path without end; falling off before the farthest point, or twice at one tile, ends it",
         family: Family::MysteryPath(Variant::Endless),
         action_space: ActionSpace::Discrete(4),
         vector_observation: 0,

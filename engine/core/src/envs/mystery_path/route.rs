@@ -62,7 +62,8 @@ impl Route {
         self.add(Path::generate(start, end, random), None);
     }
 
-    /// Adds a path from left to right that starts in the row where the last one ended; the first one starts in a random row.
+    /// Adds a path from left to right that starts in the row where the last one ended; the first one starts in a random
+    /// row.
     pub fn extend(&mut self, random: &mut Generator) {
         let mut row = || random.integers(0, i64::from(GRID)) as i32;
         let start = self.tiles.last().map_or_else(&mut row, |(_, y)| *y);

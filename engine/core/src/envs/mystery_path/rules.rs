@@ -1,7 +1,8 @@
 //! The rules of Mystery Path: those that all three ids share, and the goal of the finite ids.
 //!
-//! Source: `reset` and `step` of the original's `mystery_path.py`, `mystery_path_grid.py` and `endless_mystery_path.py`. The order
-//! of the random draws is part of the rules, and so is the order in which rewards are summed.
+//! Source: `reset` and `step` of the original's `mystery_path.py`, `mystery_path_grid.py` and
+//! `endless_mystery_path.py`. The order of the random draws is part of the rules, and so is the order in which rewards
+//! are summed.
 
 use super::config::{Config, TILE, tile_at};
 use super::parameters::Variant;

@@ -53,7 +53,7 @@ impl Game {
     }
 
     fn frame(&self) -> Vec<u8> {
-        // Of any content before.
+        // The content before must not matter.
         let mut frame = vec![77; FRAME_BYTES];
         self.env.draw(&mut frame);
         frame
@@ -77,7 +77,7 @@ impl Game {
         sum
     }
 
-    /// A tile above or below the path's tile of that number that is not on the path.
+    /// A tile above or below the path's tile with that index that is not on the path.
     fn beside(&self, number: usize) -> Option<Tile> {
         let (x, y) = self.state().route.tiles()[number];
         let free = |tile: &Tile| (0..GRID).contains(&tile.1) && self.state().route.index(*tile).is_none();
@@ -85,7 +85,7 @@ impl Game {
     }
 }
 
-/// A seed whose path never leads left, and leaves room beside the tiles with these numbers.
+/// A game with a path that never leads left, and with free tiles beside the tiles with these indices.
 fn endless_with_room(options: &Json, numbers: &[usize]) -> Game {
     let fits = |game: &Game| {
         let tiles = game.state().route.tiles();
@@ -135,14 +135,14 @@ fn the_endless_episode_ends_by_a_fall_before_the_farthest_column() {
     let mut game = endless_with_room(&json!({ "stamina_level": 1000 }), &[0]);
     let tiles = game.state().route.tiles().to_vec();
     let first = game.beside(0).unwrap();
-    assert!(!game.walk_to(first).terminated, "nothing lies before the first column");
+    assert!(!game.walk_to(first).terminated, "no column is before the first one");
     game.step(&[0]);
     for tile in tiles.iter().take_while(|tile| tile.0 < 2) {
         assert!(!game.walk_to(*tile).terminated);
     }
     let farther = tiles.iter().find(|tile| tile.0 == 2).unwrap();
     game.walk_to(*farther);
-    // A fall in the farthest column leads back to the start, where the next one is too early.
+    // A fall in the farthest column leads back to the start, where the next fall ends the episode.
     while !game.state().off_path {
         let (x, y) = game.state().tile;
         assert!(!game.walk_to((x, y - 1)).terminated);
@@ -179,7 +179,7 @@ fn stamina_runs_out_unless_there_is_progress() {
 }
 
 #[test]
-fn the_way_goes_on_and_is_kept() {
+fn the_route_is_extended_and_kept() {
     let mut game = endless_with_room(&json!({ "agent_speed": 12.0 }), &[]);
     let known = game.state().route.tiles().to_vec();
     let mut number = 0;
@@ -224,7 +224,7 @@ fn features_show_the_past_path_where_the_picture_shows_it() {
 }
 
 #[test]
-fn a_saved_state_goes_on_where_it_was() {
+fn a_restored_state_continues_identically() {
     for number in 0..SPECS.len() {
         let mut game = Game::new(number, &json!({}), 9);
         let branches = game.spec.action_space.branches();
@@ -245,7 +245,7 @@ fn a_saved_state_goes_on_where_it_was() {
 }
 
 #[test]
-fn columns_have_names_of_their_own() {
+fn column_names_are_unique() {
     for spec in SPECS {
         let mut names: Vec<&str> = spec.features.iter().map(|column| column.name).collect();
         assert!(names.iter().all(|name| !name.is_empty()));
@@ -256,7 +256,7 @@ fn columns_have_names_of_their_own() {
 }
 
 proptest! {
-    /// Whatever the reset parameters, nothing panics, and the episodes stay small.
+    /// No allowed reset parameters panic, and the episodes stay small.
     #[test]
     fn all_allowed_options_are_playable(
         number in 0..3_usize,

@@ -1,7 +1,8 @@
 //! How the pictures of Searing Spotlights are composed into a frame.
 //!
-//! The original paints a black surface with transparent circles over the scene. Here the frame is filled with the darkened
-//! background, and each circle repaints the lit scene within it, so that nothing that stays dark is painted twice.
+//! The original paints a black surface with transparent circles over the scene. Here the frame is filled with the
+//! darkened background, and each circle repaints the lit scene within it, so that nothing that stays dark is painted
+//! twice.
 
 use super::config::BAR_HEIGHT;
 use super::light::LightChange;
@@ -51,7 +52,7 @@ impl Scene {
     pub(super) fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
         let visible = self.visible_in_dark(assets);
         let hidden = Objects { coins: !visible.coins, exit: !visible.exit, agent: !visible.agent };
-        // The bar covers what lies behind it.
+        // Within the bar's rows nothing else is visible.
         if canvas.rows().end > BAR_HEIGHT {
             if self.blacked_out {
                 canvas.fill([0; 3]);
@@ -59,7 +60,8 @@ impl Scene {
                 self.paint_light(assets, hidden, canvas);
             }
         }
-        // Objects that are visible in the dark are above the light. Some are even above the bar, depending on which others are visible.
+        // Objects that are visible in the dark are above the light. Some are even above the bar, depending on which
+        // others are visible.
         let below_bar = Objects {
             coins: visible.coins,
             exit: visible.exit && visible.coins,

@@ -100,7 +100,8 @@ const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = [
 
 const COUNT: usize = SPOTLIGHT + 3 * SPOTLIGHTS;
 
-/// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit circle.
+/// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit
+/// circle.
 pub const FEATURES: &[Column] = &{
     let mut columns = [FIRST[0]; COUNT];
     let mut at = 0;

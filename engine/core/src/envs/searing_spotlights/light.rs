@@ -1,7 +1,7 @@
 //! How the light on the background changes from one frame to another.
 //!
-//! A spotlight moves by about a pixel per step, so that only the crescents that it leaves and enters differ. The crescents of all
-//! small moves are precomputed.
+//! A spotlight moves by about a pixel per step, so that only the crescents that it leaves and enters differ. The
+//! crescents of all small moves are precomputed.
 
 use std::ops::Range;
 
@@ -154,7 +154,8 @@ fn is_moved(from: &Circle, to: &Circle) -> bool {
     from == to || (from.radius == to.radius && Shape::is_precomputed(from.radius, (to.x - from.x, to.y - from.y)))
 }
 
-/// The pixels that a circle leaves when it moves. The caller must have checked with [`is_moved`] that they are precomputed.
+/// The pixels that a circle leaves when it moves. The caller must have checked with [`is_moved`] that they are
+/// precomputed.
 #[inline]
 fn crescent(from: &Circle, to: &Circle) -> &'static Crescent {
     Shape::of(from.radius).crescent((to.x - from.x, to.y - from.y))

@@ -5,8 +5,8 @@
 pub use crate::envs::family::SearingSpotlightsVariant as Variant;
 use crate::envs::parameters::ResetParameters;
 
-/// Largest number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another one
-/// leaves.
+/// Largest number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another
+/// one leaves.
 pub const MAX_SPOTLIGHTS: usize = 1000;
 
 /// Largest radius of a spotlight in pixels: more than the screen's diagonal.
@@ -17,17 +17,17 @@ pub const MAX_SPOT_RADIUS: i32 = 256;
 pub struct Parameters {
     /// Steps that an episode may last; not limited if less than 1.
     pub max_steps: i64,
-    /// Steps that the agent has to collect the endless id's coin; not limited if less than 1.
+    /// Steps within which the agent must collect the endless id's coin; not limited if less than 1.
     pub steps_per_coin: i64,
-    /// Spotlights at the start of an episode, 0 to [`MAX_SPOTLIGHTS`].
+    /// Spotlights at the start of an episode, 0 to 1000.
     pub initial_spawns: usize,
     /// Spotlights that appear during an episode; not limited in the endless id.
     pub num_spawns: i64,
     /// Steps between two new spotlights.
     pub spawn_interval: i64,
-    /// Least radius of a spotlight in pixels, 0 to [`MAX_SPOT_RADIUS`]; truncated.
+    /// Least radius of a spotlight in pixels, 0 to 256; truncated.
     pub spot_min_radius: f64,
-    /// Largest radius of a spotlight in pixels, 0 to [`MAX_SPOT_RADIUS`]; truncated.
+    /// Largest radius of a spotlight in pixels, 0 to 256; truncated.
     pub spot_max_radius: f64,
     /// Least speed of a spotlight: the share of its path per step.
     pub spot_min_speed: f64,

@@ -149,7 +149,7 @@ impl Assets {
     /// Draws the pictures.
     pub fn new(variant: Variant, parameters: Parameters) -> Self {
         let colors = [[WHITE, BLUE], [WHITE, RED], [WHITE; 2], [BLACK; 2]];
-        // Created in advance, so that no step has to.
+        // Created in advance, so that no step needs to.
         let radii = parameters.spot_min_radius as i16..=parameters.spot_max_radius as i16;
         radii.map(Shape::of).for_each(|_| ());
         let config = Config::new(variant, parameters);

@@ -1,7 +1,7 @@
 //! Random positions of agent, coins and exit, with a minimum distance between them.
 //!
-//! Source: `GridPositionSampler` of the original's `pygame_assets.py`, which searches an array of all pixels. Here a row of
-//! pixels is a bit set, so that 84 positions are counted at a time.
+//! Source: `GridPositionSampler` of the original's `pygame_assets.py`, which searches an array of all pixels. Here a
+//! row of pixels is a bit set, so that 84 positions are counted at a time.
 
 use crate::envs::screen::SCREEN;
 use crate::random::Generator;
@@ -43,8 +43,8 @@ impl PositionSampler {
         }
     }
 
-    /// Draws one of the free positions uniformly, and blocks the positions around it. If none is free, as with very many coins, all
-    /// are freed first; the original raises an error there.
+    /// Draws one of the free positions uniformly, and blocks the positions around it. If none is free, as with very
+    /// many coins, all are freed first; the original raises an error there.
     pub fn sample(&mut self, radius: i32, random: &mut Generator) -> (i32, i32) {
         let mut count: u32 = self.free.iter().map(|free| u32::from(*free)).sum();
         if count == 0 {

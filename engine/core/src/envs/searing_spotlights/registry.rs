@@ -1,7 +1,7 @@
 //! The ids of Searing Spotlights, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough for every
-//! use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
+//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough
+//! for every use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
 
 use super::features::FEATURES;
 use super::parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
@@ -54,25 +54,28 @@ const LIGHT_DIM_OFF_DURATION: Parameter = Parameter::int(
     6,
     0,
     1_000_000,
-    "Steps in which the light goes off; 0 for no light at all.",
+    "Steps until the light is off; 0 for darkness from the start.",
 );
 const LIGHT_THRESHOLD: Parameter = Parameter::int(
     "light_threshold",
     255,
     0,
     255,
-    "How dark it gets: 255 is black. With steps of dimming, darker by up to one of them.",
+    "Darkness at which dimming stops; 255 is black. The last step of dimming may exceed it.",
 );
 const COIN_SCALE: Parameter =
     Parameter::float("coin_scale", 0.375, 0.0, 8.0, "Size of a coin; 1 is a radius of 10 pixels.");
-const COINS_VISIBLE: Parameter = Parameter::bool("coins_visible", false, "Whether coins are seen in the dark.");
+const COINS_VISIBLE: Parameter = Parameter::bool("coins_visible", false, "Whether coins are visible in the dark.");
 const AGENT_SPEED: Parameter =
     Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const AGENT_SCALE: Parameter =
     Parameter::float("agent_scale", 0.25, 0.0, 4.0, "Size of the agent; 0.25 is a radius of 6 pixels.");
-const AGENT_VISIBLE: Parameter = Parameter::bool("agent_visible", false, "Whether the agent is seen in the dark.");
-const SAMPLE_AGENT_POSITION: Parameter =
-    Parameter::bool("sample_agent_position", true, "Whether the agent starts at a random place, or in the middle.");
+const AGENT_VISIBLE: Parameter = Parameter::bool("agent_visible", false, "Whether the agent is visible in the dark.");
+const SAMPLE_AGENT_POSITION: Parameter = Parameter::bool(
+    "sample_agent_position",
+    true,
+    "Whether the agent starts at a random position; otherwise in the middle.",
+);
 const SHOW_LAST_ACTION: Parameter =
     Parameter::bool("show_last_action", true, "Whether the bar at the top shows the action before the current one.");
 const SHOW_LAST_POSITIVE_REWARD: Parameter = Parameter::bool(
@@ -90,7 +93,7 @@ const REWARD_COIN: Parameter = Parameter::reward("reward_coin", 0.25, "Reward fo
 const SEARING_SPOTLIGHTS: &[Parameter] = &[
     max_steps(256),
     initial_spawns(4),
-    Parameter::int("num_spawns", 30, 0, MAX_SPOTLIGHTS as i64, "Spotlights that appear in the course of an episode."),
+    Parameter::int("num_spawns", 30, 0, MAX_SPOTLIGHTS as i64, "Spotlights that appear during an episode."),
     Parameter::int(
         "initial_spawn_interval",
         30,
@@ -125,7 +128,7 @@ const SEARING_SPOTLIGHTS: &[Parameter] = &[
         "Whether the agent must leave by an exit that opens when all coins are collected.",
     ),
     Parameter::float("exit_scale", 0.5, 0.0, 8.0, "Size of the exit; 1 is a side of 20 pixels."),
-    Parameter::bool("exit_visible", false, "Whether the exit is seen in the dark."),
+    Parameter::bool("exit_visible", false, "Whether the exit is visible in the dark."),
     AGENT_SPEED,
     agent_health(5.0),
     AGENT_SCALE,
@@ -148,7 +151,7 @@ const ENDLESS_SEARING_SPOTLIGHTS: &[Parameter] = &[
         160,
         i64::MIN,
         i64::MAX,
-        "Steps that the agent has to collect a new coin; not limited if less than 1.",
+        "Steps within which the agent must collect a new coin; not limited if less than 1.",
     ),
     initial_spawns(3),
     Parameter::int("spawn_interval", 50, 0, 1_000_000_000, "Steps between two new spotlights."),
@@ -165,10 +168,10 @@ const ENDLESS_SEARING_SPOTLIGHTS: &[Parameter] = &[
     Parameter::bool(
         "coin_enabled",
         true,
-        "Whether there is a coin to collect. Without, the background is black, as in the original.",
+        "Whether there is a coin to collect. Without a coin, the background is black, as in the original.",
     ),
     COIN_SCALE,
-    Parameter::int("coin_show_duration", 6, i64::MIN, i64::MAX, "Steps that a new coin is seen in the dark."),
+    Parameter::int("coin_show_duration", 6, i64::MIN, i64::MAX, "Steps that a new coin is visible in the dark."),
     COINS_VISIBLE,
     AGENT_SPEED,
     agent_health(10.0),
@@ -212,7 +215,7 @@ const ENDLESS_INFO: &[InfoColumn] = &[
 pub const SPECS: &[EnvSpec] = &[
     EnvSpec {
         id: "SearingSpotlights-v0",
-        summary: "Collect coins and leave by the exit in the dark, unseen by moving spotlights",
+        summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
         family: Family::SearingSpotlights(Variant { endless: false }),
         action_space: ActionSpace::MultiDiscrete(&[3, 3]),
         vector_observation: 0,
@@ -224,7 +227,7 @@ pub const SPECS: &[EnvSpec] = &[
     },
     EnvSpec {
         id: "Endless-SearingSpotlights-v0",
-        summary: "Collect one coin after the other in the dark, unseen by moving spotlights",
+        summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
         family: Family::SearingSpotlights(Variant { endless: true }),
         action_space: ActionSpace::MultiDiscrete(&[3, 3]),
         vector_observation: 0,

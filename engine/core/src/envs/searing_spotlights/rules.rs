@@ -1,7 +1,7 @@
 //! The rules of Searing Spotlights: one implementation for both ids.
 //!
-//! Source: `reset` and `step` of the original's `searing_spotlights.py` and `endless_searing_spotlights.py`. The order of the
-//! random draws is part of the rules.
+//! Source: `reset` and `step` of the original's `searing_spotlights.py` and `endless_searing_spotlights.py`. The order
+//! of the random draws is part of the rules.
 
 use super::config::{BAR_HEIGHT, Config};
 use super::parameters::{MAX_SPOTLIGHTS, Parameters};

@@ -114,8 +114,8 @@ impl State {
         if self.first_frame { Character { rotation: 0, ..self.agent } } else { self.agent }
     }
 
-    /// The agent as the ground-truth view shows it. As in the original, it is the last episode's until the first step, but with the
-    /// current scale.
+    /// The agent as the ground-truth view shows it. As in the original, it is the last episode's until the first step,
+    /// but with the current scale.
     fn ground_truth_agent(&self) -> Character {
         match self.former_agent {
             Some(former) if self.first_frame => former,

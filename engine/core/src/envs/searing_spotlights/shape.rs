@@ -31,14 +31,15 @@ pub(super) struct Crescent {
     pub pixels: Vec<(i8, i8)>,
     /// The smallest rectangle around them, relative to the circle's centre.
     pub bounds: Rect,
-    /// The same pixels as vertical blocks of 1 to [`LONGEST`] pixels, grouped by length. A block is the byte offset of its first
-    /// pixel in a frame whose corner is the corner of the circle's bounds.
+    /// The same pixels as vertical blocks of 1 to [`LONGEST`] pixels, grouped by length. A block is the byte offset of
+    /// its first pixel in a frame whose corner is the corner of the circle's bounds.
     blocks: Vec<u16>,
     /// The end of the blocks of each length in `blocks`.
     ends: [usize; LONGEST],
 }
 
-/// Length of the longest block in pixels. A longer run is several blocks, the last of which may overlap the one before it.
+/// Length of the longest block in pixels. A longer run is several blocks, the last of which may overlap the one before
+/// it.
 const LONGEST: usize = 4;
 
 impl Crescent {
@@ -71,11 +72,12 @@ impl Crescent {
         crescent
     }
 
-    /// Copies the pixels from one frame to another, for a circle whose bounds have the given corner and whose rows are all on the
-    /// screen. Columns off the screen are skipped, since their offsets are outside of the frame.
+    /// Copies the pixels from one frame to another, for a circle whose bounds have the given corner and whose rows are
+    /// all on the screen. Columns off the screen are skipped, since their offsets are outside of the frame.
     #[inline]
     pub fn copy(&self, (x, y): (i32, i32), from: &Frame, to: &mut Frame) {
-        // A negative offset wraps around to a value outside of the frame, and back for the blocks that are on the screen.
+        // A negative offset wraps around to a value outside of the frame, and back for the blocks that are on the
+        // screen.
         let corner = ((x * SCREEN as i32 + y) * 3) as usize;
         let [ones, twos, threes, fours] = self.ends;
         copy_blocks::<3>(&self.blocks[..ones], corner, from, to);
@@ -127,7 +129,8 @@ impl Shape {
         is_near(x) && is_near(y) && radius <= MAX_MOVED_RADIUS
     }
 
-    /// The pixels that the circle leaves when it moves. The caller must have checked [`is_precomputed`](Shape::is_precomputed).
+    /// The pixels that the circle leaves when it moves. The caller must have checked
+    /// [`is_precomputed`](Shape::is_precomputed).
     #[inline]
     pub fn crescent(&self, (x, y): (i16, i16)) -> &Crescent {
         &self.crescents[(x + REACH) as usize * MOVES + (y + REACH) as usize]

@@ -31,13 +31,13 @@ pub struct State {
     /// The frame is the first of its episode.
     pub(super) first_frame: bool,
     pub(super) health: f64,
-    /// Red columns of the health bar; more than [`HEALTH_WIDTH`] for negative health.
+    /// Red columns of the health bar; more than [`HEALTH_WIDTH`](super::config::HEALTH_WIDTH) for negative health.
     pub(super) red_columns: u8,
     pub(super) spotlights: Vec<Spotlight>,
     pub(super) spawn_timer: i64,
     pub(super) spawns_left: i64,
-    /// The circles that the spotlights lit in the last step, in drawing order. An episode starts with those of the episode
-    /// before.
+    /// The circles that the spotlights lit in the last step, in drawing order. An episode starts with those of the
+    /// episode before.
     pub(super) lit: Vec<Circle>,
     /// The lit circles have outlines.
     pub(super) outlined: bool,
@@ -57,7 +57,8 @@ pub struct State {
     pub(super) shown_reward_positive: bool,
     /// A spotlight touched the agent in the last step.
     pub(super) hit: bool,
-    /// The backgrounds without and with a hit. As in the original, a replaced background stays replaced in later episodes.
+    /// The backgrounds without and with a hit. As in the original, a replaced background stays replaced in later
+    /// episodes.
     pub(super) backgrounds: [Background; 2],
     /// The current background.
     pub(super) background: Background,
@@ -140,8 +141,8 @@ impl State {
         self.health / parameters.agent_health
     }
 
-    /// The final info of the finite id: share of health, share of coins, success. The share of coins is NaN without coins, as in the
-    /// original.
+    /// The final info of the finite id: share of health, share of coins, success. The share of coins is NaN without
+    /// coins, as in the original.
     pub(super) fn finite_info(&self, parameters: &Parameters) -> [f64; 3] {
         let coins = f64::from(self.coins_collected) / self.num_coins as f64;
         [self.health_share(parameters), coins, f64::from(u8::from(self.success))]

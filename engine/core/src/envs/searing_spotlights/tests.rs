@@ -1,4 +1,4 @@
-//! What the recorded traces do not show: options that the original cannot play, limits, features, snapshots.
+//! Tests of what the recorded traces do not cover: options that the original cannot play, limits, features, snapshots.
 
 use std::sync::Arc;
 
@@ -101,7 +101,7 @@ proptest! {
             environment.reset(&assets(spec, options), &mut random);
             for step in 0..=steps {
                 let state = environment.state.clone();
-                prop_assert_eq!(frame(&environment, 0), frame(&environment, 255), "drawn over what was there");
+                prop_assert_eq!(frame(&environment, 0), frame(&environment, 255), "must not depend on the canvas");
                 let mut view = Surface::new(SCREEN, SCREEN);
                 environment.draw_ground_truth(&mut view.canvas());
                 prop_assert_eq!(&environment.state, &state, "drawing changed the state");
@@ -118,7 +118,7 @@ proptest! {
 }
 
 #[test]
-fn a_snapshot_goes_on_like_the_original() {
+fn a_restored_state_continues_identically() {
     let (mut environment, mut random) = started(ENDLESS, &json!({}), 5);
     for step in 0..70 {
         environment.step(&[step % 3, 2], &mut random);
@@ -182,7 +182,7 @@ fn spotlights_are_limited() {
 }
 
 #[test]
-fn features_tell_what_the_frame_shows() {
+fn features_agree_with_the_frame() {
     let (mut environment, mut random) = started(ENDLESS, &json!({"initial_spawns": 0}), 8);
     let lit = features(&environment);
     let (x, y) = environment.state.agent.position;
@@ -197,19 +197,19 @@ fn features_tell_what_the_frame_shows() {
     assert_eq!((dark[AGENT], dark[COIN], dark[LIGHT], dark[SPOTLIGHT]), (0.0, 0.0, 0.0, 0.0));
     assert!(frame(&environment, 1).chunks_exact(SCREEN * 3).all(|column| column[12..].iter().all(|value| *value == 0)));
 
-    // A spotlight that covers the screen shows it all, and burns.
+    // A spotlight that covers the screen lights everything, and damages the agent.
     let options = json!({"spot_min_radius": 200.0, "spot_max_radius": 200.0, "light_dim_off_duration": 0,
                          "spot_min_speed": 0.1, "spot_max_speed": 0.1});
     let (mut environment, mut random) = started(ENDLESS, &options, 8);
     stand(&mut environment, &mut random, 5);
-    let burnt = features(&environment);
-    assert_eq!((burnt[AGENT], burnt[HIT], burnt[LIGHT]), (1.0, 1.0, 0.0));
-    assert!(burnt[HEALTH] < 1.0 && burnt[SPOTLIGHT] > 2.0);
+    let hit = features(&environment);
+    assert_eq!((hit[AGENT], hit[HIT], hit[LIGHT]), (1.0, 1.0, 0.0));
+    assert!(hit[HEALTH] < 1.0 && hit[SPOTLIGHT] > 2.0);
 }
 
 #[test]
 fn a_width_beyond_32_bits_wraps() {
-    // What `pygame.draw.rect` of pygame 2.4 paints of a bar that is `width` wide.
+    // What `pygame.draw.rect` of pygame 2.4 paints for a bar of this `width`.
     for (width, red) in [(41_i64, 41), (1 << 30, 84), (1 << 31, 0), ((1 << 32) - 5, 0), ((1 << 32) + 5, 5)] {
         let damage = (width as f64 + 0.5) / 42.0;
         let options = json!({"spot_min_radius": 200.0, "spot_max_radius": 200.0, "spot_min_speed": 0.1,

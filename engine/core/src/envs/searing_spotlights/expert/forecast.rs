@@ -1,38 +1,39 @@
-//! Where a spotlight will be, from where it was seen.
+//! Forecasts of a spotlight's positions from its observed positions.
 
 use super::plan::Place;
 use crate::envs::screen::SCREEN;
 
-/// How far a seen centre is off, in pixels: it is cut to whole pixels.
+/// Standard deviation of an observed centre in pixels, due to its truncation to whole pixels.
 const NOISE: f64 = 0.3;
 
-/// What is known of any spotlight before it has moved: it comes in towards the middle by about so many pixels per step,
-/// and its acceleration is about this small.
+/// Prior mean of the speed towards the middle of the screen, in pixels per step.
 const SPEED: f64 = 0.6;
+/// Prior standard deviation of the speed.
 const SPEED_DEVIATION: f64 = 0.4;
+/// Prior standard deviation of the acceleration, whose prior mean is 0.
 const ACCELERATION: f64 = 0.006;
 
-/// Frames that a spotlight may be missing from before it is given up: it may stand still in the dark for one.
+/// Number of consecutive frames that a spotlight may be missing from. A spotlight may skip a step.
 const PATIENCE: u32 = 3;
 
-/// A spotlight's motion, which is a parabola in time, estimated from the places that it was seen at.
+/// A spotlight's motion, a parabola in time, estimated from its observed positions.
 ///
-/// Time counts from the last sighting, backwards for those before.
+/// Time is relative to the last observation, negative for earlier ones.
 #[derive(Clone, Debug)]
 pub(super) struct Forecast {
     pub radius: i32,
-    /// Unit vector from where it was first seen towards the middle of the screen.
+    /// Unit vector from the first observed position to the middle of the screen.
     heading: [f64; 2],
     seen: Vec<[f64; 2]>,
     missed: u32,
-    /// Per axis: place, speed, acceleration.
+    /// Position, speed and acceleration for each axis.
     motion: [[f64; 3]; 2],
-    /// How uncertain the motion is, the same for both axes.
+    /// Covariance of the motion, the same for both axes.
     covariance: [[f64; 3]; 3],
 }
 
 impl Forecast {
-    /// A spotlight that is seen for the first time.
+    /// The forecast after the first observation.
     pub fn new(radius: i32, place: Place) -> Self {
         let [x, y] = place.map(|coordinate| SCREEN as f64 / 2.0 - f64::from(coordinate));
         let distance = x.hypot(y).max(1.0);
@@ -48,31 +49,31 @@ impl Forecast {
         forecast
     }
 
-    /// Takes in where it is now.
+    /// Adds the position in the current frame.
     pub fn observe(&mut self, place: Place) {
         self.missed = 0;
-        // The middle of the places that are cut to this pixel.
+        // The middle of the interval that is truncated to this pixel.
         self.seen.push(place.map(|coordinate| f64::from(coordinate) + 0.5 * f64::from(coordinate.signum())));
         self.fit();
     }
 
-    /// It is not seen in this frame.
+    /// Records that the spotlight is missing from the current frame.
     pub fn miss(&mut self) {
         self.missed += 1;
     }
 
-    /// Whether it may still be there.
-    pub fn is_fresh(&self) -> bool {
+    /// Whether the spotlight may still be on the screen.
+    pub fn is_alive(&self) -> bool {
         self.missed <= PATIENCE
     }
 
-    /// Pixels between where it was expected in this frame and a place.
-    pub fn surprise(&self, place: Place) -> f64 {
+    /// Distance in pixels between the forecast for this frame and a position.
+    pub fn error(&self, place: Place) -> f64 {
         let ([x, y], _) = self.at(1);
         (x - f64::from(place[0])).hypot(y - f64::from(place[1]))
     }
 
-    /// Its centre `steps` after the current frame, and by about how many pixels that may be wrong.
+    /// The centre `steps` after the current frame, and its standard deviation in pixels.
     pub fn at(&self, steps: usize) -> ([f64; 2], f64) {
         let time = steps as f64 + f64::from(self.missed);
         let terms = [1.0, time, time * time / 2.0];
@@ -84,7 +85,7 @@ impl Forecast {
         (centre, variance.max(0.0).sqrt())
     }
 
-    /// Least squares, with what is known beforehand as further sightings.
+    /// Least squares with the prior as additional observations.
     fn fit(&mut self) {
         let mut normal = [[0.0; 3]; 3];
         normal[1][1] = (SPEED_DEVIATION * SPEED_DEVIATION).recip();

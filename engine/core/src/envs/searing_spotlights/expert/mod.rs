@@ -1,4 +1,4 @@
-//! A scripted player that remembers where it is and where coins and exit were, and plans around the spotlights.
+//! A scripted player that tracks its own position, remembers coins and exit, and plans around the forecast spotlights.
 
 mod forecast;
 mod plan;
@@ -10,44 +10,48 @@ use crate::envs::screen::SCREEN;
 use forecast::Forecast;
 use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, Plan, after, choose, dash};
 
-/// Pixels from the agent's centre to that of a coin or exit at which it reaches them, a little on the safe side.
+/// Distances in pixels between the centres of agent and coin or exit at which the agent reaches them, with a safety
+/// margin.
 const COIN_REACH: i32 = 9;
 const EXIT_REACH: i32 = 11;
 
-/// Steps in which a target should be reached.
+/// Initial number of steps to reach a target.
 const PATIENCE: u32 = 150;
-/// With more steps left than this it only follows its most cautious plan.
+/// With more steps left than this, the expert only follows its most cautious plan.
 const CALM: u32 = 130;
-/// With fewer steps left than this it accepts hits, one for each so many steps, but keeps a health point.
+/// With fewer steps left than this, the expert accepts hits, but keeps one health point.
 const URGENT: u32 = 90;
+/// Steps below [`URGENT`] for each accepted hit.
 const STEPS_PER_HIT: u32 = 10;
 
-/// Health points at first, by default.
+/// Default health points at the start of an episode.
 const FINITE_HEALTH: f32 = 5.0;
 const ENDLESS_HEALTH: f32 = 10.0;
 
-/// Most pixels that it keeps away from where a spotlight is expected, beside the least distance.
-const MOST_MARGIN: f64 = 6.0;
+/// Largest margin in pixels around a forecast spotlight.
+const MAX_MARGIN: f64 = 6.0;
 
-/// The share of the margin with which it looks for the way with the fewest hits, and for a way out of the light.
+/// Share of the margin in the search for the path with the fewest hits.
 const HURRY: f64 = 0.1;
+/// Share of the margin in the search for a path out of the light.
 const ESCAPE: f64 = 0.2;
 
-/// Shares of the margin for what the forecasts do not know, and whether to keep away from the border: the most cautious first.
+/// Shares of the margin for the forecasts' uncertainty, and whether to avoid the border; the most cautious first.
 const CAUTIONS: [(f64, bool); 6] = [(1.0, true), (0.5, true), (1.0, false), (0.5, false), (0.2, false), (0.0, false)];
 
 /// Radius of the agent in pixels.
 const AGENT_RADIUS: f64 = 6.0;
 
-/// Plays Searing Spotlights from what a frame shows. It knows how the agent moves and how large things are by default, so it
-/// wants `agent_speed`, `agent_scale`, `coin_scale` and `exit_scale` as they are, and a lit first frame.
+/// Plays Searing Spotlights from the feature observation. It assumes the default movement and sizes, so that it needs
+/// the default `agent_speed`, `agent_scale`, `coin_scale` and `exit_scale`, and a lit first frame.
 ///
-/// It wins the finite id practically always. In the endless id most episodes outlast 10,000 steps; the others end because slow
-/// spotlights cover the surroundings of a coin for most of its 160 steps, so that it comes too late or pays with its health.
+/// It wins almost every episode of the finite id. In the endless id most episodes last more than 10,000 steps. The
+/// others end since slow spotlights cover the surroundings of a coin for most of its 160 steps, so that the agent is
+/// too late or loses its health.
 #[derive(Debug)]
 pub struct SpotlightsExpert {
     variant: Variant,
-    /// Where the agent is, seen or reckoned from its moves.
+    /// The agent's position, as seen or computed from its moves.
     agent: Option<Place>,
     coins: Vec<Place>,
     exit: Option<Place>,
@@ -55,7 +59,7 @@ pub struct SpotlightsExpert {
     /// Health points left.
     health: u32,
     target: Option<Place>,
-    /// Steps until it dares more to get to the target.
+    /// Steps left to reach the target; with fewer steps, the expert takes higher risks.
     patience: u32,
 }
 
@@ -74,8 +78,8 @@ impl SpotlightsExpert {
         }
     }
 
-    /// Takes in what the frame shows.
-    fn look(&mut self, features: &[f32]) {
+    /// Updates what is known from the features.
+    fn observe(&mut self, features: &[f32]) {
         let full_health = if self.variant.endless { ENDLESS_HEALTH } else { FINITE_HEALTH };
         self.health = (features[HEALTH] * full_health).round() as u32;
         let place = |at: usize| [features[at], features[at + 1]].map(|share| (share * SCREEN as f32).round() as i32);
@@ -98,11 +102,11 @@ impl SpotlightsExpert {
                 self.coins.push(coin);
             }
         }
-        self.watch(features);
+        self.track_spotlights(features);
     }
 
-    /// Follows the lit circles from frame to frame.
-    fn watch(&mut self, features: &[f32]) {
+    /// Tracks the lit circles from frame to frame.
+    fn track_spotlights(&mut self, features: &[f32]) {
         let pixels = |share: f32| (share * SCREEN as f32).round() as i32;
         let mut unmatched: Vec<(i32, Place)> = features[SPOTLIGHT..]
             .chunks_exact(3)
@@ -112,19 +116,19 @@ impl SpotlightsExpert {
         for forecast in &mut self.spotlights {
             let nearest = (0..unmatched.len())
                 .filter(|&index| unmatched[index].0 == forecast.radius)
-                .map(|index| (forecast.surprise(unmatched[index].1), index))
+                .map(|index| (forecast.error(unmatched[index].1), index))
                 .min_by(|a, b| a.0.total_cmp(&b.0));
             match nearest {
-                Some((surprise, index)) if surprise < 4.0 => forecast.observe(unmatched.swap_remove(index).1),
+                Some((error, index)) if error < 4.0 => forecast.observe(unmatched.swap_remove(index).1),
                 _ => forecast.miss(),
             }
         }
-        self.spotlights.retain(Forecast::is_fresh);
+        self.spotlights.retain(Forecast::is_alive);
         self.spotlights.extend(unmatched.into_iter().map(|(radius, place)| Forecast::new(radius, place)));
     }
 
-    /// The most cautious plan that arrives; without one, the most cautious that keeps unseen; and when time runs out, the one
-    /// that arrives with the fewest hits.
+    /// The most cautious plan that reaches the goal; else the plan with the fewest hits that reaches it, if time is
+    /// short; else the most cautious plan without hits.
     fn plan(&self, agent: Place, goal: Goal) -> Plan {
         let mut waiting: Option<Plan> = None;
         for (caution, avoid_border) in CAUTIONS {
@@ -144,16 +148,16 @@ impl SpotlightsExpert {
         dash.or(waiting).unwrap_or_else(|| choose(agent, goal, &self.dangers(ESCAPE, false)))
     }
 
-    /// The danger of each coming step, with this share of the margin for what the forecasts do not know.
+    /// The dangerous positions of each future step, with this share of the margin for the forecasts' uncertainty.
     fn dangers(&self, caution: f64, avoid_border: bool) -> Vec<Danger> {
         let mut dangers = vec![Danger::none(); HORIZON + 1];
         for (step, danger) in dangers.iter_mut().enumerate().skip(1) {
             for spotlight in &self.spotlights {
                 let (centre, deviation) = spotlight.at(step);
-                let margin = (caution * (1.0 + deviation)).min(MOST_MARGIN);
+                let margin = (caution * (1.0 + deviation)).min(MAX_MARGIN);
                 danger.add(centre, f64::from(spotlight.radius) + AGENT_RADIUS + 0.5 + margin);
             }
-            // Near the border, a spotlight that comes in leaves no time to flee. Time to get away from it comes first.
+            // Near the border, a new spotlight leaves no time to escape. The first steps allow to leave the border.
             if avoid_border && step > 4 {
                 danger.add_border();
             }
@@ -174,7 +178,7 @@ impl Expert for SpotlightsExpert {
 
     fn act(&mut self, features: &[f32], _vector_observation: &[f32], action: &mut [i32]) {
         action.fill(0);
-        self.look(features);
+        self.observe(features);
         let Some(agent) = self.agent else { return };
         let nearest = self.coins.iter().min_by_key(|coin| {
             let [x, y] = [coin[0] - agent[0], coin[1] - agent[1]];

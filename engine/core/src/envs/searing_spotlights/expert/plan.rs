@@ -1,26 +1,27 @@
-//! The way to a goal through places that become dangerous and safe again.
+//! Path planning to a goal through places that become dangerous and safe over time.
 //!
-//! Sets of places are rows of bits, so that one operation moves a whole row of agents.
+//! Sets of places are bit sets, one for each row, so that one operation moves all places of a row.
 
 use crate::envs::screen::SCREEN;
 
 /// A place in pixels: x, y.
 pub(super) type Place = [i32; 2];
 
-/// Steps that a plan looks ahead.
+/// Planning horizon in steps.
 pub(super) const HORIZON: usize = 28;
 
-/// Where the agent's centre may be, by axis.
+/// Least coordinates of the agent's centre.
 const LOW: Place = [6, 10];
+/// Largest coordinates of the agent's centre.
 const HIGH: Place = [78, 78];
 
-/// Where to wait without a goal.
+/// The place to wait at without a goal.
 pub(super) const NEUTRAL: Place = [42, 44];
 
-/// Places nearer than this to the agent's own limits are near the border.
+/// Places within this distance of the limits are near the border.
 const BORDER: i32 = 6;
 
-/// The nine actions, standing still first, with the pixels that each moves the agent.
+/// The nine actions and their movements in pixels, starting with no movement.
 const MOVES: [([i32; 2], Place); 9] = [
     ([0, 0], [0, 0]),
     ([1, 0], [-3, 0]),
@@ -33,7 +34,7 @@ const MOVES: [([i32; 2], Place); 9] = [
     ([2, 2], [2, 2]),
 ];
 
-/// Where the agent is after an action.
+/// The agent's place after an action.
 pub(super) fn after(place: Place, action: [i32; 2]) -> Place {
     let pixels = MOVES.iter().find(|(candidate, _)| *candidate == action).map_or([0, 0], |(_, pixels)| *pixels);
     moved(place, pixels)
@@ -43,7 +44,7 @@ fn moved(place: Place, pixels: Place) -> Place {
     std::array::from_fn(|axis| (place[axis] + pixels[axis]).clamp(LOW[axis], HIGH[axis]))
 }
 
-/// A set of places, row by row.
+/// A set of places, as a bit set for each row.
 #[derive(Clone, Debug, PartialEq)]
 struct Places([u128; SCREEN]);
 
@@ -70,13 +71,13 @@ impl Places {
         self.0.iter().all(|row| *row == 0)
     }
 
-    /// The places of both sets.
+    /// The intersection of both sets.
     fn and(mut self, other: &Places) -> Self {
         self.0.iter_mut().zip(&other.0).for_each(|(row, other)| *row &= other);
         self
     }
 
-    /// The places from which some action leads into the set.
+    /// The places from which an action leads into the set.
     fn before(&self) -> Self {
         let mut before = Places::NONE;
         for (_, [dx, dy]) in MOVES {
@@ -88,7 +89,7 @@ impl Places {
         before
     }
 
-    /// The places that some action leads to from the set.
+    /// The places to which an action leads from the set.
     fn after(&self) -> Self {
         let mut after = Places::NONE;
         for (_, [dx, dy]) in MOVES {
@@ -108,7 +109,7 @@ impl Places {
     }
 }
 
-/// The columns that lead into `row` by a move of `dx`, which the limits may cut short.
+/// The columns from which a move of `dx`, clamped to the limits, leads into `row`.
 fn columns_before(row: u128, dx: i32) -> u128 {
     let walkable = bits(LOW[0], HIGH[0]);
     let row = row & walkable;
@@ -119,7 +120,7 @@ fn columns_before(row: u128, dx: i32) -> u128 {
     (shifted | held) & walkable
 }
 
-/// The columns that `row` leads to by a move of `dx`, which the limits may cut short.
+/// The columns to which a move of `dx`, clamped to the limits, leads from `row`.
 fn columns_after(row: u128, dx: i32) -> u128 {
     let walkable = bits(LOW[0], HIGH[0]);
     let row = row & walkable;
@@ -132,7 +133,7 @@ fn columns_after(row: u128, dx: i32) -> u128 {
     (shifted & walkable) | held
 }
 
-/// The places where a step hurts.
+/// The places where the agent is hit in a step.
 #[derive(Clone, Debug)]
 pub(super) struct Danger(Places);
 
@@ -165,7 +166,7 @@ impl Danger {
     }
 }
 
-/// What to reach: a place to come within `reach` pixels of.
+/// The goal: any place within `reach` pixels of `place`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Goal {
     pub place: Place,
@@ -184,30 +185,31 @@ impl Goal {
     }
 }
 
-/// What to do now.
+/// The next action, and what the rest of the plan leads to.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Plan {
     pub action: [i32; 2],
-    /// Dangerous steps that cannot be avoided.
+    /// Number of dangerous steps.
     pub hits: usize,
-    /// It reaches the goal before the horizon.
+    /// Whether the plan reaches the goal before the horizon.
     pub arrives: bool,
 }
 
-/// The first action of the way that meets the least danger until the horizon and, among those, is the soonest at the goal or
-/// comes nearest to it. `dangers` has an entry for now, which does not count, and one for each step to come.
+/// The first action of the path with the fewest dangerous steps until the horizon and, among those, the earliest
+/// arrival at the goal or the least distance to it. `dangers` has an entry for the current step, which is ignored, and
+/// one for each future step.
 pub(super) fn choose(start: Place, goal: Goal, dangers: &[Danger]) -> Plan {
     let start = moved(start, [0, 0]);
     let next = MOVES.map(|(action, pixels)| (action, moved(start, pixels)));
-    let safe = bearable(dangers, None);
+    let safe = survivable(dangers, None);
     if next.iter().any(|(_, place)| safe[1].contains(*place)) {
-        let (action, arrives) = lead(start, goal, &safe);
+        let (action, arrives) = safe_action(start, goal, &safe);
         return Plan { action, hits: 0, arrives };
     }
-    // With as many hits as there are steps, every way can be gone.
+    // With as many hits as steps, every path is possible.
     let mut allowed = safe;
     for hits in 1..dangers.len() {
-        allowed = bearable(dangers, Some(&allowed));
+        allowed = survivable(dangers, Some(&allowed));
         let firsts = next.iter().filter(|(_, place)| allowed[1].contains(*place));
         if let Some((action, _)) = firsts.min_by_key(|(_, place)| goal.distance(*place)) {
             return Plan { action: *action, hits, arrives: false };
@@ -216,9 +218,9 @@ pub(super) fn choose(start: Place, goal: Goal, dangers: &[Danger]) -> Plan {
     Plan { action: [0, 0], hits: dangers.len(), arrives: false }
 }
 
-/// For each step: the places from which the rest of the way can be gone without danger, or with one dangerous step more than
-/// `easier` places allow.
-fn bearable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
+/// For each step: the places from which the rest of the path needs no dangerous step, or one more than from the places
+/// of `easier`.
+fn survivable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
     let everywhere = Places([u128::MAX; SCREEN]);
     let mut sets = vec![everywhere.clone(); dangers.len() + 1];
     for step in (1..dangers.len()).rev() {
@@ -236,26 +238,28 @@ fn bearable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
     sets
 }
 
-/// The first action of the way to the goal that meets the least danger, if there is one with at most `most_hits` dangerous
-/// steps: whatever comes after.
-pub(super) fn dash(start: Place, goal: Goal, dangers: &[Danger], most_hits: usize) -> Option<Plan> {
+/// The first action of the path to the goal with the fewest dangerous steps, if there is one with at most `max_hits` of
+/// them. Ignores what happens after the arrival.
+pub(super) fn dash(start: Place, goal: Goal, dangers: &[Danger], max_hits: usize) -> Option<Plan> {
     let safe: Vec<Places> = dangers.iter().map(Danger::safe).collect();
-    let (action, hits) = way(moved(start, [0, 0]), goal, &safe, most_hits)?;
+    let (action, hits) = shortest_path(moved(start, [0, 0]), goal, &safe, max_hits)?;
     Some(Plan { action, hits, arrives: true })
 }
 
-/// The first action of the way to the goal through `safe` places, one set for each step, and whether it arrives.
-fn lead(start: Place, goal: Goal, safe: &[Places]) -> ([i32; 2], bool) {
-    way(start, goal, safe, 0).map_or_else(|| (approach(start, goal, safe), false), |(action, _)| (action, true))
+/// The first action of the path to the goal through `safe` places, one set for each step, and whether it arrives.
+fn safe_action(start: Place, goal: Goal, safe: &[Places]) -> ([i32; 2], bool) {
+    shortest_path(start, goal, safe, 0)
+        .map_or_else(|| (approach(start, goal, safe), false), |(action, _)| (action, true))
 }
 
-/// The first action and the dangerous steps of the way to the goal with the fewest of them, and of those the shortest.
-fn way(start: Place, goal: Goal, safe: &[Places], most_hits: usize) -> Option<([i32; 2], usize)> {
+/// The first action and the number of dangerous steps of the shortest path among those to the goal with the fewest
+/// dangerous steps.
+fn shortest_path(start: Place, goal: Goal, safe: &[Places], max_hits: usize) -> Option<([i32; 2], usize)> {
     let goals = goal.places();
-    // For each number of dangerous steps on the way, the places after each step.
+    // For each number of dangerous steps, the places after each step.
     let mut easier: Vec<Places> = Vec::new();
     let mut reached: Vec<Vec<Places>> = Vec::new();
-    for hits in 0..=most_hits {
+    for hits in 0..=max_hits {
         let mut places = vec![if hits == 0 { Places::only(start) } else { Places::NONE }];
         for (step, safe) in safe.iter().enumerate().take(HORIZON + 1).skip(1) {
             let mut next = places[step - 1].after().and(safe);
@@ -278,7 +282,7 @@ fn way(start: Place, goal: Goal, safe: &[Places], most_hits: usize) -> Option<([
     None
 }
 
-/// The first action of the way that comes nearest to the goal.
+/// The first action of the path with the least distance to the goal at its end.
 fn approach(start: Place, goal: Goal, safe: &[Places]) -> [i32; 2] {
     let mut reached = vec![Places::only(start)];
     for (step, safe) in safe.iter().enumerate().take(HORIZON + 1).skip(1) {
@@ -289,7 +293,7 @@ fn approach(start: Place, goal: Goal, safe: &[Places]) -> [i32; 2] {
     nearest.and_then(|place| first_action(last, place, 0, &[reached], safe)).unwrap_or([0, 0])
 }
 
-/// Goes back from the place after some step, with so many hits, to the first step, and returns its action.
+/// Traces a path back from its place after `step` steps with `hits` hits, and returns its first action.
 fn first_action(
     mut step: usize,
     mut place: Place,
