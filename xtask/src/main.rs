@@ -1,6 +1,7 @@
 //! Development tasks: `cargo xtask test` runs all tests.
 
 mod instructions;
+mod modules;
 mod original;
 mod python;
 mod venv;
@@ -12,6 +13,7 @@ use std::time::Instant;
 const HELP: &str = "\
 cargo xtask test                 check formatting, lint, and run all tests, Rust's and Python's
 cargo xtask python               build the Python package, lint it, and run its tests alone
+cargo xtask modules              check that the files of a crate do not import each other in cycles
 cargo xtask wasm                 build the core for wasm32-unknown-unknown
 cargo xtask instructions         count the instructions of a step and compare with the budgets (--record: record new budgets)
 cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help lists ARGS)
@@ -44,6 +46,7 @@ fn main() -> ExitCode {
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let done = match arguments[..] {
         ["test"] => run(TEST, &[PROPERTY_SEED])
+            .and_then(|()| modules::check())
             .and_then(|()| wasm::check())
             .and_then(|()| instructions::run(false))
             .and_then(|()| python::test())
@@ -52,6 +55,7 @@ fn main() -> ExitCode {
         ["instructions"] => instructions::run(false),
         ["instructions", "--record"] => instructions::run(true),
         ["bench", ref arguments @ ..] => python::bench(arguments),
+        ["modules"] => modules::check(),
         ["wasm"] => wasm::build(),
         ["properties"] => run(&[PROPERTIES], &[("PROPTEST_CASES", PROPERTY_CASES)]),
         ["properties", cases] => run(&[PROPERTIES], &[("PROPTEST_CASES", cases)]),

@@ -6,7 +6,8 @@ use rand::Rng;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 
-use super::{EntropyError, SeedSequence, entropy};
+use super::entropy::{EntropyError, entropy};
+use super::seed_sequence::SeedSequence;
 
 /// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
 ///
