@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use endless_gym::batch::{Batch, zeroed};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
-use endless_gym::service::{Observer, Received, Trainer};
+use endless_gym::service::{BatchLease, Observer, Trainer};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use service_support::{ID, Place, play_role};
@@ -17,16 +17,17 @@ const SECONDS: Duration = Duration::from_secs(5);
 const NUM_ENVS: usize = 4;
 
 #[test]
+#[ignore = "a child process of the other tests"]
 fn role() {
     play_role();
 }
 
 /// Batches that somebody holds, with what was in them when they came.
 #[derive(Default)]
-struct Held(Vec<(Received, Vec<u8>)>);
+struct Held(Vec<(BatchLease, Vec<u8>)>);
 
 impl Held {
-    fn keep(&mut self, received: Received) {
+    fn keep(&mut self, received: BatchLease) {
         let frames = received.batch().observation().to_vec();
         self.0.push((received, frames));
     }

@@ -9,13 +9,14 @@ use endless_gym::batch::{Block, SNAPSHOT_BYTES, zeroed};
 use endless_gym::pool::{Options, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
-use service_support::foreign::{ActionHeader, Foreign};
+use service_support::foreign::{Foreign, RequestHeader};
 use service_support::{ID, Place, play_role};
 
 const SECONDS: Duration = Duration::from_secs(5);
 const NUM_ENVS: usize = 3;
 
 #[test]
+#[ignore = "a child process of the other tests"]
 fn role() {
     play_role();
 }
@@ -114,10 +115,10 @@ fn mistakes_are_typed_errors() {
 
     // A length that the payload does not have.
     let foreign = Foreign::new(place.namespace(), &specification);
-    let good = ActionHeader::reset_all(&specification);
+    let good = RequestHeader::reset_all(&specification);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
     for bytes in [u64::MAX, 1 << 40] {
-        let (status, text) = foreign.ask(ActionHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
+        let (status, text) = foreign.ask(RequestHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
         assert!(status != 0 && text.contains("no snapshot"), "{text}");
     }
 }
