@@ -3,7 +3,8 @@
 //! iceoryx2 removes the resources of a dead process by the records that the process kept. A process that is killed between two
 //! steps of its start or end leaves resources that iceoryx2 ignores or waits for forever:
 //!
-//! - **unsized segments**: created, but not resized yet. iceoryx2 waits without a timeout for the size, so they are removed first;
+//! - **unsized segments**: created, but not resized yet. iceoryx2 waits without a timeout for the size, so they are removed
+//!   first;
 //! - **incomplete nodes and services**: a node without details, or a service whose static configuration is not finished;
 //! - **orphans**: segments and sockets that no record names. They are recognised once a namespace has no nodes.
 //!

@@ -93,13 +93,14 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// Creates the environments and takes the engine's name. Trainers can connect, and are answered while [`run`](Engine::run) runs.
+    /// Creates the environments and takes the engine's name. Trainers can connect, and are answered while [`run`](Engine::run)
+    /// runs.
     ///
     /// # Errors
     ///
     /// [`ServiceError::InvalidName`], [`ServiceError::OutOfRange`] or [`ServiceError::Pool`] for an invalid configuration,
-    /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is running, and
-    /// [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory.
+    /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is
+    /// running, and [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
         let node = NamespaceNode::join(&config.namespace)?;
@@ -134,8 +135,8 @@ impl Engine {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer are
-    /// no errors: its requests are rejected.
+    /// [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
+    /// are no errors: its requests are rejected.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
         let mut next = 0;

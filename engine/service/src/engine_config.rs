@@ -24,8 +24,8 @@ pub struct EngineConfig {
     /// The environments of one group. The engine overrides `first_env` and `total_envs`, which count the environments of all
     /// groups. [`Options::Each`] holds the reset parameters of all groups, one group after the other.
     pub pool: PoolConfig,
-    /// Number of groups, 1 to [`MAX_GROUPS`]. Each is stepped when its actions arrive, so that a trainer can work on one group while
-    /// the engine steps another.
+    /// Number of groups, 1 to [`MAX_GROUPS`]. Each is stepped when its actions arrive, so that a trainer can work on one group
+    /// while the engine steps another.
     pub groups: usize,
     /// The threads that step the environments of all groups.
     pub threads: Threads,

@@ -30,8 +30,8 @@ pub struct BatchLease {
     _port: Arc<ResponsePort>,
 }
 
-// SAFETY: a shared reference only reads the payload and the length in iceoryx2's header, which are not written to while the sample is held. The
-// mutable parts of the sample are used when it is dropped, which requires ownership.
+// SAFETY: a shared reference only reads the payload and the length in iceoryx2's header, which are not written to while the
+// sample is held. The mutable parts of the sample are used when it is dropped, which requires ownership.
 unsafe impl Sync for BatchLease {}
 
 impl BatchLease {

@@ -1,8 +1,8 @@
 //! Memory Gym environments in shared memory: an engine, its trainer and its observers.
 //!
 //! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** read along. They are
-//! processes of one user on one host and find each other in a [`Namespace`]. The transport is iceoryx2: a message is written once,
-//! into the memory where its receiver reads it.
+//! processes of one user on one host and find each other in a [`Namespace`]. The transport is iceoryx2: a message is written
+//! once, into the memory where its receiver reads it.
 //!
 //! # Services
 //!
@@ -59,6 +59,7 @@ mod message;
 mod namespace;
 mod node;
 mod observer;
+mod pending;
 mod ports;
 mod specification;
 mod trainer;

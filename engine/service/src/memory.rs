@@ -1,8 +1,8 @@
 //! Prefaulting of shared memory: making sure that it is available before it is written to.
 //!
 //! A segment in `/dev/shm` may be larger than the space that is left there. The process is then killed by SIGBUS when it first
-//! writes to a page for which there is no memory, possibly hours after its start. Each chunk is therefore prefaulted before its first use,
-//! and missing memory is an error.
+//! writes to a page for which there is no memory, possibly hours after its start. Each chunk is therefore prefaulted before its
+//! first use, and missing memory is an error.
 
 use std::mem::MaybeUninit;
 

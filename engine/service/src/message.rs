@@ -1,7 +1,7 @@
 //! The headers of requests and responses. The payload of both is `[Block]`: actions, a batch or a snapshot.
 //!
-//! A header in shared memory may be changed by its sender at any time. A receiver must copy it once with [`copied`], check the copy,
-//! and use nothing but the copy.
+//! A header in shared memory may be changed by its sender at any time. A receiver must copy it once with [`copied`], check the
+//! copy, and use nothing but the copy.
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::{Block, LAYOUT_VERSION};

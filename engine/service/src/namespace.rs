@@ -20,8 +20,8 @@ pub const ROOT_VARIABLE: &str = "ENDLESS_GYM_ROOT";
 /// Maximum length of an engine name in bytes.
 const MAX_SERVICE_NAME: usize = 64;
 
-/// Maximum length of the root in bytes. The path of a Unix socket has at most 107 bytes: the root, a separator, the prefix (at most
-/// [`MAX_PREFIX`] bytes) and 49 bytes of the socket's own name.
+/// Maximum length of the root in bytes. The path of a Unix socket has at most 107 bytes: the root, a separator, the prefix (at
+/// most [`MAX_PREFIX`] bytes) and 49 bytes of the socket's own name.
 const MAX_ROOT: usize = 107 - 1 - MAX_PREFIX - 49;
 const MAX_PREFIX: usize = 16;
 
@@ -54,8 +54,8 @@ impl Default for Namespace {
 }
 
 impl Namespace {
-    /// The namespace with the root directory `root`, an absolute path of at most 41 bytes. The directory is created when it is first used. The
-    /// prefix is derived from the path.
+    /// The namespace with the root directory `root`, an absolute path of at most 41 bytes. The directory is created when it is
+    /// first used. The prefix is derived from the path.
     pub fn at(root: impl Into<PathBuf>) -> Self {
         let root = root.into();
         let prefix = format!("endless{:08x}_", crc32fast::hash(root.as_os_str().as_bytes()));

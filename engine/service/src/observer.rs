@@ -42,8 +42,8 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::NoSuchGroup`] if it has no
-    /// such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts, and
+    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::NoSuchGroup`] if it
+    /// has no such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts, and
     /// [`ServiceError::Version`] or [`ServiceError::IncompatibleTypes`] for an engine of another version.
     pub fn connect(config: &ConnectConfig, group: usize) -> Result<Self, ServiceError> {
         let (node, port, specification) = connect_to_engine(config, |node, specification| {
@@ -76,8 +76,8 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] if the engine has ended, and the errors of
-    /// [`newest`](Observer::newest).
+    /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] if the engine has ended, and the
+    /// errors of [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
         loop {

@@ -28,8 +28,8 @@ pub(crate) type ResponseSubscriber = Subscriber<Ipc, [PayloadBlock], ResponseHea
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and processes that are about to be refused.
 const MAX_NODES: usize = 64;
 
-/// Names of one engine's services. All names except the specification's contain the incarnation, so that a restarted engine shares
-/// nothing with the services that a dead one left.
+/// Names of one engine's services. All names except the specification's contain the incarnation, so that a restarted engine
+/// shares nothing with the services that a dead one left.
 #[derive(Clone, Debug)]
 pub(crate) struct ServiceNames {
     service: String,

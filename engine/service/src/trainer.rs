@@ -15,6 +15,7 @@ use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
 use crate::lease::{BatchLease, Response};
 use crate::message::{RequestHeader, RequestKind};
+use crate::pending::{PendingRequests, Request};
 use crate::ports;
 use crate::specification::ServiceSpecification;
 use crate::wait::wait;
@@ -55,35 +56,9 @@ pub struct Trainer {
     id: u64,
     /// Number of the last request.
     last_request: u64,
-    /// By group, the request that has not been answered yet.
-    pending: Vec<Option<PendingRequest>>,
+    pending: PendingRequests,
     /// When the last request was sent.
     sent: Instant,
-}
-
-/// A request that has not been answered yet.
-#[derive(Clone, Copy, Debug)]
-struct PendingRequest {
-    number: u64,
-    request: Request,
-}
-
-/// What is requested.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Request {
-    kind: RequestKind,
-    /// First seed of a [`RequestKind::ResetSeed`].
-    seed: u64,
-    /// Environment of a [`RequestKind::Snapshot`] or a [`RequestKind::Restore`].
-    env: usize,
-    /// Checksum of the snapshot of a [`RequestKind::Restore`].
-    checksum: u32,
-}
-
-impl Request {
-    fn new(kind: RequestKind) -> Self {
-        Request { kind, seed: 0, env: 0, checksum: 0 }
-    }
 }
 
 impl Trainer {
@@ -91,14 +66,14 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::TrainerExists`] if it has
-    /// a trainer, [`ServiceError::Version`] or [`ServiceError::IncompatibleTypes`] for an engine of another version,
+    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::TrainerExists`] if
+    /// it has a trainer, [`ServiceError::Version`] or [`ServiceError::IncompatibleTypes`] for an engine of another version,
     /// [`ServiceError::InvalidName`] or [`ServiceError::Root`] for an invalid configuration.
     pub fn connect(config: &ConnectConfig) -> Result<Self, ServiceError> {
         let (connection, specification) = EngineConnection::open(config)?;
         Ok(Trainer {
             config: config.clone(),
-            pending: vec![None; specification.groups],
+            pending: PendingRequests::new(specification.groups),
             specification: Arc::new(specification),
             connection: ForkGuard::new(connection),
             id: rand::random(),
@@ -114,7 +89,8 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::SpecificationChanged`] if the new engine serves something else, and the errors of [`connect`](Trainer::connect).
+    /// [`ServiceError::SpecificationChanged`] if the new engine serves something else, and the errors of
+    /// [`connect`](Trainer::connect).
     pub fn reconnect(&mut self, timeout: Duration) -> Result<(), ServiceError> {
         if !self.connection.is_engine_alive() {
             let config = ConnectConfig { timeout, ..self.config.clone() };
@@ -125,7 +101,7 @@ impl Trainer {
             self.specification = Arc::new(specification);
             self.connection = ForkGuard::new(connection);
         }
-        self.pending.fill(None);
+        self.pending.clear();
         Ok(())
     }
 
@@ -136,8 +112,8 @@ impl Trainer {
 
     /// Requests new episodes in a group; [`receive`](Trainer::receive) returns their first observations.
     ///
-    /// [`ResetRequest::Seed`] seeds environment `i` of the group with `seed + group * num_envs + i`: the environments of all groups are
-    /// numbered consecutively, as in one pool.
+    /// [`ResetRequest::Seed`] seeds environment `i` of the group with `seed + group * num_envs + i`: the environments of all
+    /// groups are numbered consecutively, as in one pool.
     ///
     /// # Errors
     ///
@@ -190,8 +166,9 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::ActionCount`], [`ServiceError::ActionRange`], [`ServiceError::NoSuchGroup`], [`ServiceError::AnswerPending`], and
-    /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has ended.
+    /// [`ServiceError::ActionCount`], [`ServiceError::ActionRange`], [`ServiceError::NoSuchGroup`],
+    /// [`ServiceError::AnswerPending`], and [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has
+    /// ended.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
         let expected = self.specification.num_envs * self.specification.action_space.branches().len();
         if actions.len() != expected {
@@ -224,12 +201,12 @@ impl Trainer {
     /// # Errors
     ///
     /// [`ServiceError::TimedOut`] if there is no answer in time; it stays pending and can be received later.
-    /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] within half a second after the engine's process has ended.
-    /// [`ServiceError::Rejected`] if the engine rejected the request. [`ServiceError::NothingSent`], [`ServiceError::NoSuchGroup`], and
-    /// [`ServiceError::TooManyBatchesHeld`].
+    /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] within half a second after the engine's process has
+    /// ended. [`ServiceError::Rejected`] if the engine rejected the request. [`ServiceError::NothingSent`],
+    /// [`ServiceError::NoSuchGroup`], and [`ServiceError::TooManyBatchesHeld`].
     pub fn receive(&mut self, group: usize, timeout: Duration) -> Result<BatchLease, ServiceError> {
         self.check_group(group)?;
-        if !self.has_pending_batch(group) {
+        if !self.pending.has_batch(group) {
             return Err(ServiceError::NothingSent { group });
         }
         self.receive_batch(group..group + 1, timeout)
@@ -241,10 +218,10 @@ impl Trainer {
     ///
     /// Those of [`receive`](Trainer::receive).
     pub fn receive_any(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
-        if !(0..self.pending.len()).any(|group| self.has_pending_batch(group)) {
+        if !self.pending.has_any_batch() {
             return Err(ServiceError::NothingSent { group: 0 });
         }
-        self.receive_batch(0..self.pending.len(), timeout)
+        self.receive_batch(0..self.pending.groups(), timeout)
     }
 
     /// Takes a snapshot of an environment: its whole state, for [`restore`](Trainer::restore) or
@@ -254,8 +231,8 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::AnswerPending`] if the group has a pending batch, [`ServiceError::Rejected`] if there is no such environment or the
-    /// group was not reset, and the errors of [`receive`](Trainer::receive).
+    /// [`ServiceError::AnswerPending`] if the group has a pending batch, [`ServiceError::Rejected`] if there is no such
+    /// environment or the group was not reset, and the errors of [`receive`](Trainer::receive).
     ///
     /// ```no_run
     /// # use std::time::Duration;
@@ -278,8 +255,8 @@ impl Trainer {
         self.transfer(group, Request { env, ..Request::new(RequestKind::Snapshot) }, timeout, |_| Ok(0))
     }
 
-    /// Restores an environment from a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of no environment
-    /// ([`ResetRequest::Each`]) then returns its observation.
+    /// Restores an environment from a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of no
+    /// environment ([`ResetRequest::Each`]) then returns its observation.
     ///
     /// After [`ServiceError::TimedOut`], the engine may still restore the environment, but not after a later request.
     ///
@@ -315,7 +292,7 @@ impl Trainer {
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<Vec<u8>, ServiceError> {
         self.check_group(group)?;
-        if self.pending[group].is_none_or(|pending| pending.request != request) {
+        if !self.pending.has(group, request) {
             self.post(group, request, write)?;
         }
         let response = self.receive_response(group..group + 1, false, timeout)?;
@@ -325,10 +302,6 @@ impl Trainer {
     fn receive_batch(&mut self, groups: Range<usize>, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let response = self.receive_response(groups, true, timeout)?;
         response.into_batch().ok_or_else(|| self.incompatible())
-    }
-
-    fn has_pending_batch(&self, group: usize) -> bool {
-        self.pending[group].is_some_and(|pending| pending.request.kind.returns_batch())
     }
 
     /// The first response to a pending request of `groups`, of those that return batches or of those that do not.
@@ -344,8 +317,7 @@ impl Trainer {
             let (connection, pending) = (&*self.connection, &self.pending);
             let received = wait(&connection.to_trainer, left.min(LIVENESS_INTERVAL), self.sent, || {
                 for group in groups.clone() {
-                    let due = pending[group].filter(|pending| pending.request.kind.returns_batch() == batches);
-                    let Some(PendingRequest { number, .. }) = due else { continue };
+                    let Some(number) = pending.number(group, batches) else { continue };
                     // The queue may hold the response to an earlier trainer.
                     while let Some(response) = connection.responses[group].receive(&self.specification)? {
                         if response.answers(self.id, number) {
@@ -356,7 +328,7 @@ impl Trainer {
                 Ok(None)
             })?;
             if let Some((group, response)) = received {
-                self.pending[group] = None;
+                self.pending.remove(group);
                 return response.check_accepted();
             }
             if !connection.is_engine_alive() {
@@ -369,15 +341,16 @@ impl Trainer {
     }
 
     fn check_group(&self, group: usize) -> Result<(), ServiceError> {
-        if group < self.pending.len() {
+        let groups = self.pending.groups();
+        if group < groups {
             return Ok(());
         }
-        let (service, groups) = (self.config.service.clone(), self.pending.len());
+        let service = self.config.service.clone();
         Err(ServiceError::NoSuchGroup { service, given: group, groups })
     }
 
-    /// Writes a request in shared memory and sends it. `write` fills the payload and returns the length of its options or snapshot in
-    /// bytes.
+    /// Writes a request in shared memory and sends it. `write` fills the payload and returns the length of its options or
+    /// snapshot in bytes.
     fn post(
         &mut self,
         group: usize,
@@ -385,7 +358,7 @@ impl Trainer {
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<(), ServiceError> {
         self.check_group(group)?;
-        if self.has_pending_batch(group) {
+        if self.pending.has_batch(group) {
             return Err(ServiceError::AnswerPending { group });
         }
         let failed = ServiceError::middleware("cannot send a request");
@@ -412,7 +385,7 @@ impl Trainer {
             return Err(self.lost());
         }
         ports::notify(&self.connection.to_engine, group);
-        self.pending[group] = Some(PendingRequest { number: self.last_request, request });
+        self.pending.insert(group, self.last_request, request);
         self.sent = Instant::now();
         Ok(())
     }

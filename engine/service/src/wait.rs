@@ -20,9 +20,9 @@ const SPIN: Duration = Duration::from_micros(3);
 /// one. Waking a parked waiter takes up to half a millisecond on a virtual machine, during which the sender may park in turn.
 const YIELD: Duration = Duration::from_millis(3);
 
-/// Calls `poll` until it returns a value or `timeout` has passed, and parks on `listener` between the calls. Spinning and yielding
-/// end a fixed time after `since`, the time of the last message, so that repeated calls without a message park at once. A
-/// signal ends the wait like the timeout.
+/// Calls `poll` until it returns a value or `timeout` has passed, and parks on `listener` between the calls. Spinning and
+/// yielding end a fixed time after `since`, the time of the last message, so that repeated calls without a message park at once.
+/// A signal ends the wait like the timeout.
 pub(crate) fn wait<T>(
     listener: &Listener<Ipc>,
     timeout: Duration,
