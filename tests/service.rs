@@ -8,10 +8,11 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym::batch::{Batch, zeroed};
+use endless_gym::batch::{Batch, action_layout, zeroed};
+use endless_gym::envs::spec;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{
-    ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, Trainer, running_engines,
+    ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
 };
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::foreign::{Foreign, RequestHeader};
@@ -25,7 +26,7 @@ fn role() {
     play_role();
 }
 
-/// Resets a group and plays some steps.
+/// Resets a group and steps it.
 fn play(trainer: &mut Trainer, group: usize, steps: u64) {
     trainer.reset(group, ResetRequest::Seed(3)).unwrap();
     let first = trainer.receive(group, SECONDS).unwrap().step();
@@ -68,7 +69,7 @@ fn groups_are_reset_and_stepped_independently() {
     let stepped = trainer.receive_any(SECONDS).unwrap();
     assert_eq!((stepped.group(), stepped.step()), (0, 2));
     assert_eq!(stepped.batch().episode_length(), [1; 4]);
-    assert_eq!(first.batch().episode_length(), [0; 4], "a held batch stays as it was");
+    assert_eq!(first.batch().episode_length(), [0; 4], "a held batch does not change");
 
     trainer.reset(0, ResetRequest::Each { reset: &[0, 2, 0, 1], seed: &[0, 7, 0, 0] }).unwrap();
     let again = trainer.receive(0, SECONDS).unwrap();
@@ -108,7 +109,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
         ));
         assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::ActionCount { given: 1, num_envs: 2, .. })));
 
-        // Nothing can be stepped before the first reset.
+        // The environments must be reset before the first step.
         trainer.send(0, &vec![0; 2 * width]).unwrap();
         let rejected = trainer.receive(0, SECONDS).unwrap_err();
         assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
@@ -169,7 +170,7 @@ fn an_unknown_engine_is_named_among_those_that_exist() {
 }
 
 #[test]
-fn observers_see_the_newest_batch_and_hold_nobody_up() {
+fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
     let place = Place::new();
     let _engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -179,11 +180,11 @@ fn observers_see_the_newest_batch_and_hold_nobody_up() {
     play(&mut trainer, 0, 10);
     let seen = observer.newest().unwrap().unwrap();
     assert_eq!(seen.step(), 11);
-    // One that hoards what it gets runs out by itself; the trainer does not notice.
-    let mut hoard = vec![seen];
-    while hoard.len() < 3 {
+    // An observer that holds its batches reaches its own limit and does not affect the trainer.
+    let mut held = vec![seen];
+    while held.len() < 3 {
         play(&mut trainer, 0, 1);
-        hoard.push(observer.next(SECONDS).unwrap());
+        held.push(observer.next(SECONDS).unwrap());
     }
     play(&mut trainer, 0, 10);
     assert!(matches!(observer.newest(), Err(ServiceError::TooManyBatchesHeld { .. })));
@@ -201,12 +202,12 @@ fn after_a_killed_trainer_the_next_one_plays_on() {
     let _engine = place.engine("gym", 2, 2);
     for _ in 0..2 {
         let mut killed = place.role("trainer", "gym", &[]);
-        // It plays for as long as it lives; the observer shows that it does.
+        // The observer shows that the trainer steps.
         let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
         observer.next(SECONDS).unwrap();
         killed.kill();
         let mut trainer = place.trainer("gym").unwrap();
-        // The environments are in the dead one's episodes.
+        // The environments are in the episodes of the dead trainer.
         trainer.send_with(0, |actions| actions.fill(0)).unwrap();
         let rejected = trainer.receive(0, SECONDS).unwrap_err();
         assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
@@ -216,7 +217,7 @@ fn after_a_killed_trainer_the_next_one_plays_on() {
 }
 
 #[test]
-fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
+fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
     let place = Place::new();
     let mut engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -239,9 +240,9 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     let mut engine = place.engine("gym", 2, 1);
     trainer.reconnect(SECONDS).unwrap();
     play(&mut trainer, 0, 3);
-    assert_eq!(held.batch().observation(), frame, "what a dead engine lent stays");
+    assert_eq!(held.batch().observation(), frame, "a batch of a dead engine remains readable");
 
-    // The next one is replaced before the trainer notices anything.
+    // The engine is replaced before the trainer checks whether it is running.
     engine.kill();
     let mut engine = place.engine("gym", 2, 1);
     Observer::connect(&place.connect_config("gym"), 0).unwrap();
@@ -253,7 +254,7 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     trainer.reconnect(SECONDS).unwrap();
     play(&mut trainer, 0, 3);
 
-    // One that serves something else is no successor.
+    // An engine that serves something else is not a successor.
     engine.kill();
     let _engine = place.engine("gym", 3, 1);
     let error = trainer.reconnect(SECONDS).unwrap_err();
@@ -262,13 +263,13 @@ fn a_killed_engine_is_noticed_and_its_successor_taken_up() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
-/// Deaths come at any moment, also while starting and connecting. `ENDLESS_TEST_ROUNDS=1000` looks for rarer moments.
+/// Kills processes at any moment, also while they start and connect. `ENDLESS_TEST_ROUNDS=1000` tests rarer moments.
 #[test]
 fn deaths_at_any_moment_are_survived() {
     let place = Place::new();
     let rounds = std::env::var("ENDLESS_TEST_ROUNDS").map_or(60, |rounds| rounds.parse().unwrap());
     for round in 0..rounds {
-        // Start, connection and play of a process take some 30 milliseconds.
+        // A process takes about 30 milliseconds to start, connect and step.
         let moment = |step: u64| Duration::from_micros(round * step % 40_000);
         let mut engine = place.engine("gym", 3, 2);
         std::thread::sleep(moment(7919));
@@ -283,14 +284,14 @@ fn deaths_at_any_moment_are_survived() {
         play(&mut trainer, 0, 3);
         play(&mut trainer, 1, 3);
     }
-    // What died too early to be recognised at once is recognised by its age.
+    // Incomplete nodes are recognised by their age.
     std::thread::sleep(Duration::from_secs(11));
     assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
     assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
 }
 
 #[test]
-fn an_engine_that_ends_is_noticed_too() {
+fn a_trainer_notices_that_its_engine_has_ended() {
     let place = Place::new();
     let engine = place.engine("gym", 1, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -304,7 +305,7 @@ fn an_engine_that_ends_is_noticed_too() {
 }
 
 #[test]
-fn a_slow_engine_is_waited_for() {
+fn a_late_answer_can_be_received_after_a_timeout() {
     let place = Place::new();
     let engine = place.engine("gym", 1, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -334,7 +335,7 @@ fn nothing_is_left_behind() {
     drop(held);
     assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
 
-    // Nor after a crash, once anyone has come by.
+    // After a crash, the next process that joins removes everything.
     let mut engine = place.engine("gym", 2, 2);
     place.trainer("gym").unwrap();
     engine.kill();
@@ -366,9 +367,9 @@ fn bad_messages_are_answered_with_rejections() {
     let (status, text) = foreign.ask(step, foreign.blocks(), out_of_range).unwrap();
     assert!(status != 0 && text.contains("-1"), "{text}");
     let earlier = RequestHeader { incarnation: specification.incarnation.wrapping_sub(1), ..good };
-    assert_eq!(foreign.ask(earlier, foreign.blocks(), |_| {}), None, "a message of another incarnation is dropped");
+    assert_eq!(foreign.ask(earlier, foreign.blocks(), |_| {}), None, "a request for another incarnation is dropped");
 
-    // Nothing of that has harmed the engine.
+    // The engine still answers.
     let fine = |blocks: &mut [endless_gym::batch::Block]| {
         specification.action.write::<i32>(blocks, "action").fill(0);
     };
@@ -384,6 +385,26 @@ fn another_version_is_refused_with_both_numbers() {
     let error = place.trainer_now("old").map(drop).unwrap_err();
     assert!(matches!(&error, ServiceError::Version { layout, .. } if layout == "999"), "{error}");
     assert!(error.to_string().contains("install the same version"), "{error}");
+}
+
+#[test]
+fn a_malformed_specification_is_an_error_and_not_a_panic() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 1, 1);
+    let valid = place.trainer("gym").unwrap().specification().clone();
+    let malformed = [
+        ("groups", ServiceSpecification { groups: 0, ..valid.clone() }),
+        ("num_envs", ServiceSpecification { num_envs: 0, ..valid.clone() }),
+        ("batches_held", ServiceSpecification { batches_held: 0, ..valid.clone() }),
+        ("Chess-v0", ServiceSpecification { id: "Chess-v0".to_owned(), ..valid.clone() }),
+        ("action", ServiceSpecification { action: valid.batch.clone(), ..valid.clone() }),
+        ("batch", ServiceSpecification { batch: action_layout(spec(ID).unwrap(), 2), ..valid.clone() }),
+    ];
+    for (part, specification) in malformed {
+        let _published = service_support::foreign::specification(place.namespace(), "malformed", &specification);
+        let error = place.trainer_now("malformed").map(drop).unwrap_err();
+        assert!(matches!(&error, ServiceError::Specification { reason, .. } if reason.contains(part)), "{error}");
+    }
 }
 
 #[test]

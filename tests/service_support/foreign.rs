@@ -247,6 +247,18 @@ pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u
     Box::new((published, node))
 }
 
+/// Publishes a specification under the name `service`, without the services that it describes.
+pub fn specification(
+    namespace: &Namespace,
+    service: &str,
+    specification: &ServiceSpecification,
+) -> Box<dyn std::any::Any> {
+    let node = node(namespace);
+    let text = serde_json::to_vec(specification).unwrap();
+    let published = publish(&node, service, LAYOUT_VERSION, &text);
+    Box::new((published, node))
+}
+
 /// An engine of the right version whose requests have another type.
 pub fn engine_of_other_type(
     namespace: &Namespace,

@@ -72,7 +72,7 @@ pub(crate) struct PublishedSpecification {
 impl Drop for PublishedSpecification {
     fn drop(&mut self) {
         // Closing the board removes the service by its name, which must not be a successor's by then.
-        let lock = NamespaceLock::exclusive(&self.root);
+        let lock = NamespaceLock::acquire(&self.root);
         if let Err(e) = &lock {
             tracing::warn!(error = %e, "the specification is removed without the lock");
         }
@@ -90,7 +90,7 @@ pub(crate) fn publish(
     let name = ServiceNames::specification(&specification.service)?;
     let mut blocked_since = None;
     loop {
-        let lock = NamespaceLock::exclusive(node.root())?;
+        let lock = NamespaceLock::acquire(node.root())?;
         if let Some(published) = create(node, &name, &text)? {
             return Ok(published);
         }
@@ -191,7 +191,7 @@ fn writer_node(board: &Board) -> Option<UniqueNodeId> {
 pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<ServiceSpecification>, ServiceError> {
     check_name(service)?;
     let invalid = |reason: String| ServiceError::Specification { service: service.to_owned(), reason };
-    let _lock = NamespaceLock::shared(node.root())?;
+    let _lock = NamespaceLock::acquire(node.root())?;
     let Some(board) = open(node, service)? else { return Ok(None) };
     if !writer_node(&board).is_some_and(|writer| node.is_alive(writer)) {
         return Ok(None);
@@ -219,14 +219,14 @@ pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<Service
 ///
 /// # Errors
 ///
-/// [`ServiceError::Root`] if the namespace's directory cannot be used, and [`ServiceError::NamespaceLocked`] if it stays locked.
+/// [`ServiceError::Root`] if the namespace's directory cannot be used.
 pub fn running_engines(namespace: &Namespace) -> Result<Vec<String>, ServiceError> {
     list(&NamespaceNode::join(namespace)?)
 }
 
 /// Names of the running engines, sorted.
 pub(crate) fn list(node: &NamespaceNode) -> Result<Vec<String>, ServiceError> {
-    let _lock = NamespaceLock::shared(node.root())?;
+    // Without the lock: listing opens no service.
     let mut names = Vec::new();
     let listed = Ipc::list(node.config(), |service| {
         let name = service.static_details.name().as_str();

@@ -49,7 +49,7 @@ pub(crate) fn remove_unsized_segments(config: &Config) {
     }
 }
 
-/// Removes incomplete services, which block their names. The exclusive lock keeps an engine from creating a service of the same
+/// Removes incomplete services, which block their names. The lock keeps an engine from creating a service of the same
 /// name between the check and the removal.
 pub(crate) fn remove_incomplete_services(config: &Config, _lock: &NamespaceLock) {
     for path in entries(&directory(&config.global.service_dir())) {
@@ -194,7 +194,7 @@ mod tests {
             [("a", 0o400, 60), ("b", 0o600, 0), ("c", 0o600, 60)].map(|(n, m, s)| file(&services, &config, n, m, s));
         let nodes = root.join("nodes");
         let [young, old] = [("1", 1), ("2", 60)].map(|(n, s)| file(&nodes, &config, n, 0o600, s));
-        remove_incomplete_services(&config, &NamespaceLock::exclusive(&root).unwrap());
+        remove_incomplete_services(&config, &NamespaceLock::acquire(&root).unwrap());
         remove_incomplete_nodes(&config);
         assert!(finished.exists() && begun.exists() && !stuck.exists());
         assert!(young.exists() && !old.exists());

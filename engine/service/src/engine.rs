@@ -104,7 +104,7 @@ impl Engine {
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
         let node = NamespaceNode::join(&config.namespace)?;
-        blackboard::refuse_second_engine(&node, &config.service, &NamespaceLock::shared(node.root())?)?;
+        blackboard::refuse_second_engine(&node, &config.service, &NamespaceLock::acquire(node.root())?)?;
         let pools: Vec<Pool> =
             config.pools()?.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<_, _>>()?;
         let specification = specify(config, &pools[0]);

@@ -3,15 +3,13 @@
 //! iceoryx2 removes a service by its name. A process that has decided to remove the service of a dead engine could therefore
 //! remove that of a successor which has taken the name in the meantime. The lock covers decision and removal:
 //!
-//! | operation | lock |
-//! | --- | --- |
-//! | publish a specification; remove what a dead engine left under the name | exclusive |
-//! | close the specification service of an engine that ends | exclusive |
-//! | remove the resources of dead nodes | exclusive, skipped if it is not free |
-//! | read a specification, list the engines | shared |
+//! - publish a specification, and remove what a dead engine left under its name;
+//! - close the specification service of an engine that ends;
+//! - remove the resources of dead nodes, which is skipped if the lock is not free;
+//! - read a specification, because the last process that closes a service removes it.
 //!
-//! Readers need the lock because the last process that closes a service removes it. The lock is an advisory `flock` on the
-//! namespace's directory: it leaves no file behind, and the kernel releases it when its holder dies.
+//! Readers exclude each other too: with a shared lock, many waiting trainers could starve an engine that starts. The lock is an
+//! advisory `flock` on the namespace's directory: it leaves no file behind, and the kernel releases it when its holder dies.
 
 use std::fs::{File, TryLockError};
 use std::path::Path;
@@ -30,29 +28,20 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(1);
 pub(crate) struct NamespaceLock(File);
 
 impl NamespaceLock {
-    /// Waits for the exclusive lock of the namespace at `root`.
-    pub(crate) fn exclusive(root: &Path) -> Result<Self, ServiceError> {
-        Self::acquire(root, File::try_lock)
-    }
-
-    /// Waits for the shared lock of the namespace at `root`.
-    pub(crate) fn shared(root: &Path) -> Result<Self, ServiceError> {
-        Self::acquire(root, File::try_lock_shared)
-    }
-
-    /// The exclusive lock if it is free.
-    pub(crate) fn try_exclusive(root: &Path) -> Option<Self> {
+    /// The lock of the namespace at `root` if it is free.
+    pub(crate) fn try_acquire(root: &Path) -> Option<Self> {
         let directory = File::open(root).ok()?;
         directory.try_lock().ok()?;
         Some(NamespaceLock(directory))
     }
 
-    fn acquire(root: &Path, try_lock: impl Fn(&File) -> Result<(), TryLockError>) -> Result<Self, ServiceError> {
+    /// Waits for the lock of the namespace at `root`.
+    pub(crate) fn acquire(root: &Path) -> Result<Self, ServiceError> {
         let unusable = |e: std::io::Error| ServiceError::Root { path: root.to_owned(), reason: e.to_string() };
         let directory = File::open(root).map_err(unusable)?;
         let start = Instant::now();
         loop {
-            match try_lock(&directory) {
+            match directory.try_lock() {
                 Ok(()) => return Ok(NamespaceLock(directory)),
                 Err(TryLockError::Error(e)) => return Err(unusable(e)),
                 Err(TryLockError::WouldBlock) if start.elapsed() >= LOCK_TIMEOUT => {
@@ -76,17 +65,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_exclusive_lock_excludes_all_others() {
+    fn one_holder_excludes_all_others() {
         let root = std::env::temp_dir().join(format!("endless-lock-{}", std::process::id()));
         std::fs::create_dir_all(&root).unwrap();
-        let exclusive = NamespaceLock::exclusive(&root).unwrap();
-        assert!(NamespaceLock::try_exclusive(&root).is_none());
-        drop(exclusive);
-        let readers = [NamespaceLock::shared(&root).unwrap(), NamespaceLock::shared(&root).unwrap()];
-        assert!(NamespaceLock::try_exclusive(&root).is_none());
-        drop(readers);
-        assert!(NamespaceLock::try_exclusive(&root).is_some());
+        let lock = NamespaceLock::acquire(&root).unwrap();
+        assert!(NamespaceLock::try_acquire(&root).is_none());
+        drop(lock);
+        assert!(NamespaceLock::try_acquire(&root).is_some());
         std::fs::remove_dir(&root).unwrap();
-        assert!(matches!(NamespaceLock::exclusive(&root), Err(ServiceError::Root { .. })));
+        assert!(matches!(NamespaceLock::acquire(&root), Err(ServiceError::Root { .. })));
     }
 }

@@ -34,7 +34,7 @@ impl NamespaceNode {
             .map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))?;
         let node = NamespaceNode { node: ForkGuard::new(node), root: namespace.root().to_owned() };
         node.remove_dead_nodes();
-        if let Some(lock) = NamespaceLock::try_exclusive(&node.root) {
+        if let Some(lock) = NamespaceLock::try_acquire(&node.root) {
             cleanup::remove_incomplete_services(&config, &lock);
         }
         cleanup::remove_incomplete_nodes(&config);
@@ -63,7 +63,7 @@ impl NamespaceNode {
         }
         // Before iceoryx2 opens the dead nodes' segments: it would wait forever for one without a size.
         cleanup::remove_unsized_segments(self.config());
-        let Some(_lock) = NamespaceLock::try_exclusive(&self.root) else { return };
+        let Some(_lock) = NamespaceLock::try_acquire(&self.root) else { return };
         for node in dead.into_iter().filter(|node| node.details().is_some()) {
             if let Err(e) = node.try_remove_stale_resources() {
                 tracing::debug!(error = %e, "cannot remove a dead node");
