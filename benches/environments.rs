@@ -8,13 +8,13 @@ use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main, meas
 use endless_gym::envs::mortar_mayhem::MortarMayhem;
 use endless_gym::envs::mystery_path::MysteryPath;
 use endless_gym::envs::searing_spotlights::SearingSpotlights;
-use endless_gym::envs::{self, Environment, FRAME_BYTES, Family, ResetParameters, Spec};
+use endless_gym::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters};
 use endless_gym::random::Generator;
 use serde_json::Map;
 
 use actions::Actions;
 
-fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &'static Spec, variant: E::Variant) {
+fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &'static EnvSpec, variant: E::Variant) {
     let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
     let assets = Arc::new(E::assets(variant, &parameters));
     let mut env = E::new(&assets);

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use endless_gym::envs::mortar_mayhem::MortarMayhem;
 use endless_gym::envs::mystery_path::MysteryPath;
 use endless_gym::envs::searing_spotlights::SearingSpotlights;
-use endless_gym::envs::{self, Environment, Family, ResetParameters, SCREEN, Spec};
+use endless_gym::envs::{self, EnvSpec, Environment, Family, ResetParameters, SCREEN};
 use endless_gym::random::Generator;
 use endless_gym::raster::Sketch;
 use serde_json::Map;
@@ -17,7 +17,7 @@ use actions::Actions;
 const STEPS: usize = 30_000;
 const LINE: usize = 64;
 
-fn measure<E: Environment>(spec: &'static Spec, variant: E::Variant) {
+fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
     let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
     let assets = Arc::new(E::assets(variant, &parameters));
     let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1));

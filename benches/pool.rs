@@ -4,13 +4,19 @@ mod actions;
 
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime};
 use endless_gym::batch::{Frames, zeroed};
-use endless_gym::envs::{self, Spec};
+use endless_gym::envs::{self, EnvSpec};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 use endless_gym::raster::PixelFormat;
 
 use actions::Actions;
 
-fn measure(group: &mut BenchmarkGroup<'_, WallTime>, name: String, spec: &Spec, config: &PoolConfig, threads: usize) {
+fn measure(
+    group: &mut BenchmarkGroup<'_, WallTime>,
+    name: String,
+    spec: &EnvSpec,
+    config: &PoolConfig,
+    threads: usize,
+) {
     let mut pool = Pool::new(config, &Threads::new(threads).unwrap()).unwrap();
     let mut batch = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut batch).unwrap();
@@ -19,7 +25,7 @@ fn measure(group: &mut BenchmarkGroup<'_, WallTime>, name: String, spec: &Spec, 
     group.bench_function(name, |bencher| bencher.iter(|| pool.step(actions.next(), &mut batch).unwrap()));
 }
 
-fn config(spec: &Spec, num_envs: usize) -> PoolConfig {
+fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
     PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) }
 }
 

@@ -6,7 +6,7 @@
 mod common;
 
 use endless_gym::batch::{Batch, Block, Frames, zeroed};
-use endless_gym::envs::{self, FRAME_BYTES, SCREEN, Spec};
+use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, SCREEN};
 use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads, WrongFrame};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
@@ -14,7 +14,7 @@ use rand::{RngExt, SeedableRng};
 
 const NUM_ENVS: usize = 3;
 
-fn config(spec: &Spec) -> PoolConfig {
+fn config(spec: &EnvSpec) -> PoolConfig {
     let seeding = Seeding::Continue { seed: Some(3) };
     PoolConfig { seeding, check_drawing: true, ..PoolConfig::new(spec.id, NUM_ENVS) }
 }
@@ -23,7 +23,7 @@ fn pool(config: &PoolConfig) -> Pool {
     Pool::new(config, &Threads::new(1).unwrap()).unwrap()
 }
 
-fn random_actions(spec: &Spec, random: &mut SmallRng) -> Vec<i32> {
+fn random_actions(spec: &EnvSpec, random: &mut SmallRng) -> Vec<i32> {
     let branches = spec.action_space.branches();
     (0..NUM_ENVS).flat_map(|_| branches).map(|choices| random.random_range(0..*choices)).collect()
 }

@@ -5,7 +5,7 @@ mod common;
 use std::collections::VecDeque;
 
 use endless_gym::batch::{Batch, Block, Frames, zeroed};
-use endless_gym::envs::{self, FRAME_BYTES, Parameter, SCREEN, Spec};
+use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, Parameter, SCREEN};
 use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads};
 use endless_gym::raster::PixelFormat;
 use rand::rngs::SmallRng;
@@ -45,7 +45,7 @@ struct Player {
 }
 
 impl Player {
-    fn new(spec: &Spec, frames: Frames) -> Self {
+    fn new(spec: &EnvSpec, frames: Frames) -> Self {
         // Short episodes, where they can be had.
         let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
         let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
@@ -71,7 +71,7 @@ impl Player {
 }
 
 /// Plays both pools alike, and compares every observation with the conversion of the last standard ones.
-fn compare(spec: &Spec, frames: Frames, steps: usize) {
+fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
     let mut standard = Player::new(spec, Frames::default());
     let mut other = Player::new(spec, frames);
     let what = format!("{}: {frames:?}", spec.id);

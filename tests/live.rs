@@ -11,7 +11,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use endless_gym::batch::{Batch, Block, zeroed};
-use endless_gym::envs::{self, Spec};
+use endless_gym::envs::{self, EnvSpec};
 use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::trace::{Trace, replay};
 use proptest::prelude::*;
@@ -73,7 +73,7 @@ struct Case {
     action_seed: u64,
 }
 
-fn case(spec: &'static Spec) -> impl Strategy<Value = Case> {
+fn case(spec: &'static EnvSpec) -> impl Strategy<Value = Case> {
     let seeds = prop::collection::vec(prop::option::of(any::<u64>()), 1..4);
     let error_rate = prop_oneof![Just(0.0), Just(0.03), Just(0.3), Just(1.0)];
     let options = common::options(spec).prop_map(|mut options| {
@@ -92,7 +92,7 @@ fn case(spec: &'static Spec) -> impl Strategy<Value = Case> {
 }
 
 /// Plays a case in the engine: the request that makes the original play the same.
-fn play(spec: &'static Spec, case: &Case) -> Json {
+fn play(spec: &'static EnvSpec, case: &Case) -> Json {
     let config = PoolConfig {
         options: Options::Shared(case.options.clone()),
         autoreset: Autoreset::Disabled,

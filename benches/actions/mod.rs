@@ -1,6 +1,6 @@
 //! Random actions, drawn before the clock starts, since drawing them takes as long as many a step.
 
-use endless_gym::envs::Spec;
+use endless_gym::envs::EnvSpec;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
@@ -14,7 +14,7 @@ pub struct Actions {
 }
 
 impl Actions {
-    pub fn new(spec: &Spec, num_envs: usize) -> Self {
+    pub fn new(spec: &EnvSpec, num_envs: usize) -> Self {
         let branches = spec.action_space.branches();
         let mut random = SmallRng::seed_from_u64(1);
         let mut draw = |choices: &i32| random.random_range(0..*choices);

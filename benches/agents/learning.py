@@ -1,12 +1,12 @@
-"""Memory matters, in minutes: agents with and without memory on small tasks, evaluated on levels that they have not seen.
+"""Trains agents with and without memory on small tasks, and evaluates them on seeds that training never uses.
 
     python learning.py --task one-command --agents gru trxl none --seeds 1 2 3
     python learning.py --plot
 
-Each run is one `endless-train` with the preset `quick` and the flags below, and stops at the task's reward
-or at the limit of minutes; an agent without memory gets as many updates as the slowest of the others took. Then it plays 50 seeds
-from 200,000 three times each. The results of a task are kept in `learning/TASK.json`, with the commands and the curves; `--plot`
-draws all that there are, and sums them up in `learning/README.md`.
+Each run is one `endless-train` with the preset `quick` and the flags below. It stops at the target reward or the time limit
+of the task; an agent without memory gets as many updates as the slowest run with memory. The evaluation plays 50 seeds from
+200,000 on, three episodes each. The results of a task are stored in `learning/TASK.json`, with the commands and the learning
+curves; `--plot` plots all results and writes `learning/README.md`.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from endless_gym.agents.settings import Settings
 from endless_gym.agents.train import parse, train
 
 FOLDER = Path(__file__).parent / "learning"
-#: Flags, minutes at most, the reward of training at which a run stops, and what the reward can be at most.
+#: Flags, time limit in minutes, target reward, and the largest possible reward if it is known.
 TASKS = {
     "one-command": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[1]", 15, 0.097, 0.1),
     "one-command-pixels": (
@@ -45,7 +45,7 @@ TASKS = {
 
 
 def run(flags: list[str], folder: Path) -> dict:
-    """Trains, evaluates, and tells how it went."""
+    """Train and evaluate an agent; returns the row for the results file."""
     start = time.perf_counter()
     settings: Settings = parse(flags)
     done = checkpoint.load(train(dataclasses.replace(settings, run=str(folder))))
@@ -67,14 +67,14 @@ def run(flags: list[str], folder: Path) -> dict:
 
 
 def as_json(data: dict) -> str:
-    """JSON with each run on a line of its own."""
+    """JSON with one run per line."""
     task, best = json.dumps(data["task"]), json.dumps(data["best_reward"])
     runs = ",\n".join(json.dumps(run) for run in data["runs"])
     return f'{{"task": {task}, "best_reward": {best}, "runs": [\n{runs}\n]}}\n'
 
 
 def plot() -> None:
-    """Draws each task's curves beside its evaluations."""
+    """Plot the learning curves of each task beside its evaluations."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -110,24 +110,24 @@ def plot() -> None:
 
 
 def report() -> None:
-    """Writes a table of all runs, with the pictures."""
+    """Write `learning/README.md` with a table of all runs and the plots."""
     lines = [
-        "# Memory matters, in minutes",
+        "# Learning with and without memory",
         "",
-        "Agents with and without memory on small tasks, from feature observations where the name does not say pixels. Each run",
-        "is one command, on one core or two of a shared machine; the reward is the mean over 50 levels that no training has",
-        "seen, three times each. An agent without memory learned from as many updates as the slowest of the others until then.",
-        "Written by `learning.py --plot` from the files beside it, which have the curves and the commands.",
+        "Agents with and without memory on small tasks, with feature observations unless the name contains `pixels`. Each run is",
+        "one command, on one or two cores of a shared machine. The reward is the mean over 50 seeds that training never uses,",
+        "three episodes each. An agent without memory was trained for as many updates as the slowest earlier run with memory.",
+        "Written by `learning.py --plot` from the JSON files in this folder, which contain the learning curves and the commands.",
     ]
     for task in TASKS:
         file = FOLDER / f"{task}.json"
         if not file.exists():
             continue
         data = json.loads(file.read_text())
-        best = f", of {data['best_reward']} at most" if data["best_reward"] else ""
+        best = f", {data['best_reward']} at most" if data["best_reward"] else ""
         lines += ["", f"## {task}", "", f"    {data['runs'][0]['command']}", ""]
         lines += [
-            f"| agent | seed | steps | minutes | reward on unseen levels{best} |",
+            f"| agent | seed | steps | minutes | evaluation reward{best} |",
             "| --- | --- | --- | --- | --- |",
         ]
         for row in sorted(data["runs"], key=lambda row: (row["agent"] == "none", row["agent"], row["seed"])):
@@ -138,12 +138,12 @@ def report() -> None:
 
 
 def main() -> None:
-    """Measures, and writes down."""
+    """Train, evaluate and plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--agents", nargs="+", default=["gru", "none"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--threads", type=int, default=1, help="PyTorch's, for each run (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads of PyTorch (default: %(default)s)")
     parser.add_argument("--plot", action="store_true")
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)

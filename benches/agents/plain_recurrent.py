@@ -1,10 +1,10 @@
-"""Recurrent PPO on the original environments, plainly: what `speed.py` compares `endless-train --agent gru` with.
+"""Plain recurrent PPO on the original environments: the baseline of `speed.py` for `endless-train --agent gru`.
 
-In the manner of the authors' training code: a process for each environment behind a pipe, frames as floats, the steps of an
-episode as one sequence that is padded to the longest one's length; padding goes through the whole network and is taken out
-before the losses. Model and hyperparameters are those of the preset `paper`.
+It is structured like the authors' training code: one process and pipe per environment, float frames, and one sequence per
+episode, padded to the longest sequence. Padding passes through the whole network and is masked out before the losses. Model
+and hyperparameters are those of the preset `paper`.
 
-It needs the original (memory-gym 1.0.2) and torch; it prints a line for each update: the steps played so far.
+It needs the original (memory-gym 1.0.2) and torch. It prints the number of environment steps so far after each update.
 """
 
 import argparse
@@ -20,7 +20,7 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 
 def worker(pipe: Connection, env_id: str) -> None:
-    """Steps one environment whenever it is told to."""
+    """Step one environment on request, until the pipe is closed."""
     import gymnasium
     import memory_gym  # noqa: F401
 
@@ -38,17 +38,17 @@ def worker(pipe: Connection, env_id: str) -> None:
             pipe.send((frame(observation), reward, done or truncated))
 
 
-def padded(data: np.ndarray | torch.Tensor, pieces: list[tuple[int, int, int]]) -> torch.Tensor:
-    """Pieces (environment, first step, step after the last) of data (n, steps, ...), all as long as the longest."""
-    data, longest = torch.as_tensor(data), max(b - a for _, a, b in pieces)
-    out = torch.zeros((len(pieces), longest, *data.shape[2:]), dtype=data.dtype)
-    for i, (env, a, b) in enumerate(pieces):
+def padded(data: np.ndarray | torch.Tensor, sequences: list[tuple[int, int, int]]) -> torch.Tensor:
+    """Zero-pad sequences (environment, start, stop) of data (n, steps, ...) to (sequences, longest, ...)."""
+    data, longest = torch.as_tensor(data), max(b - a for _, a, b in sequences)
+    out = torch.zeros((len(sequences), longest, *data.shape[2:]), dtype=data.dtype)
+    for i, (env, a, b) in enumerate(sequences):
         out[i, : b - a] = data[env, a:b]
     return out
 
 
 class Agent(nn.Module):
-    """The paper's GRU agent."""
+    """The GRU agent of the paper."""
 
     def __init__(self, branches: list[int], hidden: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class Agent(nn.Module):
     def forward(
         self, frames: torch.Tensor, hidden: torch.Tensor, length: int
     ) -> tuple[list[torch.distributions.Categorical], torch.Tensor, torch.Tensor]:
-        """Distributions of the branches, values and hidden states of sequences of `length` frames each."""
+        """Action distributions per branch, values, and final hidden states of sequences of `length` frames each."""
         x = self.cnn(frames)
         x, hidden = self.gru(x.view(-1, length, x.shape[-1]), hidden)
         x = self.body(x.flatten(0, 1))
@@ -75,7 +75,7 @@ class Agent(nn.Module):
 
 
 def main() -> None:
-    """Trains, and prints."""
+    """Train, and print the number of steps after each update."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="Endless-MortarMayhem-v0")
     parser.add_argument("--num-envs", type=int, default=8)
@@ -94,7 +94,7 @@ def main() -> None:
         here, there = multiprocessing.Pipe()
         processes.append(multiprocessing.Process(target=worker, args=(there, args.env), daemon=True))
         processes[-1].start()
-        there.close()  # so that a worker's end is seen
+        there.close()  # so that the end of a worker closes the pipe
         pipes.append(here)
 
     def reset(env: int) -> np.ndarray:
@@ -123,19 +123,19 @@ def main() -> None:
                     if dones[env, t]:
                         now[env] = reset(env)
                         hidden[:, env] = 0
-            following, last = agent(torch.tensor(now), hidden, 1)[1], torch.zeros(n)
+            next_value, last = agent(torch.tensor(now), hidden, 1)[1], torch.zeros(n)
             advantages = torch.zeros(n, steps)
             for t in reversed(range(steps)):
                 on = torch.tensor(~dones[:, t]).float()
-                delta = torch.tensor(rewards[:, t]) + 0.995 * following * on - values[:, t]
+                delta = torch.tensor(rewards[:, t]) + 0.995 * next_value * on - values[:, t]
                 advantages[:, t] = last = delta + 0.995 * 0.95 * on * last
-                following = values[:, t]
-        # Episodes become sequences, all as long as the longest.
-        pieces = []
+                next_value = values[:, t]
+        # One sequence per episode, padded to the longest.
+        sequences = []
         for env in range(n):
             starts = [0, *(np.flatnonzero(dones[env, :-1]) + 1)]
-            pieces += [(env, a, b) for a, b in zip(starts, [*starts[1:], steps], strict=True)]
-        longest = max(b - a for _, a, b in pieces)
+            sequences += [(env, a, b) for a, b in zip(starts, [*starts[1:], steps], strict=True)]
+        longest = max(b - a for _, a, b in sequences)
 
         batch = {
             "frames": frames,
@@ -144,11 +144,11 @@ def main() -> None:
             "values": values,
             "advantages": advantages,
         }
-        batch = {name: padded(data, pieces) for name, data in batch.items()}
-        mask = padded(torch.ones(n, steps, dtype=torch.bool), pieces)
-        start = torch.stack([states[env, a] for env, a, _ in pieces])
+        batch = {name: padded(data, sequences) for name, data in batch.items()}
+        mask = padded(torch.ones(n, steps, dtype=torch.bool), sequences)
+        start = torch.stack([states[env, a] for env, a, _ in sequences])
         for _ in range(3):
-            for chosen in torch.randperm(len(pieces)).chunk(args.minibatches):
+            for chosen in torch.randperm(len(sequences)).chunk(args.minibatches):
                 real = mask[chosen].flatten()
                 part = {name: data[chosen].flatten(0, 1) for name, data in batch.items()}
                 policy, value, _ = agent(part["frames"], start[chosen].unsqueeze(0), longest)

@@ -1,11 +1,12 @@
-"""Steps per second of training, end to end, on the CPU: `endless-train` beside CleanRL's ppo_trxl and a plain recurrent PPO.
+"""End-to-end training throughput on the CPU: `endless-train` compared with CleanRL's ppo_trxl and a plain recurrent PPO.
 
     python speed.py --original PYTHON --cleanrl FOLDER
 
-PYTHON has the original (memory-gym 1.0.2), torch, and what CleanRL's ppo_trxl needs; FOLDER is CleanRL's folder `ppo_trxl`. Both
-sides have the same number of environments, steps, minibatches, epochs, window and threads, run in turns, and are measured between
-the ends of their first and their last update: in seconds, and in seconds of CPU time of all their processes, which other work
-on the machine disturbs less. CleanRL's network lacks the 512-wide hidden layers of the two heads that `endless-train` has.
+PYTHON is an interpreter with the original (memory-gym 1.0.2), torch, and the dependencies of CleanRL's ppo_trxl; FOLDER is
+CleanRL's folder `ppo_trxl`. Both programs have the same number of environments, steps, minibatches, epochs, window and
+threads, and run alternately. The time between the ends of the first and the last update is measured in seconds, and in CPU
+seconds of all processes, which are less sensitive to other load on the machine. CleanRL's network lacks the 512 hidden units
+of the policy and value heads.
 """
 
 import argparse
@@ -23,20 +24,20 @@ HERE = Path(__file__).parent
 
 
 def cpu_seconds(session: int) -> float:
-    """CPU time of all living processes of a session."""
+    """CPU time of all running processes of a session, in seconds."""
     ticks = 0
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
         except OSError:
-            continue  # it has just ended
+            continue  # the process has ended
         if int(fields[3]) == session:
             ticks += sum(map(int, fields[11:15]))
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def timed(command: list[str], threads: int, pattern: str, folder: str) -> list[tuple[float, float]]:
-    """Runs a command, and returns the time and the CPU time at which it printed each line that matches."""
+    """Run a command; returns the time and the CPU time at each output line that matches `pattern`."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "SDL_VIDEODRIVER": "dummy", "PYTHONUNBUFFERED": "1"}
     if command[0] != sys.executable:
         environment.pop("PYTHONPATH", None)
@@ -60,14 +61,14 @@ def timed(command: list[str], threads: int, pattern: str, folder: str) -> list[t
 
 
 def rate(times: list[tuple[float, float]], batch: int) -> tuple[float, float]:
-    """Steps per second and per second of CPU time, after the first update, which warms up."""
+    """Steps per second and per CPU second; the first update is excluded as warm-up."""
     (first, first_cpu), (last, last_cpu) = times[0], times[-1]
     steps = batch * (len(times) - 1)
     return steps / (last - first), steps / (last_cpu - first_cpu)
 
 
 def main() -> None:
-    """Measures, and writes down."""
+    """Measure, print and write the throughput."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--original", required=True)
     parser.add_argument("--cleanrl", default="")

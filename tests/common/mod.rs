@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use endless_gym::envs::{Kind, Parameter, Spec};
+use endless_gym::envs::{EnvSpec, Parameter, ParameterKind};
 use endless_gym::raster::PixelFormat;
 use proptest::prelude::*;
 use serde_json::{Map, Value as Json};
@@ -39,17 +39,17 @@ fn traces_in(folder: &str, id: &str) -> Vec<PathBuf> {
 /// Any value within the parameter's limits, more often one that is not far from the default.
 fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
     match parameter.kind {
-        Kind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
-        Kind::Int { default, min, max } => {
+        ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
+        ParameterKind::Int { default, min, max } => {
             let near = (2 * default.abs() + 200).clamp(min, max);
             (min.max(-1)..=near).prop_map(Json::from).boxed()
         }
-        Kind::Float { default, min, max } => {
+        ParameterKind::Float { default, min, max } => {
             let reach = 2.0 * default.abs() + 0.1;
             let near = (default - reach).max(min)..=(default + reach).min(max);
             prop_oneof![8 => near, 1 => min..=max, 1 => Just(min)].prop_map(Json::from).boxed()
         }
-        Kind::IntList { default, min, max } => {
+        ParameterKind::IntList { default, min, max } => {
             let near = (2 * default.iter().max().unwrap_or(&min) + 1).clamp(min, max);
             prop::collection::vec(min..=near, 1..4).prop_map(Json::from).boxed()
         }
@@ -57,7 +57,7 @@ fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
 }
 
 /// Any set of options within the limits: some of the parameters, each with any value.
-pub fn options(spec: &'static Spec) -> impl Strategy<Value = Map<String, Json>> {
+pub fn options(spec: &'static EnvSpec) -> impl Strategy<Value = Map<String, Json>> {
     let options: Vec<_> = spec
         .parameters
         .iter()

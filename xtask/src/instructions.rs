@@ -1,4 +1,4 @@
-//! Instructions that a step takes, against recorded budgets: they tell a slower step from a noisy machine.
+//! Instructions of a step against recorded budgets: unlike times, they do not depend on the load of the machine.
 
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -6,19 +6,19 @@ use std::process::Command;
 
 use crate::venv::workspace;
 
-/// Steps that `benches/instructions.rs` has counted, of all environments together.
+/// Environment steps that `benches/instructions.rs` counts.
 const STEPS: u64 = 250 * 16;
 
-/// By how much a count may differ: processors of other kinds copy memory by other instructions.
+/// Allowed deviation: processors of other kinds copy memory with other instructions.
 const MARGIN_PERCENT: u64 = 10;
 
-/// Counts, and compares with the budgets; with `record`, the counts become the budgets.
+/// Counts and compares with the budgets; with `record`, writes the counts as the new budgets.
 pub fn run(record: bool) -> Result<(), String> {
     let file = budgets_file();
     let text = std::fs::read_to_string(&file).map_err(|error| format!("{}: {error}", file.display()))?;
     let mut recorded = String::new();
     let mut failures = Vec::new();
-    println!("{:30} {:>24} {:>8}", "environment", "instructions for a step", "budget");
+    println!("{:30} {:>24} {:>8}", "environment", "instructions a step", "budget");
     for line in text.lines() {
         let (id, budget) = line.split_once(' ').unwrap_or((line, "0"));
         let budget: u64 = budget.parse().map_err(|error| format!("{}: {line}: {error}", file.display()))?;
@@ -26,7 +26,7 @@ pub fn run(record: bool) -> Result<(), String> {
         println!("{id:30} {count:24} {budget:8}");
         let _ = writeln!(recorded, "{id} {count}");
         if count.abs_diff(budget) * 100 > budget * MARGIN_PERCENT {
-            failures.push(format!("{id} takes {count} instructions for a step, {budget} are recorded"));
+            failures.push(format!("{id}: {count} instructions a step, the budget is {budget} ± {MARGIN_PERCENT} %"));
         }
     }
     if record {
@@ -35,7 +35,7 @@ pub fn run(record: bool) -> Result<(), String> {
     if failures.is_empty() {
         return Ok(());
     }
-    failures.push("if that is meant to be so, record it: cargo xtask instructions --record".to_owned());
+    failures.push("if the change is intended, record it: cargo xtask instructions --record".to_owned());
     Err(failures.join("\n"))
 }
 
@@ -43,7 +43,7 @@ fn budgets_file() -> PathBuf {
     workspace().join("benches/instructions.txt")
 }
 
-/// Instructions of all counted steps of an environment, by callgrind.
+/// Instructions of all counted steps of an environment, measured by callgrind.
 fn count(id: &str) -> Result<u64, String> {
     const VALGRIND: &str =
         "valgrind --tool=callgrind --callgrind-out-file=/dev/null --toggle-collect=instructions::steps";
@@ -58,6 +58,6 @@ fn count(id: &str) -> Result<u64, String> {
     let collected = printed.lines().find_map(|line| line.split_once("Collected :")).map(|(_, count)| count.trim());
     match collected.and_then(|count| count.parse().ok()) {
         Some(count) if count > 0 && output.status.success() => Ok(count),
-        _ => Err(format!("no instructions of {id} were counted; is valgrind installed?\n{printed}")),
+        _ => Err(format!("callgrind counted no instructions of {id}; is valgrind installed?\n{printed}")),
     }
 }

@@ -1,28 +1,39 @@
-//! The project's chores: `cargo xtask test` passes all tests.
+//! Development tasks: `cargo xtask test` runs all tests.
 
 mod instructions;
 mod original;
 mod python;
 mod venv;
+mod wasm;
 
 use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 const HELP: &str = "\
-cargo xtask test                 check the format, lint, and run all tests, Rust's and Python's
-cargo xtask python               build the Python package, check it, and run its tests alone
-cargo xtask instructions         count the instructions of a step, and compare with what is recorded (--record records)
-cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help shows ARGS)
-cargo xtask live [STEPS]         compare STEPS steps of each environment with the original (default 100000)
+cargo xtask test                 check formatting, lint, and run all tests, Rust's and Python's
+cargo xtask python               build the Python package, lint it, and run its tests alone
+cargo xtask wasm                 build the core for wasm32-unknown-unknown
+cargo xtask instructions         count the instructions of a step and compare with the budgets (--record: record new budgets)
+cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help lists ARGS)
+cargo xtask live [STEPS]         compare STEPS steps of each environment with the original, from new seeds (default 100000)
+cargo xtask properties [CASES]   run the property tests with CASES cases each, from new seeds (default 2000)
 cargo xtask original             set up the original in a virtual environment and print the path of its Python";
 
-/// What `cargo xtask test` runs, in this order; the first that fails ends it.
+/// What `cargo xtask test` runs, in this order; the first failure ends it.
 const TEST: &[&[&str]] = &[
     &["fmt", "--all", "--check"],
     &["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"],
+    &["clippy", "--package", "endless-gym-core", "--no-default-features", "--locked", "--", "--deny", "warnings"],
     &["test", "--workspace", "--locked"],
     &["doc", "--workspace", "--no-deps", "--locked"],
 ];
+
+/// The seed of the property tests in `cargo xtask test`: a failure there is due to a change.
+const PROPERTY_SEED: (&str, &str) = ("PROPTEST_RNG_SEED", "20251122");
+
+/// The property tests alone, optimised, since they are long.
+const PROPERTIES: &[&str] = &["test", "--release", "--workspace", "--locked", "--lib", "--tests"];
+const PROPERTY_CASES: &str = "2000";
 
 /// The live comparison alone, optimised, since it is long.
 const LIVE: &[&str] = &["test", "--release", "--locked", "--test", "live", "--", "--nocapture"];
@@ -32,7 +43,8 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let done = match arguments[..] {
-        ["test"] => run(TEST, &[])
+        ["test"] => run(TEST, &[PROPERTY_SEED])
+            .and_then(|()| wasm::check())
             .and_then(|()| instructions::run(false))
             .and_then(|()| python::test())
             .map(|()| println!("all passed")),
@@ -40,6 +52,9 @@ fn main() -> ExitCode {
         ["instructions"] => instructions::run(false),
         ["instructions", "--record"] => instructions::run(true),
         ["bench", ref arguments @ ..] => python::bench(arguments),
+        ["wasm"] => wasm::build(),
+        ["properties"] => run(&[PROPERTIES], &[("PROPTEST_CASES", PROPERTY_CASES)]),
+        ["properties", cases] => run(&[PROPERTIES], &[("PROPTEST_CASES", cases)]),
         ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
         ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
         ["original"] => original::python().map(|python| println!("{}", python.display())),
@@ -47,7 +62,7 @@ fn main() -> ExitCode {
             println!("{HELP}");
             Ok(())
         }
-        _ => Err(format!("there is no `{}`; there is\n{HELP}", arguments.join(" "))),
+        _ => Err(format!("unknown task `{}`; the tasks are\n{HELP}", arguments.join(" "))),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -58,7 +73,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Runs cargo with each of the argument lists, beside a Python that has the original.
+/// Runs cargo with each of the argument lists. `ENDLESS_ORIGINAL_PYTHON` names a Python with the original environments.
 fn run(commands: &[&[&str]], variables: &[(&str, &str)]) -> Result<(), String> {
     let python = original::python()?;
     for arguments in commands {

@@ -1,4 +1,4 @@
-//! The Python package: its wheel, the checks and tests of it, and how fast it is.
+//! The Python package: wheel, lints, tests and benchmarks.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -7,10 +7,10 @@ use std::time::Instant;
 use crate::original;
 use crate::venv::{Install, execute, target, venv, workspace};
 
-/// Lints, checks the types, and runs the tests.
+/// Lints, checks types, and runs the tests.
 pub fn test() -> Result<(), String> {
     let package = package();
-    // The profile of the tests, whose dependencies are built already.
+    // The profile of the tests, whose dependencies have been built.
     let folder = install("dev")?;
     let ruff = |what: &str, arguments: &[&str]| {
         let program = folder.join("bin/ruff");
@@ -31,7 +31,7 @@ pub fn test() -> Result<(), String> {
     run("pytest", pytest.env("ENDLESS_ORIGINAL_PYTHON", original::python()?))
 }
 
-/// Compares steps per second with the original's, and for scale with EnvPool's own environments where it can be installed.
+/// Compares steps per second with the original's and, for scale, with EnvPool's own environments where it can be installed.
 pub fn bench(arguments: &[&str]) -> Result<(), String> {
     let folder = install("release")?;
     let envpool = venv("envpool", original::base()?, &[Install::of(&["envpool==1.2.5"])]);
@@ -49,7 +49,7 @@ fn package() -> PathBuf {
     workspace().join("bindings/python")
 }
 
-/// Builds the wheel and installs it into a virtual environment beside the tools that it is tested with, whose folder it returns.
+/// Builds the wheel and installs it into a virtual environment with the test tools. Returns the environment's folder.
 fn install(profile: &str) -> Result<PathBuf, String> {
     let folder = venv("python", original::base()?, &[Install::of_file("requirements-test.txt")?, pufferlib()?])?;
     let wheels = target()?.join("wheels");
@@ -69,7 +69,7 @@ fn only_file(folder: &Path) -> Result<PathBuf, String> {
     Ok(file.ok_or("maturin built no wheel")?.path())
 }
 
-/// PufferLib, of which PyPI has a source archive alone, without the games and the trainer in C that it would compile.
+/// PufferLib, which PyPI has only as a source archive, without the games and the trainer in C that it would compile.
 fn pufferlib() -> Result<Install, String> {
     let mut install = Install::of_file("requirements-pufferlib.txt")?;
     install.arguments.extend(["--no-deps", "--no-build-isolation"].map(str::to_owned));

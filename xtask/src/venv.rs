@@ -8,7 +8,7 @@ pub fn workspace() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
 }
 
-/// Where cargo puts what it builds.
+/// Cargo's target directory.
 pub fn target() -> Result<PathBuf, String> {
     let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace().join("target"), PathBuf::from);
     std::path::absolute(target).map_err(|error| error.to_string())
@@ -17,7 +17,7 @@ pub fn target() -> Result<PathBuf, String> {
 /// One call of `pip install`.
 #[derive(Clone, Debug, Default)]
 pub struct Install {
-    /// Packages with their versions, and pip's options.
+    /// Packages with their versions, and options of pip.
     pub arguments: Vec<String>,
     pub environment: Vec<(&'static str, String)>,
 }
@@ -27,7 +27,7 @@ impl Install {
         Install { arguments: packages.iter().copied().map(str::to_owned).collect(), ..Install::default() }
     }
 
-    /// What a requirements file of the Python package lists.
+    /// The packages that a requirements file of the Python package lists.
     pub fn of_file(name: &str) -> Result<Self, String> {
         let file = workspace().join("bindings/python").join(name);
         let text = std::fs::read_to_string(&file).map_err(|error| format!("{}: {error}", file.display()))?;
@@ -36,8 +36,8 @@ impl Install {
     }
 }
 
-/// The folder of the virtual environment `name`, made from the Python `base` with what `installs` tell pip to install, one after
-/// the other. One that is there with the same is taken as it is.
+/// The folder of the virtual environment `name`, created from the Python `base` with the packages of `installs`, in that order. An
+/// existing one with the same packages is reused.
 pub fn venv(name: &str, base: &str, installs: &[Install]) -> Result<PathBuf, String> {
     let folder = target()?.join("venvs").join(name);
     let stamp = folder.join("packages");
@@ -57,7 +57,7 @@ pub fn venv(name: &str, base: &str, installs: &[Install]) -> Result<PathBuf, Str
     Ok(folder)
 }
 
-/// Runs a command to its end.
+/// Runs a command and waits for it.
 pub fn execute(command: &mut Command) -> Result<(), String> {
     match command.status() {
         Ok(status) if status.success() => Ok(()),

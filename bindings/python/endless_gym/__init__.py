@@ -1,11 +1,11 @@
-"""Endless Gym: the Memory Gym environments, bit for bit, at memory speed, in shared memory.
+"""Endless Gym: bit-exact Memory Gym environments, vectorised, in this process or in an engine process over shared memory.
 
 ```python
 import endless_gym, gymnasium
 
-env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment, as the original's
+env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment, like the original
 envs = gymnasium.make_vec("EndlessGym/MortarMayhem-v0", num_envs=1024)    # many, in this process
-envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # many, in an engine's process
+envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # many, in an engine process
 ```
 """
 
@@ -41,7 +41,7 @@ __all__ = [
     "torch_view",
 ]
 
-# Loaded when they are asked for: they need Gymnasium 1.1, and programs that are held to 0.29 can do without them.
+# Imported lazily: they need Gymnasium 1.1, while single environments also run on Gymnasium 0.29.
 _LATER = {"serve": "engine", "EndlessVectorEnv": "vector", "connect": "vector", "make_vec": "vector"}
 
 

@@ -1,4 +1,4 @@
-"""The engine, as the native module offers it; the package wraps it."""
+"""Types of the native module, which the package wraps."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 __version__: str
 
 class EngineLost(ConnectionError):
-    """The engine has ended, or was replaced by another one."""
+    """The engine process has ended, or was replaced by another one."""
 
 class TooManyBatchesHeld(BufferError):
-    """All batches that the engine can lend are held by arrays of this process."""
+    """Arrays of this process reference all batches that the engine can lend."""
 
 # All environments with the seed `s + i`, or for each environment 0, 1 or 2 and a seed.
 Reset = int | tuple[Sequence[int], Sequence[int]]

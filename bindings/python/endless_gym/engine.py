@@ -18,13 +18,14 @@ from endless_gym.vector import AutoresetMode, EndlessVectorEnv, Options, autores
 
 _numbers = count()
 
-#: In a process group of its own, so that Ctrl-C reaches this process alone, which then ends the engine. Not in a session of its
-#: own where Python can do without: Linux divides processor time among sessions first, and a step then took a third longer.
+#: The engine gets its own process group, so that Ctrl-C reaches only this process, which then ends the engine. A new session is
+#: the fallback before Python 3.11: the Linux scheduler divides CPU time among sessions first (autogroup), which made steps a
+#: third slower.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
 class EngineProcess:
-    """A child process that serves environments. It ends with `end`, and also when this process does."""
+    """A child process that serves environments. It ends with `end`, and when this process ends."""
 
     def __init__(self, arguments: list[str]) -> None:
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
@@ -39,11 +40,11 @@ class EngineProcess:
 
     @property
     def pid(self) -> int:
-        """The process's number."""
+        """Process id."""
         return self._process.pid
 
     def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
-        """Connects as the engine's trainer, once it is there."""
+        """Wait until the engine runs, and connect to it as its trainer."""
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
@@ -57,7 +58,7 @@ class EngineProcess:
             time.sleep(0.01)
 
     def end(self) -> None:
-        """Ends the process and waits for it."""
+        """End the process and wait until it has exited."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
@@ -84,7 +85,7 @@ def serve(
     timeout: float = 30.0,
     copy: bool = False,
 ) -> EndlessVectorEnv:
-    """Environments in an engine that this call starts in a process of its own. It ends when the environments are closed.
+    """Start an engine in a child process, and connect to its environments. The engine ends when they are closed.
 
     ```python
     with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
@@ -94,20 +95,21 @@ def serve(
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.
         num_envs: Environments in each group.
-        num_threads: The engine's threads; `None` for one for each core.
-        groups: Groups that are stepped independently, for `send` and `recv`.
+        num_threads: Threads of the engine; `None` for one per core.
+        groups: Number of groups, which are stepped independently with `send` and `recv`.
         seed: As for `make_vec`.
         seeds: As for `make_vec`.
         options: As for `make_vec`.
         autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
         observation: `rgb`, `features` or `rgb+features`.
         frames: As for `make_vec`.
-        batches_held: Steps of a group whose arrays may be held at a time, 1 to 16.
-        timeout: Seconds to wait for the engine to start, and for each of its answers.
+        batches_held: Number of steps of a group whose arrays can be held at the same time, 1 to 16.
+        timeout: Seconds to wait for the start of the engine, and for each of its answers.
         copy: Return writeable copies instead of read-only views into shared memory.
 
     Raises:
-        RuntimeError: The engine cannot start; the message says why.
+        RuntimeError: The engine cannot start; the message contains the reason.
+        TimeoutError: The engine has not started within `timeout` seconds.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
     frames, features = contents(observation, frames)

@@ -1,4 +1,4 @@
-"""One environment, as the original's class."""
+"""A single environment with the interface of the original classes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from endless_gym.specs import options_text, spec
 
 Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
 
-#: Environments whose ground truth the original makes of integers.
+#: Environments whose ground truth has an integer dtype in the original.
 _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
 #: Side of the ground-truth view in pixels.
@@ -23,16 +23,17 @@ _VIEW = 336
 
 
 class Env(gymnasium.Env[Any, Any]):
-    """A Memory Gym environment: observations, rewards, flags and infos equal the original's byte for byte.
+    """A Memory Gym environment; observations, rewards, flags and infos are identical to those of the original.
 
     Observations are uint8 (84, 84, 3), indexed [x][y][channel] as the original returns them; the ids with `MortarMayhemB`
     return a dict of `visual_observation` and `vector_observation` (float32 (180,)).
 
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
-        render_mode: What `render` returns: `rgb_array` the frame as uint8 (84, 84, 3), `debug_rgb_array` the ground-truth view
-            as uint8 (336, 336, 3), both indexed [row][column][channel]. `human` shows that view in a window (needs pygame).
-        options: Reset parameters for every episode; those that `reset` is given are laid over them.
+        render_mode: `rgb_array`: `render` returns the frame as uint8 (84, 84, 3); `debug_rgb_array`: it returns the ground-truth
+            view as uint8 (336, 336, 3); both indexed [row][column][channel]. `human`: a window shows that view (needs
+            pygame).
+        options: Reset parameters of every episode; the options of `reset` override them.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
@@ -43,8 +44,10 @@ class Env(gymnasium.Env[Any, Any]):
     def __init__(self, id: str, render_mode: str | None = None, options: dict[str, Any] | None = None) -> None:
         self._spec = spec(id)
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"no render mode `{render_mode}`; there are {', '.join(self.metadata['render_modes'])}")
-        # The frame rate differs from id to id.
+            raise ValueError(
+                f"render_mode must be None, {', '.join(self.metadata['render_modes'])}; got `{render_mode}`"
+            )
+        # The frame rate depends on the id.
         self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
         self.render_mode = render_mode
         self.action_space = self._spec.action_space()
@@ -59,12 +62,12 @@ class Env(gymnasium.Env[Any, Any]):
         self._window: _Window | None = None
         self._is_shown = False
         self._was_reset = False
-        #: Reset parameters of the current episode, the defaults included.
+        #: Reset parameters of the current episode, with the defaults.
         self.reset_params: dict[str, Any] = {**self._spec.reset_parameters, **self._options}
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which an episode ends, by the current reset parameters; -1 for none. As in the original."""
+        """Step limit of an episode with the current reset parameters; -1 for none. As in the original."""
         return self._spec.max_episode_steps(self.reset_params)
 
     def reset(
@@ -73,8 +76,8 @@ class Env(gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: Seeds the environment as numpy's `default_rng` does. `None` goes on with its generator.
-            options: Reset parameters by the original's names. `None` stands for those given to the constructor.
+            seed: Seed of the environment's generator, as in numpy's `default_rng`. `None` continues with the current generator.
+            options: Reset parameters by the original's names; they override those of the constructor for this episode.
 
         Raises:
             ValueError: A reset parameter is unknown or out of its range.
@@ -91,7 +94,7 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), self._info(arrays)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Play one step. As in the original, every end of an episode is reported as `terminated`, also by the step limit."""
+        """Play one step. As in the original, every end of an episode is `terminated`, including the step limit."""
         if not self._was_reset:
             raise ResetNeeded("call `env.reset()` before `env.step()`")
         arrays, reward, terminated, end = self._native.step(action)
@@ -106,35 +109,35 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), reward, terminated, False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The current picture in the render mode; `None` where it is shown in a window or no mode was given."""
+        """The current picture in the render mode; `None` in the mode `human` and without render mode."""
         if self.render_mode == "rgb_array":
             return self._native.rgb_array()
         if self.render_mode == "debug_rgb_array":
             return self._native.ground_truth_view()
         if self.render_mode == "human":
-            # `reset` and `step` show the picture, as Gymnasium asks; the original leaves that to calls of this.
+            # Gymnasium requires that `reset` and `step` show the picture; the original shows it only in `render`.
             self._show()
         return None
 
     def snapshot(self) -> bytes:
-        """The whole state, the generator included, for `restore`."""
+        """The complete state, including the random generator, for `restore`."""
         return self._native.snapshot()
 
     def restore(self, snapshot: bytes) -> tuple[Observation, dict[str, Any]]:
-        """Go on from a snapshot of an environment with the same id; returns what it looks like."""
+        """Restore a snapshot of an environment with the same id, and return the current observation and info."""
         arrays = self._native.restore(snapshot)
         self._was_reset = True
         self._is_shown = False
         return self._observation(arrays), self._info(arrays)
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if it is open."""
         if self._window is not None:
             self._window.close()
             self._window = None
 
     def _show(self) -> None:
-        """Shows the current picture once: the ground-truth view goes through a shown clue with each call."""
+        """Show the current picture once: every ground-truth view of a clue advances the clue."""
         if self._is_shown:
             return
         if self._window is None:
@@ -153,13 +156,15 @@ class Env(gymnasium.Env[Any, Any]):
 
 
 class _Window:
-    """A window that shows pictures, by pygame."""
+    """A pygame window."""
 
     def __init__(self) -> None:
         try:
             import pygame
         except ImportError as error:
-            raise ImportError('render_mode="human" needs pygame: pip install "endless-gym[render]"') from error
+            raise ImportError(
+                'render_mode="human" needs pygame, which is not installed: pip install "endless-gym[render]"'
+            ) from error
         self._pygame = pygame
         pygame.display.init()
         self._screen = pygame.display.set_mode((_VIEW, _VIEW))

@@ -1,4 +1,4 @@
-"""The arrays as other libraries' tensors, without a copy."""
+"""Zero-copy conversion of arrays to tensors of other libraries, and page-locking of their memory."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ if TYPE_CHECKING:
 
 
 class DLPackView:
-    """An array for `from_dlpack` of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
+    """Wraps an array for the `from_dlpack` function of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
 
-    The tensor shares the array's memory and keeps it alive. DLPack's common version cannot say that memory is read-only: do not
-    write to such a tensor.
+    The tensor shares the memory of the array and keeps it alive. The common version of DLPack cannot express that memory is
+    read-only: do not write to such a tensor.
     """
 
     def __init__(self, array: NDArray[Any]) -> None:
         self._array = array
 
     def __dlpack__(self, **_: Any) -> Any:
-        """The capsule of DLPack's protocol."""
+        """The DLPack capsule."""
         return _native.dlpack(self._array)
 
     def __dlpack_device__(self) -> tuple[int, int]:
-        """The processor."""
+        """The device: the CPU."""
         return (1, 0)
 
 
 def torch_view(array: NDArray[Any]) -> torch.Tensor:
-    """A tensor that shares the array's memory and keeps it alive.
+    """Return a tensor that shares the memory of the array and keeps it alive.
 
-    As `torch.from_numpy`, but without its warning that a read-only array makes a tensor that must not be written to.
+    Like `torch.from_numpy`, but without the warning for read-only arrays. Do not write to a tensor of a read-only array.
     """
     from torch.utils.dlpack import from_dlpack
 
@@ -44,10 +44,10 @@ def torch_view(array: NDArray[Any]) -> torch.Tensor:
 
 
 def pin_memory(array: NDArray[Any]) -> bool:
-    """Page-locks the memory that the array lies in, so that `tensor.to("cuda", non_blocking=True)` copies while others work.
+    """Page-lock the memory of the array, so that `tensor.to("cuda", non_blocking=True)` copies asynchronously.
 
-    The whole mapping is locked, with all batches in it: once for each group of an engine's environments is enough. Without CUDA
-    this warns once and does nothing.
+    The whole memory mapping is locked, with all batches in it, so one call per group of an engine's environments is sufficient.
+    Without CUDA this warns and does nothing.
 
     Args:
         array: Any array of a step.
@@ -62,7 +62,11 @@ def pin_memory(array: NDArray[Any]) -> bool:
 
 
 def mapping_of(address: int) -> tuple[int, int]:
-    """First address and size of the mapping of this process in which `address` lies."""
+    """Start address and size in bytes of the memory mapping of this process that contains `address`.
+
+    Raises:
+        ValueError: There is no such mapping.
+    """
     with open("/proc/self/maps") as maps:
         for line in maps:
             first, end = (int(number, 16) for number in line.split(maxsplit=1)[0].split("-"))
@@ -77,7 +81,7 @@ _ALREADY_REGISTERED = 712
 
 
 def _pin(array: NDArray[Any]) -> str | None:
-    """Page-locks, or says why not."""
+    """Page-lock the mapping of the array; returns None, or the reason why it failed."""
     try:
         import torch
     except ImportError:
@@ -88,10 +92,10 @@ def _pin(array: NDArray[Any]) -> str | None:
     if first in _PINNED:
         return None
     runtime = torch.cuda.cudart()
-    # What an engine maps is read-only here, which CUDA wants to be told.
+    # Shared memory of an engine is mapped read-only, which needs a flag of its own in CUDA.
     for flags in (_READ_ONLY, 0):
         status = int(runtime.cudaHostRegister(first, size, flags))
         if status in (0, _ALREADY_REGISTERED):
             _PINNED.add(first)
             return None
-    return f"CUDA refuses to register {size} bytes, with error {status}"
+    return f"cudaHostRegister failed for {size} bytes with error {status}"

@@ -1,10 +1,10 @@
-"""The program `endless`, as the package brings it along."""
+"""The program `endless`, which is part of the package."""
 
 import sys
 
 from endless_gym import _native
 
-# Loads the native module from its file, without the package around it, which takes numpy and Gymnasium along.
+# Loads the native module from its file, without the package, which would import numpy and Gymnasium.
 _PROGRAM = """
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
@@ -17,10 +17,10 @@ sys.exit(native.endless(sys.argv[2:], itself))
 
 
 def program() -> list[str]:
-    """The command that starts the program `endless`."""
+    """The command line that starts the program `endless`."""
     return [sys.executable, "-I", "-S", "-c", _PROGRAM, str(_native.__file__)]
 
 
 def main() -> int:
-    """Runs the program with this process's arguments."""
+    """Run the program with the arguments of this process; returns the exit status."""
     return _native.endless(sys.argv[1:], program())

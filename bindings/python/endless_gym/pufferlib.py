@@ -1,4 +1,4 @@
-"""Endless Gym as a native PufferLib environment: one `PufferEnv` holds the whole batch.
+"""A native PufferLib environment: one `PufferEnv` with the whole batch of environments.
 
 ```python
 import pufferlib.vector
@@ -20,8 +20,8 @@ try:
     from pufferlib import PufferEnv
 except ImportError as error:
     raise ImportError(
-        f"endless_gym.pufferlib needs PufferLib 3.0 and what it imports ({error}): pip install psutil gym-notices; "
-        "pip install --no-deps pufferlib==3.0.0 gym==0.26.2 pettingzoo shimmy; examples/pufferlib_rollout.py says more"
+        f"endless_gym.pufferlib needs PufferLib 3.0 and its imports ({error}): pip install psutil gym-notices; "
+        "pip install --no-deps pufferlib==3.0.0 gym==0.26.2 pettingzoo shimmy; see examples/pufferlib_rollout.py"
     ) from error
 
 from endless_gym.vector import make_vec
@@ -30,16 +30,15 @@ __all__ = ["EndlessPufferEnv"]
 
 
 class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
-    """A batch of Endless Gym environments, each of them one of PufferLib's agents.
+    """A batch of Endless Gym environments; each environment is one agent of PufferLib.
 
     Buffers: `observations` uint8 (num_envs, 84, 84, 3), `rewards` float32 (num_envs,), `terminals`, `truncations` and
-    `masks` bool (num_envs,). Where PufferLib passes buffers of its own, observations are copied into them. Where it
-    does not, which is its native backend, `observations` is the engine's own, read-only memory, another array after
-    each step.
+    `masks` bool (num_envs,). If PufferLib passes buffers, observations are copied into them. If it does not (its native
+    backend), `observations` is a read-only view of the engine's memory, a new array after each step.
 
-    An environment whose terminal or truncation is set shows its next episode's first observation already. The infos are
-    empty, or one dict with a list for each number that is known of the episodes that ended in this step:
-    `episode_return`, `episode_length`, and what the original environment reports.
+    Auto-reset is same-step: an environment whose terminal or truncation is set returns the first observation of its next
+    episode. The infos are empty, or contain one dict with a list for each statistic of the episodes that ended in this step:
+    `episode_return`, `episode_length`, and the final infos of the original environment.
     """
 
     def __init__(
@@ -50,7 +49,11 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        """Make `num_envs` environments; `kwargs` are those of `make_vec`. `buf` and `seed` are PufferLib's."""
+        """Make `num_envs` environments. `buf` and `seed` are passed by PufferLib; `kwargs` are those of `make_vec`.
+
+        Raises:
+            ValueError: The observation is a dict.
+        """
         self.envs = make_vec(
             env_id, num_envs=num_envs, seed=_first_seed(seed, num_envs), autoreset="same_step", **kwargs
         )
@@ -59,16 +62,17 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         if not isinstance(self.single_observation_space, gymnasium.spaces.Box):
             self.envs.close()
             raise ValueError(
-                f"PufferEnv has Box observations only: choose another id than {env_id}, or one kind of them"
+                f"PufferEnv supports only Box observations, and {env_id} has a dict; "
+                "choose another id, or one kind of observation"
             )
         self.num_agents = num_envs
         self._owns_buffers = buf is None
         super().__init__(buf)
 
     def reset(self, seed: int | None = None) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Start an episode in every environment; number `i` with the seed `seed * num_envs + i`.
+        """Start an episode in every environment; environment `i` gets the seed `seed * num_envs + i`.
 
-        That way no two of the environments that PufferLib makes, whose seeds follow each other, play the same episodes.
+        PufferLib gives consecutive seeds to its environments; with this seeding no two of them play the same episodes.
         """
         observations, _ = self.envs.reset(seed=_first_seed(seed, self.num_agents))
         self._show(observations)
@@ -92,7 +96,7 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         return self.observations, self.rewards, self.terminals, self.truncations, infos
 
     def notify(self) -> None:
-        """PufferLib tells environments of its progress; these have no use for it."""
+        """Does nothing; part of PufferLib's interface."""
 
     def close(self) -> None:
         """Close the environments."""
@@ -110,7 +114,7 @@ def _first_seed(seed: int | None, num_envs: int) -> int | None:
 
 
 def _statistics(info: dict[str, Any]) -> dict[str, list[float]]:
-    """Return the numbers that a vector environment's `info` has for the episodes that have just ended."""
+    """Return the statistics in a vector environment's `info` of the episodes that have just ended."""
     ended = info["_episode"]
     statistics = {"episode_return": info["episode"]["r"], "episode_length": info["episode"]["l"]}
     for key, values in info["final_info"].items():

@@ -1,4 +1,4 @@
-"""Endless Gym as a Stable-Baselines3 `VecEnv`, without a Python loop over the environments.
+"""A Stable-Baselines3 `VecEnv` without a Python loop over the environments.
 
 ```python
 from sb3_contrib import RecurrentPPO
@@ -34,34 +34,39 @@ __all__ = ["EndlessVecEnv"]
 
 
 class EndlessVecEnv(VecEnv):
-    """A batch of Endless Gym environments that Stable-Baselines3 trains on.
+    """A batch of Endless Gym environments for Stable-Baselines3.
 
     `step` returns
 
-    * observations: uint8 (num_envs, 84, 84, 3), or a dict of arrays where the environment's space is a dict; read-only,
+    * observations: uint8 (num_envs, 84, 84, 3), or a dict of arrays if the observation space is a dict; read-only,
     * rewards: float32 (num_envs,),
-    * dones: bool (num_envs,); an environment that is done shows its next episode's first observation already,
-    * infos: one dict for each environment. That of an environment that is done has `terminal_observation`,
-      `TimeLimit.truncated`, `episode` (`r`, `l` and `t`, as `Monitor` writes it) and what the original environment
-      reports when an episode ends. The dict of any other is the same in each step: read it, don't write to it.
+    * dones: bool (num_envs,); with same-step auto-reset, an environment that is done returns the first observation of its
+      next episode,
+    * infos: one dict per environment. If the environment is done, it contains `terminal_observation`,
+      `TimeLimit.truncated`, `episode` (`r`, `l` and `t`, as in `Monitor`) and the final infos of the original environment.
+      The dict of every other environment is shared between steps and must not be modified.
 
-    `info` is the last step's info as the vector environment returned it, in arrays.
+    `info` is the info of the last step as the vector environment returned it, in arrays.
     """
 
     def __init__(self, envs: EndlessVectorEnv) -> None:
-        """Take over `envs`, made by `make_vec`, `serve` or `connect` with same-step auto-reset and one group."""
+        """Wrap `envs`, made by `make_vec`, `serve` or `connect` with same-step auto-reset and one group.
+
+        Raises:
+            ValueError: Another auto-reset mode, or several groups.
+        """
         mode = gymnasium.vector.AutoresetMode(envs.metadata["autoreset_mode"])
         if mode is not gymnasium.vector.AutoresetMode.SAME_STEP:
-            raise ValueError(f'Stable-Baselines3 needs autoreset="same_step", not {mode.name.lower()!r}')
+            raise ValueError(f'Stable-Baselines3 needs autoreset="same_step", got {mode.name.lower()!r}')
         if envs.num_groups != 1:
-            raise ValueError("Stable-Baselines3 steps all environments together: make them in one group")
+            raise ValueError(f"Stable-Baselines3 needs one group of environments, got {envs.num_groups} groups")
         self.envs = envs
         self._actions: np.ndarray | None = None
         self.info: dict[str, Any] = {}
         self._running: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
-        # Stable-Baselines3 wraps observations in tensors, which warns of read-only arrays, and only reads them. The filter is for
-        # its own modules: a trainer's code is still warned.
+        # Stable-Baselines3 converts observations to tensors, for which PyTorch warns about read-only arrays, and only reads them.
+        # The filter applies to its modules only.
         module = r"(stable_baselines3|sb3_contrib)\."
         warnings.filterwarnings("ignore", "The given NumPy array is not writ", UserWarning, module)
 
@@ -71,10 +76,10 @@ class EndlessVecEnv(VecEnv):
         return cls(make_vec(env_id, num_envs=num_envs, autoreset="same_step", **kwargs))
 
     def reset(self) -> VecEnvObs:
-        """Start an episode in every environment, with what `seed` and `set_options` have set."""
+        """Start an episode in every environment, with the seeds of `seed` and the options of `set_options`."""
         options = self._options[0]
         if any(other != options for other in self._options):
-            raise ValueError("all environments of a batch have the same options")
+            raise ValueError("all environments of a batch must have the same options, got different ones")
         seeds = None if self._seeds[0] is None else list(self._seeds)
         observations: VecEnvObs
         observations, self.info = self.envs.reset(seed=seeds, options=options or None)
@@ -84,7 +89,7 @@ class EndlessVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep integer `actions`, (num_envs,) or (num_envs, 2), for `step_wait`."""
+        """Store integer `actions`, (num_envs,) or (num_envs, 2), for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -102,22 +107,26 @@ class EndlessVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return the batch's attribute once for each of `indices`: all environments of a batch are alike."""
+        """Return the attribute of the batch once for each of `indices`; it is the same for all environments."""
         value = getattr(self.envs, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Not supported: environments of a batch have no attributes of their own."""
-        raise NotImplementedError("environments of a batch have no attributes of their own; use set_options")
+        """Not supported: the environments of a batch have no individual attributes."""
+        raise NotImplementedError(
+            f"cannot set {attr_name!r}: the environments of a batch have no individual attributes; use set_options"
+        )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Not supported: environments of a batch have no methods of their own."""
-        raise NotImplementedError(f"environments of a batch have no methods of their own, so no {method_name!r}")
+        """Not supported: the environments of a batch have no individual methods."""
+        raise NotImplementedError(
+            f"cannot call {method_name!r}: the environments of a batch have no individual methods"
+        )
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Return true for `Monitor`, whose `episode` statistics the infos have, and false for other wrappers."""
+        """Return true for `Monitor`, whose `episode` statistics are in the infos, and false for other wrappers."""
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
     def _get_indices(self, indices: VecEnvIndices) -> Iterable[int]:
@@ -125,16 +134,16 @@ class EndlessVecEnv(VecEnv):
 
 
 def _final_row(info: dict[str, Any], index: int) -> dict[str, Any]:
-    """Return all that `info` says of the episode that has ended in environment number `index`."""
+    """Return the info of environment `index`, whose episode has ended."""
     row = _row(info, index)
-    # A copy, lest one frame that is kept keeps the whole batch.
+    # A copy, since a view of one frame would keep the whole batch alive.
     row["terminal_observation"] = deepcopy(row.pop("final_obs"))
     final: dict[str, Any] = row.pop("final_info")
     return row | final
 
 
 def _row(info: dict[str, Any], index: int) -> dict[str, Any]:
-    """Return what a vector environment's `info`, arrays with masks, says of environment number `index`."""
+    """Return the entries of a vector environment's `info` (arrays with masks) for environment `index`."""
     row = {}
     for key, values in info.items():
         mask = info.get(f"_{key}")

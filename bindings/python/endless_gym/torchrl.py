@@ -1,4 +1,4 @@
-"""Endless Gym as a TorchRL environment whose batch size is the number of environments.
+"""A TorchRL environment whose batch size is the number of environments.
 
 ```python
 from endless_gym.torchrl import EndlessEnv
@@ -30,26 +30,32 @@ __all__ = ["EndlessEnv"]
 
 
 class EndlessEnv(EnvBase):  # type: ignore[misc]
-    """A batch of Endless Gym environments for TorchRL, batch size [num_envs].
+    """A batch of Endless Gym environments for TorchRL, with batch size [num_envs].
 
-    Entries, each with the batch size first:
+    Entries, with shapes after the batch dimension:
 
-    * `observation`: uint8 (84, 84, 3); where the environment's space is a dict, an entry for each of its keys,
+    * `observation`: uint8 (84, 84, 3); if the observation space is a dict, one entry for each of its keys,
     * `action`: int64 () for Discrete, (2,) for MultiDiscrete spaces,
     * `reward`: float32 (1,); `done`, `terminated`, `truncated`: bool (1,).
 
-    The last observation of an episode is in `next`, and an environment resets when TorchRL asks for it, as it does by
-    itself in rollouts and collectors. On the CPU observations are copied out of the engine's memory, because TorchRL
-    keeps them and its transforms may write to them; to another device they are sent from there.
+    `next` contains the last observation of an episode. Environments are reset by TorchRL, which does so automatically in rollouts
+    and collectors. On the CPU, observations are copied out of the engine's memory, since TorchRL stores them and its transforms
+    may modify them; to other devices they are transferred directly.
     """
 
     def __init__(self, envs: EndlessVectorEnv, device: torch.device | str = "cpu") -> None:
-        """Take over `envs`, made by `make_vec`, `serve` or `connect` with auto-reset disabled and one group."""
+        """Wrap `envs`, made by `make_vec`, `serve` or `connect` with disabled auto-reset and one group.
+
+        Raises:
+            ValueError: Another auto-reset mode, or several groups.
+        """
         mode = gymnasium.vector.AutoresetMode(envs.metadata["autoreset_mode"])
         if mode is not gymnasium.vector.AutoresetMode.DISABLED:
-            raise ValueError(f'TorchRL needs autoreset="disabled", not {mode.name.lower()!r}: it resets by itself')
+            raise ValueError(
+                f'TorchRL resets the environments and needs autoreset="disabled", got {mode.name.lower()!r}'
+            )
         if envs.num_groups != 1:
-            raise ValueError("TorchRL steps all environments together: make them in one group")
+            raise ValueError(f"TorchRL needs one group of environments, got {envs.num_groups} groups")
         super().__init__(device=device, batch_size=[envs.num_envs])
         self.envs = envs
         self._seed: int | None = None
@@ -116,7 +122,7 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         return {key: self._own(array) for key, array in observations.items()}
 
     def _own(self, array: np.ndarray) -> torch.Tensor:
-        """Turn an observation into a tensor that shares no memory with the engine."""
+        """Convert an observation to a tensor that shares no memory with the engine."""
         if array.flags.writeable:
             return torch.from_numpy(array).to(self.device)
         return torch_view(array).to(self.device, copy=True)
@@ -135,6 +141,6 @@ def _action_spec(space: gymnasium.Space[Any], batch: torch.Size, device: torch.d
     if isinstance(space, gymnasium.spaces.Discrete):
         return Categorical(int(space.n), shape=batch, device=device)
     assert isinstance(space, gymnasium.spaces.MultiDiscrete)
-    # All branches have as many values; TorchRL then describes them by one Categorical with another dimension.
+    # All branches have the same number of choices, so one Categorical with an additional dimension describes them.
     (values,) = set(space.nvec.tolist())
     return Categorical(values, shape=torch.Size((*batch, len(space.nvec))), device=device)

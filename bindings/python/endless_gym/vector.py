@@ -1,4 +1,4 @@
-"""Many environments as one `gymnasium.vector.VectorEnv`: in this process, or in an engine's."""
+"""Vector environments (`gymnasium.vector.VectorEnv`), in this process or in an engine process."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ try:
     from gymnasium.vector import VectorEnv
 except ImportError as error:
     raise ImportError(
-        f"many environments at a time need Gymnasium 1.1 or newer, and there is {gymnasium.__version__}: "
-        "pip install 'gymnasium>=1.1'; with this one, `gymnasium.make` and its own vector environments work"
+        f"vector environments need Gymnasium 1.1 or newer, got {gymnasium.__version__}: pip install 'gymnasium>=1.1'; "
+        "`gymnasium.make` and Gymnasium's vector environments work with this version"
     ) from error
 
 Options = Mapping[str, Any]
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
-#: What `observation` may be, and whether the batch then has frames and the feature observation.
+#: Values of `observation`, and whether the batch contains frames and the feature observation.
 OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
 
 _MODES = {
@@ -38,17 +38,17 @@ _MODES = {
 
 
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
-    """Environments of one id in lockstep.
+    """Environments of one id that step in lockstep.
 
-    `make_vec`, `serve` and `connect` make it. `step` returns arrays of `num_envs` rows: observation uint8 (n, 84, 84, 3) or as
-    `single_observation_space` says, reward float64 (n,), terminated and truncated bool (n,), and `info`. Arrays are read-only
-    views of the memory that the engine wrote to, and stay as they are for as long as they are held; with `copy=True` they are
-    writeable copies. `torch.from_numpy` warns of read-only arrays; `endless_gym.torch_view` does the same without the warning.
+    Created by `make_vec`, `serve` and `connect`. `step` returns arrays with one row per environment: observation uint8
+    (n, 84, 84, 3) or as in `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`.
+    Arrays are read-only views of the engine's memory that do not change while they are referenced; with `copy=True` they are
+    writeable copies. `torch.from_numpy` warns about read-only arrays; `endless_gym.torch_view` does not.
 
-    `info` has an array for each key, and under the key with a leading underscore where it is set, as in Gymnasium:
-    `ground_truth` float64 (n, k) where the original has it; in steps that end episodes the original's final infos (`reward`,
-    `length`, ...), and `episode` with return `r`, length `l` and seconds since the environments were made `t`. With same-step
-    auto-reset the final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended.
+    As in Gymnasium, `info` has an array for each key, and a mask under the key with a leading underscore: `ground_truth` float64
+    (n, k) if the original has it; in steps that end episodes, the final infos of the original (`reward`, `length`, ...), and
+    `episode` with return `r`, length `l` and seconds `t` since the environments were made. With same-step auto-reset the final
+    infos are in `final_info`, and `final_obs` contains the last observation of each episode that ended.
     """
 
     def __init__(
@@ -105,13 +105,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` goes by
-                the seeds that the environments were made with, and then goes on with their generators.
-            options: Reset parameters for these and all later episodes, laid over those that the environments were made with;
-                and `reset_mask`, bool (n,), the environments that start an episode. Environments that were made with options
-                of their own each take none here.
-            group: The group of environments; with several groups all are reset, and the first group's are returned, unless
-                one is named.
+            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` uses
+                the seeds that the environments were made with, and after that continues with their generators.
+            options: Reset parameters of these and all later episodes, which override those that the environments were made
+                with; and `reset_mask`, bool (n,), the environments that start an episode. Not supported if the environments
+                were made with a sequence of options.
+            group: The group to reset. `None` resets all groups, and returns the observations of the first one.
 
         Returns:
             The observations and the info.
@@ -136,22 +135,22 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             actions: Integers, (n, branches) or (n,) for one branch.
 
         Raises:
-            ValueError: There are too many or too few actions, or one is out of its range. No environment has moved.
-            EngineLost: The engine's process has ended.
-            TooManyBatchesHeld: Arrays of too many earlier steps are held; drop them, or make the environments with `copy=True`.
+            ValueError: The number of actions is wrong, or an action is out of range. No environment was stepped.
+            EngineLost: The engine process has ended.
+            TooManyBatchesHeld: Arrays of too many earlier steps are referenced; delete them, or use `copy=True`.
         """
         return self._step(self._backend.step(actions))
 
     def send(self, actions: Any, group: int = 0) -> None:
-        """Step a group without waiting for it; `recv` returns what came of it. `actions` as for `step`.
+        """Step a group without waiting for the result, which `recv` returns. `actions` as for `step`.
 
-        In this process the step is played when `recv` asks for it; in an engine's, at once.
+        In this process the step is executed by `recv`; in an engine process it starts immediately.
         """
         self._backend.send(actions, group)
 
     def recv(self, group: int | None = None) -> Step:
-        """What `step` returns, for a group's `send`, waiting for it. `None` takes the group that is first; `info["group"]` tells
-        which.
+        """Wait for the result of `send`, and return it as `step` does. `None` returns the first available group; its number is
+        `info["group"]`.
         """
         number, arrays = self._backend.receive(group)
         step = self._step(arrays)
@@ -159,45 +158,46 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return step
 
     def send_reset(self, group: int = 0, *, seed: int | None = None) -> None:
-        """Reset a group without waiting for it; `recv` returns its first observations with rewards of 0. Environment `i` of the
-        group is seeded with `seed + group * num_envs + i`.
+        """Reset a group without waiting for the result; `recv` returns its first observations with rewards of 0.
+
+        Environment `i` of the group is seeded with `seed + group * num_envs + i`.
         """
         self._backend.send_reset(group, seed)
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
-        """The whole state of one environment of a group, for `restore`, also of environments elsewhere.
+        """The complete state of one environment of a group, for `restore` here or in other environments of the same id.
 
         Raises:
             ValueError: There is no such environment.
-            RuntimeError: It has not been reset, or the group's `send` was not received yet.
+            RuntimeError: The environment has not been reset, or the result of the group's `send` has not been received.
         """
         return self._backend.snapshot(group, self._env(env))
 
     def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
-        """Put environments into the states of snapshots, also of other environments of the same id. Reset them all once before.
+        """Restore snapshots by environment index. All environments must have been reset at least once.
 
         Returns:
             The observations and the info of all environments of the group.
 
         Raises:
-            ValueError: There is no such environment, or what was given is no snapshot of that id. Those before it are restored.
+            ValueError: There is no such environment, or a value is not a snapshot of this id. Earlier snapshots are restored.
             RuntimeError: As for `snapshot`.
         """
         for env, snapshot in snapshots.items():
             self._backend.restore(group, self._env(env), snapshot)
-        # A reset of none shows what they look like now.
+        # A reset of no environment returns the current observations.
         return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
-        """What the original's `render()` shows a person, uint8 (336, 336, 3). Only for environments in this process."""
+        """Ground-truth view of the original's `render()`, uint8 (336, 336, 3). Only for environments in this process."""
         return self._backend.ground_truth_view(env)
 
     def reconnect(self, timeout: float = 30.0) -> None:
-        """Go on with an engine that was started in place of a lost one; `reset` it then."""
+        """Connect to an engine that replaces a lost one; the environments must then be reset."""
         self._backend.reconnect(timeout)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the engine, if it is this object's own, and give up the connection. Arrays that are held stay as they are."""
+        """Close the connection, and end the engine if this object started it. Referenced arrays stay valid."""
         self._backend.close()
 
     def __enter__(self) -> EndlessVectorEnv:
@@ -208,7 +208,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def _env(self, given: int) -> int:
         if not 0 <= given < self.num_envs:
-            raise ValueError(f"there is no environment {given}; a group has 0 to {self.num_envs - 1}")
+            raise ValueError(f"no environment {given}: the index must be 0 to {self.num_envs - 1}")
         return given
 
     def _request(self, seed: int | Sequence[int | None] | None, mask: Any, group: int) -> _native.Reset | None:
@@ -220,7 +220,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             chosen = np.asarray(mask)
             if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
                 raise ValueError(
-                    f"`reset_mask` is {chosen.dtype} {chosen.shape}; give a bool array of shape ({self.num_envs},)"
+                    f"`reset_mask` must be bool of shape ({self.num_envs},), got {chosen.dtype} of shape {chosen.shape}"
                 )
         seeds = seed if isinstance(seed, Sequence) else self._seeds(seed, group)
         if len(seeds) != self.num_envs:
@@ -257,7 +257,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self._observation(arrays, self._observed), reward, terminated, truncated, info
 
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
-        """Adds what is told of episodes that this step ended, if it ended any."""
+        """Add the final infos of the episodes that this step ended to `info`."""
         returns, lengths, infos = (arrays[place] for place in self._ends)
         seconds = time.perf_counter() - self._start
         ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers, seconds)
@@ -283,7 +283,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
 
 class _Backend:
-    """Where the environments are."""
+    """The implementation behind `EndlessVectorEnv`: in this process or in an engine process."""
 
     groups = 1
 
@@ -309,17 +309,17 @@ class _Backend:
         raise NotImplementedError
 
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
-        raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
+        raise RuntimeError("the ground-truth view needs environments in this process; use `make_vec`")
 
     def reconnect(self, timeout: float) -> None:
-        raise RuntimeError("the environments are in this process; there is no engine to reconnect to")
+        raise RuntimeError("the environments are in this process and have no engine to reconnect to")
 
     def close(self) -> None:
         raise NotImplementedError
 
 
 class _InProcess(_Backend):
-    """In this process, in one pool for each group."""
+    """Environments in this process, with one pool per group."""
 
     def __init__(self, pools: list[_native.Pool]) -> None:
         self._pools = pools
@@ -363,7 +363,7 @@ class _InProcess(_Backend):
         self._pools, self._sent = [], {}
 
     def _received(self, group: int) -> _native.Pool:
-        """The group's pool, which has no pending answer."""
+        """The pool of a group without pending `send`."""
         if group in self._sent:
             raise RuntimeError(f"group {group} has a pending answer; `recv` it first")
         return self._group(group)
@@ -372,12 +372,12 @@ class _InProcess(_Backend):
         if not self._pools:
             raise RuntimeError("the environments are closed")
         if not 0 <= group < len(self._pools):
-            raise ValueError(f"there is no group {group}; there are 0 to {len(self._pools) - 1}")
+            raise ValueError(f"no group {group}: the index must be 0 to {len(self._pools) - 1}")
         return self._pools[group]
 
 
 class _Remote(_Backend):
-    """In an engine's process. `engine` is the process where it is this object's own."""
+    """Environments in an engine process. `engine` is the process if this object started it, else None."""
 
     def __init__(self, connection: _native.Connection, groups: int, timeout: float, engine: Any = None) -> None:
         self._connection: _native.Connection | None = connection
@@ -437,27 +437,27 @@ def make_vec(
     groups: int = 1,
     copy: bool = False,
 ) -> EndlessVectorEnv:
-    """Environments in this process.
+    """Make environments in this process.
 
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.
         num_envs: Environments in each group.
-        num_threads: Threads that step them; `None` for one for each core.
-        seed: Environment `i` is seeded with `seed + i` at its first reset and goes on with its generator. `None`: entropy.
-        seeds: Where each episode's seed comes from instead: a `range` to draw from, as the paper's training does from
-            `range(100_000)` (`seed` then fixes the draws), or a list that is played in turn.
-        options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each,
-            those of the first group first.
+        num_threads: Threads that step them; `None` for one per core.
+        seed: Environment `i` is seeded with `seed + i` at its first reset and then continues with its generator. `None`: entropy.
+        seeds: Seeds of the episodes instead: a `range` from which each episode draws its seed, as in the paper's training with
+            `range(100_000)` (`seed` then seeds the draws), or a list that is used in order.
+        options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one mapping per
+            environment, ordered by group.
         autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
-        observation: `rgb`, `features` (a short vector of what the frame shows; nothing is drawn), or both as a dict:
+        observation: `rgb`, `features` (a short vector that describes the frame; nothing is drawn), or both as a dict:
             `rgb+features`.
-        frames: What frames look like where they are not as the original's: grey, channels first, row-major, several of them.
-        groups: Groups of environments for `send` and `recv`.
+        frames: Format of the frames if it differs from the original: grey, channels first, row-major, stacked.
+        groups: Number of groups, for `send` and `recv`.
         copy: Return writeable copies instead of read-only views.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
     frames, features = contents(observation, frames)
-    # As in an engine, groups share their threads and count their environments through.
+    # As in an engine, groups share the threads, and environments are numbered across all groups.
     threads = _native.Threads(num_threads or 0)
     pools = [
         _native.Pool(
@@ -490,16 +490,16 @@ def make_vec(
 
 
 def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: Any = None) -> EndlessVectorEnv:
-    """Environments of the engine with that name, which `endless serve --service NAME` or `serve` started.
+    """Connect to a running engine, started by `endless serve --service NAME` or by `serve`.
 
     Args:
-        service: The engine's name.
-        timeout: Seconds to wait for the engine to appear, and for each of its answers.
+        service: Name of the engine.
+        timeout: Seconds to wait for the engine, and for each of its answers.
         copy: Return writeable copies instead of read-only views into shared memory.
-        engine: Used by `serve`.
+        engine: The engine process; only used by `serve`.
 
     Raises:
-        ConnectionError: There is no such engine, or it has a trainer already.
+        ConnectionError: There is no such engine, or another trainer is connected to it.
     """
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
@@ -517,27 +517,29 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
 
 
 def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> EndlessVectorEnv:
-    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
+    """Entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
     if render_mode is not None:
-        raise gymnasium.error.Error("vector environments are not rendered; use `gymnasium.make` to render one")
+        raise gymnasium.error.Error(
+            f"vector environments do not support render_mode, got `{render_mode}`; use `gymnasium.make` to render"
+        )
     return make_vec(id, num_envs, **kwargs)
 
 
 def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
-    """Gymnasium's auto-reset mode, also by its name."""
+    """Convert the name of an auto-reset mode to Gymnasium's `AutoresetMode`."""
     mode = given if isinstance(given, AutoresetMode) else _MODES.get(given)
     if mode is None:
-        raise ValueError(f"no auto-reset mode `{given}`; there are {', '.join(_MODES)}")
+        raise ValueError(f"autoreset must be {', '.join(_MODES)}; got `{given}`")
     return mode
 
 
 def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The frames that a batch has, and whether it has the feature observation."""
+    """Format of the frames in a batch, or None without frames; and whether it contains the feature observation."""
     if observation not in OBSERVATIONS:
-        raise ValueError(f"no observation `{observation}`; there are {', '.join(OBSERVATIONS)}")
+        raise ValueError(f"observation must be {', '.join(OBSERVATIONS)}; got `{observation}`")
     has_frames, has_features = OBSERVATIONS[observation]
     if frames is not None and not has_frames:
-        raise ValueError(f"the observation `{observation}` has no frames; leave out {frames}")
+        raise ValueError(f"the observation `{observation}` has no frames; frames must be None, got {frames}")
     return (frames or Frames()) if has_frames else None, has_features
 
 
@@ -546,9 +548,9 @@ def _name(mode: AutoresetMode) -> str:
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
-    """The reset parameters of one group's environments, as the native module reads them."""
+    """Reset parameters of the environments of one group as JSON text for the native module."""
     if given is None or isinstance(given, Mapping):
         return options_text(given)
     if len(given) != groups * num_envs:
-        raise ValueError(f"{len(given)} sets of reset parameters given for {groups * num_envs} environments")
+        raise ValueError(f"got {len(given)} mappings of reset parameters for {groups * num_envs} environments")
     return f"[{', '.join(options_text(each) for each in given[first : first + num_envs])}]"

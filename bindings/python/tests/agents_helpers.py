@@ -1,4 +1,4 @@
-"""Small agents, and segments that they have played, for the agents' tests."""
+"""Small agents and their rollouts, for the tests of the agents."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,7 +13,7 @@ BRANCHES = (3, 2)
 
 
 def settings(agent: str, **changes: Any) -> Settings:
-    """Tiny networks; `changes` replace whole fields."""
+    """Settings of a small network; `changes` replace fields."""
     small = {
         "recurrence": Recurrence(hidden_size=16, sequence_length=8),
         "transformer": Transformer(layers=2, width=16, heads=2, window=6, sequence_length=8, positions=64),
@@ -29,7 +29,7 @@ def transformer(**changes: Any) -> dict[str, Transformer]:
 def make(agent: str, shapes: dict[str, tuple[int, ...]] = FEATURES, **changes: Any) -> Agent:
     torch.manual_seed(3)
     made = Agent(settings(agent, **changes), shapes, BRANCHES)
-    # Weights as after some training: biases and the policy's last layer are not near zero any more.
+    # As after some training: the biases and the output layer of the policy are no longer near zero.
     for parameter in made.parameters():
         parameter.data += 0.2 * torch.randn_like(parameter)
     return made
@@ -40,7 +40,7 @@ def observations(steps: int, envs: int) -> torch.Tensor:
 
 
 def ends(steps: int, envs: int) -> torch.Tensor:
-    """Where episodes end, bool (steps, envs): in environment 0 never, in the others at different times."""
+    """Ends of episodes, bool (steps, envs): none in environment 0, different ones in the others."""
     done = torch.rand(steps, envs, generator=torch.Generator().manual_seed(6)) < 0.15
     done[:, 0] = False
     return done
@@ -52,17 +52,17 @@ def play(
     """Act on given observations (T, N, 6) as one segment.
 
     Returns:
-        Which steps start an episode (T, N), actions (T, N, 2), their log-probabilities (T, N, 2), and values (T, N).
+        Reset mask (T, N), actions (T, N, 2), log-probabilities (T, N, 2), and values (T, N).
     """
     agent.memory.begin_segment(memory.state, observed.shape[0])
     rows = []
     generator = torch.Generator().manual_seed(7)
     for observation, end in zip(observed, done, strict=True):
-        first = memory.first
-        acted = agent.act({"features": observation}, memory, generator)
-        rows.append((first, acted.action, acted.log_prob, acted.value))
-        memory.forget(end)
-    # A segment ends with a look at what comes next, which must leave it as it is.
-    agent.estimate({"features": observed[-1]}, memory)
-    first, action, log_prob, value = (torch.stack(column) for column in zip(*rows, strict=True))
-    return first, action, log_prob, value
+        reset_mask = memory.reset_mask
+        output = agent.act({"features": observation}, memory, generator)
+        rows.append((reset_mask, output.action, output.log_prob, output.value))
+        memory.reset(end)
+    # A rollout ends with a bootstrap value, which must not change the memory.
+    agent.bootstrap_value({"features": observed[-1]}, memory)
+    reset_mask, action, log_prob, value = (torch.stack(column) for column in zip(*rows, strict=True))
+    return reset_mask, action, log_prob, value

@@ -1,8 +1,7 @@
-"""A device that is not the processor, on a machine that has no other: what agents do on CUDA can be tried on it.
+"""A stand-in for a CUDA device on machines without one.
 
-Its tensors hold those of the processor that they stand for. As on CUDA, an operation that is given tensors of both devices is
-an error, and so is a look into them without a copy. Run as a program, this trains on it and on the processor, and prints what
-came of both:
+A tensor of this device wraps a CPU tensor. As on CUDA, an operation on tensors of both devices is an error, and so is access to
+the data without a copy. Run as a program, this trains on the device and on the CPU, and prints the results of both as JSON:
 
     python other_device.py FOLDER FLAGS_AS_JSON ...
 """
@@ -24,7 +23,7 @@ NAME = "elsewhere"
 
 
 class There(torch.Tensor):
-    """A tensor of the device."""
+    """A tensor of the device; `here` is the wrapped CPU tensor."""
 
     @staticmethod
     def __new__(cls, here: torch.Tensor) -> "There":
@@ -43,7 +42,7 @@ class There(torch.Tensor):
 
 
 class Device(TorchDispatchMode):
-    """Has tensors of the device made where they are asked for."""
+    """Dispatches factory functions with `device="elsewhere"`, such as `torch.zeros`."""
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return computed(operation, args, kwargs or {})
@@ -53,11 +52,11 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name = operation.overloadpacket.__name__
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
     there = [tensor for tensor in tensors if isinstance(tensor, There)]
-    # Numbers may be anywhere, and copies go from one device to the other.
+    # Zero-dimensional tensors may be on any device, and copies cross devices.
     here = [tensor for tensor in tensors if not isinstance(tensor, There) and tensor.dim()]
     if there and here and name not in ("_to_copy", "copy_"):
         shapes = [[tuple(tensor.shape) for tensor in some] for some in (there, here)]
-        raise RuntimeError(f"{name} is given tensors of two devices: {shapes[0]} and {shapes[1]}")
+        raise RuntimeError(f"{name}: tensors on two devices, of shapes {shapes[0]} and {shapes[1]}")
     asked = kwargs.get("device")
     if asked is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}
@@ -74,7 +73,7 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def lstm_cell(x: Any, h: Any, cell: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
-    """What PyTorch computes in one piece on other devices."""
+    """The fused LSTM cell, which PyTorch calls on devices other than the CPU."""
     gates = x + h if bias_x is None else x + h + bias_x + bias_h
     into, forget, new, out = gates.chunk(4, 1)
     into, forget, new, out = into.sigmoid(), forget.sigmoid(), new.tanh(), out.sigmoid()
@@ -99,7 +98,7 @@ def lstm_cell_backward(grad_h: Any, grad_c: Any, before: Any, after: Any, kept: 
 
 
 def gru_cell(x: Any, h: Any, hidden: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
-    """As `lstm_cell`."""
+    """The fused GRU cell."""
     x, h = (x, h) if bias_x is None else (x + bias_x, h + bias_h)
     (reset_x, update_x, new_x), (reset_h, update_h, new_h) = x.chunk(3, 1), h.chunk(3, 1)
     reset, update = (reset_x + reset_h).sigmoid(), (update_x + update_h).sigmoid()
@@ -117,13 +116,13 @@ def gru_cell_backward(grad: Any, kept: Any, has_bias: bool) -> Any:
     return to_x, to_h, grad * update, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
 
 
-#: Operations that PyTorch asks of other devices only.
+#: Operations that PyTorch calls on devices other than the CPU only.
 REPLACED = {
     "_thnn_fused_gru_cell": gru_cell,
     "_thnn_fused_gru_cell_backward": gru_cell_backward,
     "_thnn_fused_lstm_cell": lstm_cell,
     "_thnn_fused_lstm_cell_backward_impl": lstm_cell_backward,
-    # Attention without kernels of a device's own.
+    # Use the unfused attention.
     "_fused_sdp_choice": lambda *args, **kwargs: 0,
 }
 
@@ -134,32 +133,32 @@ class Module(backend_registration._DummyBackendModule):
 
 
 class Generator(torch.Generator):
-    """Draws the same numbers, whatever the device."""
+    """A CPU generator for every device, so that random numbers are equal on all devices."""
 
     def __new__(cls, device: Any = "cpu") -> torch.Generator:
         return super().__new__(cls, "cpu")
 
 
 def register() -> None:
-    """Tell PyTorch of the device, for good, before it first computes a gradient."""
+    """Register the device with PyTorch; must be called before the first backward pass, and cannot be undone."""
     backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=Module())
 
 
 @contextlib.contextmanager
 def device() -> Iterator[None]:
-    """The device can be used."""
+    """Context in which the device can be used."""
     generator, save, to = torch.Generator, torch.save, torch.nn.Module.to
     torch.Generator = Generator
 
     def moved(module: torch.nn.Module, *args: Any, **kwargs: Any) -> torch.nn.Module:
-        """With other parameters in place of the module's, whose class is another."""
+        """Replace the parameters, whose class changes with the device."""
         torch.__future__.set_swap_module_params_on_conversion(True)
         to(module, *args, **kwargs)
         torch.__future__.set_swap_module_params_on_conversion(False)
         return module
 
     torch.nn.Module.to = moved
-    # Files hold tensors of the processor, as map_location makes them of CUDA's.
+    # Files contain CPU tensors; for CUDA tensors, `map_location` has this effect.
     torch.save = lambda state, file: save(tree_map_only(There, lambda tensor: tensor.here.clone(), state), file)
     try:
         with Device():
@@ -182,7 +181,7 @@ def main() -> None:
             settings = replace(parse(flags), device=name, run=str(folder / f"{number}-{name}"))
             with device() if name == NAME else contextlib.nullcontext():
                 run = train(settings)
-                # Once more, from the checkpoint.
+                # Resume from the checkpoint.
                 settings = replace(
                     settings, resume=str(run), ppo=replace(settings.ppo, updates=settings.ppo.updates + 1)
                 )

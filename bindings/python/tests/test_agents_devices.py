@@ -1,4 +1,4 @@
-"""Agents on a device that is not the processor: everything is where it belongs, and the numbers are the same."""
+"""Agents on a device other than the CPU: all tensors are on the right device, and the results are those of the CPU."""
 
 import json
 import subprocess
@@ -29,7 +29,7 @@ FLAGS = {
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the program printed, in a process of its own, since PyTorch knows a device for good."""
+    """Output of `other_device.py`, run in a subprocess since a registered device cannot be removed."""
     given = [json.dumps([*flags.split(), *SMALL.split()]) for flags in FLAGS.values()]
     command = [sys.executable, other_device.__file__, str(tmp_path_factory.mktemp("runs")), *given]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
@@ -39,20 +39,20 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", FLAGS)
-def test_a_run_elsewhere_is_the_run_on_the_processor(results: dict[str, Any], name: str) -> None:
-    """Training, a checkpoint, going on from it, evaluation."""
+def test_run_on_another_device_equals_the_run_on_the_cpu(results: dict[str, Any], name: str) -> None:
+    """Training, a checkpoint, resumption from it, and evaluation."""
     here, there = results[name]["cpu"], results[name][other_device.NAME]
     assert [row["update"] for row in there["rows"]] == [1, 2]
     for one, other in zip(here["rows"], there["rows"], strict=True):
         timed = {key for key in one if key.startswith("seconds/")} | {"steps_per_second"}
         assert other.keys() == one.keys()
-        # Cells in one piece and attention in several round otherwise than the processor's.
+        # Fused cells and unfused attention round differently from the CPU kernels.
         for key in one.keys() - timed:
             assert other[key] == pytest.approx(one[key], rel=1e-3, abs=1e-5), key
     assert there["episodes"] == here["episodes"]
 
 
-def test_the_stand_in_refuses_what_cuda_refuses() -> None:
+def test_stand_in_rejects_what_cuda_rejects() -> None:
     program = f"""
 import sys
 
@@ -73,6 +73,6 @@ with device():
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     lines = done.stdout.splitlines()
     assert done.returncode == 0 and len(lines) == 3, done.stderr
-    assert "addmm is given tensors of two devices" in lines[0]
-    assert "add is given tensors of two devices" in lines[1]
+    assert "addmm: tensors on two devices" in lines[0]
+    assert "add: tensors on two devices" in lines[1]
     assert "numpy" in lines[2]

@@ -1,4 +1,4 @@
-"""The paper's protocol: its metrics from known infos, and its numbers from checkpoints."""
+"""The evaluation protocol: metrics from known infos, and results of checkpoints."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ from endless_gym import agents
 from endless_gym.agents import protocol
 from endless_gym.agents.evaluate import evaluate
 from endless_gym.agents.metrics import metric, path_length, task_progress
-from endless_gym.agents.protocol import Evaluation, evaluate_runs, find
+from endless_gym.agents.protocol import EvalArguments, evaluate_runs, find
 from endless_gym.agents.results import label, read, to_json
 from endless_gym.agents.train import parse, train
 from endless_gym.env import Env
@@ -22,7 +22,7 @@ from endless_gym.specs import spec
 
 GRID = "MortarMayhem-Grid-v0"
 
-#: Tiles to reach in the paths of the evaluation's seeds, from the best rewards of the paper's agents in the published episodes.
+#: Path lengths of the evaluation seeds, from the best rewards of the published episodes of the paper.
 PATHS = [8, 9, 9, 12, 9, 10, 8, 7, 12, 9, 10, 10, 10, 10, 11, 9, 9, 8, 9, 10, 8, 9, 8, 9, 8]
 PATHS += [12, 7, 9, 11, 7, 11, 12, 9, 9, 8, 10, 11, 7, 10, 9, 6, 6, 10, 7, 9, 10, 11, 11, 7, 11]
 
@@ -39,8 +39,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def small(*paths: Path, **changes: object) -> Evaluation:
-    return replace(Evaluation(paths), seeds=5, threads=1, engine_threads=1, **changes)
+def small(*paths: Path, **changes: object) -> EvalArguments:
+    return replace(EvalArguments(paths), seeds=5, threads=1, engine_threads=1, **changes)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def small(*paths: Path, **changes: object) -> Evaluation:
         ("MortarMayhem-v0", {}, {"reward": 1.0, "commands_completed": 1.0, "success": 1}, 0, 1.0),
         (GRID, {"command_count": [1]}, {"reward": 0.0, "commands_completed": 1.0, "success": 1}, 0, 0.0),
         (GRID, {"command_count": [2, 4]}, {"reward": 0.3, "commands_completed": 1.0, "success": 1}, 0, 0.75),
-        # Such a reward does not tell.
+        # This reward does not show whether the last command failed.
         (GRID, {"reward_episode_success": 1}, {"reward": 1.9, "commands_completed": 1.0, "success": 1}, 0, 1.0),
         ("MysteryPath-v0", {}, {"reward": 0.4, "success": 0}, 8, 0.5),
         ("MysteryPath-v0", {}, {"reward": 1.7, "success": 1}, 8, 1.0),
@@ -78,7 +78,7 @@ def test_metrics_of_the_paper() -> None:
     assert metric("MysteryPath-v0")[0] == "task_progress"
 
 
-def test_paths_are_as_long_as_the_published_episodes_say() -> None:
+def test_path_lengths_match_the_published_episodes() -> None:
     env = Env("MysteryPath-v0", render_mode="debug_rgb_array")
     lengths = []
     for seed in range(200_000, 200_050):
@@ -87,8 +87,8 @@ def test_paths_are_as_long_as_the_published_episodes_say() -> None:
     assert lengths == PATHS
 
 
-def test_progress_on_a_path_is_that_of_its_length() -> None:
-    """Untrained, an agent reaches a tile or two: each is one part of the path, for each seed its own."""
+def test_task_progress_uses_the_path_length_of_each_seed() -> None:
+    """An untrained agent reaches one or two tiles; each is a fraction of the path of its seed."""
     agent = settings(
         "none", env="MysteryPath-v0", environment=replace(settings("none").environment, option=("max_steps=60",))
     )
@@ -118,7 +118,7 @@ def test_progress_on_a_path_is_that_of_its_length() -> None:
         ("--agent trxl --transformer.positional-encoding learned", "trxl_learned"),
     ],
 )
-def test_agents_are_called_as_in_the_published_results(flags: str, expected: str) -> None:
+def test_labels_match_the_published_results(flags: str, expected: str) -> None:
     assert label(parse(flags.split())) == expected
     published = json.loads((Path(agents.__file__).parent / "published.json").read_text())
     assert any(expected.replace("_learned", "_lr_learned") in curves for curves in published["curves"].values())
@@ -136,7 +136,7 @@ def test_runs_and_checkpoints_are_found(runs: Path) -> None:
     assert find((file,), False) == [(runs / "b", [file])]
 
 
-def test_each_seed_is_played_as_often_and_the_numbers_are_the_same_again(runs: Path) -> None:
+def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path) -> None:
     quiet = Console(quiet=True)
     once = evaluate_runs(small(runs), quiet)
     assert [(one.label, len(one.runs), one.common_steps()) for one in once] == [
@@ -148,24 +148,30 @@ def test_each_seed_is_played_as_often_and_the_numbers_are_the_same_again(runs: P
             assert Counter(episode["seed"] for episode in episodes) == dict.fromkeys(range(200_000, 200_005), 3)
     again = evaluate_runs(small(runs), quiet)
     assert to_json(again, {}, True) == to_json(once, {}, True)
-    other = evaluate_runs(small(runs, draws=1), quiet)
+    other = evaluate_runs(small(runs, action_seed=1), quiet)
     assert to_json(other, {}, True) != to_json(once, {}, True)
 
 
-def test_progress_is_told_for_each_episode(runs: Path) -> None:
-    told: list[int] = []
+def test_progress_callback_counts_every_episode(runs: Path) -> None:
+    counts: list[int] = []
     agent = protocol.command.load_checkpoint(runs / "a", "cpu").agent
-    evaluate(agent, range(200_000, 200_004), 2, num_threads=1, ended=told.append)
-    assert sum(told) == 8
-    assert min(told) > 0
+    evaluate(agent, range(200_000, 200_004), 2, num_threads=1, ended=counts.append)
+    assert sum(counts) == 8
+    assert min(counts) > 0
 
 
-def test_results_are_written_and_read(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_round_trip_through_json(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "results.json"
-    protocol.work(small(runs, json=str(file), episodes=True))
+    protocol.execute(small(runs, json=str(file), episodes=True))
     table = capsys.readouterr().out
     written = json.loads(file.read_text())
-    assert written["protocol"] == {"first_seed": 200_000, "seeds": 5, "repetitions": 3, "draws": 0, "greedy": False}
+    assert written["protocol"] == {
+        "first_seed": 200_000,
+        "seeds": 5,
+        "repetitions": 3,
+        "action_seed": 0,
+        "greedy": False,
+    }
     gru, none = written["experiments"]
     means = []
     for run in gru["runs"]:
@@ -183,13 +189,13 @@ def test_results_are_written_and_read(runs: Path, tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "nothing to evaluate; give a checkpoint"),
-        ("nowhere", "no file or folder nowhere; give a checkpoint"),
-        (".", "no checkpoint in .; give a run's folder"),
-        ("text.pt", "text.pt is not a checkpoint of this version's `endless-train`"),
-        ("text.pt --seeds 0", "0 seeds, 3 times each: give 1 or more of both"),
-        ("text.pt --json none/results.json", "no folder none to write none/results.json to; make it first"),
-        ("text.pt --device nonsense", "no device `nonsense`"),
+        ("", "no path given; expected checkpoint files"),
+        ("nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
+        (".", "no checkpoint in .; expected the folder of a run"),
+        ("text.pt", "text.pt is not a checkpoint of this version of endless-train"),
+        ("text.pt --seeds 0", "--seeds and --repetitions must be 1 or more, got 0 and 3"),
+        ("text.pt --json none/results.json", "cannot write none/results.json: no folder none"),
+        ("text.pt --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
     ],
 )
 def test_errors_are_one_line(

@@ -1,4 +1,4 @@
-"""Every loss against a value worked out by hand or a slow, plain computation."""
+"""Advantages and losses against values computed by hand or by a plain loop."""
 
 import math
 from dataclasses import replace
@@ -8,10 +8,10 @@ import torch
 from agents_helpers import BRANCHES, ends, make, observations, play, settings
 
 from endless_gym.agents import losses
-from endless_gym.agents.agent import Agent, Evaluated
+from endless_gym.agents.agent import Agent, AgentOutput
 from endless_gym.agents.encoders import FRAME
-from endless_gym.agents.memory import Plan
-from endless_gym.agents.ppo import decayed, learn, minibatch_loss
+from endless_gym.agents.memory import Minibatch
+from endless_gym.agents.ppo import learn, linear_decay, minibatch_loss
 from endless_gym.agents.rollout import Segment
 from endless_gym.agents.settings import PPO, Environment
 
@@ -19,18 +19,18 @@ GAMMA, LAMBDA = 0.9, 0.8
 
 
 def test_advantages_by_hand() -> None:
-    """Three steps, of which the second ends its episode."""
+    """Three steps; the second one ends its episode."""
     rewards, values = torch.tensor([[1.0], [2.0], [4.0]]), torch.tensor([[0.5], [1.0], [3.0]])
     dones = torch.tensor([[False], [True], [False]])
     advantages = losses.generalised_advantages(rewards, values, dones, torch.tensor([10.0]), GAMMA, LAMBDA)
     third = 4.0 + 0.9 * 10.0 - 3.0  # 10
-    second = 2.0 - 1.0  # its episode ends: nothing follows
+    second = 2.0 - 1.0  # end of the episode: no bootstrapping
     first = 1.0 + 0.9 * 1.0 - 0.5 + 0.9 * 0.8 * second  # 2.12
     torch.testing.assert_close(advantages.flatten(), torch.tensor([first, second, third]))
 
 
-def test_advantages_are_sums_of_errors() -> None:
-    """By definition: errors of one step, discounted with gamma * lambda to the end of the episode or the segment."""
+def test_advantages_are_discounted_sums_of_td_errors() -> None:
+    """By definition: TD errors, discounted with gamma * lambda, up to the end of the episode or the segment."""
     steps, envs = 12, 4
     rewards, values, last = torch.randn(steps, envs), torch.randn(steps, envs), torch.randn(envs)
     dones = ends(steps, envs)
@@ -52,8 +52,8 @@ def test_advantages_are_sums_of_errors() -> None:
     ("ratio", "advantage", "expected"),
     [
         (1.0, 2.0, -2.0),
-        (1.5, 2.0, -2.2),  # clipped to 1.1: no reward for going further
-        (0.5, 2.0, -1.0),  # not clipped: the way back is open
+        (1.5, 2.0, -2.2),  # clipped to 1.1
+        (0.5, 2.0, -1.0),  # not clipped
         (1.5, -2.0, 3.0),  # not clipped
         (0.5, -2.0, 1.8),  # clipped to 0.9
     ],
@@ -64,7 +64,7 @@ def test_policy_loss_of_one_branch(ratio: float, advantage: float, expected: flo
 
 
 def test_policy_loss_clips_each_branch_and_takes_the_mean() -> None:
-    """Ratios 1.5 and 0.5 are 0.75 together, but are clipped each: (1.1 + 0.5) / 2."""
+    """The ratios 1.5 and 0.5, with the product 0.75, are clipped separately: (1.1 + 0.5) / 2."""
     new, old = torch.tensor([[1.5, 0.5]]).log(), torch.zeros(1, 2)
     assert float(losses.policy_loss(new, old, torch.tensor([1.0]), 0.1)) == pytest.approx(-0.8, abs=1e-6)
 
@@ -73,8 +73,8 @@ def test_policy_loss_clips_each_branch_and_takes_the_mean() -> None:
     ("value", "old", "target", "expected"),
     [
         (1.0, 1.0, 3.0, 4.0),
-        (2.0, 1.0, 3.0, 1.9**2),  # clipped to 1.1, which is further away
-        (5.0, 1.0, 1.0, 16.0),  # clipped to 1.1, which is nearer: the larger error counts
+        (2.0, 1.0, 3.0, 1.9**2),  # clipped to 1.1, which has the larger error
+        (5.0, 1.0, 1.0, 16.0),  # clipped to 1.1, which has the smaller error
         (1.05, 1.0, 0.0, 1.05**2),  # within the range
     ],
 )
@@ -90,18 +90,18 @@ def test_losses_are_means() -> None:
 
 
 def test_entropy_and_log_prob_by_hand() -> None:
-    """Of two branches: entropies are summed, log-probabilities stay apart."""
+    """Two branches: entropies are summed, log-probabilities are returned per branch."""
     logits = [torch.tensor([[0.5, 0.25, 0.25]]).log(), torch.tensor([[0.9, 0.1]]).log()]
-    evaluated = Evaluated(logits, torch.zeros(1), None, None)
+    output = AgentOutput(logits, torch.zeros(1), None, None)
     one = -(0.5 * math.log(0.5) + 0.5 * math.log(0.25))
     two = -(0.9 * math.log(0.9) + 0.1 * math.log(0.1))
-    assert float(evaluated.entropy()) == pytest.approx(one + two, abs=1e-6)
-    chosen = evaluated.log_prob(torch.tensor([[2, 1]]))
+    assert float(output.entropy()) == pytest.approx(one + two, abs=1e-6)
+    chosen = output.log_prob(torch.tensor([[2, 1]]))
     torch.testing.assert_close(chosen, torch.tensor([[math.log(0.25), math.log(0.1)]]))
 
 
-def test_reconstruction_is_binary_cross_entropy() -> None:
-    """-[o log p + (1 - o) log(1 - p)] of each number of the frame, whose axes the head's output has in another order."""
+def test_reconstruction_loss_is_binary_cross_entropy() -> None:
+    """-[o log p + (1 - o) log(1 - p)] for each number of the frame; frame and logits have different axis orders."""
     frames = torch.randint(0, 256, (2, 84, 84, 3), dtype=torch.uint8)
     logits = torch.randn(2, 3, 84, 84, dtype=torch.float64)
     total = 0.0
@@ -112,7 +112,7 @@ def test_reconstruction_is_binary_cross_entropy() -> None:
         expected = -(o * math.log(p) + (1 - o) * math.log(1 - p))
         patched = torch.zeros(1, 3, 84, 84, dtype=torch.float64)
         patched[0, c, x, y] = single
-        # All other numbers are half and half, and cost log 2 each.
+        # All other numbers have p = 1/2 and contribute log 2 each.
         others = torch.full((1, 84, 84, 3), 0, dtype=torch.uint8)
         others[0, x, y, c] = frames[n, x, y, c]
         loss = float(losses.reconstruction_loss(patched, others)) * 84 * 84 * 3 - (84 * 84 * 3 - 1) * math.log(2)
@@ -135,24 +135,24 @@ def test_explained_variance() -> None:
 
 
 def test_decay() -> None:
-    assert decayed(2.75e-4, 1e-5, 0, 10_000) == 2.75e-4
-    assert decayed(2.75e-4, 1e-5, 5_000, 10_000) == pytest.approx((2.75e-4 + 1e-5) / 2)
-    assert decayed(2.75e-4, 1e-5, 10_000, 10_000) == 1e-5
-    assert decayed(2.75e-4, 1e-5, 99_999, 10_000) == 1e-5
+    assert linear_decay(2.75e-4, 1e-5, 0, 10_000) == 2.75e-4
+    assert linear_decay(2.75e-4, 1e-5, 5_000, 10_000) == pytest.approx((2.75e-4 + 1e-5) / 2)
+    assert linear_decay(2.75e-4, 1e-5, 10_000, 10_000) == 1e-5
+    assert linear_decay(2.75e-4, 1e-5, 99_999, 10_000) == 1e-5
 
 
 def played(kind: str, **changes: object) -> tuple[Agent, Segment, object]:
-    """A segment that the agent played, with rewards and ground truths drawn at random."""
+    """A segment collected by the agent, with random rewards and ground truths."""
     steps, envs = 16, 4
     agent = make(kind, **changes)
     memory, observed, done = agent.initial_memory(envs), observations(steps, envs), ends(steps, envs)
-    first, action, log_prob, value = play(agent, memory, observed, done)
+    reset_mask, action, log_prob, value = play(agent, memory, observed, done)
     draws = torch.Generator().manual_seed(2)
     segment = Segment(
         observation={"features": observed},
-        first=first,
+        reset_mask=reset_mask,
         action=action,
-        # Not quite the current policy's, as in a later epoch.
+        # Perturbed, as in a later epoch.
         log_prob=log_prob + 0.2 * torch.randn(log_prob.shape, generator=draws),
         value=value + 0.2 * torch.randn(value.shape, generator=draws),
         reward=torch.randn(steps, envs, generator=draws),
@@ -165,8 +165,8 @@ def played(kind: str, **changes: object) -> tuple[Agent, Segment, object]:
 
 @pytest.mark.parametrize("normalisation", ["none", "minibatch"])
 @pytest.mark.parametrize("kind", ["none", "gru", "trxl"])
-def test_minibatch_loss_is_the_paper_s_sum(kind: str, normalisation: str) -> None:
-    """Step by step, from the network's outputs."""
+def test_minibatch_loss_is_the_weighted_sum(kind: str, normalisation: str) -> None:
+    """Computed in a loop over the steps from the outputs of the network."""
     ppo = replace(
         settings(kind).ppo, ground_truth_coefficient=0.3, advantage_normalisation=normalisation, clip_range=0.1
     )
@@ -174,36 +174,36 @@ def test_minibatch_loss_is_the_paper_s_sum(kind: str, normalisation: str) -> Non
     agent = Agent(settings(kind, ppo=ppo), {"features": (6,)}, BRANCHES, ground_truth=2)
     steps, envs = 16, 4
     memory, observed, done = agent.initial_memory(envs), observations(steps, envs), ends(steps, envs)
-    first, action, log_prob, value = play(agent, memory, observed, done)
+    reset_mask, action, log_prob, value = play(agent, memory, observed, done)
     old_log_prob, old_value = log_prob + 0.2 * torch.randn_like(log_prob), value + 0.2 * torch.randn_like(value)
     truth = torch.randn(steps, envs, 2)
     none = torch.zeros(steps, envs)
     segment = Segment(
-        {"features": observed}, first, action, old_log_prob, old_value, none, done, truth, torch.zeros(envs)
+        {"features": observed}, reset_mask, action, old_log_prob, old_value, none, done, truth, torch.zeros(envs)
     ).flat()
     advantages, returns = torch.randn(steps * envs), torch.randn(steps * envs)
-    plan = agent.memory.plan([memory.state], first, 3, torch.Generator().manual_seed(0))[1]
-    loss, parts = minibatch_loss(agent, segment, plan, advantages, returns, ppo, 0.05)
+    minibatch = agent.memory.minibatches([memory.state], reset_mask, 3, torch.Generator().manual_seed(0))[1]
+    loss, parts = minibatch_loss(agent, segment, minibatch, advantages, returns, ppo, 0.05)
 
-    chosen = plan.steps.tolist()
+    chosen = minibatch.indices.tolist()
     mean = sum(float(advantages[i]) for i in chosen) / len(chosen)
     deviation = math.sqrt(sum((float(advantages[i]) - mean) ** 2 for i in chosen) / (len(chosen) - 1))
-    evaluated = agent.evaluate({"features": segment.observation["features"][plan.steps]}, plan)
+    output = agent({"features": segment.observation["features"][minibatch.indices]}, minibatch)
     total = 0.0
     for row, i in enumerate(chosen):
         advantage = float(advantages[i])
         if normalisation == "minibatch":
             advantage = (advantage - mean) / deviation
-        for branch, logits in enumerate(evaluated.logits):
+        for branch, logits in enumerate(output.logits):
             p = torch.softmax(logits[row], 0)
             ratio = float(p[segment.action[i, branch]]) / math.exp(float(segment.log_prob[i, branch]))
             clipped = min(max(ratio, 0.9), 1.1)
             total -= min(ratio * advantage, clipped * advantage) / len(BRANCHES)
             total += 0.05 * float((p * p.log()).sum())
-        v, old, target = float(evaluated.value[row]), float(segment.value[i]), float(returns[i])
+        v, old, target = float(output.value[row]), float(segment.value[i]), float(returns[i])
         v_clipped = min(max(v, old - 0.1), old + 0.1)
         total += 0.5 * max((v - target) ** 2, (v_clipped - target) ** 2)
-        error = evaluated.ground_truth[row] - segment.ground_truth[i]
+        error = output.ground_truth[row] - segment.ground_truth[i]
         total += 0.3 * float((error**2).mean())
     assert float(loss) == pytest.approx(total / len(chosen), abs=1e-4)
     assert 0 < float(parts["clip_fraction"]) < 1
@@ -211,7 +211,7 @@ def test_minibatch_loss_is_the_paper_s_sum(kind: str, normalisation: str) -> Non
 
 
 def test_reconstruction_is_a_term_of_the_loss() -> None:
-    """What the loss has more with the coefficient is its multiple of the mean binary cross entropy, pixel by pixel."""
+    """The coefficient adds its multiple of the mean binary cross-entropy to the loss."""
     shapes, frames = {FRAME: (84, 84, 3)}, torch.randint(0, 256, (4, 84, 84, 3), dtype=torch.uint8)
     given = settings("none")
     given = replace(
@@ -224,10 +224,10 @@ def test_reconstruction_is_a_term_of_the_loss() -> None:
     terms = []
     for coefficient in (0.1, 0.0):
         ppo = replace(given.ppo, reconstruction_coefficient=coefficient)
-        loss, parts = minibatch_loss(agent, segment, Plan(torch.arange(4)), numbers, numbers, ppo, 0.05)
+        loss, parts = minibatch_loss(agent, segment, Minibatch(torch.arange(4)), numbers, numbers, ppo, 0.05)
         terms.append(float(loss))
-    evaluated = agent.evaluate({FRAME: frames}, Plan(torch.arange(4)))
-    p = torch.sigmoid(evaluated.frame.detach().double())
+    output = agent({FRAME: frames}, Minibatch(torch.arange(4)))
+    p = torch.sigmoid(output.frame.detach().double())
     target = frames.permute(0, 3, 1, 2).double() / 255.0
     entropy = float(-(target * p.log() + (1 - target) * (1 - p).log()).mean())
     assert float(parts["reconstruction_loss"]) == pytest.approx(entropy, rel=1e-4)
@@ -235,7 +235,7 @@ def test_reconstruction_is_a_term_of_the_loss() -> None:
 
 
 def test_learning_is_adamw_on_clipped_gradients() -> None:
-    """One epoch of one minibatch, against the same step taken by hand."""
+    """One epoch of one minibatch, against the same optimizer step computed by hand."""
     agent, segment, state = played("gru")
     ppo = PPO(epochs=1, minibatches=1, steps=16, max_gradient_norm=0.01, decay_updates=10)
     other = make("gru")
@@ -248,10 +248,10 @@ def test_learning_is_adamw_on_clipped_gradients() -> None:
     advantages = losses.generalised_advantages(
         segment.reward, segment.value, segment.done, segment.last_value, ppo.gamma, ppo.gae_lambda
     )
-    (plan,) = other.memory.plan([state], segment.first, 1, torch.Generator().manual_seed(0))
+    (minibatch,) = other.memory.minibatches([state], segment.reset_mask, 1, torch.Generator().manual_seed(0))
     returns = (advantages + segment.value).flatten()
     loss, _ = minibatch_loss(
-        other, segment.flat(), plan, advantages.flatten(), returns, ppo, measures["entropy_coefficient"]
+        other, segment.flat(), minibatch, advantages.flatten(), returns, ppo, measures["entropy_coefficient"]
     )
     loss.backward()
     norm = math.sqrt(sum(float(p.grad.square().sum()) for p in other.parameters() if p.grad is not None))
@@ -259,13 +259,13 @@ def test_learning_is_adamw_on_clipped_gradients() -> None:
     rate = measures["learning_rate"]
     for (name, learned), before in zip(agent.named_parameters(), other.parameters(), strict=True):
         gradient = before.grad * (0.01 / (norm + 1e-6))
-        # AdamW's first step: decay of 0.01, then the gradient over its own size.
+        # First step of AdamW: weight decay of 0.01, then the gradient divided by its absolute value.
         expected = before * (1 - rate * 0.01) - rate * gradient / (gradient.abs() + 1e-8)
         torch.testing.assert_close(learned, expected, rtol=1e-4, atol=1e-6, msg=name)
 
 
 def test_batch_normalisation_is_over_the_whole_segment() -> None:
-    """With one minibatch both kinds are the same; with several they differ."""
+    """With one minibatch both kinds are equal; with several they differ."""
     results = {}
     for kind in ("batch", "minibatch", "none"):
         for minibatches in (1, 4):
@@ -279,11 +279,11 @@ def test_batch_normalisation_is_over_the_whole_segment() -> None:
     assert not torch.allclose(results["batch", 1], results["none", 1])
 
 
-def test_plan_is_only_where_to_look() -> None:
-    """A plan's steps say which rows are taken: the same loss, whatever the order of a memoryless agent's rows."""
+def test_loss_does_not_depend_on_the_order_of_steps() -> None:
+    """Without memory, the loss of a minibatch is invariant to a permutation of its steps."""
     agent, segment, _ = played("none")
     flat, numbers = segment.flat(), torch.arange(64)
     arguments = (torch.randn(64), torch.randn(64), PPO(), 0.01)
-    one, _ = minibatch_loss(agent, flat, Plan(numbers), *arguments)
-    two, _ = minibatch_loss(agent, flat, Plan(numbers.flip(0)), *arguments)
+    one, _ = minibatch_loss(agent, flat, Minibatch(numbers), *arguments)
+    two, _ = minibatch_loss(agent, flat, Minibatch(numbers.flip(0)), *arguments)
     torch.testing.assert_close(one, two)

@@ -1,4 +1,4 @@
-"""The memories: what they compute, against plain references, and that nothing leaks from the future or another episode."""
+"""The memories: their outputs against plain references, and that no information leaks from the future or other episodes."""
 
 import math
 
@@ -7,7 +7,7 @@ import torch
 from agents_helpers import BRANCHES, ends, make, observations, play, settings, transformer
 
 from endless_gym.agents.agent import Agent
-from endless_gym.agents.memory import shares
+from endless_gym.agents.memory import balanced_split
 from endless_gym.agents.settings import PRESETS, Recurrence
 from endless_gym.agents.transformer import Block, Gate, TransformerMemory
 
@@ -31,7 +31,7 @@ KINDS = {
     "trxl, one sequence": ("trxl", transformer(sequence_length=64)),
     "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
 }
-REMEMBERING = [name for name in KINDS if name not in ("none", "position")]
+WITH_STATE = [name for name in KINDS if name not in ("none", "position")]
 
 
 @pytest.fixture(params=KINDS)
@@ -41,98 +41,101 @@ def agent(request: pytest.FixtureRequest) -> Agent:
 
 
 @pytest.mark.parametrize("minibatches", [1, 3])
-def test_learning_sees_what_acting_saw(agent: Agent, minibatches: int) -> None:
-    """The same log-probabilities and values, for each step of the second of two segments, once."""
+def test_forward_equals_act(agent: Agent, minibatches: int) -> None:
+    """Equal log-probabilities and values for each step of the second of two segments; each step is in one minibatch."""
     memory, done = agent.initial_memory(ENVS), ends(2 * STEPS, ENVS)
     observed = observations(2 * STEPS, ENVS)
     play(agent, memory, observed[:STEPS], done[:STEPS])
-    acted_on = []
-    agent.observer.observe, observe = _recording(agent.observer.observe, acted_on), agent.observer.observe
-    first, action, log_prob, value = play(agent, memory, observed[STEPS:], done[STEPS:])
-    agent.observer.observe = observe
-    seen = {key: torch.stack([step[key] for step in acted_on]).flatten(0, 1) for key in acted_on[0]}
-    plans = agent.memory.plan([memory.state], first, minibatches, torch.Generator().manual_seed(0))
-    steps = torch.cat([plan.steps for plan in plans])
-    assert sorted(steps.tolist()) == list(range(STEPS * ENVS))
-    assert len(plans) == minibatches
-    for plan in plans:
-        evaluated = agent.evaluate({key: part[plan.steps] for key, part in seen.items()}, plan)
-        assert_close(evaluated.value, value.flatten()[plan.steps])
-        assert_close(evaluated.log_prob(action.flatten(0, 1)[plan.steps]), log_prob.flatten(0, 1)[plan.steps])
+    observations_seen = []
+    agent.transform.apply, apply = _recording(agent.transform.apply, observations_seen), agent.transform.apply
+    reset_mask, action, log_prob, value = play(agent, memory, observed[STEPS:], done[STEPS:])
+    agent.transform.apply = apply
+    seen = {key: torch.stack([step[key] for step in observations_seen]).flatten(0, 1) for key in observations_seen[0]}
+    batches = agent.memory.minibatches([memory.state], reset_mask, minibatches, torch.Generator().manual_seed(0))
+    indices = torch.cat([minibatch.indices for minibatch in batches])
+    assert sorted(indices.tolist()) == list(range(STEPS * ENVS))
+    assert len(batches) == minibatches
+    for minibatch in batches:
+        output = agent({key: part[minibatch.indices] for key, part in seen.items()}, minibatch)
+        assert_close(output.value, value.flatten()[minibatch.indices])
+        assert_close(
+            output.log_prob(action.flatten(0, 1)[minibatch.indices]), log_prob.flatten(0, 1)[minibatch.indices]
+        )
 
 
-def test_groups_are_put_side_by_side() -> None:
+def test_groups_are_concatenated_along_the_environments() -> None:
     for kind in ("gru", "lstm", "trxl"):
         agent, observed, done = make(kind), observations(STEPS, 4), ends(STEPS, 4)
         memories = [agent.initial_memory(2) for _ in range(2)]
         parts = [play(agent, memories[g], observed[:, 2 * g : 2 * g + 2], done[:, 2 * g : 2 * g + 2]) for g in range(2)]
-        first, value = (torch.cat([part[i] for part in parts], dim=1) for i in (0, 3))
-        for plan in agent.memory.plan([m.state for m in memories], first, 2, torch.Generator().manual_seed(0)):
-            evaluated = agent.evaluate({"features": observed.flatten(0, 1)[plan.steps]}, plan)
-            assert_close(evaluated.value, value.flatten()[plan.steps])
+        reset_mask, value = (torch.cat([part[i] for part in parts], dim=1) for i in (0, 3))
+        states = [memory.state for memory in memories]
+        for minibatch in agent.memory.minibatches(states, reset_mask, 2, torch.Generator().manual_seed(0)):
+            output = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch)
+            assert_close(output.value, value.flatten()[minibatch.indices])
 
 
-@pytest.mark.parametrize("name", REMEMBERING)
-def test_no_leak_while_acting(name: str) -> None:
-    """An input reaches what comes after it in its own episode, in its own environment, and nothing else."""
+@pytest.mark.parametrize("name", WITH_STATE)
+def test_act_does_not_leak(name: str) -> None:
+    """An observation influences only the later steps of its own episode in its own environment."""
     kind, changes = KINDS[name]
     agent = make(kind, **changes)
     done = torch.zeros(STEPS, ENVS, dtype=torch.bool)
-    done[9, 1] = True  # the episode that the changed step belongs to has steps 0 to 9
+    done[9, 1] = True  # the changed step belongs to the episode of steps 0 to 9
     observed = observations(STEPS, ENVS)
     changed = observed.clone()
     changed[6, 1] += 1.0
     _, _, _, before = play(agent, agent.initial_memory(ENVS), observed, done)
     _, _, _, after = play(agent, agent.initial_memory(ENVS), changed, done)
     differs = before != after
-    may = torch.zeros_like(differs)
-    may[6:10, 1] = True
-    assert not differs[~may].any()
-    # The stack is four steps long: with it as with the others, all steps up to 9 are reached.
+    allowed = torch.zeros_like(differs)
+    allowed[6:10, 1] = True
+    assert not differs[~allowed].any()
+    # All later steps of the episode are influenced, also with the stack of four observations.
     assert differs[6:10, 1].all()
 
 
-# Stacks are made while acting: learning takes them as they are.
-@pytest.mark.parametrize("name", [name for name in REMEMBERING if KINDS[name][0] != "stack"])
-def test_no_leak_while_learning(name: str) -> None:
-    """The gradient of one step's value with regard to all observations: in its own episode, not after it, and its own."""
+# Frame stacks are made in `act`; `forward` takes the stacked observations.
+@pytest.mark.parametrize("name", [name for name in WITH_STATE if KINDS[name][0] != "stack"])
+def test_forward_does_not_leak(name: str) -> None:
+    """The gradient of one step's value with respect to all observations is nonzero only up to that step, within its episode."""
     kind, changes = KINDS[name]
     agent = make(kind, **changes)
     memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
     done[9, 1] = True
     observed = observations(STEPS, ENVS)
-    first, *_ = play(agent, memory, observed, done)
-    (plan,) = agent.memory.plan([memory.state], first, 1, torch.Generator().manual_seed(0))
-    flat = observed.flatten(0, 1)[plan.steps].requires_grad_()
-    value = agent.evaluate({"features": flat}, plan).value
-    (gradient,) = torch.autograd.grad(value[(plan.steps == 15 * ENVS + 1).nonzero().item()], flat)
-    reached = {(int(step) // ENVS, int(step) % ENVS) for step in plan.steps[gradient.abs().sum(-1) > 0]}
+    reset_mask, *_ = play(agent, memory, observed, done)
+    (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+    flat = observed.flatten(0, 1)[minibatch.indices].requires_grad_()
+    value = agent({"features": flat}, minibatch).value
+    (gradient,) = torch.autograd.grad(value[(minibatch.indices == 15 * ENVS + 1).nonzero().item()], flat)
+    reached = {(int(step) // ENVS, int(step) % ENVS) for step in minibatch.indices[gradient.abs().sum(-1) > 0]}
     assert (15, 1) in reached
     assert reached <= {(t, 1) for t in range(10, 16)}
     if kind in ("trxl", "gtrxl"):
-        # The episodic memory has no gradient.
+        # Cached tokens have no gradient.
         assert reached == {(15, 1)}
     else:
-        # Back to the start of the episode or of the sequence.
+        # Truncated BPTT: back to the start of the episode or of the sequence.
         length = changes.get("recurrence", settings(kind).recurrence).sequence_length
         assert reached == {(t, 1) for t in range(max(10, 15 - 15 % length), 16)}
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
-def test_cached_tokens_leak_nothing_while_learning(name: str) -> None:
-    """What a cached token may change: the next `window - 1` steps of its own episode."""
+def test_band_mask_of_cached_tokens(name: str) -> None:
+    """A cached token influences exactly the next `window - 1` steps of its own episode."""
     kind, changes = KINDS[name]
     agent = make(kind, **changes)
     window = agent.memory.settings.window
     memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
     done[13, 1] = True
     observed = observations(STEPS, ENVS)
-    first, *_ = play(agent, memory, observed, done)
+    reset_mask, *_ = play(agent, memory, observed, done)
 
     def values() -> torch.Tensor:
-        (plan,) = agent.memory.plan([memory.state], first, 1, torch.Generator().manual_seed(0))
-        value = agent.evaluate({"features": observed.flatten(0, 1)[plan.steps]}, plan).value
-        return torch.zeros(STEPS * ENVS).index_copy(0, plan.steps, value.detach()).view(STEPS, ENVS)
+        (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+        value = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch).value
+        return torch.zeros(STEPS * ENVS).index_copy(0, minibatch.indices, value.detach()).view(STEPS, ENVS)
 
     for step, last in ((6, 6 + window - 1), (11, 13)):
         before = values()
@@ -147,20 +150,20 @@ def test_cached_tokens_leak_nothing_while_learning(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
-@pytest.mark.parametrize("room", ["segments", "free"])
-def test_window_free_attention_is_the_windows(name: str, room: str) -> None:
-    """Transformer-XL against a plain loop: for each step and environment its own window, projected anew."""
+@pytest.mark.parametrize("recording", [True, False])
+def test_kv_cache_equals_a_loop_over_windows(name: str, recording: bool) -> None:
+    """Transformer-XL against a plain loop that projects the window of each step and environment separately."""
     kind, changes = KINDS[name]
     agent = make(kind, **changes)
     memory, steps = agent.initial_memory(ENVS), 5 * STEPS
     observed, done = observations(steps, ENVS), ends(steps, ENVS)
     outputs = []
     for step in range(steps):
-        # Without segments, the memory is moved to the front whenever it is full.
-        if room == "segments" and step % STEPS == 0:
+        # Without segments, the state is compacted whenever it is full.
+        if recording and step % STEPS == 0:
             agent.memory.begin_segment(memory.state, STEPS)
         outputs.append(agent.act({"features": observed[step]}, memory).value)
-        memory.forget(done[step])
+        memory.reset(done[step])
     expected = _plain_transformer(agent, observed, done)
     assert_close(torch.stack(outputs), expected)
 
@@ -169,7 +172,7 @@ def _plain_transformer(agent: Agent, observed: torch.Tensor, done: torch.Tensor)
     module: TransformerMemory = agent.memory
     values = torch.zeros(observed.shape[:2])
     for env in range(observed.shape[1]):
-        episode: list[list[torch.Tensor]] = []  # for each step of the episode the inputs of all blocks
+        episode: list[list[torch.Tensor]] = []  # the inputs of all blocks for each step of the episode
         for step in range(observed.shape[0]):
             with torch.no_grad():
                 x = module.embedding(agent.encoder({"features": observed[step, env : env + 1]}))[0]
@@ -240,15 +243,15 @@ def _plain_gate(gate: Gate, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     return (1 - z) * x + z * torch.tanh(w_g @ y + gate.from_reset.weight @ (r * x))
 
 
-def test_gru_cell_by_hand() -> None:
-    """One step of the GRU agent from the equations, with its weights."""
+def test_gru_cell_from_its_equations() -> None:
+    """One step of the GRU agent, computed from the equations of the GRU."""
     agent = make("gru")
     x = agent.memory.embedding(agent.encoder({"features": observations(1, 1)[0]}))[0]
     parts = agent.memory.recurrent
     hidden = torch.randn(16)
     memory = agent.initial_memory(1)
     memory.state.hidden[0, 0, 0] = hidden
-    memory.first[:] = False
+    memory.reset_mask[:] = False
     i_r, i_z, i_n = (parts.weight_ih_l0 @ x + parts.bias_ih_l0).split(16)
     h_r, h_z, h_n = (parts.weight_hh_l0 @ hidden + parts.bias_hh_l0).split(16)
     r, z = torch.sigmoid(i_r + h_r), torch.sigmoid(i_z + h_z)
@@ -257,41 +260,41 @@ def test_gru_cell_by_hand() -> None:
     assert_close(memory.state.hidden[0, 0, 0], expected.detach())
 
 
-def test_estimate_remembers_nothing() -> None:
+def test_bootstrap_value_does_not_change_the_memory() -> None:
     for kind in ("none", "position", "stack", "gru", "lstm", "trxl"):
         agent, observed = make(kind), observations(4, ENVS)
         memory = agent.initial_memory(ENVS)
         for step in range(3):
             agent.act({"features": observed[step]}, memory)
-        once = agent.estimate({"features": observed[3]}, memory)
-        assert torch.equal(agent.estimate({"features": observed[3]}, memory), once)
+        once = agent.bootstrap_value({"features": observed[3]}, memory)
+        assert torch.equal(agent.bootstrap_value({"features": observed[3]}, memory), once)
         assert_close(agent.act({"features": observed[3]}, memory).value, once)
 
 
-def test_memory_travels_through_a_checkpoint() -> None:
+def test_state_dict_of_the_memory() -> None:
     for kind, changes in KINDS.values():
         agent, observed, done = make(kind, **changes), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
         memory, other = agent.initial_memory(ENVS), agent.initial_memory(ENVS)
         play(agent, memory, observed[:STEPS], done[:STEPS])
-        other.load(memory.tensors())
+        other.load_state_dict(memory.state_dict())
         one, two = (play(agent, m, observed[STEPS:], done[STEPS:])[3] for m in (memory, other))
         assert torch.equal(one, two)
 
 
-def test_weights_that_change_reach_the_cached_tokens() -> None:
-    """Keys and values are made anew at each segment."""
+def test_kv_cache_is_recomputed_when_a_segment_begins() -> None:
+    """After an update of the weights, the outputs are those of the new weights."""
     agent, observed, done = make("trxl"), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
     memory = agent.initial_memory(ENVS)
     play(agent, memory, observed[:STEPS], done[:STEPS])
     for block in agent.memory.blocks:
         block.attention.keys.weight.data.mul_(-1)
-    first, _, _, value = play(agent, memory, observed[STEPS:], done[STEPS:])
-    (plan,) = agent.memory.plan([memory.state], first, 1, torch.Generator().manual_seed(0))
-    evaluated = agent.evaluate({"features": observed[STEPS:].flatten(0, 1)[plan.steps]}, plan)
-    assert_close(evaluated.value, value.flatten()[plan.steps])
+    reset_mask, _, _, value = play(agent, memory, observed[STEPS:], done[STEPS:])
+    (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+    output = agent({"features": observed[STEPS:].flatten(0, 1)[minibatch.indices]}, minibatch)
+    assert_close(output.value, value.flatten()[minibatch.indices])
 
 
-def test_a_compiled_agent_says_the_same() -> None:
+def test_compiled_agent_has_the_same_outputs() -> None:
     agent, observed, done = make("trxl"), observations(STEPS, ENVS), ends(STEPS, ENVS)
     _, action, _, value = play(agent, agent.initial_memory(ENVS), observed, done)
     parameters = agent.state_dict().keys()
@@ -302,12 +305,12 @@ def test_a_compiled_agent_says_the_same() -> None:
     assert agent.state_dict().keys() == parameters
 
 
-def test_shares_are_of_about_the_same_size() -> None:
+def test_balanced_split() -> None:
     sizes = [1, 30, 5, 5, 9, 2, 2, 2, 8, 8, 8, 20]
-    parts = shares(sizes, 4, torch.Generator().manual_seed(1))
+    parts = balanced_split(sizes, 4, torch.Generator().manual_seed(1))
     assert sorted(torch.cat(parts).tolist()) == list(range(len(sizes)))
     assert all(10 <= sum(sizes[i] for i in part) <= 40 for part in parts)
-    assert len(shares([1], 4, torch.Generator())) == 1
+    assert len(balanced_split([1], 4, torch.Generator())) == 1
 
 
 def test_stack_of_grey_frames() -> None:
@@ -318,20 +321,20 @@ def test_stack_of_grey_frames() -> None:
     for colour in colours:
         frames = colour.expand(2, 84, 84, 3)
         stacks.append(agent.act({"visual_observation": frames}, memory).observation["visual_observation"])
-        memory.forget(torch.tensor([False, len(stacks) == 3]))
+        memory.reset(torch.tensor([False, len(stacks) == 3]))
     assert stacks[0].shape == (2, 84, 84, 4)
     assert stacks[0][0, 5, 7].tolist() == [76] * 4  # 0.299 * 255
     assert stacks[2][0, 5, 7].tolist() == [76, 76, 150, 29]
     assert stacks[4][0, 0, 0].tolist() == [150, 29, 255, 18]
-    assert stacks[4][1, 0, 0].tolist() == [255, 255, 255, 18]  # its episode began with the fourth frame
+    assert stacks[4][1, 0, 0].tolist() == [255, 255, 255, 18]  # its episode starts with the fourth frame
 
 
-def test_positions_are_told_in_turns_of_sine_and_cosine() -> None:
+def test_position_encoding_alternates_sine_and_cosine() -> None:
     agent, observed = make("position"), observations(3, 2)
     memory = agent.initial_memory(2)
     for step in range(3):
         seen = agent.act({"features": observed[step]}, memory).observation["position"]
-        memory.forget(torch.tensor([False, step == 0]))
+        memory.reset(torch.tensor([False, step == 0]))
     expected = [f(2 / 10_000 ** (2 * i / 16)) for i in range(8) for f in (math.sin, math.cos)]
     assert_close(seen[0], torch.tensor(expected))
     assert_close(seen[1, :2], torch.tensor([math.sin(1), math.cos(1)]))
@@ -341,9 +344,9 @@ def assert_close(one: torch.Tensor, two: torch.Tensor) -> None:
     torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
 
 
-def _recording(observe, seen):
-    def recorded(observation, state, first):
-        result = observe(observation, state, first)
+def _recording(apply, seen):
+    def recorded(observation, state, reset_mask):
+        result = apply(observation, state, reset_mask)
         seen.append(result[0])
         return result
 

@@ -1,4 +1,4 @@
-"""The network: its size, its heads, its options and presets."""
+"""The network: number of parameters, heads, settings and presets."""
 
 import math
 from dataclasses import asdict, replace
@@ -10,9 +10,9 @@ from agents_helpers import BRANCHES, make, settings, transformer
 
 from endless_gym import spec
 from endless_gym.agents.agent import Agent, make_agent
-from endless_gym.agents.encoders import FRAMES_IN_PIECE, AtariEncoder
+from endless_gym.agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
 from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
-from endless_gym.agents.memory import Plan
+from endless_gym.agents.memory import Minibatch
 from endless_gym.agents.settings import PRESETS, Recurrence, Settings, Transformer, from_dict, to_dict
 from endless_gym.agents.transformer import Block, Gate, TransformerMemory
 
@@ -45,7 +45,7 @@ def test_numbers_of_parameters(agent: str, changes: dict, count: int) -> None:
     assert made.num_parameters == count
 
 
-def test_paper_is_the_paper_s_table() -> None:
+def test_preset_paper_equals_the_table_of_the_paper() -> None:
     """Hyperparameters of the column `Final`."""
     ppo, recurrence, trxl = PAPER.ppo, PAPER.recurrence, PAPER.transformer
     assert PAPER.environment.num_envs == 32
@@ -88,7 +88,7 @@ def test_paper_is_the_paper_s_table() -> None:
 def test_window_and_positions_follow_the_longest_episode(
     env: str, option: tuple[str, ...], window: int, positions: int
 ) -> None:
-    given = replace(PAPER, env=env, agent="trxl", environment=replace(PAPER.environment, option=option)).checked()
+    given = replace(PAPER, env=env, agent="trxl", environment=replace(PAPER.environment, option=option)).validated()
     assert (given.window(), given.positions()) == (window, positions)
     memory = make_agent(given, spec(env)).memory
     assert isinstance(memory, TransformerMemory)
@@ -97,7 +97,7 @@ def test_window_and_positions_follow_the_longest_episode(
     assert (fixed.window(), fixed.positions()) == (9, 11)
 
 
-def test_throughput_sees_as_many_steps_in_many_more_environments() -> None:
+def test_preset_throughput_has_more_environments_and_equal_steps_per_update() -> None:
     given = PRESETS["throughput"]
     assert (given.environment.num_envs, given.ppo.steps) == (512, 32)
     assert given.environment.num_envs * given.ppo.steps == PAPER.environment.num_envs * PAPER.ppo.steps
@@ -105,7 +105,7 @@ def test_throughput_sees_as_many_steps_in_many_more_environments() -> None:
     assert replace(given.ppo, steps=PAPER.ppo.steps) == PAPER.ppo
 
 
-def test_old_differs_in_its_column_alone() -> None:
+def test_preset_old_differs_only_in_its_column() -> None:
     old = PRESETS["old"]
     assert (old.ppo.gamma, old.ppo.clip_range, old.ppo.value_coefficient) == (0.99, 0.2, 0.25)
     assert (old.ppo.learning_rate, old.ppo.final_learning_rate) == (3.0e-4, 1.0e-4)
@@ -122,35 +122,38 @@ def test_old_differs_in_its_column_alone() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_settings_travel_as_json(name: str) -> None:
+def test_settings_round_trip_through_dicts(name: str) -> None:
     given = replace(PRESETS[name], environment=replace(PAPER.environment, option=("command_count=[2]",)))
-    assert from_dict(to_dict(given)) == given.checked()
+    assert from_dict(to_dict(given)) == given.validated()
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": replace(PAPER.environment, num_envs=31)}, "31 environments do not divide into 2 groups"),
-        ({"environment": replace(PAPER.environment, option=("a",))}, "`a`: give NAME=VALUE"),
-        ({"environment": replace(PAPER.environment, option=("a=x",))}, "`a=x`: give NAME=VALUE"),
-        ({"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100)}, "100 steps do not divide into sequences of 64"),
-        ({"transformer": Transformer(window=1)}, "a window of 1 has no past"),
-        ({"transformer": Transformer(width=100, heads=3)}, "multiple of twice the 3 heads"),
-        ({"transformer": Transformer(query_encoding=True, positional_encoding="relative")}, "not relative"),
-        ({"ppo": replace(PAPER.ppo, epochs=0)}, "--ppo.epochs is 0; give 1 or more"),
-        ({"ppo": replace(PAPER.ppo, decay_updates=0)}, "--ppo.decay-updates is 0; give 1 or more"),
-        ({"transformer": Transformer(width=0)}, "--transformer.width is 0; give 1 or more"),
-        ({"threads": -1}, "--threads is -1; give 0 or more"),
-        ({"env": "Nothing-v0"}, "no environment `Nothing-v0`"),
+        ({"environment": replace(PAPER.environment, num_envs=31)}, "got 31 environments and 2 groups"),
+        ({"environment": replace(PAPER.environment, option=("a",))}, "must be NAME=VALUE .* got `a`"),
+        ({"environment": replace(PAPER.environment, option=("a=x",))}, "must be NAME=VALUE .* got `a=x`"),
+        ({"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100)}, "got 100 steps and sequences of 64"),
+        ({"transformer": Transformer(window=1)}, "window must be 0 .* or 2 or more, got 1"),
+        (
+            {"transformer": Transformer(width=100, heads=3)},
+            "multiple of twice --transformer.heads, got width 100 and 3 heads",
+        ),
+        ({"transformer": Transformer(query_encoding=True, positional_encoding="relative")}, "got relative"),
+        ({"ppo": replace(PAPER.ppo, epochs=0)}, "--ppo.epochs must be 1 or more, got 0"),
+        ({"ppo": replace(PAPER.ppo, decay_updates=0)}, "--ppo.decay-updates must be 1 or more, got 0"),
+        ({"transformer": Transformer(width=0)}, "--transformer.width must be 1 or more, got 0"),
+        ({"threads": -1}, "--threads must be 0 or more, got -1"),
+        ({"env": "Nothing-v0"}, "unknown environment id `Nothing-v0`"),
         (
             {"env": "MortarMayhem-v0", "environment": replace(PAPER.environment, option=("command_count=3",))},
-            "no episode's length follows from {'command_count': 3}",
+            "the reset parameters {'command_count': 3} determine no episode length",
         ),
     ],
 )
-def test_impossible_settings_are_refused(changes: dict, message: str) -> None:
+def test_invalid_settings_are_rejected(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        replace(PAPER, **changes).checked()
+        replace(PAPER, **changes).validated()
 
 
 def test_options_are_json() -> None:
@@ -158,59 +161,59 @@ def test_options_are_json() -> None:
     assert given.options() == {"a": [1, 2], "b": True, "c": False, "d": 0.5}
 
 
-def test_heads_that_cannot_be() -> None:
-    with pytest.raises(ValueError, match="no ground truth"):
+def test_heads_without_their_targets_are_rejected() -> None:
+    with pytest.raises(ValueError, match=r"needs a ground truth, and .* has none"):
         make("gru", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
-    with pytest.raises(ValueError, match="no frames"):
+    with pytest.raises(ValueError, match="needs frames, and the observation has only features"):
         make("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
 
 
-def test_atari_encoder_sees_frames_as_they_are() -> None:
-    """Against the convolutions of frames that were made float and transposed by hand."""
-    encoder, frames = AtariEncoder(3), torch.randint(0, 256, (FRAMES_IN_PIECE + 2, 84, 84, 3), dtype=torch.uint8)
+def test_atari_encoder_scales_and_permutes_frames() -> None:
+    """Against the same convolutions of frames that are converted and transposed by hand."""
+    encoder, frames = AtariEncoder(3), torch.randint(0, 256, (FRAMES_PER_CHUNK + 2, 84, 84, 3), dtype=torch.uint8)
     x = torch.zeros(len(frames), 3, 84, 84)
     for channel in range(3):
         x[:, channel] = frames[:, :, :, channel].float() / 255
     for layer in encoder.convolutions:
         x = layer(x)
-    assert x.shape == (FRAMES_IN_PIECE + 2, 3136)
+    assert x.shape == (FRAMES_PER_CHUNK + 2, 3136)
     torch.testing.assert_close(encoder(frames), x, rtol=1e-4, atol=1e-5)
 
 
-def test_policy_starts_nearly_uniform_and_draws_what_it_says() -> None:
+def test_initial_policy_is_nearly_uniform_and_sampling_follows_it() -> None:
     agent = make("none")
     memory, rows = agent.initial_memory(20_000), torch.randn(1, 6).expand(20_000, 6)
-    acted = agent.act({"features": rows}, memory, torch.Generator().manual_seed(0))
+    output = agent.act({"features": rows}, memory, torch.Generator().manual_seed(0))
     for branch, choices in enumerate(BRANCHES):
         for choice in range(choices):
-            drawn = acted.action[:, branch] == choice
-            expected = float(acted.log_prob[drawn][0, branch].exp())
+            drawn = output.action[:, branch] == choice
+            expected = float(output.log_prob[drawn][0, branch].exp())
             # Five standard deviations.
             assert abs(float(drawn.float().mean()) - expected) < 5 * math.sqrt(expected * (1 - expected) / 20_000)
     greedy = agent.act({"features": rows}, agent.initial_memory(20_000), greedy=True)
-    assert (greedy.log_prob >= acted.log_prob).all()
+    assert (greedy.log_prob >= output.log_prob).all()
     fresh = PolicyHead(64, 64, (3, 3))(torch.randn(100, 64))
     assert all((logits.softmax(-1) - 1 / 3).abs().max() < 0.15 for logits in fresh)
 
 
-def test_reconstruction_from_the_memory_s_output() -> None:
-    """The head's gradient reaches the memory; the frame has the observation's shape."""
+def test_reconstruction_head_takes_the_output_of_the_memory() -> None:
+    """The gradient of the head reaches the memory, not the body; the frame has the shape of the observation."""
     given = settings("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
     given = replace(given, environment=replace(given.environment, observation="rgb"))
     agent = Agent(given, {"visual_observation": (84, 84, 3)}, BRANCHES)
     memory, frames = agent.initial_memory(2), torch.randint(0, 256, (2, 84, 84, 3), dtype=torch.uint8)
     agent.memory.begin_segment(memory.state, 1)
     agent.act({"visual_observation": frames}, memory)
-    (plan,) = agent.memory.plan([memory.state], torch.ones(1, 2, dtype=torch.bool), 1, torch.Generator())
-    evaluated = agent.evaluate({"visual_observation": frames[plan.steps]}, plan)
-    assert evaluated.frame.shape == (2, 3, 84, 84)
-    evaluated.frame.sum().backward()
+    (minibatch,) = agent.memory.minibatches([memory.state], torch.ones(1, 2, dtype=torch.bool), 1, torch.Generator())
+    output = agent({"visual_observation": frames[minibatch.indices]}, minibatch)
+    assert output.frame.shape == (2, 3, 84, 84)
+    output.frame.sum().backward()
     assert agent.memory.recurrent.weight_ih_l0.grad.abs().sum() > 0
     assert agent.body[0].weight.grad is None
 
 
-def test_heads_are_one_hidden_layer_and_one_of_outputs() -> None:
-    """Against products and sums, number by number."""
+def test_heads_are_two_layer_perceptrons() -> None:
+    """Against a computation with Python floats."""
 
     def row(layer: torch.nn.Linear, x: list[float]) -> list[float]:
         weights, biases = layer.weight.tolist(), layer.bias.tolist()
@@ -230,8 +233,8 @@ def test_heads_are_one_hidden_layer_and_one_of_outputs() -> None:
             assert found == pytest.approx([v for layer in last for v in row(layer, middle)], rel=1e-4, abs=1e-5)
 
 
-def test_reconstruction_head_spreads_each_cell_with_its_kernel() -> None:
-    """Against a loop that adds kernels up, with numpy, in float64."""
+def test_reconstruction_head_is_a_stack_of_transposed_convolutions() -> None:
+    """Against a loop over cells that adds the kernels, in numpy with float64."""
     torch.manual_seed(2)
     head = ReconstructionHead(5, 3)
     for parameter in head.parameters():
@@ -252,8 +255,8 @@ def test_reconstruction_head_spreads_each_cell_with_its_kernel() -> None:
         np.testing.assert_allclose(found, frame, rtol=1e-3, atol=1e-3)
 
 
-def test_transposed_convolutions_undo_the_shapes() -> None:
-    """Layer by layer the Atari encoder's shapes, backwards."""
+def test_reconstruction_head_mirrors_the_shapes_of_the_encoder() -> None:
+    """The shapes of the layers are those of the Atari encoder in reverse order."""
     x, shapes = torch.randn(1, 32), []
     for layer in ReconstructionHead(32, 4).layers:
         x = layer(x)
@@ -262,13 +265,13 @@ def test_transposed_convolutions_undo_the_shapes() -> None:
     assert [shapes[i] for i in (3, 5, 7)] == [(64, 9, 9), (32, 20, 20), (4, 84, 84)]
 
 
-def test_ground_truth_head_reads_the_memory() -> None:
+def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
     given = settings("trxl", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
     agent = Agent(given, {"features": (6,)}, BRANCHES, ground_truth=2)
     layers = agent.ground_truth.layers
     assert (layers[0].in_features, layers[2].out_features) == (16, 2)
-    plan = Plan(torch.arange(3))
-    assert make("none").evaluate({"features": torch.randn(3, 6)}, plan).ground_truth is None
+    minibatch = Minibatch(torch.arange(3))
+    assert make("none")({"features": torch.randn(3, 6)}, minibatch).ground_truth is None
 
 
 @pytest.mark.parametrize(
@@ -276,7 +279,7 @@ def test_ground_truth_head_reads_the_memory() -> None:
     [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))],
 )
 def test_uniform_initialisations(kind: str, bound: float) -> None:
-    """All weights of a block lie within the bound, and come near it; T-Fixup scales three of the matrices."""
+    """The weights of a block are within the bound and close to it; T-Fixup scales three of the matrices."""
     block = Block(Transformer(layers=3, width=64, heads=4, shared_heads=False, initialisation=kind))
     scaled = ("values", "fc_out", "fc.")
     for name, weight in block.named_parameters():
@@ -293,16 +296,16 @@ def test_orthogonal_initialisation() -> None:
 
 
 @pytest.mark.parametrize("bias", [0.0, 2.0])
-def test_gate_with_silent_weights(bias: float) -> None:
-    """With weights 0 the candidate is 0, and the stream is scaled by 1 - sigmoid(-bias): nearer to the identity with 2."""
+def test_gate_with_zero_weights(bias: float) -> None:
+    """With zero weights the candidate is 0 and x is scaled by 1 - sigmoid(-bias), which is closer to 1 for a bias of 2."""
     gate, x = Gate(8, bias), torch.randn(5, 8)
     for layer in (gate.from_x, gate.from_y, gate.from_reset):
         layer.weight.data.zero_()
     torch.testing.assert_close(gate(x, torch.randn(5, 8)), x * (1 - 1 / (1 + math.exp(bias))))
 
 
-def test_table_is_reversed_and_concatenated() -> None:
-    """Row p is the encoding of `positions - 1 - p`: the sines of all frequencies first, then the cosines."""
+def test_table_of_the_absolute_encoding() -> None:
+    """Row p is the encoding of `positions - 1 - p`: the sines of all frequencies, then the cosines."""
     agent = make("trxl", **transformer(positions=10))
     table = agent.memory.table
     assert table.shape == (10, 16)
@@ -312,7 +315,7 @@ def test_table_is_reversed_and_concatenated() -> None:
 
 
 def test_every_setting_is_documented() -> None:
-    """tyro reads a field's help from the string below it."""
+    """tyro takes the help text of a field from the docstring below it."""
     import contextlib
     import io
 

@@ -1,4 +1,4 @@
-"""Films of episodes and plots of curves."""
+"""Videos of episodes and plots of learning curves."""
 
 import csv
 import json
@@ -12,10 +12,10 @@ import pytest
 from agents_helpers import settings
 from PIL import Image
 
-from endless_gym.agents import enjoy, film, plot
+from endless_gym.agents import enjoy, plot, video
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.curves import aggregate, evaluated, published, scale
-from endless_gym.agents.plot import Plots, draw_all
+from endless_gym.agents.plot import PlotArguments, draw_all
 from endless_gym.agents.results import Experiment, Run, to_json
 from endless_gym.agents.train import train
 from endless_gym.env import Env
@@ -36,26 +36,26 @@ def rgb(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGB"))
 
 
-def test_a_picture_has_the_observation_beside_the_view() -> None:
+def test_frame_shows_the_observation_beside_the_view() -> None:
     frame = np.zeros((84, 84, 3), np.uint8)
     frame[10, 20] = (255, 0, 0)  # x 10, y 20
     view = np.random.default_rng(0).integers(256, size=(336, 336, 3), dtype=np.uint8)
-    picture = film.compose(frame, view, "one line")
-    assert picture.shape == (film.HEIGHT, film.WIDTH, 3)
+    picture = video.compose(frame, view, "one line")
+    assert picture.shape == (video.HEIGHT, video.WIDTH, 3)
     assert (picture[80:84, 40:44] == (255, 0, 0)).all()
     assert (picture[:336, :336] == (255, 0, 0)).all(-1).sum() == 16
     assert (picture[:336, 344:] == view).all()
-    assert (picture[336:] == film._INK).all(-1).any()
+    assert (picture[336:] == video._TEXT_COLOUR).all(-1).any()
 
 
-def test_a_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "film.gif"
-    enjoy.work(enjoy.Enjoyment(run, seeds=(200_000, 200_003), out=out))
+def test_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "video.gif"
+    enjoy.execute(enjoy.EnjoyArguments(run, seeds=(200_000, 200_003), out=out))
     lengths = [int(line.split(" in ")[1].split()[0]) for line in capsys.readouterr().out.splitlines()[:2]]
     assert min(lengths) > 0
     with Image.open(out) as image:
-        assert image.size == (film.WIDTH, film.HEIGHT)
-        # The start and each step of both; the end stays for a second.
+        assert image.size == (video.WIDTH, video.HEIGHT)
+        # One frame for the start and for each step; the repeated last frame of an episode is merged.
         assert image.n_frames == sum(lengths) + 2
         for place, seed in ((0, 200_000), (lengths[0] + 1, 200_003)):
             env = Env(GRID, render_mode="debug_rgb_array", options={"command_count": [1]})
@@ -65,41 +65,44 @@ def test_a_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.Capt
             assert (shown[:336:4, :336:4] == observation.swapaxes(0, 1)).all()
             assert (shown[:336, 344:] == env.render()).all()
         assert image.info["duration"] == pytest.approx(1000 / spec(GRID).render_fps, rel=0.1)
-    assert [file.name for file in tmp_path.iterdir()] == ["film.gif"]
+    assert [file.name for file in tmp_path.iterdir()] == ["video.gif"]
 
 
-def test_the_same_draws_give_the_same_film() -> None:
+def test_video_is_reproducible() -> None:
     agent = make_agent(settings("none", env=GRID), spec(GRID))
-    one, two, other = (np.stack(list(enjoy.Showing(agent, draws, max_steps=12).pictures((5,)))) for draws in (0, 0, 1))
+    one, two, other = (
+        np.stack(list(enjoy.EpisodeRecorder(agent, action_seed, max_steps=12).frames((5,))))
+        for action_seed in (0, 0, 1)
+    )
     assert np.array_equal(one, two)
     assert one.shape != other.shape or not np.array_equal(one, other)
 
 
-def test_mp4_goes_through_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program in ffmpeg's place keeps what it is sent, and what it is called with."""
+def test_mp4_is_piped_to_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stub in place of ffmpeg stores its input and its arguments."""
     program = tmp_path / "bin" / "ffmpeg"
     program.parent.mkdir()
     program.write_text('#!/bin/sh\necho "$@" > "$(dirname "$0")/called"\nfor last; do :; done\nexec cat > "$last"\n')
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
-    pictures = [np.full((film.HEIGHT, film.WIDTH, 3), value, np.uint8) for value in (1, 2, 3)]
-    film.write(tmp_path / "film.mp4", pictures, 25)
-    assert (tmp_path / "film.mp4").read_bytes() == np.stack(pictures).tobytes()
-    assert f"-s {film.WIDTH}x{film.HEIGHT} -r 25 -i -" in (program.parent / "called").read_text()
+    pictures = [np.full((video.HEIGHT, video.WIDTH, 3), value, np.uint8) for value in (1, 2, 3)]
+    video.write(tmp_path / "video.mp4", pictures, 25)
+    assert (tmp_path / "video.mp4").read_bytes() == np.stack(pictures).tobytes()
+    assert f"-s {video.WIDTH}x{video.HEIGHT} -r 25 -i -" in (program.parent / "called").read_text()
 
     program.write_text("#!/bin/sh\ncat > /dev/null\necho no such encoder >&2\nexit 1\n")
     with pytest.raises(OSError, match="no such encoder"):
-        film.write(tmp_path / "other.mp4", pictures, 25)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["bin", "film.mp4"]
+        video.write(tmp_path / "other.mp4", pictures, 25)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["bin", "video.mp4"]
 
 
-def test_an_interrupted_film_leaves_nothing(tmp_path: Path) -> None:
+def test_interrupted_video_leaves_no_file(tmp_path: Path) -> None:
     def pictures() -> object:
-        yield np.zeros((film.HEIGHT, film.WIDTH, 3), np.uint8)
+        yield np.zeros((video.HEIGHT, video.WIDTH, 3), np.uint8)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        film.write(tmp_path / "film.gif", pictures(), 25)
+        video.write(tmp_path / "video.gif", pictures(), 25)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -107,13 +110,13 @@ def test_an_interrupted_film_leaves_nothing(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ("nowhere", "no checkpoint nowhere"),
-        ("nowhere --out film.avi", "films are .gif or .mp4, not `film.avi`"),
-        ("nowhere --out none/film.gif", "no folder none to write film.gif to"),
-        ("nowhere --out film.mp4", "MP4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg"),
-        ("nowhere --seeds", "no seeds to play"),
+        ("nowhere --out video.avi", "--out must end in .gif or .mp4, got `video.avi`"),
+        ("nowhere --out none/video.gif", "cannot write none/video.gif: no folder none"),
+        ("nowhere --out video.mp4", "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg"),
+        ("nowhere --seeds", "--seeds must contain at least one seed, got none"),
     ],
 )
-def test_errors_of_films_are_one_line(
+def test_errors_of_enjoy_are_one_line(
     arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -139,10 +142,10 @@ def results(file: Path, *experiments: Experiment) -> Path:
     return file
 
 
-def test_plots_have_the_curves_that_were_given(tmp_path: Path) -> None:
+def test_plots_contain_the_given_curves(tmp_path: Path) -> None:
     scores = [[0.0, 0.2, 0.5], [0.2, 0.4, 0.7]]
     file = results(tmp_path / "results.json", experiment("MysteryPath-v0", "task_progress", "gru", scores))
-    (picture,) = draw_all(Plots((file,), tmp_path / "plots", published=("trxl",)))
+    (picture,) = draw_all(PlotArguments((file,), tmp_path / "plots", published=("trxl",)))
     with Image.open(picture) as image:
         assert image.size == (1350, 750)
         colours = {colour for _, colour in image.convert("RGB").getcolors(1 << 20)}
@@ -160,20 +163,20 @@ def test_plots_have_the_curves_that_were_given(tmp_path: Path) -> None:
     assert sum(row["source"] == "published" for row in rows) == trxl.scores.shape[1] == 51
 
 
-def test_each_run_by_itself_and_interquartile_means(tmp_path: Path) -> None:
+def test_spreads_runs_and_iqm(tmp_path: Path) -> None:
     scores = [[0.0], [0.1], [0.2], [0.3], [1.0]]
     file = results(tmp_path / "results.json", experiment("MysteryPath-v0", "task_progress", "gru", scores))
-    (picture,) = draw_all(Plots((file,), tmp_path, published=(), spread="runs"))
+    (picture,) = draw_all(PlotArguments((file,), tmp_path, published=(), spread="runs"))
     rows = list(csv.DictReader(picture.with_suffix(".csv").open()))
     assert [[float(row["score"])] for row in rows] == scores
-    (picture,) = draw_all(Plots((file,), tmp_path, published=(), spread="iqm"))
+    (picture,) = draw_all(PlotArguments((file,), tmp_path, published=(), spread="iqm"))
     (row,) = csv.DictReader(picture.with_suffix(".csv").open())
     assert float(row["iqm"]) == pytest.approx(0.2)
     assert 0 <= float(row["low"]) < 0.2 < float(row["high"]) <= 1
 
 
-def test_the_aggregated_plots_say_what_the_paper_says() -> None:
-    """Its text: GRU peaks at 0.98 in the endless tasks and Transformer-XL reaches 0.39; the finite tasks end as below."""
+def test_aggregated_curves_match_the_text_of_the_paper() -> None:
+    """The paper states peaks of 0.98 (GRU) and 0.39 (Transformer-XL) in the endless tasks, and those below in the finite ones."""
     peaks = {}
     for family, envs in plot.FAMILIES.items():
         curves = [curve for env in envs for curve in published(env, ("gru", "trxl", "gru_rec", "trxl_rec"))]
@@ -185,7 +188,7 @@ def test_the_aggregated_plots_say_what_the_paper_says() -> None:
     assert peaks["finite"] == {name: pytest.approx(value, abs=0.006) for name, value in expected.items()}
 
 
-def test_ours_are_normalised_as_the_paper_s(tmp_path: Path) -> None:
+def test_evaluations_are_normalised_like_the_paper(tmp_path: Path) -> None:
     best = {env: scale(env) for env in plot.FAMILIES["endless"]}
     # The paper: at best, the mean of the five GRU runs is 115 commands.
     assert best["Endless-MortarMayhem-v0"] == pytest.approx(115.8, abs=0.1)
@@ -196,13 +199,13 @@ def test_ours_are_normalised_as_the_paper_s(tmp_path: Path) -> None:
         for env, name, label in zip(best, names, labels, strict=True)
     ]
     file = results(tmp_path / "results.json", *given)
-    (picture,) = draw_all(Plots((file,), tmp_path, aggregate="endless", published=()))
+    (picture,) = draw_all(PlotArguments((file,), tmp_path, aggregate="endless", published=()))
     (curve,) = json.loads(picture.with_suffix(".json").read_text())["curves"]
     assert (curve["label"], curve["steps"]) == ("gru", [10, 20])
     assert np.allclose(curve["scores"], 3 * [[0.5, 1.0], [0.0, 0.25]])
 
 
-def test_only_steps_that_all_runs_have_are_compared() -> None:
+def test_curve_has_the_common_steps_of_its_runs() -> None:
     given = experiment("MysteryPath-v0", "task_progress", "gru", [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     given.runs[1].steps = [20, 30, 40]
     curve = evaluated(given)
@@ -210,8 +213,8 @@ def test_only_steps_that_all_runs_have_are_compared() -> None:
     assert curve.scores.tolist() == [[0.2, 0.3], [0.4, 0.5]]
 
 
-def test_rewards_of_training(run: Path, tmp_path: Path) -> None:
-    (picture,) = draw_all(Plots((run,), tmp_path))
+def test_training_rewards(run: Path, tmp_path: Path) -> None:
+    (picture,) = draw_all(PlotArguments((run,), tmp_path))
     (curve,) = json.loads(picture.with_suffix(".json").read_text())["curves"]
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
     assert curve["steps"] == [row["steps"] for row in rows]
@@ -221,11 +224,11 @@ def test_rewards_of_training(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("nowhere.json", "no file or folder nowhere.json"),
+        ("nowhere.json", "no such file or folder: nowhere.json"),
         ("text.json", "text.json is not a file of `endless-eval --json`"),
-        (".", "no progress.jsonl in .; give a run's folder"),
-        ("--env NoSuch-v0", "no curves of environment `NoSuch-v0`; the paper has "),
-        ("one.json --aggregate finite", "gru: the finite plot wants evaluations in all of MortarMayhem-v0, "),
+        (".", "no progress.jsonl in .; expected the folder of a run"),
+        ("--env NoSuch-v0", "no curves of environment `NoSuch-v0`; the paper has curves of "),
+        ("one.json --aggregate finite", "gru: the finite plot needs evaluations in all of MortarMayhem-v0, "),
     ],
 )
 def test_errors_of_plots_are_one_line(

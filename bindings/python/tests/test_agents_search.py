@@ -1,4 +1,4 @@
-"""The search for hyperparameters: its space, its order, its pruning, and that it goes on where it was stopped."""
+"""The hyperparameter search: search space, order of the trials, pruning, and resumption."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from agents_helpers import settings
 from rich.console import Console
 
 from endless_gym.agents import search
-from endless_gym.agents.search import Search, Trials, parse
+from endless_gym.agents.search import SearchArguments, Trials, parse
 from endless_gym.agents.search_space import single_changes, space, value, with_choices
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import train
@@ -20,19 +20,21 @@ from endless_gym.agents.train import train
 QUIET = Console(quiet=True)
 
 
-def small(folder: Path, **changes: Any) -> Search:
+def small(folder: Path, **changes: Any) -> SearchArguments:
     given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, checkpoint_interval=100)
     environment = replace(given.environment, num_envs=4, option=("command_count=[1]",))
     ppo = replace(given.ppo, steps=16, minibatches=1, updates=3)
     start = replace(given, environment=environment, ppo=ppo)
-    return replace(Search(str(folder), parameters=("ppo.epochs",), trials=1, period=1, settings=start), **changes)
+    return replace(
+        SearchArguments(str(folder), parameters=("ppo.epochs",), trials=1, period=1, settings=start), **changes
+    )
 
 
 def states(trials: Trials) -> list[str]:
     return [trial.state.name for trial in trials.study.trials]
 
 
-def test_the_space_is_the_paper_s_table() -> None:
+def test_search_space_is_the_table_of_the_paper() -> None:
     gru, trxl = (space(replace(PRESETS["paper"], agent=agent)) for agent in ("gru", "trxl"))
     assert gru["ppo.learning_rate"] == (2.75e-4, 2.0e-4, 3.0e-4, 3.5e-4)
     assert gru["recurrence.hidden_size"] == (512, 256, 384)
@@ -44,13 +46,13 @@ def test_the_space_is_the_paper_s_table() -> None:
     assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 16 + 10)
     rebuilt = replace(PRESETS["paper"], ppo=replace(PRESETS["paper"].ppo, reconstruction_coefficient=0.1))
     assert space(rebuilt)["ppo.reconstruction_coefficient"] == (0.1, 0.5, 1.0)
-    # Every single choice makes settings that can be trained.
+    # Every single change gives valid settings.
     for agent, choices in (("gru", gru), ("trxl", trxl)):
         for change in single_changes(choices):
-            with_choices(replace(PRESETS["paper"], agent=agent), change).checked()
+            with_choices(replace(PRESETS["paper"], agent=agent), change).validated()
 
 
-def test_each_choice_is_tried_by_itself() -> None:
+def test_single_changes_differ_in_one_parameter() -> None:
     base = PRESETS["quick"]
     choices = space(base, ("ppo.epochs", "ppo.max-gradient-norm", "agent"))
     start, *changes = single_changes(choices)
@@ -62,8 +64,8 @@ def test_each_choice_is_tried_by_itself() -> None:
     assert (value(lstm, "agent"), lstm.ppo.epochs, lstm.ppo.gamma) == ("lstm", 4, base.ppo.gamma)
 
 
-def test_a_search_from_end_to_end(tmp_path: Path) -> None:
-    """The choices one by one, then a combination; started again, nothing is left to do; wanted more, there is."""
+def test_search_from_start_to_end(tmp_path: Path) -> None:
+    """Single changes, then a combination; restarting a complete search runs no trial."""
     first = Trials(small(tmp_path, stage="single"), QUIET)
     first.run()
     assert [trial.params["ppo.epochs"] for trial in first.study.trials] == [3, 2, 4]
@@ -78,17 +80,17 @@ def test_a_search_from_end_to_end(tmp_path: Path) -> None:
     assert best["reward"] == max(trial.value for trial in third.study.trials)
     (chosen,) = [trial for trial in best["trials"] if trial["trial"] == best["trial"]]
     assert chosen["choices"]["ppo.epochs"] == best["settings"]["ppo"]["epochs"]
-    # A trial's value is its run's.
+    # The value of a trial is the last mean reward of its run.
     for trial in third.study.trials:
         lines = (tmp_path / f"trial-{trial.number:04d}" / "progress.jsonl").read_text().splitlines()
         assert json.loads(lines[-1])["episode/reward"] == trial.value
-    with pytest.raises(ValueError, match="begun with other settings"):
+    with pytest.raises(ValueError, match="started with other settings"):
         Trials(small(tmp_path, parameters=("ppo.minibatches",)), QUIET)
 
 
 @pytest.mark.parametrize("with_checkpoint", [True, False])
-def test_a_stopped_trial_goes_on(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stopped after the first trial's first update, a search comes to the same results as one that was not."""
+def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that is interrupted after the first update has the results of an uninterrupted search."""
     through = Trials(small(tmp_path / "through", stage="single"), QUIET)
     through.run()
 
@@ -115,9 +117,7 @@ def test_a_stopped_trial_goes_on(with_checkpoint: bool, tmp_path: Path, monkeypa
     assert not (tmp_path / "broken" / "trial-0003").exists()
 
 
-def test_trials_that_fall_behind_are_stopped_once_they_are_warm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trials_are_pruned_after_the_warm_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rewards, watched = {3: 1.0, 2: 0.5, 4: 2.0}, {}
 
     def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
@@ -140,12 +140,14 @@ def test_trials_that_fall_behind_are_stopped_once_they_are_warm(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--env NoSuch-v0", "no environment `NoSuch-v0`; there are "),
-        ("--parameters ppo.gamma", "`ppo.gamma` is not searched for gru; there are ppo.epochs, "),
-        ("--percentile 0", "--percentile is 0.0; give more than 0 and at most 100"),
-        ("--run mine", "a search names its runs itself; give --folder"),
-        ("--time-limit 3", "trials are compared at the same updates; drop --time-limit"),
-        ("--ppo.epochs 0", "--ppo.epochs is 0; give 1 or more"),
+        ("--env NoSuch-v0", "unknown environment id `NoSuch-v0`; "),
+        ("--parameters ppo.gamma", "--parameters for gru must be among ppo.epochs, "),
+        ("--percentile 0", "--percentile must be greater than 0 and at most 100, got 0.0"),
+        ("--run mine", "--run and --resume are not supported: the search names its runs; use --folder"),
+        ("--time-limit 3", "--time-limit and --target-reward are not supported: "),
+        ("--ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
+        ("--trials -1", "--trials must be 0 or more, got -1"),
+        ("--period 0", "--period must be 1 or more, got 0"),
     ],
 )
 def test_errors_are_one_line(
@@ -160,7 +162,7 @@ def test_errors_are_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_line_has_the_training_s_flags() -> None:
+def test_command_line_includes_the_training_flags() -> None:
     given = parse(["--preset", "quick", "--agent", "trxl", "--ppo.updates", "7", "--trials", "3"])
     assert (given.trials, given.warm_up, given.percentile) == (3, 2000, 25.0)
     expected = PRESETS["quick"]

@@ -1,4 +1,4 @@
-"""Estimates of a few runs, against values computed by hand."""
+"""Statistical estimates against values computed by hand."""
 
 import numpy as np
 import pytest
@@ -10,9 +10,9 @@ from endless_gym.agents.statistics import interquartile_mean, stratified_bootstr
     ("scores", "expected"),
     [
         ([8, 1, 7, 2, 6, 3, 5, 4], 4.5),  # of 3, 4, 5, 6
-        ([100, 0, 1, 2, 3], 2.0),  # one is left out at each end
-        ([1, 2, 6], 3.0),  # too few to leave any out
-        ([[0, 10], [0, 10]], 5.0),  # tasks and runs alike
+        ([100, 0, 1, 2, 3], 2.0),  # one score is discarded at each end
+        ([1, 2, 6], 3.0),  # too few scores to discard any
+        ([[0, 10], [0, 10]], 5.0),  # over runs and tasks
     ],
 )
 def test_interquartile_mean(scores: list[float], expected: float) -> None:
@@ -20,30 +20,30 @@ def test_interquartile_mean(scores: list[float], expected: float) -> None:
 
 
 def test_bootstrap_of_three_runs() -> None:
-    """Three of 0, 3, 9 with replacement: 27 samples. Their sums are at most 0 in 1, 3 in 4, 18 in 23, 21 in 26 of them."""
+    """There are 27 samples of 0, 3 and 9 with replacement; their sums are at most 0, 3, 18 and 21 in 1, 4, 23 and 26 of them."""
     assert stratified_bootstrap([0, 3, 9], confidence=0.8) == (1.0, 7.0)
 
 
-def test_bootstrap_draws_each_task_s_runs_by_themselves() -> None:
-    """Tasks of different difficulty, runs without any spread: there is nothing to be unsure of."""
+def test_bootstrap_is_stratified_by_task() -> None:
+    """Without variance between the runs of each task the interval is a point."""
     assert stratified_bootstrap([[0, 10], [0, 10], [0, 10], [0, 10]]) == (5.0, 5.0)
 
-    # The tasks favour different runs: drawn together, 0 and 2 would always make up for each other.
+    # If whole runs were drawn, 0 and 2 would always average to 1.
     assert stratified_bootstrap([[0, 2], [2, 0]]) == (0.0, 2.0)
 
 
 def test_bootstrap_is_of_the_interquartile_mean() -> None:
-    """Three or more of four draws are the one success, 5 in 100 times; the middle half is then 1, the mean at most 3/4."""
+    """Three or more of four draws are the 1 in 5 % of the samples: their interquartile mean is then 1, their mean less."""
     assert stratified_bootstrap([0, 0, 0, 1]) == (0.0, 1.0)
 
 
-def test_bootstrap_follows_from_its_seed() -> None:
+def test_bootstrap_is_reproducible() -> None:
     scores = np.random.default_rng(1).normal(size=(5, 3))
     assert stratified_bootstrap(scores, seed=1) == stratified_bootstrap(scores, seed=1)
     assert stratified_bootstrap(scores, seed=1) != stratified_bootstrap(scores, seed=2)
 
 
-def test_bootstrap_covers_the_truth_as_often_as_it_says() -> None:
+def test_bootstrap_interval_has_its_coverage() -> None:
     samples = np.random.default_rng(0).normal(size=(200, 40))
     covered = [low < 0 < high for low, high in (stratified_bootstrap(sample, repetitions=300) for sample in samples)]
     assert 0.87 < np.mean(covered) < 0.99
@@ -54,5 +54,5 @@ def test_summary() -> None:
     assert summary.mean == pytest.approx(21.2)
     assert summary.std == pytest.approx(1553.36**0.5)
     assert (summary.iqm, summary.low < 2.0 < summary.high) == (2.0, True)
-    with pytest.raises(ValueError, match="no scores"):
+    with pytest.raises(ValueError, match="at least one number"):
         summarise([])

@@ -1,4 +1,4 @@
-"""Whole runs: they resume exactly, stop cleanly, and learn; memory matters."""
+"""Complete training runs: exact resumption, interruption, logs, and learning with and without memory."""
 
 import json
 import os
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import wandb
 from agents_helpers import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -22,9 +23,9 @@ from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.evaluate import evaluate, mean
-from endless_gym.agents.rollout import Player
+from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings
-from endless_gym.agents.train import go_on_drawing, main, parse, same_network, train
+from endless_gym.agents.train import check_resumable, main, parse, restore_generator, train
 
 GRID = "MortarMayhem-Grid-v0"
 
@@ -39,13 +40,13 @@ def small(agent: str, run: Path, updates: int = 4, **environment: Any) -> Settin
 
 
 def progress(run: Path) -> list[dict[str, Any]]:
-    """The measures of all updates, without the times that they took."""
+    """The metrics of all updates without timings."""
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
     return [{k: v for k, v in row.items() if not k.startswith("seconds/") and k != "steps_per_second"} for row in rows]
 
 
 def same(one: Any, two: Any) -> bool:
-    """Whether two checkpoints' contents are equal, to the last bit."""
+    """Whether the contents of two checkpoints are bitwise equal."""
     if isinstance(one, torch.Tensor):
         return torch.equal(one, two)
     if isinstance(one, dict):
@@ -56,25 +57,25 @@ def same(one: Any, two: Any) -> bool:
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
-def test_nothing_has_changed_before_the_first_step_of_learning(agent: str, tmp_path: Path) -> None:
-    """What the network says of two played segments is what it said while it played them."""
+def test_forward_equals_the_rollout_before_the_first_optimizer_step(agent: str, tmp_path: Path) -> None:
+    """Log-probabilities and values of two segments are those of the rollout."""
     given = small(agent, tmp_path)
     with Environments(given) as environments:
         torch.manual_seed(1)
         made = make_agent(given, environments.spec)
-        player = Player(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+        collector = RolloutCollector(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
         for _ in range(2):
-            segment, _ = player.play(Clock())
-            flat, states = segment.flat(), [memory.state for memory in player.memories]
-            for plan in made.memory.plan(states, segment.first, 2, torch.Generator().manual_seed(1)):
-                evaluated = made.evaluate({key: part[plan.steps] for key, part in flat.observation.items()}, plan)
-                log_prob = evaluated.log_prob(flat.action[plan.steps])
-                torch.testing.assert_close(log_prob, flat.log_prob[plan.steps], rtol=1e-5, atol=1e-5)
-                torch.testing.assert_close(evaluated.value, flat.value[plan.steps], rtol=1e-5, atol=1e-5)
+            segment, _ = collector.collect(Clock())
+            flat, states = segment.flat(), [memory.state for memory in collector.memories]
+            for minibatch in made.memory.minibatches(states, segment.reset_mask, 2, torch.Generator().manual_seed(1)):
+                output = made({key: part[minibatch.indices] for key, part in flat.observation.items()}, minibatch)
+                log_prob = output.log_prob(flat.action[minibatch.indices])
+                torch.testing.assert_close(log_prob, flat.log_prob[minibatch.indices], rtol=1e-5, atol=1e-5)
+                torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
-def test_a_resumed_run_is_the_run_that_never_stopped(agent: str, tmp_path: Path) -> None:
+def test_resumed_run_equals_an_uninterrupted_run(agent: str, tmp_path: Path) -> None:
     through = train(small(agent, tmp_path / "through", 4))
     halved = train(small(agent, tmp_path / "halved", 2))
     train(replace(small(agent, tmp_path, 4), resume=str(halved)))
@@ -85,7 +86,7 @@ def test_a_resumed_run_is_the_run_that_never_stopped(agent: str, tmp_path: Path)
         assert same(one[part], two[part]), part
 
 
-def test_resumed_from_frames_with_all_heads(tmp_path: Path) -> None:
+def test_resumed_run_with_frames_and_all_heads(tmp_path: Path) -> None:
     def given(run: Path, updates: int) -> Settings:
         made = small("gru", run, updates)
         return replace(
@@ -114,8 +115,8 @@ def test_resumed_from_frames_with_all_heads(tmp_path: Path) -> None:
         "--env Endless-MysteryPath-v0 --agent position",
     ],
 )
-def test_observations_and_actions_of_all_kinds(flags: str, tmp_path: Path) -> None:
-    """Frames, features, vectors beside both; one branch and two; an update changes each head that there is."""
+def test_all_kinds_of_observations_and_actions(flags: str, tmp_path: Path) -> None:
+    """Frames, features and vectors, with one and two action branches; an update changes every weight."""
     small_run = "--preset quick --environment.num-envs 4 --ppo.steps 32 --ppo.updates 1 --threads 1"
     given = parse([*flags.split(), *small_run.split(), "--run", str(tmp_path / "run"), "--ppo.learning-rate", "0.01"])
     torch.manual_seed(given.seed)
@@ -125,8 +126,8 @@ def test_observations_and_actions_of_all_kinds(flags: str, tmp_path: Path) -> No
     assert all(not torch.equal(before[name], after[name]) for name in before if name.endswith("weight"))
 
 
-def test_what_is_written_beyond_the_checkpoint_is_written_anew(tmp_path: Path) -> None:
-    """A run that was killed between two checkpoints goes on from the last one."""
+def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:
+    """A run that was killed between two checkpoints resumes from the last one."""
     run = train(small("gru", tmp_path / "run", 2))
     expected = progress(train(small("gru", tmp_path / "through", 4)))
     with (run / "progress.jsonl").open("a") as file:
@@ -135,8 +136,8 @@ def test_what_is_written_beyond_the_checkpoint_is_written_anew(tmp_path: Path) -
     assert progress(run) == expected
 
 
-def test_groups_and_threads_change_nothing_that_is_random(tmp_path: Path) -> None:
-    """The engine's threads do not change a run; its process and this process give the same one."""
+def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
+    """The number of threads and an engine process do not change the results."""
     runs = {
         "one": train(small("gru", tmp_path / "one", 3)),
         "threads": train(small("gru", tmp_path / "threads", 3, num_threads=3)),
@@ -146,7 +147,7 @@ def test_groups_and_threads_change_nothing_that_is_random(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("engines", [("process", "process"), ("process", "thread"), ("thread", "process")])
-def test_a_run_resumes_exactly_wherever_its_environments_are(engines: tuple[str, str], tmp_path: Path) -> None:
+def test_run_resumes_exactly_with_another_engine(engines: tuple[str, str], tmp_path: Path) -> None:
     through = train(small("gru", tmp_path / "through", 4))
     run = train(small("gru", tmp_path / "run", 2, engine=engines[0]))
     train(replace(small("gru", tmp_path, 4, engine=engines[1]), resume=str(run)))
@@ -155,7 +156,7 @@ def test_a_run_resumes_exactly_wherever_its_environments_are(engines: tuple[str,
 
 
 @pytest.mark.parametrize("engine", ["thread", "process"])
-def test_ctrl_c_writes_a_checkpoint_and_leaves_nothing(engine: str, tmp_path: Path) -> None:
+def test_ctrl_c_writes_a_checkpoint_and_frees_shared_memory(engine: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     before = set(os.listdir("/dev/shm"))
     arguments = f"--env {GRID} --agent gru --preset quick --run {run} --threads 1 --environment.engine {engine}"
@@ -176,12 +177,12 @@ def test_ctrl_c_writes_a_checkpoint_and_leaves_nothing(engine: str, tmp_path: Pa
     assert "stopping after this update" in output
     done = checkpoint.load(run).update
     assert 1 <= done < 2000
-    assert f"{done} of 2000 updates are done" in output
+    assert f"{done} of 2000 updates done" in output
     assert len(progress(run)) == done
     assert {name for name in set(os.listdir("/dev/shm")) - before if "endless" in name} == set()
 
 
-def test_checkpoints_are_kept_and_act(tmp_path: Path) -> None:
+def test_kept_checkpoints_can_be_loaded(tmp_path: Path) -> None:
     given = replace(small("trxl", tmp_path / "run", 4), keep_checkpoints=True)
     run = train(given)
     files = checkpoint.files(run)
@@ -190,12 +191,12 @@ def test_checkpoints_are_kept_and_act(tmp_path: Path) -> None:
     assert (loaded.update, loaded.steps, loaded.settings) == (2, 2 * 8 * 16, given)
     assert same(checkpoint.load(run).agent.state_dict(), checkpoint.load(files[2]).agent.state_dict())
     memory = loaded.agent.initial_memory(3)
-    acted = loaded.agent.act(torch.zeros(3, 17).numpy(), memory)
-    assert acted.action.shape == (3, 1)
+    output = loaded.agent.act(torch.zeros(3, 17).numpy(), memory)
+    assert output.action.shape == (3, 1)
 
 
-def test_a_run_that_has_not_learned_yet_can_go_on(tmp_path: Path) -> None:
-    """As after Ctrl-C in its first update."""
+def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
+    """As after an interruption of the first update."""
     run = train(replace(small("gru", tmp_path / "run", 2), time_limit=1e-9, keep_checkpoints=True))
     assert len(progress(run)) == 1
     (run / "checkpoints" / "last.pt").unlink()
@@ -207,24 +208,24 @@ def test_a_run_that_has_not_learned_yet_can_go_on(tmp_path: Path) -> None:
     assert [event.step for event in board.Scalars("steps")] == [1, 2]
 
 
-def test_a_generator_of_another_kind_of_device_starts_anew() -> None:
-    """A state of CUDA's generator has 16 bytes."""
+def test_generator_state_of_another_device_is_replaced_by_a_seed() -> None:
+    """The state of a CUDA generator has 16 bytes."""
     one, two = torch.Generator(), torch.Generator()
-    go_on_drawing(one, torch.zeros(16, dtype=torch.uint8), 5)
+    restore_generator(one, torch.zeros(16, dtype=torch.uint8), 5)
     assert torch.equal(torch.rand(3, generator=one), torch.rand(3, generator=two.manual_seed(5)))
-    go_on_drawing(one, two.get_state(), 6)
+    restore_generator(one, two.get_state(), 6)
     assert torch.equal(torch.rand(3, generator=one), torch.rand(3, generator=two))
 
 
-def test_a_target_is_of_a_hundred_episodes(tmp_path: Path) -> None:
+def test_target_reward_needs_a_hundred_episodes(tmp_path: Path) -> None:
     run = train(replace(small("none", tmp_path / "run", 40), target_reward=-1.0))
     ended = len(checkpoint.load(run).state["episodes"])
     assert ended == 100 and 1 < len(progress(run)) < 40
 
 
 @pytest.mark.parametrize("engine", ["thread", "process"])
-def test_a_segment_is_what_the_environments_did(engine: str, tmp_path: Path) -> None:
-    """What four segments hold of the environments, against others that are stepped one group at a time in a plain loop."""
+def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: Path) -> None:
+    """Four segments, against environments with the same seeds that are stepped in a plain loop."""
     given = small("none", tmp_path, engine=engine)
     ppo = replace(given.ppo, ground_truth_coefficient=0.1)
     given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))
@@ -232,11 +233,13 @@ def test_a_segment_is_what_the_environments_did(engine: str, tmp_path: Path) -> 
         given.env, 4, 1, seed=1, seeds=range(100_000), groups=2, autoreset="same_step", observation="features"
     )
     now = [plain.reset(group=group) for group in range(2)]
-    first = [np.ones(4, np.bool_) for _ in range(2)]
+    reset_mask = [np.ones(4, np.bool_) for _ in range(2)]
     with Environments(given) as environments:
-        player = Player(make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1))
+        collector = RolloutCollector(
+            make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1)
+        )
         for _ in range(4):
-            segment, episodes = player.play(Clock())
+            segment, episodes = collector.collect(Clock())
             ended = []
             for step in range(16):
                 for group, columns in enumerate((slice(0, 4), slice(4, 8))):
@@ -244,35 +247,35 @@ def test_a_segment_is_what_the_environments_did(engine: str, tmp_path: Path) -> 
                     np.testing.assert_array_equal(segment.observation["features"][step, columns], observation)
                     truth = torch.tensor(info["ground_truth"]).float()
                     assert torch.equal(segment.ground_truth[step, columns], truth)
-                    np.testing.assert_array_equal(segment.first[step, columns], first[group])
+                    np.testing.assert_array_equal(segment.reset_mask[step, columns], reset_mask[group])
                     plain.send(segment.action[step, columns].numpy(), group)
                     observation, reward, terminated, truncated, info = plain.recv(group)
-                    now[group], first[group] = (observation, info), terminated | truncated
+                    now[group], reset_mask[group] = (observation, info), terminated | truncated
                     np.testing.assert_array_equal(segment.reward[step, columns], reward.astype(np.float32))
-                    np.testing.assert_array_equal(segment.done[step, columns], first[group])
-                    ended += [float(info["final_info"]["reward"][env]) for env in np.flatnonzero(first[group])]
+                    np.testing.assert_array_equal(segment.done[step, columns], reset_mask[group])
+                    ended += [float(info["final_info"]["reward"][env]) for env in np.flatnonzero(reset_mask[group])]
             assert sorted(episode["reward"] for episode in episodes) == sorted(ended)
         assert segment.done.any()
 
 
-def test_evaluation_plays_each_seed_as_often(tmp_path: Path) -> None:
+def test_evaluation_plays_each_seed_equally_often(tmp_path: Path) -> None:
     agent = checkpoint.load(train(small("gru", tmp_path / "run", 1))).agent
     results = evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
     assert [result["seed"] for result in results] == list(range(200_000, 200_007)) * 3
     assert all(result["length"] > 0 for result in results)
     assert mean(results) == pytest.approx(sum(result["reward"] for result in results) / 21)
-    # Draws differ between the repetitions of a seed; the seed of the draws makes them the same again.
+    # Sampling differs between the repetitions of a seed, and is reproducible with the same `action_seed`.
     assert results == evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
-    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, draws=1)
+    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, action_seed=1)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--env NoSuch-v0", "no environment `NoSuch-v0`; there are "),
-        (f"--env {GRID} --device nonsense", "no device `nonsense`; give auto, cpu, cuda or cuda:NUMBER"),
-        (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs is 0; give 1 or more"),
-        ("--resume nowhere", "no run in nowhere; give a folder with settings.json"),
+        ("--env NoSuch-v0", "unknown environment id `NoSuch-v0`; "),
+        (f"--env {GRID} --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
+        (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
+        ("--resume nowhere", "no run in nowhere; expected a folder with settings.json"),
         (f"--env {GRID} --environment.option command_count=[1] colour=1", "colour"),
         (f"--env {GRID} --environment.option colour=1 --environment.engine process", "colour"),
     ],
@@ -287,32 +290,32 @@ def test_errors_are_one_line(
     assert error.startswith("endless-train: ")
     assert message in error
     assert error.count("\n") == 1
-    assert not list(tmp_path.rglob("settings.json")), "the same folder can be given again"
+    assert not list(tmp_path.rglob("settings.json")), "the folder can be used again"
 
 
-def test_a_run_goes_on_with_its_own_settings(tmp_path: Path) -> None:
+def test_resumed_run_keeps_its_settings(tmp_path: Path) -> None:
     run = train(small("gru", tmp_path / "run", 2))
     resumed = parse(["--resume", str(run), "--ppo.updates", "3"])
     assert resumed.ppo == replace(small("gru", run, 2).ppo, updates=3)
     train(resumed)
     assert len(progress(run)) == 3
-    # What was changed holds from then on; steps that were played stay played.
+    # Changed settings persist; the step count continues.
     again = parse(["--resume", str(run)])
     assert again.ppo == resumed.ppo
     train(replace(again, ppo=replace(again.ppo, updates=4, steps=32)))
     assert [row["steps"] for row in progress(run)] == [128, 256, 384, 384 + 256]
-    with pytest.raises(ValueError, match=r"reconstruction-coefficient 0 adds or takes away a head.* began with 0\.1"):
-        same_network(again, replace(again, ppo=replace(again.ppo, reconstruction_coefficient=0.1)))
-    with pytest.raises(ValueError, match="began with agent gru, not lstm"):
+    with pytest.raises(ValueError, match=r"reconstruction-coefficient must stay positive \(it was 0\.1\), got 0;"):
+        check_resumable(again, replace(again, ppo=replace(again.ppo, reconstruction_coefficient=0.1)))
+    with pytest.raises(ValueError, match="must keep its agent: expected gru, got lstm"):
         train(parse(["--resume", str(run), "--agent", "lstm"]))
-    with pytest.raises(ValueError, match="began with seed 1, not 2"):
+    with pytest.raises(ValueError, match="must keep its seed: expected 1, got 2"):
         train(parse(["--resume", str(run), "--seed", "2"]))
     assert parse(["--resume", str(run)]).ppo.steps == 32
-    with pytest.raises(FileExistsError, match="has a run already"):
+    with pytest.raises(FileExistsError, match="already contains a run"):
         train(small("gru", run, 2))
 
 
-def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
+def test_tensorboard_files_contain_the_metrics(tmp_path: Path) -> None:
     run = train(small("gru", tmp_path / "run", 2))
     board = EventAccumulator(str(run))
     board.Reload()
@@ -323,12 +326,16 @@ def test_tensorboard_s_files_have_the_measures(tmp_path: Path) -> None:
     )
 
 
-def test_weights_and_biases_has_them_too_under_one_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Written by the real library, without its server; a run that resumes is the same one there."""
+def test_weights_and_biases_logs_contain_the_metrics_under_one_id(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Written by the real library in offline mode; a resumed run keeps its id."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     run = train(replace(small("gru", tmp_path / "run", 1), wandb=True))
     train(replace(small("gru", tmp_path, 2), wandb=True, resume=str(run)))
+    # `finish` can return before the file is written; the end of the library's process flushes it.
+    wandb.teardown()
     (id,) = {file.stem.removeprefix("run-") for file in run.glob("wandb/offline-run-*/run-*.wandb")}
     assert id == (run / "wandb-id.txt").read_text()
     written = b"".join(file.read_bytes() for file in run.glob("wandb/offline-run-*/run-*.wandb"))
@@ -339,7 +346,7 @@ def test_weights_and_biases_has_them_too_under_one_id(tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
 def test_bf16_runs(agent: str, tmp_path: Path) -> None:
-    """bfloat16 changes the numbers a little, and what is stored stays float32."""
+    """bfloat16 changes the numbers slightly; weights stay float32."""
     plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
     one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
     assert one != two
@@ -364,7 +371,7 @@ def one_command(agent: str, run: Path, **changes: Any) -> Settings:
 
 @pytest.mark.timeout(600)
 def test_memory_matters(tmp_path: Path) -> None:
-    """One command that is shown and then gone: the GRU learns to follow it; without memory nothing can."""
+    """One command that is shown and then hidden: the GRU learns to execute it; an agent without memory cannot."""
     gru = checkpoint.load(train(one_command("gru", tmp_path / "gru")))
     assert mean(evaluate(gru.agent, num_threads=1)) >= 0.085
     updates = gru.update

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{Batch, zeroed};
-use endless_gym_core::envs::{self, Spec};
+use endless_gym_core::envs::{self, EnvSpec};
 use endless_gym_core::pool::{Pool, ResetRequest, Threads};
 use endless_gym_service::timeout_from_seconds;
 use serde::Serialize;
@@ -84,7 +84,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     timeout_from_seconds(args.seconds)
         .map_err(|_| format!("--seconds must be finite and not negative, got {}", args.seconds))?;
     let stop = stop::on_signal()?;
-    let specs: Vec<&Spec> = if args.id == "all" { envs::specs().collect() } else { vec![envs::spec(&args.id)?] };
+    let specs: Vec<&EnvSpec> = if args.id == "all" { envs::specs().collect() } else { vec![envs::spec(&args.id)?] };
     let cores = Threads::new(0)?.count();
     let mut ways = vec![Way::InProcess { threads: 1 }];
     if cores > 1 {
@@ -170,7 +170,7 @@ fn show(args: &Args, rows: &[Row]) {
 }
 
 /// Steps per second in one way.
-fn measure(args: &Args, spec: &'static Spec, way: Way, stop: &AtomicBool) -> Result<f64, Failure> {
+fn measure(args: &Args, spec: &'static EnvSpec, way: Way, stop: &AtomicBool) -> Result<f64, Failure> {
     match way {
         Way::InProcess { threads } => in_process(args, spec, threads, stop),
         Way::ServiceReceives => through_service(args, spec, false, stop),
@@ -193,7 +193,7 @@ fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Fai
     Ok((batches * args.num_envs) as f64 / start.elapsed().as_secs_f64())
 }
 
-fn in_process(args: &Args, spec: &'static Spec, threads: usize, stop: &AtomicBool) -> Result<f64, Failure> {
+fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &AtomicBool) -> Result<f64, Failure> {
     let mut pool = Pool::new(&args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut blocks)?;
@@ -204,7 +204,7 @@ fn in_process(args: &Args, spec: &'static Spec, threads: usize, stop: &AtomicBoo
     })
 }
 
-fn through_service(args: &Args, spec: &'static Spec, reads: bool, stop: &AtomicBool) -> Result<f64, Failure> {
+fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &AtomicBool) -> Result<f64, Failure> {
     let mut arguments = vec![
         format!("--env={}", spec.id),
         format!("--num-envs={}", args.num_envs),
@@ -240,7 +240,7 @@ impl Actions {
     /// Steps after which the same actions come again, in other states.
     const STEPS: usize = 1009;
 
-    fn new(spec: &Spec, num_envs: usize) -> Self {
+    fn new(spec: &EnvSpec, num_envs: usize) -> Self {
         let branches = spec.action_space.branches().len();
         let mut numbers = vec![0; (num_envs + Self::STEPS) * branches];
         RandomPlayer::new(spec).act(&mut numbers);
@@ -260,7 +260,7 @@ fn sum(batch: &Batch<'_>) -> u64 {
     words.iter().fold(0, |sum, word| sum.wrapping_add(*word))
 }
 
-fn original(args: &Args, spec: &Spec) -> Result<f64, Failure> {
+fn original(args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
     let python = args.original.as_deref().unwrap_or("python3");
     let output = Command::new(python)
         .args(["-c", ORIGINAL, spec.id, &args.seconds.to_string()])

@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use endless_gym_core::envs::{self, Family, Spec};
+use endless_gym_core::envs::{self, EnvSpec, Family};
 use endless_gym_core::pool::ResetRequest;
 use endless_gym_service::timeout_from_seconds;
 use serde_json::{Map, Value as Json, json};
@@ -119,7 +119,7 @@ fn per_second(tally: &Tally, elapsed: Duration) -> f64 {
     tally.steps as f64 / elapsed.as_secs_f64()
 }
 
-fn live(spec: &Spec, tally: &Tally, elapsed: Duration) -> String {
+fn live(spec: &EnvSpec, tally: &Tally, elapsed: Duration) -> String {
     let mut text = format!(
         "{} steps/s, {} episodes, {}",
         grouped(per_second(tally, elapsed)),
@@ -139,7 +139,7 @@ fn live(spec: &Spec, tally: &Tally, elapsed: Duration) -> String {
     text
 }
 
-fn summarise(args: &Args, spec: &Spec, num_envs: usize, tally: &Tally, elapsed: Duration) -> Result<(), Failure> {
+fn summarise(args: &Args, spec: &EnvSpec, num_envs: usize, tally: &Tally, elapsed: Duration) -> Result<(), Failure> {
     let policy = match args.policy {
         Policy::Expert => "expert",
         Policy::Random => "random",

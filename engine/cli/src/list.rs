@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use endless_gym_core::envs::{self, SCREEN, Spec};
+use endless_gym_core::envs::{self, EnvSpec, SCREEN};
 use serde_json::json;
 
 use super::Failure;
@@ -36,7 +36,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn observation(spec: &Spec) -> String {
+fn observation(spec: &EnvSpec) -> String {
     let frame = format!("uint8 ({SCREEN}, {SCREEN}, 3)");
     match spec.vector_observation {
         0 => frame,
@@ -44,14 +44,14 @@ fn observation(spec: &Spec) -> String {
     }
 }
 
-fn as_json(spec: &Spec) -> serde_json::Value {
+fn as_json(spec: &EnvSpec) -> serde_json::Value {
     let mut value = json!(spec);
     value["action_branches"] = json!(spec.action_space.branches());
     value["observation_shape"] = json!([SCREEN, SCREEN, 3]);
     value
 }
 
-fn show(spec: &Spec) {
+fn show(spec: &EnvSpec) {
     print(format_args!("{}: {}\n", spec.id, spec.summary));
     print(format_args!("actions      {}", spec.action_space));
     print(format_args!("observation  {}, indexed [x][y][channel]", observation(spec)));

@@ -2,7 +2,7 @@
 
 use clap::ValueEnum;
 use endless_gym_core::batch::Batch;
-use endless_gym_core::envs::{Expert, Spec, expert};
+use endless_gym_core::envs::{EnvSpec, Expert, expert};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
@@ -22,7 +22,7 @@ pub struct RandomPlayer {
 }
 
 impl RandomPlayer {
-    pub fn new(spec: &Spec) -> Self {
+    pub fn new(spec: &EnvSpec) -> Self {
         RandomPlayer { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(0) }
     }
 
@@ -46,7 +46,7 @@ pub struct ExpertPlayer {
 }
 
 impl ExpertPlayer {
-    pub fn new(spec: &Spec, num_envs: usize) -> Self {
+    pub fn new(spec: &EnvSpec, num_envs: usize) -> Self {
         ExpertPlayer {
             experts: (0..num_envs).map(|_| expert(spec)).collect(),
             ended: vec![true; num_envs],
@@ -83,7 +83,7 @@ pub struct Tally {
 }
 
 impl Tally {
-    pub fn new(spec: &Spec) -> Self {
+    pub fn new(spec: &EnvSpec) -> Self {
         Tally {
             steps: 0,
             episodes: 0,

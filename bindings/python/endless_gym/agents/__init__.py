@@ -1,11 +1,13 @@
-"""The paper's baselines: PPO agents with memory, trained from shared memory.
+"""PPO agents with memory in PyTorch: the baselines of the Memory Gym paper.
 
-`endless-train` trains one; `pip install endless-gym[agents]` brings what it needs. From top to bottom: `train` is the loop,
-`settings` what it can be told, `rollout` plays, `ppo` learns with `losses`; `agent` puts `encoders`, a memory (`recurrent`,
-`transformer`, `naive`) and `heads` together; `checkpoint` loads what was trained.
+`pip install endless-gym[agents]` installs the dependencies; `endless-train` trains an agent.
 
-What comes after training: `protocol` is `endless-eval`, over `evaluate`, `metrics`, `statistics` and `results`; `plot` with
-`curves` is `endless-plot`; `enjoy` with `film` is `endless-enjoy`; `search` with `search_space` is `endless-search`.
+Training, from top to bottom: `train` is the training loop and `settings` its configuration; `rollout` collects segments from
+`environments`; `ppo` optimises the agent with `losses`; `agent` combines an observation transform (`naive`), `encoders`, a memory
+(`memory`, `recurrent`, `transformer`) and `heads`; `checkpoint` saves and loads.
+
+Evaluation: `protocol` is `endless-eval`, with `evaluate`, `metrics`, `statistics` and `results`; `plot` with `curves` is
+`endless-plot`; `enjoy` with `video` is `endless-enjoy`; `search` with `search_space` is `endless-search`.
 """
 
 try:
@@ -13,12 +15,24 @@ try:
     import torch
     import tyro
 except ImportError as error:
-    raise ImportError(f"{error.name} is not installed; the agents need: pip install 'endless-gym[agents]'") from error
+    raise ImportError(
+        f"endless_gym.agents needs {error.name}, which is not installed: pip install 'endless-gym[agents]'"
+    ) from error
 
-from endless_gym.agents.agent import Acted, Agent, AgentMemory, make_agent
+from endless_gym.agents.agent import ActOutput, Agent, AgentMemory, AgentOutput, make_agent
 from endless_gym.agents.checkpoint import Checkpoint, load
 from endless_gym.agents.settings import PRESETS, Settings
 
-__all__ = ["PRESETS", "Acted", "Agent", "AgentMemory", "Checkpoint", "Settings", "load", "make_agent"]
+__all__ = [
+    "PRESETS",
+    "ActOutput",
+    "Agent",
+    "AgentMemory",
+    "AgentOutput",
+    "Checkpoint",
+    "Settings",
+    "load",
+    "make_agent",
+]
 
 del rich, torch, tyro

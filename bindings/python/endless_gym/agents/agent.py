@@ -1,11 +1,11 @@
-"""The agent: encoder, memory, body and heads.
+"""The agent: an actor-critic of encoder, memory, body and heads.
 
 ```python
 memory = agent.initial_memory(num_envs)
 while playing:
-    acted = agent.act(observation, memory)          # memory is brought up to date
-    observation, done = step(acted.action)
-    memory.forget(done)                             # where an episode has ended
+    output = agent.act(observation, memory)         # updates the memory
+    observation, done = step(output.action)
+    memory.reset(done)                              # where an episode has ended
 ```
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -24,13 +24,18 @@ from torch import Tensor, nn
 
 from endless_gym.agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
 from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
-from endless_gym.agents.memory import Memory, NoMemory, Plan, State
-from endless_gym.agents.naive import ObserverState, make_observer
+from endless_gym.agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
+from endless_gym.agents.naive import POSITION, TransformState, make_observation_transform
 from endless_gym.agents.recurrent import RecurrentMemory
 from endless_gym.agents.settings import Settings
 from endless_gym.agents.transformer import TransformerMemory
 from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
+
+#: An array or tensor of n environments, (n, ...).
+Array: TypeAlias = NDArray[Any] | Tensor
+#: An observation as a vector environment returns it: an array, or a mapping if the observation space is a dict.
+RawObservation: TypeAlias = Array | Mapping[str, Array]
 
 
 @dataclass
@@ -38,40 +43,45 @@ class AgentMemory:
     """What the agent keeps of n environments between two steps.
 
     Attributes:
-        first: Which environments' next observation starts an episode, bool (n,).
-        observer: The observer's state.
-        state: The memory's state.
+        reset_mask: Whether the next observation is the first of an episode, bool (n,).
+        transform_state: State of the observation transform.
+        state: State of the memory.
     """
 
-    first: Tensor
-    observer: ObserverState
-    state: State
+    reset_mask: Tensor
+    transform_state: TransformState
+    state: MemoryState
 
-    def forget(self, done: Tensor | NDArray[np.bool_]) -> None:
-        """The next observation of these environments, bool (n,), starts an episode."""
-        self.first = self.first | torch.as_tensor(done, device=self.first.device)
+    def reset(self, done: Tensor | NDArray[np.bool_]) -> None:
+        """Mark the next observation as the first of an episode where `done`, bool (n,), is true."""
+        self.reset_mask = self.reset_mask | torch.as_tensor(done, device=self.reset_mask.device)
 
-    def tensors(self) -> dict[str, Any]:
-        """All of it, for a checkpoint."""
-        return {"first": self.first, "observer": self.observer.kept, "state": self.state.tensors()}
+    def state_dict(self) -> dict[str, Any]:
+        """Everything as tensors and numbers by name, for a checkpoint."""
+        # The keys are those of the checkpoint format.
+        return {
+            "first": self.reset_mask,
+            "observer": self.transform_state.tensors,
+            "state": self.state.state_dict(),
+        }
 
-    def load(self, tensors: dict[str, Any]) -> None:
-        """The reverse of `tensors`."""
-        device = self.first.device
-        self.first = tensors["first"].to(device)
-        self.observer.kept = {name: kept.to(device) for name, kept in tensors["observer"].items()}
-        self.state.load(tensors["state"])
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load what `state_dict` returned, for the same number of environments; tensors are moved to this memory's device."""
+        device = self.reset_mask.device
+        self.reset_mask = state_dict["first"].to(device)
+        self.transform_state.tensors = {name: tensor.to(device) for name, tensor in state_dict["observer"].items()}
+        self.state.load_state_dict(state_dict["state"])
 
 
 @dataclass
-class Acted:
-    """One decision for each of n environments.
+class ActOutput:
+    """The agent's output for one step of n environments.
 
     Attributes:
         action: int64 (n, branches).
-        log_prob: Of each branch's choice, (n, branches).
-        value: The expected return, (n,).
-        observation: What the agent observed, as it is learned from.
+        log_prob: Log-probability of the choice in each branch, float32 (n, branches).
+        value: Value estimate, float32 (n,).
+        observation: The transformed observation that the network received, as stored for learning.
     """
 
     action: Tensor
@@ -81,14 +91,14 @@ class Acted:
 
 
 @dataclass
-class Evaluated:
-    """What the network says of a minibatch of M steps.
+class AgentOutput:
+    """The network's outputs for a minibatch of M steps, with gradients.
 
     Attributes:
-        logits: Of each branch, normalised to log-probabilities, list of (M, choices).
-        value: (M,)
-        frame: Logits of the reconstructed frame, (M, channels, 84, 84), if there is such a head.
-        ground_truth: (M, entries), if there is such a head.
+        logits: Log-probabilities of all choices of each branch, list of float32 (M, choices).
+        value: Value estimates, float32 (M,).
+        frame: Logits of the reconstructed frames, float32 (M, channels, 84, 84); None without reconstruction head.
+        ground_truth: Estimates of the ground truth, float32 (M, entries); None without ground-truth head.
     """
 
     logits: list[Tensor]
@@ -97,17 +107,20 @@ class Evaluated:
     ground_truth: Tensor | None
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        """Of actions int64 (M, branches): (M, branches)."""
+        """Log-probabilities of actions int64 (M, branches), float32 (M, branches)."""
         chosen = [logits.gather(1, actions[:, i : i + 1]) for i, logits in enumerate(self.logits)]
         return torch.cat(chosen, dim=1)
 
     def entropy(self) -> Tensor:
-        """Summed over the branches, (M,)."""
+        """Entropy of the policy, summed over the branches, float32 (M,)."""
         return torch.stack([-(logits.exp() * logits).sum(-1) for logits in self.logits]).sum(0)
 
 
 class Agent(nn.Module):
-    """An actor-critic with memory, for environments with a given observation and action space."""
+    """An actor-critic with memory, for environments with a given observation and action space.
+
+    `act` computes one step while a rollout is collected; `forward` computes a minibatch with gradients.
+    """
 
     def __init__(
         self,
@@ -117,24 +130,24 @@ class Agent(nn.Module):
         ground_truth: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Make an agent with fresh weights.
+        """Make an agent with newly initialised weights.
 
         Args:
-            settings: Of the network and its memory.
-            shapes: Of one environment's observation, as `observation_shapes` gives them.
-            branches: Choices of each branch of the action.
-            ground_truth: Entries of the environment's ground truth.
-            device: Where to compute.
+            settings: Settings of the network and its memory.
+            shapes: Shapes of one environment's observation, as `observation_shapes` returns them.
+            branches: Number of choices of each branch of the action.
+            ground_truth: Entries of the environment's ground truth; 0 if it has none.
+            device: Device of the weights and the memories.
 
         Raises:
-            ValueError: The settings ask for what these environments do not have.
+            ValueError: Reconstruction without frames, or a ground-truth loss without ground truth.
         """
         super().__init__()
         self.settings, self.device = settings, torch.device(device)
         self.branches = tuple(branches)
-        self.observer = make_observer(settings, shapes, self.device)
-        self.encoder = Encoder(self.observer.shapes, settings.model.vector_width)
-        self.memory: Memory
+        self.transform = make_observation_transform(settings, shapes, self.device)
+        self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
+        self.memory: AnyMemory
         if settings.agent == "gru" or settings.agent == "lstm":
             self.memory = RecurrentMemory(settings.agent, self.encoder.width, settings.recurrence, self.device)
         elif settings.agent == "trxl" or settings.agent == "gtrxl":
@@ -143,21 +156,25 @@ class Agent(nn.Module):
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
-        remembers = not isinstance(self.memory, NoMemory)
-        width = settings.model.body_width or (self.memory.width if remembers else settings.recurrence.hidden_size)
+        has_memory = not isinstance(self.memory, NoMemory)
+        width = settings.model.body_width or (self.memory.width if has_memory else settings.recurrence.hidden_size)
         self.body = nn.Sequential(orthogonal(nn.Linear(self.memory.width, width)), nn.ReLU())
         self.policy = PolicyHead(width, settings.model.head_width, branches)
         self.value = ValueHead(width, settings.model.head_width, settings.model.value_gain)
         self.reconstruction: ReconstructionHead | None = None
         if settings.ppo.reconstruction_coefficient:
             if FRAME not in shapes:
-                raise ValueError("there are no frames to reconstruct; observe `rgb` or set the coefficient to 0")
-            self.reconstruction = ReconstructionHead(self.memory.width, self.observer.shapes[FRAME][-1])
+                raise ValueError(
+                    "--ppo.reconstruction-coefficient needs frames, and the observation has only "
+                    f"{', '.join(shapes)}; use --environment.observation rgb or the coefficient 0"
+                )
+            self.reconstruction = ReconstructionHead(self.memory.width, self.transform.shapes[FRAME][-1])
         self.ground_truth: GroundTruthHead | None = None
         if settings.ppo.ground_truth_coefficient:
             if not ground_truth:
                 raise ValueError(
-                    f"{settings.env} has no ground truth; set the coefficient to 0 or take an endless environment"
+                    f"--ppo.ground-truth-coefficient needs a ground truth, and {settings.env} has none; "
+                    "use an endless environment or the coefficient 0"
                 )
             self.ground_truth = GroundTruthHead(self.memory.width, settings.model.head_width, ground_truth)
         self.to(self.device)
@@ -165,11 +182,11 @@ class Agent(nn.Module):
 
     @property
     def num_parameters(self) -> int:
-        """How many numbers are learned."""
+        """Number of trainable parameters."""
         return sum(parameter.numel() for parameter in self.parameters())
 
     def compile_parts(self) -> None:
-        """Compile what has the same shapes, or nearly, in each call."""
+        """Compile, with `torch.compile`, the submodules whose input shapes are constant or nearly so."""
         parts: list[nn.Module | None] = [
             self.encoder,
             self.body,
@@ -185,84 +202,94 @@ class Agent(nn.Module):
                 part.compile()
 
     def initial_memory(self, num_envs: int) -> AgentMemory:
-        """The memory of environments whose next observations start episodes."""
-        first = torch.ones(num_envs, dtype=torch.bool, device=self.device)
-        return AgentMemory(first, self.observer.initial_state(num_envs), self.memory.initial_state(num_envs))
+        """A new memory for `num_envs` environments, each of whose next observation is the first of an episode."""
+        reset_mask = torch.ones(num_envs, dtype=torch.bool, device=self.device)
+        return AgentMemory(reset_mask, self.transform.initial_state(num_envs), self.memory.initial_state(num_envs))
 
     @torch.no_grad()
     def act(
         self,
-        observation: Any,
+        observation: RawObservation,
         memory: AgentMemory,
         generator: torch.Generator | None = None,
         greedy: bool = False,
-    ) -> Acted:
-        """Decide, and remember.
+    ) -> ActOutput:
+        """Choose actions for one observation, and update the memory.
 
         Args:
-            observation: As a vector environment returns it, or a dict of tensors.
-            memory: Of the same environments; it is brought up to date.
-            generator: Of the draws, on the agent's device; PyTorch's own if there is none.
-            greedy: Take the most likely action instead of drawing one.
+            observation: Observation of n environments, as a vector environment returns it, or a dict of tensors.
+            memory: Memory of the same n environments; updated in place.
+            generator: Generator that samples the actions, on the agent's device; None for PyTorch's default generator.
+            greedy: Take the most likely choice of each branch instead of sampling.
         """
-        observed, news = self.observer.observe(self.tensors(observation), memory.observer, memory.first)
-        with self._precision():
-            hidden, latent = self.memory.step(self.encoder(observed), memory.state, memory.first)
-            self.memory.remember(memory.state, latent)
+        observed, transform_update = self.transform.apply(
+            self.to_tensors(observation), memory.transform_state, memory.reset_mask
+        )
+        with self._autocast():
+            hidden, memory_update = self.memory.step(self.encoder(observed), memory.state, memory.reset_mask)
+            self.memory.update_state(memory.state, memory_update)
             hidden = self.body(hidden)
             logits, value = self.policy(hidden), self.value(hidden)
-        self.observer.remember(memory.observer, news)
-        memory.first = torch.zeros_like(memory.first)
+        self.transform.update_state(memory.transform_state, transform_update)
+        memory.reset_mask = torch.zeros_like(memory.reset_mask)
         actions, log_probs = [], []
         for branch in logits:
             branch = branch.log_softmax(-1)
-            action = branch.argmax(-1, keepdim=True) if greedy else self._draw(branch, generator)
+            action = branch.argmax(-1, keepdim=True) if greedy else self._sample(branch, generator)
             actions.append(action)
             log_probs.append(branch.gather(1, action))
-        return Acted(torch.cat(actions, 1), torch.cat(log_probs, 1), value, observed)
+        return ActOutput(torch.cat(actions, 1), torch.cat(log_probs, 1), value, observed)
 
     @torch.no_grad()
-    def estimate(self, observation: Any, memory: AgentMemory) -> Tensor:
-        """The expected return (n,); nothing is remembered."""
-        observed, _ = self.observer.observe(self.tensors(observation), memory.observer, memory.first)
-        with self._precision():
-            hidden, _ = self.memory.step(self.encoder(observed), memory.state, memory.first)
+    def bootstrap_value(self, observation: RawObservation, memory: AgentMemory) -> Tensor:
+        """Value estimates float32 (n,) of an observation, without updating the memory; arguments as for `act`."""
+        observed, _ = self.transform.apply(self.to_tensors(observation), memory.transform_state, memory.reset_mask)
+        with self._autocast():
+            hidden, _ = self.memory.step(self.encoder(observed), memory.state, memory.reset_mask)
             value: Tensor = self.value(self.body(hidden))
         return value
 
-    def evaluate(self, observation: Observation, plan: Plan) -> Evaluated:
-        """The network's outputs, with gradients, for the observations of a plan's steps, (M, ...) each."""
-        with self._precision():
-            remembered = self.memory(self.encoder(observation), plan)
-            hidden = self.body(remembered)
-            logits, value = self.policy(hidden), self.value(hidden)
-            frame = self.reconstruction(remembered) if self.reconstruction is not None else None
-            truth = self.ground_truth(remembered) if self.ground_truth is not None else None
-        return Evaluated([branch.log_softmax(-1) for branch in logits], value, frame, truth)
+    def forward(self, observation: Observation, minibatch: Minibatch) -> AgentOutput:
+        """Compute the network's outputs for a minibatch, with gradients.
 
-    def tensors(self, observation: Any) -> Observation:
-        """A vector environment's observation as tensors on the agent's device; frames stay uint8."""
+        Args:
+            observation: Transformed observations of the steps `minibatch.indices`, tensors (M, ...) on the agent's device.
+            minibatch: A minibatch that `memory.minibatches` returned.
+        """
+        with self._autocast():
+            memory_output = self.memory(self.encoder(observation), minibatch)
+            hidden = self.body(memory_output)
+            logits, value = self.policy(hidden), self.value(hidden)
+            frame = self.reconstruction(memory_output) if self.reconstruction is not None else None
+            truth = self.ground_truth(memory_output) if self.ground_truth is not None else None
+        return AgentOutput([branch.log_softmax(-1) for branch in logits], value, frame, truth)
+
+    def to_tensors(self, observation: RawObservation) -> Observation:
+        """Convert a vector environment's observation to tensors on the agent's device; frames stay uint8."""
         if not isinstance(observation, Mapping):
-            observation = {next(iter(self._keys())): observation}
+            key = next(key for key in self.transform.shapes if key != POSITION)
+            observation = {key: observation}
         return {
             key: (value if isinstance(value, Tensor) else torch_view(value)).to(self.device, non_blocking=True)
             for key, value in observation.items()
         }
 
-    def _keys(self) -> list[str]:
-        return [key for key in self.observer.shapes if key != "position"]
-
-    def _draw(self, log_probs: Tensor, generator: torch.Generator | None) -> Tensor:
-        """One choice for each row, by the Gumbel trick: int64 (n, 1)."""
+    def _sample(self, log_probs: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Sample one choice for each row of log-probabilities (n, choices) with the Gumbel-max trick: int64 (n, 1)."""
         noise = torch.empty_like(log_probs).exponential_(generator=generator).log_()
         return (log_probs - noise).argmax(-1, keepdim=True)
 
-    def _precision(self) -> torch.autocast:
+    def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16)
 
 
 def observation_shapes(spec: Spec, observation: str) -> dict[str, tuple[int, ...]]:
-    """Shapes of one environment's observation by key; `observation` is `rgb` or `features`."""
+    """Shapes of one environment's observation by key.
+
+    Args:
+        spec: The environment's specification.
+        observation: Kind of the observation, `rgb` or `features`.
+    """
     space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
     if not isinstance(space, spaces.Dict):
         space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
@@ -270,6 +297,15 @@ def observation_shapes(spec: Spec, observation: str) -> dict[str, tuple[int, ...
 
 
 def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu") -> Agent:
-    """A fresh agent for an environment."""
+    """Make an agent with newly initialised weights for an environment.
+
+    Args:
+        settings: Settings of the agent.
+        spec: The environment's specification.
+        device: Device of the weights and the memories.
+
+    Raises:
+        ValueError: The settings need frames or a ground truth that the environment does not have.
+    """
     shapes = observation_shapes(spec, settings.environment.observation)
     return Agent(settings, shapes, spec.branches, spec.ground_truth, device)

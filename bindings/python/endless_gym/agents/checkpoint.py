@@ -1,9 +1,9 @@
-"""Checkpoints: all that a run needs to go on, and all that an evaluation needs to act.
+"""Checkpoints: the state from which a run resumes, and the agent for evaluation.
 
 ```python
-agent = checkpoint.load("runs/mine").agent         # the run's last checkpoint; or a checkpoint's file
+agent = checkpoint.load("runs/mine").agent         # the last checkpoint of a run, or a checkpoint file
 memory = agent.initial_memory(num_envs)
-acted = agent.act(observation, memory)
+output = agent.act(observation, memory)
 ```
 """
 
@@ -21,6 +21,7 @@ from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.settings import Settings, from_dict
 from endless_gym.specs import spec
 
+#: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it.
 SETTINGS = "settings.json"
 FOLDER = "checkpoints"
 LAST = "last.pt"
@@ -31,11 +32,11 @@ class Checkpoint:
     """A loaded checkpoint.
 
     Attributes:
-        settings: Of the run.
-        agent: With the checkpoint's weights.
-        update: Updates that the agent has learned from.
-        steps: Steps of environments that these updates saw.
-        state: All that was saved; see `save`.
+        settings: Settings of the run.
+        agent: The agent with the weights of the checkpoint, in evaluation mode.
+        update: Number of updates so far.
+        steps: Number of environment steps so far.
+        state: The saved state; see `save`.
     """
 
     settings: Settings
@@ -46,31 +47,32 @@ class Checkpoint:
 
 
 def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
-    """Write a checkpoint into a run's folder, as its last one.
+    """Write a checkpoint as the last one of a run, atomically.
 
     Args:
-        run: The run's folder.
-        state: `settings` as a dict, `update`, `steps`, `model`, and for going on `optimizer`, `generators`, `player`, `episodes`.
-        keep: Keep it under the update's number, too.
+        run: Folder of the run.
+        state: `settings` (from `to_dict`), `update`, `steps`, `model`; and to resume, `optimizer`, `generators`, `player` (the
+            state of the rollout collector) and `episodes`.
+        keep: Also keep the checkpoint under the number of its update.
 
     Returns:
-        The file.
+        Path of the last checkpoint.
     """
     folder = run / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    last, fresh = folder / LAST, folder / f"{LAST}.new"
-    torch.save(state, fresh)
+    last, temporary = folder / LAST, folder / f"{LAST}.new"
+    torch.save(state, temporary)
     if keep:
-        # The same file under two names.
+        # A hard link: the same file under a second name.
         numbered = folder / f"update-{state['update']:06d}.pt"
         numbered.unlink(missing_ok=True)
-        os.link(fresh, numbered)
-    os.replace(fresh, last)
+        os.link(temporary, numbered)
+    os.replace(temporary, last)
     return last
 
 
 def files(run: str | Path) -> list[Path]:
-    """The numbered checkpoints of a run, in order, or its last one if it kept no others."""
+    """The numbered checkpoints of a run in order of their updates, or the last checkpoint if there are none."""
     folder = Path(run) / FOLDER
     return sorted(folder.glob("update-*.pt")) or [folder / LAST]
 
@@ -79,18 +81,20 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     """Load a checkpoint.
 
     Args:
-        path: A checkpoint's file, or a run's folder for its last one.
-        device: Where the agent is to compute.
+        path: A checkpoint file, or the folder of a run for its last checkpoint.
+        device: Device of the agent.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: There is no such checkpoint.
     """
     file = Path(path)
     if file.is_dir():
         file = file / FOLDER / LAST
     if not file.exists():
-        raise FileNotFoundError(f"no checkpoint {file}; give a run's folder, or a file of its folder `{FOLDER}`")
-    # Nothing but tensors, numbers and strings is read: a checkpoint cannot run code.
+        raise FileNotFoundError(
+            f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
+        )
+    # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
     state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
     settings = from_dict(state["settings"])
     agent = make_agent(settings, spec(settings.env), device)
@@ -100,11 +104,11 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
 
 
 def read_settings(run: str | Path) -> Settings:
-    """The settings of a run.
+    """Read the settings of the run in folder `run`.
 
     Raises:
-        FileNotFoundError: The folder has no run.
+        FileNotFoundError: The folder contains no run.
     """
     if not (Path(run) / SETTINGS).exists():
-        raise FileNotFoundError(f"no run in {run}; give a folder with {SETTINGS}, as endless-train writes it")
+        raise FileNotFoundError(f"no run in {run}; expected a folder with {SETTINGS}, as endless-train writes it")
     return from_dict(json.loads((Path(run) / SETTINGS).read_text()))

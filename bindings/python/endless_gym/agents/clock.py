@@ -1,4 +1,4 @@
-"""Where the time of an update goes."""
+"""Timing of the phases of an update."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ from contextlib import contextmanager
 
 
 class Clock:
-    """Sums up seconds under names.
+    """Accumulates the seconds of named phases.
 
-    A GPU works on after Python has moved on; `synchronise` is called before each reading, so that its time is not booked under
-    what comes next.
+    GPU kernels run asynchronously. `synchronise` is called at the end of each phase, so that their time counts for the phase that
+    launched them.
+
+    Attributes:
+        seconds: Accumulated seconds by phase.
     """
 
     def __init__(self, synchronise: Callable[[], None] | None = None) -> None:
+        """Make a clock; `synchronise` waits for the device, as `torch.cuda.synchronize` does. None on the CPU."""
         self._synchronise = synchronise or (lambda: None)
         self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
-        """Adds the seconds of the `with` block to `name`."""
+        """Add the duration of the `with` block to the phase `name`."""
         start = time.perf_counter()
         try:
             yield
@@ -30,6 +34,6 @@ class Clock:
             self.seconds[name] += time.perf_counter() - start
 
     def take(self) -> dict[str, float]:
-        """The sums since the last call."""
+        """Return the seconds by phase since the last call, and start again from 0."""
         taken, self.seconds = dict(self.seconds), defaultdict(float)
         return taken

@@ -1,4 +1,4 @@
-"""What the commands have in common: how they fail and how they stop."""
+"""Common parts of the commands: error messages, exit statuses and loading of checkpoints."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ import torch
 
 from endless_gym.agents import checkpoint
 
-#: The exit status of a program that Ctrl-C has stopped, as shells have it.
+#: Exit status after SIGINT, by the convention of shells: 128 + 2.
 INTERRUPTED = 130
 
 
 def run(name: str, work: Callable[[], object]) -> int:
-    """Run a command's work; what the user can put right becomes one line.
+    """Run a command, and report errors of the user in one line on standard error.
+
+    Args:
+        name: Name of the command.
+        work: The command. `ValueError`, `OSError`, `ModuleNotFoundError` and `KeyboardInterrupt` are reported without traceback.
 
     Returns:
         The exit status.
@@ -27,7 +31,7 @@ def run(name: str, work: Callable[[], object]) -> int:
         return INTERRUPTED
     except ModuleNotFoundError as error:
         print(
-            f"{name}: {error.name} is not installed; the agents need: pip install 'endless-gym[agents]'",
+            f"{name}: {error.name} is not installed: pip install 'endless-gym[agents]'",
             file=sys.stderr,
         )
         return 1
@@ -38,23 +42,25 @@ def run(name: str, work: Callable[[], object]) -> int:
 
 
 def load_checkpoint(path: Path, device: torch.device | str) -> checkpoint.Checkpoint:
-    """A checkpoint's agent.
+    """Load a checkpoint, with an error message for users if the file is none.
+
+    Args:
+        path: A checkpoint file, or the folder of a run for its last checkpoint.
+        device: Device of the agent.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is something else.
+        ValueError: The file is not a checkpoint of this version.
     """
     try:
         return checkpoint.load(path, device)
     except (FileNotFoundError, IsADirectoryError, PermissionError):
         raise
-    except Exception as error:  # torch.load raises what its parts raise
-        message = (
-            f"{path} is not a checkpoint of this version's `endless-train`; give a file of a run's folder `checkpoints`"
-        )
+    except Exception as error:  # `torch.load` and `load_state_dict` raise many types
+        message = f"{path} is not a checkpoint of this version of endless-train; expected a file of a run's folder `checkpoints`"
         raise ValueError(message) from error
 
 
 def description(text: str | None) -> str:
-    """A module's text for its command's help, without the examples."""
+    """The part of a module's docstring before its examples, as the description in a command's help."""
     return (text or "").split("```")[0].strip()

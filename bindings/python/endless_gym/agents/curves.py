@@ -1,7 +1,8 @@
-"""Learning curves: of evaluations, of training, and the paper's; and the paper's way to put several environments into one.
+"""Learning curves from evaluations, from training logs and from the paper, and their aggregation over environments as in the
+paper.
 
-A curve has one environment's scores, float64 (runs, checkpoints), over the environment steps that the checkpoints have learned
-from.
+A curve contains the scores of one environment, float64 (runs, checkpoints), over the number of environment steps before each
+checkpoint.
 """
 
 from __future__ import annotations
@@ -26,26 +27,26 @@ from endless_gym.agents.statistics import interquartile_mean, stratified_bootstr
 Floats = NDArray[np.float64]
 Family = Literal["finite", "endless"]
 
-#: The environments whose scores the paper puts into one plot.
+#: The environments whose scores the paper aggregates into one plot.
 FAMILIES: dict[Family, tuple[str, str, str]] = {
     "finite": ("MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"),
     "endless": ("Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"),
 }
-#: In this environment the paper's agents reconstruct observations; there `gru_rec` stands for `gru`.
+#: In this environment all agents of the paper use observation reconstruction; there, `gru_rec` takes the place of `gru`.
 _WITH_RECONSTRUCTION = "Endless-SearingSpotlights-v0"
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One agent's learning curve.
+    """The learning curve of an agent.
 
     Attributes:
-        env: Environment id, or the family that was put together.
-        label: The agent's name.
-        source: Where the scores are from.
+        env: Environment id, or the name of an aggregated family.
+        label: Name of the agent.
+        source: Origin of the scores.
         steps: Environment steps, int64 (checkpoints,).
         scores: float64 (runs, checkpoints).
-        tasks: How many environments the runs are of, each with equally many, one environment after the other.
+        tasks: Number of environments in the curve. Each has the same number of runs; the runs are ordered by environment.
     """
 
     env: str
@@ -56,19 +57,19 @@ class Curve:
     tasks: int = 1
 
     def mean(self) -> tuple[Floats, Floats, Floats]:
-        """The mean over the runs, and it minus and plus one standard deviation; each (checkpoints,)."""
+        """Mean over the runs, mean minus and mean plus one standard deviation, float64 (checkpoints,) each."""
         mean, std = self.scores.mean(0), self.scores.std(0)
         return mean, mean - std, mean + std
 
     def interquartile_mean(self) -> tuple[Floats, Floats, Floats]:
-        """The interquartile mean over the runs, and the ends of its 95 % interval; each (checkpoints,)."""
+        """Interquartile mean over the runs, and the ends of its 95 % bootstrap interval, float64 (checkpoints,) each."""
         means = np.array([interquartile_mean(column) for column in self.scores.T])
         tables = [column.reshape(self.tasks, -1).T for column in self.scores.T]
         ends = np.array([stratified_bootstrap(table, repetitions=1000) for table in tables])
         return means, ends[:, 0], ends[:, 1]
 
     def until(self, steps: int) -> Curve:
-        """Its part up to a number of steps."""
+        """The curve up to a number of environment steps."""
         kept = self.steps <= steps
         return Curve(self.env, self.label, self.source, self.steps[kept], self.scores[:, kept], self.tasks)
 
@@ -81,7 +82,7 @@ def _published() -> dict[str, Any]:
 
 
 def published(env: str, labels: Sequence[str] | None = None) -> list[Curve]:
-    """The paper's curves of an environment; of these agents, or of all."""
+    """The curves of the paper for an environment: those of the agents in `labels` that exist, or all."""
     known, step = _published()["curves"].get(env, {}), _published()["steps_per_checkpoint"]
     chosen = known if labels is None else [name for name in labels if name in known]
     curves = []
@@ -92,12 +93,12 @@ def published(env: str, labels: Sequence[str] | None = None) -> list[Curve]:
 
 
 def published_environments() -> list[str]:
-    """Environments that the paper has curves of."""
+    """Ids of the environments for which the paper has curves."""
     return list(_published()["curves"])
 
 
 def evaluated(experiment: Experiment) -> Curve:
-    """The curve of the paper's metric, from an evaluation, at the steps at which all runs have a checkpoint.
+    """The curve of an experiment in the metric of the paper, at the steps at which all runs have a checkpoint.
 
     Raises:
         ValueError: There are no such steps.
@@ -106,36 +107,38 @@ def evaluated(experiment: Experiment) -> Curve:
     steps = np.array(experiment.common_steps(), dtype=np.int64)
     if not steps.size:
         raise ValueError(
-            f"the runs of {experiment.env}, {experiment.label}, have no checkpoint at the same number of steps"
+            f"the runs of {experiment.env}, {experiment.label}, have no checkpoints at a common number of steps"
         )
     scores = experiment.scores(name)
-    # Other reset parameters make another task than the paper's; the plot says so.
+    # With reset parameters the task differs from that of the paper; the label shows them.
     options = "".join(f", {option}={value}" for option, value in experiment.options.items())
     return Curve(experiment.env, experiment.label + options, "evaluated", steps, scores)
 
 
 def training(run: Path) -> Curve:
-    """The mean reward of the last 100 training episodes, from a run's folder.
+    """The mean reward of the last 100 training episodes of the run in folder `run`.
 
     Raises:
-        FileNotFoundError: The folder is not a run's.
+        FileNotFoundError: The folder contains no run.
         ValueError: No episode has ended yet.
     """
     if not (run / PROGRESS).exists():
-        raise FileNotFoundError(f"no {PROGRESS} in {run}; give a run's folder, or a file of `endless-eval --json`")
+        raise FileNotFoundError(
+            f"no {PROGRESS} in {run}; expected the folder of a run, or a file of `endless-eval --json`"
+        )
     settings = from_dict(json.loads((run / "settings.json").read_text()))
     rows = [row for row in read_progress(run) if row.get("episode/reward") is not None]
     if not rows:
-        raise ValueError(f"in {run} no episode has ended yet; train longer")
+        raise ValueError(f"no episode of the run {run} has ended yet; train longer")
     steps = np.array([row["steps"] for row in rows], dtype=np.int64)
     scores = np.array([[row["episode/reward"] for row in rows]])
     return Curve(settings.env, f"{label(settings)}-{settings.seed}", "training", steps, scores)
 
 
 def scale(env: str) -> float:
-    """What scores of an environment are divided by, before those of several are put together.
+    """Divisor that normalises the scores of an environment before aggregation.
 
-    A task progress stays as it is. Commands, tiles and coins are divided by the best mean over the runs that the paper's GRU has
+    1 for task progress. Commands, tiles and coins are divided by the highest mean over runs that the GRU of the paper reaches
     at any checkpoint.
     """
     if metrics.is_finite(env):
@@ -146,34 +149,44 @@ def scale(env: str) -> float:
 
 
 def aggregate(family: Family, curves: Sequence[Curve]) -> list[Curve]:
-    """Put the normalised runs of a family's environments together, one curve for each agent that has all of them.
+    """Aggregate the normalised scores over the environments of a family.
 
-    The curve ends with the shortest, at the steps that all have; runs count alike, as many from each environment as the one with
-    the fewest has.
+    The steps of an aggregated curve are those that all its curves have. Each environment contributes the same number of runs:
+    that of the environment with the fewest.
+
+    Args:
+        family: The environments.
+        curves: Curves of any environments; those of other environments and of training are ignored.
+
+    Returns:
+        One curve for each agent that has curves in all environments of the family.
+
+    Raises:
+        ValueError: The curves of an agent have no common steps.
     """
     found: dict[tuple[str, str], dict[str, Curve]] = {}
     for curve in curves:
         if curve.env in FAMILIES[family] and curve.source != "training":
             found.setdefault((curve.source, curve.label), {})[curve.env] = curve
-    together = []
+    aggregated = []
     for (source, name), own in found.items():
         if _WITH_RECONSTRUCTION not in own and (source, f"{name}_rec") in found:
-            own = _with(own, found[source, f"{name}_rec"])
+            own = _with_reconstruction(own, found[source, f"{name}_rec"])
         if set(own) == set(FAMILIES[family]):
-            together.append(_put_together(family, name, [own[env] for env in FAMILIES[family]]))
-    return together
+            aggregated.append(_aggregate_one(family, name, [own[env] for env in FAMILIES[family]]))
+    return aggregated
 
 
-def _with(own: Mapping[str, Curve], others: Mapping[str, Curve]) -> dict[str, Curve]:
-    """Completed by the curve with reconstruction, where that is the paper's way."""
+def _with_reconstruction(own: Mapping[str, Curve], others: Mapping[str, Curve]) -> dict[str, Curve]:
+    """Add the curve with reconstruction in the environment where the paper uses it."""
     return {**own, **{env: curve for env, curve in others.items() if env == _WITH_RECONSTRUCTION}}
 
 
-def _put_together(family: str, name: str, curves: Sequence[Curve]) -> Curve:
+def _aggregate_one(family: str, name: str, curves: Sequence[Curve]) -> Curve:
     steps = sorted(set(curves[0].steps.tolist()).intersection(*(curve.steps.tolist() for curve in curves)))
     if not steps:
         raise ValueError(
-            f"the runs of {name} have no checkpoint at the same number of steps in all {family} environments"
+            f"the runs of {name} have no checkpoints at a common number of steps in all {family} environments"
         )
     runs = min(len(curve.scores) for curve in curves)
     parts = [curve.scores[:runs, np.isin(curve.steps, steps)] / scale(curve.env) for curve in curves]

@@ -1,6 +1,6 @@
-"""From observations to the vectors that the memory takes.
+"""The encoder: from observations to the input vectors of the memory.
 
-An observation is a dict of tensors, keyed as the environments' spaces are: `visual_observation` uint8 (n, 84, 84, channels),
+An observation is a dict of tensors with the keys of the observation space: `visual_observation` uint8 (n, 84, 84, channels),
 `features` and `vector_observation` float32 (n, k).
 """
 
@@ -13,32 +13,36 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
+#: An observation of n environments, by key.
 Observation = dict[str, Tensor]
-#: Shapes of one environment's observation, by key.
+#: Shapes of one environment's observation, by key, without the batch dimension.
 Shapes = Mapping[str, tuple[int, ...]]
 
+#: Key of the frames in an observation.
 FRAME = "visual_observation"
 
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d, nn.ConvTranspose2d)
 
 
 def orthogonal(layer: Layer, gain: float = math.sqrt(2)) -> Layer:
-    """The layer with orthogonal weights."""
+    """Initialise the layer's weights with a scaled orthogonal matrix, in place, and return the layer."""
     nn.init.orthogonal_(layer.weight, gain)
     return layer
 
 
-#: Frames that a processor convolves at a time: what lies between two layers then stays in its cache, which saves a quarter of the
-#: time.
-FRAMES_IN_PIECE = 128
+#: Frames per chunk on the CPU. The activations between two layers of a chunk stay in the CPU's cache, which saves a quarter of
+#: the time.
+FRAMES_PER_CHUNK = 128
 
 
 class AtariEncoder(nn.Module):
-    """The convolutions of the Atari agents: frames uint8 (n, 84, 84, channels) to features (n, 3136)."""
+    """The convolutional network of DQN (Mnih et al., 2015) without its fully connected layers."""
 
+    #: Size of the output vectors.
     width = 64 * 7 * 7
 
     def __init__(self, channels: int) -> None:
+        """Make the network for frames with `channels` channels."""
         super().__init__()
         self.convolutions = nn.Sequential(
             *(orthogonal(nn.Conv2d(channels, 32, 8, stride=4)), nn.ReLU()),
@@ -48,18 +52,24 @@ class AtariEncoder(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> Tensor:
-        if frames.device.type == "cpu" and len(frames) > FRAMES_IN_PIECE and not torch.compiler.is_compiling():
-            return torch.cat([self(piece) for piece in frames.split(FRAMES_IN_PIECE)])
-        # The permuted view of frames with their channels last is PyTorch's channels_last format: nothing is copied but the
-        # conversion to float.
+        """Encode frames, uint8 (n, 84, 84, channels), as float (n, 3136)."""
+        if frames.device.type == "cpu" and len(frames) > FRAMES_PER_CHUNK and not torch.compiler.is_compiling():
+            return torch.cat([self(chunk) for chunk in frames.split(FRAMES_PER_CHUNK)])
+        # The permuted view already has PyTorch's channels_last memory format; the conversion to float is the only copy.
         x: Tensor = self.convolutions(frames.permute(0, 3, 1, 2).float() / 255.0)
         return x
 
 
 class Encoder(nn.Module):
-    """Encodes every part of an observation and concatenates: (n, width)."""
+    """Encodes frames with `AtariEncoder` and all vectors with one fully connected layer, and concatenates both."""
 
     def __init__(self, shapes: Shapes, vector_width: int) -> None:
+        """Make the encoder.
+
+        Args:
+            shapes: Shapes of one environment's observation; the vectors are concatenated in this order.
+            vector_width: Units of the fully connected layer.
+        """
         super().__init__()
         self.vectors = [key for key in shapes if key != FRAME]
         self.frames = AtariEncoder(shapes[FRAME][-1]) if FRAME in shapes else None
@@ -68,6 +78,7 @@ class Encoder(nn.Module):
         self.width = (AtariEncoder.width if self.frames else 0) + (vector_width if self.vector else 0)
 
     def forward(self, observation: Observation) -> Tensor:
+        """Encode an observation of n environments as float (n, width)."""
         parts = []
         if self.frames is not None:
             parts.append(self.frames(observation[FRAME]))

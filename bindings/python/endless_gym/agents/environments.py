@@ -1,4 +1,4 @@
-"""The environments that an agent trains on: groups of them, stepped while the agent is busy with another group."""
+"""The training environments, in groups: one group is stepped while the agent computes the actions of another."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from endless_gym.vector import EndlessVectorEnv, make_vec
 
 
 @dataclass
-class Received:
-    """What one step of a group of n environments brought.
+class StepResult:
+    """The result of one step of a group of n environments.
 
     Attributes:
-        observation: Of the step's end; where an episode has ended, the next one's first.
-        reward: float64 (n,)
-        done: bool (n,)
-        ground_truth: What `info` says of the observation, float64 (n, entries), or None.
-        episodes: The final infos of the episodes that ended, one dict each.
+        observation: Observation after the step; where an episode has ended, the first one of the next episode.
+        reward: float64 (n,).
+        done: Whether the episode has ended, bool (n,).
+        ground_truth: Ground truth of the observation, float64 (n, entries); None if the environment has none.
+        episodes: Final infos of the episodes that have ended, one dict each.
     """
 
-    observation: Any
+    observation: NDArray[Any] | dict[str, NDArray[Any]]
     reward: NDArray[np.float64]
     done: NDArray[np.bool_]
     ground_truth: NDArray[np.float64] | None
@@ -35,12 +35,22 @@ class Received:
 
 
 class Environments:
-    """Groups of environments that step at their own pace: `send` a group's actions, do something else, `receive`.
+    """Groups of environments that are stepped asynchronously: `send` a group's actions, `receive` the result later.
 
-    Each episode draws its seed from 0 to 99,999, as in the paper's training.
+    The seed of each episode is drawn from 0 to 99,999, as in the paper's training.
+
+    Attributes:
+        spec: Specification of the environment.
+        groups: Number of groups.
+        per_group: Environments in each group.
     """
 
     def __init__(self, settings: Settings) -> None:
+        """Make the environments, in this process or in an engine process.
+
+        Raises:
+            ValueError: A reset parameter is unknown or out of its range, or the engine cannot start.
+        """
         wanted = settings.environment
         self.spec: Spec = spec(settings.env)
         self.groups, self.per_group = wanted.groups, wanted.num_envs // wanted.groups
@@ -57,25 +67,25 @@ class Environments:
         }
         try:
             self._envs: EndlessVectorEnv = (make_vec if in_process else serve)(settings.env, **arguments)
-        except RuntimeError as error:  # An engine that cannot start says why.
+        except RuntimeError as error:  # The engine reports why it cannot start.
             raise ValueError(str(error)) from error
-        # In this process a group steps in a thread, which needs no interpreter while it does.
+        # In this process a group is stepped in a worker thread; stepping releases the GIL.
         self._thread = ThreadPoolExecutor(1, "environments") if in_process else None
         self._results: dict[int, Future[Any]] = {}
 
-    def reset(self, group: int) -> Received:
-        """Start episodes in all environments of a group."""
+    def reset(self, group: int) -> StepResult:
+        """Start an episode in every environment of a group."""
         observation, info = self._envs.reset(group=group)
         return self._start(observation, info)
 
     def send(self, actions: NDArray[np.int64], group: int) -> None:
-        """Step a group, without waiting for it; actions (n, branches)."""
+        """Start a step of a group with actions int64 (n, branches), without waiting for the result."""
         self._envs.send(actions, group)
         if self._thread is not None:
             self._results[group] = self._thread.submit(self._envs.recv, group)
 
-    def receive(self, group: int) -> Received:
-        """What came of a group's actions."""
+    def receive(self, group: int) -> StepResult:
+        """Wait for the result of a group's last `send`."""
         result = self._results.pop(group).result() if self._thread is not None else self._envs.recv(group)
         observation, reward, terminated, truncated, info = result
         done = terminated | truncated
@@ -84,18 +94,18 @@ class Environments:
             final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
             final.pop("ground_truth", None)
             episodes = [{key: float(value[env]) for key, value in final.items()} for env in np.flatnonzero(done)]
-        return Received(observation, reward, done, info.get("ground_truth"), episodes)
+        return StepResult(observation, reward, done, info.get("ground_truth"), episodes)
 
     def snapshots(self) -> list[list[bytes]]:
-        """The states of all environments of each group."""
+        """Snapshots of all environments of each group, for `restore`."""
         return [[self._envs.snapshot(env, group) for env in range(self.per_group)] for group in range(self.groups)]
 
-    def restore(self, snapshots: list[list[bytes]]) -> list[Received]:
-        """Go on from `snapshots`."""
+    def restore(self, snapshots: list[list[bytes]]) -> list[StepResult]:
+        """Restore snapshots, and return the current observations of each group."""
         return [self._start(*self._envs.restore(dict(enumerate(each)), group)) for group, each in enumerate(snapshots)]
 
     def close(self) -> None:
-        """End the engine and give up its memory."""
+        """Close the environments and end the engine process, if there is one."""
         if self._thread is not None:
             self._thread.shutdown(wait=True)
         self._envs.close()
@@ -106,6 +116,6 @@ class Environments:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def _start(self, observation: Any, info: dict[str, Any]) -> Received:
-        nothing = np.zeros(self.per_group)
-        return Received(observation, nothing, nothing.astype(np.bool_), info.get("ground_truth"), [])
+    def _start(self, observation: Any, info: dict[str, Any]) -> StepResult:
+        zeros = np.zeros(self.per_group)
+        return StepResult(observation, zeros, zeros.astype(np.bool_), info.get("ground_truth"), [])

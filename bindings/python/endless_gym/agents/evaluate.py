@@ -1,4 +1,4 @@
-"""Playing whole episodes of given seeds with a trained agent, as the paper's evaluation does."""
+"""Evaluation of a trained agent on complete episodes of given seeds, as in the paper."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from endless_gym.agents.metrics import TASK_PROGRESS, needs_path_length, path_le
 from endless_gym.specs import spec
 from endless_gym.vector import make_vec
 
-#: Seeds that no training has seen, and how often each is played; the agent's actions are drawn, so that episodes differ.
+#: The paper's protocol: seeds that training never uses, and episodes per seed. Actions are sampled, so the episodes of a seed
+#: differ.
 EVALUATION_SEEDS = range(200_000, 200_050)
 REPETITIONS = 3
 
@@ -23,65 +24,66 @@ def evaluate(
     repetitions: int = REPETITIONS,
     *,
     num_threads: int | None = None,
-    draws: int = 0,
+    action_seed: int = 0,
     greedy: bool = False,
     ended: Callable[[int], None] | None = None,
 ) -> list[dict[str, float]]:
-    """Play each seed several times, all episodes at once.
+    """Play several episodes of each seed, all in parallel.
 
     Args:
-        agent: Who plays; its settings name the environment and its reset parameters.
-        seeds: Of the episodes.
-        repetitions: How often each is played.
-        num_threads: Threads that step the environments; `None` for one for each core.
-        draws: Seed of the agent's draws.
-        greedy: Take the most likely actions instead of drawing them.
-        ended: Is told, whenever some of the episodes have ended, how many.
+        agent: The agent; its settings name the environment and its reset parameters.
+        seeds: Seeds of the episodes.
+        repetitions: Episodes per seed.
+        num_threads: Threads that step the environments; `None` for one per core.
+        action_seed: Seed of the generator that samples the actions.
+        greedy: Take the most likely actions instead of sampling.
+        ended: Called with the number of episodes that have ended, after each step in which some have.
 
     Returns:
-        The final infos of all episodes, with `seed` and in finite environments `task_progress`: `repetitions` times all seeds
-        in turn.
+        The final infos of all episodes with `seed`, and `task_progress` in finite environments; all seeds in order, repeated
+        `repetitions` times.
     """
-    settings, described = agent.settings, spec(agent.settings.env)
+    settings, env_spec = agent.settings, spec(agent.settings.env)
     options = settings.options()
-    played = [seed for _ in range(repetitions) for seed in seeds]
-    memory, generator = agent.initial_memory(len(played)), torch.Generator(agent.device).manual_seed(draws)
-    results: list[dict[str, float]] = [{} for _ in played]
+    episode_seeds = [seed for _ in range(repetitions) for seed in seeds]
+    num_envs = len(episode_seeds)
+    memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)
+    results: list[dict[str, float]] = [{} for _ in episode_seeds]
     with make_vec(
         settings.env,
-        len(played),
+        num_envs,
         num_threads,
-        seeds=played,
+        seeds=episode_seeds,
         options=options,
         autoreset="same_step",
         observation=settings.environment.observation,
     ) as envs:
         observation, _ = envs.reset()
-        paths = [0] * len(played)
-        if needs_path_length(described.id):
-            paths = [path_length(envs.ground_truth_view(env)) for env in range(len(played))]
+        paths = [0] * num_envs
+        if needs_path_length(env_spec.id):
+            paths = [path_length(envs.ground_truth_view(env)) for env in range(num_envs)]
         while not all(results):
-            acted = agent.act(observation, memory, generator, greedy)
-            observation, _, terminated, truncated, info = envs.step(acted.action.cpu().numpy())
+            output = agent.act(observation, memory, generator, greedy)
+            observation, _, terminated, truncated, info = envs.step(output.action.cpu().numpy())
             done = terminated | truncated
-            memory.forget(done)
+            memory.reset(done)
             before = sum(map(bool, results))
             for env in np.flatnonzero(done):
-                # An environment that is done goes on with another episode, which does not count.
+                # After its first episode an environment continues with another one, which is ignored.
                 if not results[env]:
                     final = info["final_info"]
                     names = [name for name in final if not name.startswith("_") and name != "ground_truth"]
                     result = {name: float(final[name][env]) for name in names}
-                    progress = task_progress(described, options, result, paths[env])
-                    results[env] = result | {"seed": float(played[env])}
+                    progress = task_progress(env_spec, options, result, paths[env])
+                    results[env] = result | {"seed": float(episode_seeds[env])}
                     if progress is not None:
                         results[env][TASK_PROGRESS] = progress
-            now = sum(map(bool, results))
-            if ended is not None and now > before:
-                ended(now - before)
+            after = sum(map(bool, results))
+            if ended is not None and after > before:
+                ended(after - before)
     return results
 
 
 def mean(results: Sequence[dict[str, float]], name: str = "reward") -> float:
-    """The mean of one entry of the infos."""
+    """Mean of the entry `name` over the episodes that `evaluate` returned."""
     return sum(result[name] for result in results) / len(results)

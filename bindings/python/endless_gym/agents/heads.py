@@ -1,4 +1,4 @@
-"""What is computed from the memory's output."""
+"""The heads: policy, value, and the auxiliary heads that reconstruct the frame and estimate the ground truth."""
 
 from __future__ import annotations
 
@@ -10,37 +10,48 @@ from endless_gym.agents.encoders import orthogonal
 
 
 class PolicyHead(nn.Module):
-    """Unnormalised log-probabilities for each branch of a multi-discrete action: a list of (n, choices)."""
+    """The policy of a multi-discrete action, with independent branches."""
 
     def __init__(self, input_width: int, width: int, branches: Sequence[int]) -> None:
+        """Make the head.
+
+        Args:
+            input_width: Size of the input vectors.
+            width: Units of the hidden layer.
+            branches: Number of choices of each branch.
+        """
         super().__init__()
         self.hidden = nn.Sequential(orthogonal(nn.Linear(input_width, width)), nn.ReLU())
-        # Small weights: at the start all actions are about as likely.
+        # Small weights make the initial policy nearly uniform.
         self.branches = nn.ModuleList(orthogonal(nn.Linear(width, choices), 0.1) for choices in branches)
 
     def forward(self, x: Tensor) -> list[Tensor]:
+        """The logits of each branch, a list of float32 (n, choices), for inputs float (n, input width)."""
         x = self.hidden(x)
         return [branch(x).float() for branch in self.branches]
 
 
 class ValueHead(nn.Module):
-    """The expected return, (n,)."""
+    """The state value: an estimate of the discounted return."""
 
     def __init__(self, input_width: int, width: int, gain: float) -> None:
+        """Make the head with `width` hidden units; `gain` scales the initial weights of the output layer."""
         super().__init__()
         self.layers = nn.Sequential(
             orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, 1), gain)
         )
 
     def forward(self, x: Tensor) -> Tensor:
+        """The values, float32 (n,), for inputs float (n, input width)."""
         value: Tensor = self.layers(x).squeeze(-1)
         return value.float()
 
 
 class ReconstructionHead(nn.Module):
-    """The Atari encoder backwards: logits of the frame, (n, channels, 84, 84)."""
+    """The mirror image of `AtariEncoder`, with transposed convolutions: reconstructs the observed frame."""
 
     def __init__(self, input_width: int, channels: int) -> None:
+        """Make the head for frames with `channels` channels."""
         super().__init__()
         self.layers = nn.Sequential(
             *(orthogonal(nn.Linear(input_width, 64 * 7 * 7)), nn.ReLU(), nn.Unflatten(1, (64, 7, 7))),
@@ -50,19 +61,22 @@ class ReconstructionHead(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
+        """The logits of the frame, float32 (n, channels, 84, 84), for inputs float (n, input width)."""
         logits: Tensor = self.layers(x)
         return logits.float()
 
 
 class GroundTruthHead(nn.Module):
-    """An estimate of what `info["ground_truth"]` says, (n, entries)."""
+    """Estimates `info["ground_truth"]`."""
 
     def __init__(self, input_width: int, width: int, entries: int) -> None:
+        """Make the head with `width` hidden units for a ground truth of `entries` numbers."""
         super().__init__()
         self.layers = nn.Sequential(
             orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, entries))
         )
 
     def forward(self, x: Tensor) -> Tensor:
+        """The estimates, float32 (n, entries), for inputs float (n, input width)."""
         estimate: Tensor = self.layers(x)
         return estimate.float()

@@ -1,4 +1,4 @@
-"""What a run writes down: a line on the terminal for each update, TensorBoard's files, and `progress.jsonl`."""
+"""Logs of a run: one line per update on the terminal, `progress.jsonl`, TensorBoard and Weights & Biases."""
 
 from __future__ import annotations
 
@@ -14,16 +14,23 @@ from rich.console import Console
 
 from endless_gym.agents.settings import Settings, to_dict
 
+#: Log file in the folder of a run, with one JSON object per update.
 PROGRESS = "progress.jsonl"
-#: Episodes that means are taken over.
+#: Number of episodes that the means are computed over.
 RECENT = 100
 
 
 class Logger:
-    """Writes the measures of each update."""
+    """Writes the metrics of each update."""
 
     def __init__(self, run: Path, settings: Settings, update: int = 0) -> None:
-        """Open the logs of a run; what an earlier process wrote beyond `update` is cut off."""
+        """Open the logs of a run.
+
+        Args:
+            run: Folder of the run.
+            settings: Settings of the run.
+            update: Number of updates so far; entries of later updates are removed.
+        """
         from torch.utils.tensorboard import SummaryWriter
 
         self.console = Console(highlight=False)
@@ -38,34 +45,39 @@ class Logger:
         self._board.add_text("settings", f"|setting|value|\n|-|-|\n{rows}", update)
         self._wandb: Any = _weights_and_biases(run, settings, self.console) if settings.wandb else None
 
-    def update(self, measures: dict[str, Any], seconds: dict[str, float]) -> None:
-        """Write down an update: its measures, and where its seconds went."""
-        row = measures | {f"seconds/{name}": value for name, value in seconds.items()}
+    def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
+        """Log one update.
+
+        Args:
+            metrics: Metrics of the update by name, with `update`, `steps`, `steps_per_second`, `loss` and `entropy`.
+            seconds: Seconds by phase.
+        """
+        row = metrics | {f"seconds/{name}": value for name, value in seconds.items()}
         self._progress.write(json.dumps({k: None if _is_nan(v) else v for k, v in row.items()}) + "\n")
         self._progress.flush()
-        step = measures["update"]
+        step = metrics["update"]
         for name, value in row.items():
             if name not in ("update", "steps"):
                 self._board.add_scalar(name if "/" in name else f"learning/{name}", value, step)
-        self._board.add_scalar("steps", measures["steps"], step)
+        self._board.add_scalar("steps", metrics["steps"], step)
         if self._wandb is not None:
             self._wandb.log(row, step=step)
         total = sum(seconds.values()) or 1.0
         shares = " ".join(f"{name} {value / total:4.0%}" for name, value in seconds.items())
-        reward = measures.get("episode/reward")
-        played = (
+        reward = metrics.get("episode/reward")
+        episodes = (
             "no episode has ended yet"
             if reward is None
-            else (f"reward {reward:.4f} length {measures['episode/length']:.1f}")
+            else (f"reward {reward:.4f} length {metrics['episode/length']:.1f}")
         )
         self.console.print(
-            f"[bold]{step:>5}[/]/{self._updates} {measures['steps']:>11,} steps {measures['steps_per_second']:>8,.0f}/s  "
-            f"[green]{played}[/]  loss {measures['loss']:.4f} entropy {measures['entropy']:.3f}  [dim]{shares}[/]",
+            f"[bold]{step:>5}[/]/{self._updates} {metrics['steps']:>11,} steps {metrics['steps_per_second']:>8,.0f}/s  "
+            f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]",
             soft_wrap=True,
         )
 
-    def say(self, text: str) -> None:
-        """Tell the user something."""
+    def print(self, text: str) -> None:
+        """Print a line on the terminal."""
         self.console.print(text, soft_wrap=True)
 
     def close(self) -> None:
@@ -77,28 +89,33 @@ class Logger:
 
 
 class Episodes:
-    """The infos of the last episodes that ended."""
+    """The final infos of the last 100 episodes.
+
+    Attributes:
+        recent: The infos, oldest first.
+    """
 
     def __init__(self, infos: Iterable[dict[str, float]] = ()) -> None:
+        """Start with the infos of earlier episodes."""
         self.recent: deque[dict[str, float]] = deque(infos, maxlen=RECENT)
 
     def add(self, infos: Iterable[dict[str, float]]) -> None:
-        """Take in the infos of more episodes."""
+        """Append the infos of more episodes."""
         self.recent.extend(infos)
 
     def is_full(self) -> bool:
-        """Whether as many have ended as are kept."""
+        """Whether 100 episodes have ended."""
         return len(self.recent) == RECENT
 
     def means(self) -> dict[str, float]:
-        """The mean of each entry, as `episode/NAME`; empty if no episode has ended."""
+        """Mean of each entry under the key `episode/NAME`; empty if no episode has ended."""
         if not self.recent:
             return {}
         return {f"episode/{key}": sum(info[key] for info in self.recent) / len(self.recent) for key in self.recent[0]}
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:
-    """What a run has written down of each update; a last line of which a killed process has written half does not count."""
+    """The rows of `progress.jsonl`, one per update; an incomplete last line, from a killed process, is ignored."""
     rows = []
     for line in (run / PROGRESS).read_text().splitlines():
         try:
@@ -124,9 +141,11 @@ def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
     try:
         import wandb
     except ImportError:
-        console.print("Weights & Biases is not installed; logging without it (pip install wandb)")
+        console.print(
+            "--wandb needs Weights & Biases, which is not installed (pip install wandb); continuing without it"
+        )
         return None
-    # A run that resumes goes on there under the same id.
+    # A resumed run keeps its id.
     kept = run / "wandb-id.txt"
     if not kept.exists():
         kept.write_text(secrets.token_hex(4))
@@ -134,4 +153,4 @@ def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
     try:
         return wandb.init(project="endless-gym", resume="allow", **given)
     except wandb.Error as error:
-        raise ValueError(f"Weights & Biases: {error} Or keep its log on this machine: WANDB_MODE=offline") from None
+        raise ValueError(f"Weights & Biases: {error}; or log to local files with WANDB_MODE=offline") from None

@@ -1,6 +1,7 @@
-"""The paper's equations: advantages, and the losses that are summed up.
+"""Generalised advantage estimation, and the loss terms of PPO and its auxiliary tasks.
 
-All functions work on float32 tensors and return means over the steps they are given.
+Tensors are float32 unless stated otherwise. T is the number of steps of a segment, N of its environments, M of the steps of a
+minibatch. Every loss is a scalar, the mean over the minibatch.
 """
 
 from __future__ import annotations
@@ -13,45 +14,48 @@ from torch.nn import functional
 def generalised_advantages(
     rewards: Tensor, values: Tensor, dones: Tensor, last_value: Tensor, gamma: float, gae_lambda: float
 ) -> Tensor:
-    """Generalised advantage estimation.
+    """Generalised advantage estimation (Schulman et al., 2016).
 
-    An episode that ends, be it by the step limit, has no value after its last step.
+    There is no bootstrapping at the end of an episode, including one that ends at the step limit.
 
     Args:
-        rewards: What step `t` earned, (T, N).
-        values: The value estimated before step `t`, (T, N).
+        rewards: Reward of step `t`, (T, N).
+        values: Value estimate of the observation before step `t`, (T, N).
         dones: Whether step `t` ended its episode, bool (T, N).
-        last_value: The value estimated after the last step, (N,).
+        last_value: Bootstrap value: the value estimate of the observation after the last step, (N,).
         gamma: Discount factor.
-        gae_lambda: Weight of longer returns.
+        gae_lambda: Lambda, the trade-off between bias (0) and variance (1).
 
     Returns:
-        The advantages, (T, N); returns are these plus `values`.
+        The advantages, (T, N). The returns, targets of the value function, are the advantages plus `values`.
     """
     advantages = torch.empty_like(rewards)
-    following, advantage = last_value, torch.zeros_like(last_value)
-    goes_on = (~dones).to(rewards.dtype)
+    next_value, advantage = last_value, torch.zeros_like(last_value)
+    not_done = (~dones).to(rewards.dtype)
     for t in range(rewards.shape[0] - 1, -1, -1):
-        error = rewards[t] + gamma * following * goes_on[t] - values[t]
-        advantage = error + gamma * gae_lambda * goes_on[t] * advantage
+        delta = rewards[t] + gamma * next_value * not_done[t] - values[t]
+        advantage = delta + gamma * gae_lambda * not_done[t] * advantage
         advantages[t] = advantage
-        following = values[t]
+        next_value = values[t]
     return advantages
 
 
 def normalised(advantages: Tensor) -> Tensor:
-    """Advantages with mean 0 and standard deviation 1."""
+    """Scale advantages of any shape to mean 0 and standard deviation 1."""
     return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
 
 
 def policy_loss(log_probs: Tensor, old_log_probs: Tensor, advantages: Tensor, clip_range: float) -> Tensor:
-    """PPO's clipped surrogate, negated; the ratio is clipped for each branch of the action, and all are averaged.
+    """The negated clipped surrogate objective of PPO.
+
+    The probability ratio is computed and clipped for each branch of the action separately; the loss is the mean over all
+    branches.
 
     Args:
-        log_probs: Of the actions taken, under the current policy, (M, branches).
-        old_log_probs: Under the policy that took them, (M, branches).
+        log_probs: Log-probabilities of the taken actions under the current policy, (M, branches).
+        old_log_probs: Log-probabilities under the policy that collected the rollout, (M, branches).
         advantages: (M,).
-        clip_range: How far the ratio may leave 1 and still be rewarded.
+        clip_range: Epsilon: the ratio is clipped to 1 - epsilon to 1 + epsilon.
     """
     ratio = (log_probs - old_log_probs).exp()
     weight = advantages.unsqueeze(1)
@@ -59,28 +63,35 @@ def policy_loss(log_probs: Tensor, old_log_probs: Tensor, advantages: Tensor, cl
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_range: float) -> Tensor:
-    """The larger of the squared errors of the value and of the value clipped to the old one's neighbourhood; all (M,)."""
+    """The clipped value loss of PPO: the larger of the squared errors of the value and of the clipped value.
+
+    Args:
+        values: Current value estimates, (M,).
+        old_values: Value estimates while the rollout was collected, (M,).
+        returns: Targets, (M,).
+        clip_range: Largest difference between the clipped value and the old one.
+    """
     clipped = old_values + (values - old_values).clamp(-clip_range, clip_range)
     return torch.max((values - returns).square(), (clipped - returns).square()).mean()
 
 
 def reconstruction_loss(logits: Tensor, frames: Tensor) -> Tensor:
-    """Binary cross entropy between the sigmoid of `logits` and the frames.
+    """Binary cross-entropy between the sigmoid of the logits and the frames scaled to 0 to 1.
 
     Args:
-        logits: (M, channels, 84, 84).
-        frames: uint8 (M, 84, 84, channels).
+        logits: Logits of the reconstruction, (M, channels, 84, 84).
+        frames: Observed frames, uint8 (M, 84, 84, channels).
     """
     target = frames.permute(0, 3, 1, 2).to(logits.dtype) / 255.0
     return functional.binary_cross_entropy_with_logits(logits, target)
 
 
 def ground_truth_loss(estimates: Tensor, truth: Tensor) -> Tensor:
-    """Mean squared error of the estimated ground truth, (M, k)."""
+    """Mean squared error between the estimated and the actual ground truth, (M, entries) each."""
     return (estimates - truth).square().mean()
 
 
 def explained_variance(values: Tensor, returns: Tensor) -> float:
-    """Share of the returns' variance that the values explain: 1 is all, 0 is none; NaN if there is no variance."""
+    """Fraction of the variance of `returns` that `values` explain, of equal shape; NaN if the returns have no variance."""
     variance = returns.var()
     return float("nan") if variance == 0 else float(1.0 - (returns - values).var() / variance)

@@ -1,13 +1,14 @@
-"""What all memories have in common, and the agent without one.
+"""The interface of the agent's memory, and the memoryless agent.
 
-A memory is a module between encoder and heads. It meets the same steps twice:
+A memory is a module between the encoder and the heads. It computes its outputs in two ways:
 
-* While the agent acts, one step of `n` environments at a time: `step` reads a `State`, which `remember` then brings up to date.
-  `first` tells which environments have just started an episode; nothing from before may reach them.
-* While it learns, many steps at once, with gradients: `plan` divides a segment of T steps in N environments into minibatches, and
-  `forward` computes the outputs of one of them.
+* Acting: one step of n environments at a time. `step` reads the state and returns the output together with an update;
+  `update_state` writes the update into the state. The reset mask says which environments start an episode at this step; nothing
+  from before that step may influence their output.
+* Learning: many steps at once, with gradients. `minibatches` divides a segment of T steps in N environments into minibatches, and
+  `forward` computes the outputs of one minibatch.
 
-Both give the same outputs for the same weights.
+With the same weights both give the same outputs.
 """
 
 from __future__ import annotations
@@ -15,120 +16,139 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 
 @dataclass
-class Plan:
-    """One minibatch.
+class Minibatch:
+    """M steps of a segment, in the order in which `Memory.forward` takes them.
 
     Attributes:
-        steps: Which steps of the segment it has, in the order in which `forward` takes them: t * N + n, int64 (M,).
+        indices: Index t * N + n of each step in the flattened segment, int64 (M,), on the memory's device.
     """
 
-    steps: Tensor
+    indices: Tensor
 
 
-class State(ABC):
+class MemoryState(ABC):
     """What a memory keeps of n environments between two steps."""
 
     @abstractmethod
-    def tensors(self) -> dict[str, Any]:
-        """All of it, for a checkpoint."""
+    def state_dict(self) -> dict[str, Any]:
+        """The state as tensors and numbers by name, for a checkpoint."""
 
     @abstractmethod
-    def load(self, tensors: dict[str, Any]) -> None:
-        """The reverse of `tensors`."""
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load what `state_dict` returned; tensors are moved to this state's device."""
 
 
-class Memory(nn.Module, ABC):
-    """A module that remembers; see the module's text."""
+StateT = TypeVar("StateT", bound=MemoryState)
+UpdateT = TypeVar("UpdateT")
+MinibatchT = TypeVar("MinibatchT", bound=Minibatch)
+
+
+class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
+    """A memory module.
+
+    Type parameters: `StateT` is the state between two steps, `UpdateT` is what `step` hands to `update_state`, `MinibatchT` is
+    the minibatch that `forward` takes.
+    """
 
     #: Size of the output vectors.
     width: int
 
     @abstractmethod
-    def initial_state(self, num_envs: int) -> State:
-        """The state of environments that have seen nothing."""
+    def initial_state(self, num_envs: int) -> StateT:
+        """The state of `num_envs` environments before their first step."""
 
     @abstractmethod
-    def begin_segment(self, state: State, steps: int) -> None:
-        """Prepare for recording `steps` steps to learn from; weights may have changed since the last one."""
+    def begin_segment(self, state: StateT, steps: int) -> None:
+        """Prepare the state for recording a segment of `steps` steps. The weights may have changed since the previous one."""
 
     @abstractmethod
-    def step(self, x: Tensor, state: State, first: Tensor) -> tuple[Tensor, Any]:
-        """One step: what is remembered of it is only kept with `remember`.
+    def step(self, x: Tensor, state: StateT, reset_mask: Tensor) -> tuple[Tensor, UpdateT]:
+        """Compute the output of one step without changing the state.
 
         Args:
-            x: Encoded observations, (n, input width).
-            state: Of the same environments; it is not changed.
-            first: Whether this is the first step of an episode, bool (n,).
+            x: Encoded observations, float (n, input width).
+            state: State of the same n environments.
+            reset_mask: Whether the observation is the first of an episode, bool (n,).
 
         Returns:
-            The output (n, width), and what `remember` takes.
+            The output, float (n, width), and the update for `update_state`.
         """
 
     @abstractmethod
-    def remember(self, state: State, news: Any) -> None:
-        """Bring the state up to date."""
+    def update_state(self, state: StateT, update: UpdateT) -> None:
+        """Write the update that `step` returned into the state."""
 
     @abstractmethod
-    def plan(
-        self, states: Sequence[State], first: Tensor, minibatches: int, generator: torch.Generator
-    ) -> Sequence[Plan]:
-        """Divide a recorded segment, at random.
+    def minibatches(
+        self, states: Sequence[StateT], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+    ) -> Sequence[MinibatchT]:
+        """Shuffle a recorded segment and divide it into minibatches.
 
         Args:
-            states: One for each group of environments, after the segment.
-            first: Which steps are the first of an episode, bool (T, N) on the CPU.
-            minibatches: How many.
-            generator: Of the random division, on the CPU.
+            states: The state of each group of environments after the segment, in the order of their columns in the segment.
+            reset_mask: Whether each step is the first of an episode, bool (T, N), on the CPU.
+            num_minibatches: Number of minibatches; there are fewer if the segment has fewer sequences.
+            generator: Generator of the shuffle, on the CPU.
         """
 
     @abstractmethod
-    def forward(self, x: Tensor, plan: Any) -> Tensor:
-        """The outputs of a minibatch.
+    def forward(self, x: Tensor, minibatch: MinibatchT) -> Tensor:
+        """Compute the outputs of a minibatch, with gradients.
 
         Args:
-            x: The encoded observations of `plan.steps`, (M, input width).
-            plan: From `plan`.
+            x: Encoded observations of the steps `minibatch.indices`, float (M, input width).
+            minibatch: A minibatch that `minibatches` returned.
 
         Returns:
-            (M, width)
+            The outputs, float (M, width).
         """
 
 
-def shares(sizes: Sequence[int], minibatches: int, generator: torch.Generator) -> list[Tensor]:
-    """Shuffle items and divide them into `minibatches` of about the same total size.
+#: A memory of any kind. The settings choose the memory at run time, so its type parameters are not known statically.
+AnyMemory: TypeAlias = Memory[Any, Any, Any]
+
+
+def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Generator) -> list[Tensor]:
+    """Shuffle items and split them into parts of about the same total size.
+
+    Args:
+        sizes: Size of each item, 1 or more.
+        num_parts: Number of parts.
+        generator: Generator of the shuffle, on the CPU.
 
     Returns:
-        The items' numbers in each minibatch; none is empty, so that there are fewer if there are too few items.
+        The indices of the items in each part, int64 on the CPU. No part is empty: with too few items there are fewer parts.
     """
     order = torch.randperm(len(sizes), generator=generator)
-    # An item belongs to the share in which its middle lies, along the shuffled row of all.
+    # An item belongs to the part that contains the middle of the item's interval on the cumulative sum of the shuffled sizes.
     size = torch.tensor(sizes, dtype=torch.float64)[order]
     middle = size.cumsum(0) - size / 2
-    share = (middle * minibatches / size.sum()).long()
-    return [order[share == number] for number in range(minibatches) if bool((share == number).any())]
+    part = (middle * num_parts / size.sum()).long()
+    return [order[part == number] for number in range(num_parts) if bool((part == number).any())]
 
 
-class NoState(State):
-    """Nothing."""
+class NoState(MemoryState):
+    """The empty state of `NoMemory`."""
 
-    def tensors(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {}
 
-    def load(self, tensors: dict[str, Any]) -> None:
-        del tensors
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        del state_dict
 
 
-class NoMemory(Memory):
-    """The current observation is all there is: its encoding is passed on as it is."""
+class NoMemory(Memory[NoState, None, Minibatch]):
+    """The identity: the output is the encoding of the current observation."""
 
     def __init__(self, input_width: int, device: torch.device) -> None:
+        """Make the memory for encoded observations of size `input_width`; `device` is the device of the minibatches."""
         super().__init__()
         self.width = input_width
         self.device = device
@@ -137,23 +157,23 @@ class NoMemory(Memory):
         del num_envs
         return NoState()
 
-    def begin_segment(self, state: State, steps: int) -> None:
+    def begin_segment(self, state: NoState, steps: int) -> None:
         del state, steps
 
-    def step(self, x: Tensor, state: State, first: Tensor) -> tuple[Tensor, None]:
-        del state, first
+    def step(self, x: Tensor, state: NoState, reset_mask: Tensor) -> tuple[Tensor, None]:
+        del state, reset_mask
         return x, None
 
-    def remember(self, state: State, news: Any) -> None:
-        del state, news
+    def update_state(self, state: NoState, update: None) -> None:
+        del state, update
 
-    def plan(
-        self, states: Sequence[State], first: Tensor, minibatches: int, generator: torch.Generator
-    ) -> Sequence[Plan]:
+    def minibatches(
+        self, states: Sequence[NoState], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+    ) -> Sequence[Minibatch]:
         del states
-        order = torch.randperm(first.numel(), generator=generator)
-        return [Plan(steps.to(self.device)) for steps in order.chunk(minibatches)]
+        order = torch.randperm(reset_mask.numel(), generator=generator)
+        return [Minibatch(indices.to(self.device)) for indices in order.chunk(num_minibatches)]
 
-    def forward(self, x: Tensor, plan: Plan) -> Tensor:
-        del plan
+    def forward(self, x: Tensor, minibatch: Minibatch) -> Tensor:
+        del minibatch
         return x

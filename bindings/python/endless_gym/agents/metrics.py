@@ -1,10 +1,10 @@
-"""What the paper reports of an episode: its task progress where the task is finite; commands, tiles or coins where it has no end.
+"""The metrics of the paper: task progress in finite environments; commands, tiles or coins in endless ones.
 
-A task progress lies between 0 and 1. The infos of an episode's end do not always tell it:
+Task progress is 0 to 1. The final infos of an episode do not always contain it, so it is computed:
 
-* Mortar Mayhem: the share of the commands that were carried out. The infos count a last command that failed, the reward does not.
-* Mystery Path: the share of the path's tiles that were reached, from the reward and the length of the path.
-* Searing Spotlights: half for the coins, half for leaving by the exit.
+* Mortar Mayhem: fraction of the commands that were executed. The infos count a failed last command; the reward does not.
+* Mystery Path: fraction of the path's tiles that were reached, from the reward and the length of the path.
+* Searing Spotlights: half for the collected coins, half for leaving through the exit.
 """
 
 from __future__ import annotations
@@ -17,56 +17,57 @@ from numpy.typing import NDArray
 
 from endless_gym.specs import Spec
 
+#: Name of the task progress in the results of an episode.
 TASK_PROGRESS = "task_progress"
 
-#: The paper's metric of each environment, and how a plot calls it.
+#: Name and plot label of the metric of each endless environment.
 METRICS = {
     "Endless-MortarMayhem-v0": ("commands_completed", "Commands"),
     "Endless-MysteryPath-v0": ("tiles_visited", "Tiles"),
     "Endless-SearingSpotlights-v0": ("coins_collected", "Coins"),
 }
 
-#: Side of a tile of Mystery Path in the ground-truth view, in pixels, and the colours of the path's tiles and of its goal.
+#: Side of a tile in the ground-truth view of Mystery Path, in pixels, and the colours of the path and of its goal.
 _TILE = 48
 _PATH, _GOAL = (255, 255, 255), (0, 255, 0)
 
 
 def metric(env: str) -> tuple[str, str]:
-    """The name of an environment's metric in the results, and its label."""
+    """Name of an environment's metric in the results, and its plot label."""
     return METRICS.get(env, (TASK_PROGRESS, "Task progress"))
 
 
 def is_finite(env: str) -> bool:
-    """Whether the environment's task has an end, and so a task progress."""
+    """Whether the environment is finite, so that its metric is the task progress."""
     return env not in METRICS
 
 
 def path_length(view: NDArray[np.uint8]) -> int:
-    """Tiles of a path that there are to reach, its goal counted and its origin not.
+    """Number of tiles of a path, with its goal and without its origin.
 
     Args:
-        view: Mystery Path's ground-truth view at the start of an episode, uint8 (336, 336, 3).
+        view: Ground-truth view of Mystery Path at the start of an episode, uint8 (336, 336, 3).
     """
     centres = view[_TILE // 2 :: _TILE, _TILE // 2 :: _TILE]
     return int(sum((centres == colour).all(-1).sum() for colour in (_PATH, _GOAL)))
 
 
 def needs_path_length(env: str) -> bool:
-    """Whether `task_progress` wants to know the path's length."""
+    """Whether `task_progress` needs the length of the path in this environment."""
     return env.startswith("MysteryPath")
 
 
 def task_progress(spec: Spec, options: Mapping[str, Any], final: Mapping[str, float], path: int = 0) -> float | None:
-    """How much of its task an episode has done, from 0 to 1.
+    """Task progress of an episode, 0 to 1.
 
     Args:
-        spec: Of the environment.
-        options: The reset parameters that differ from the defaults.
-        final: The episode's final infos, with `reward`.
-        path: What `path_length` says, for Mystery Path.
+        spec: Specification of the environment.
+        options: Reset parameters that differ from the defaults.
+        final: Final infos of the episode, with `reward`.
+        path: Length of the path, from `path_length`; only used in Mystery Path.
 
     Returns:
-        None for an environment without an end.
+        The task progress; None in an endless environment.
     """
     parameters = {**spec.reset_parameters, **options}
     if not is_finite(spec.id):
@@ -79,23 +80,23 @@ def task_progress(spec: Spec, options: Mapping[str, Any], final: Mapping[str, fl
 
 
 def _commands(parameters: Mapping[str, Any], final: Mapping[str, float]) -> float:
-    """Mortar Mayhem. `commands_completed` is a share, and counts the last command even if it failed; the reward tells.
+    """Mortar Mayhem. `commands_completed` is a fraction that counts a failed last command; the reward shows whether it failed.
 
-    Where the number of commands is drawn from several that follow each other, an episode of the larger one that failed at its
-    last command looks like a whole one of the smaller, and counts as that.
+    If `command_count` contains both n and n + 1, an episode with n + 1 commands that fails at the last one is indistinguishable
+    from a complete episode with n commands, and counts as complete.
     """
     share, reward = final["commands_completed"], parameters["reward_command_success"]
-    tells = reward > 0 and not parameters["reward_command_failure"] and not parameters["reward_episode_success"]
-    if share < 1 or not tells:
+    informative = reward > 0 and not parameters["reward_command_failure"] and not parameters["reward_episode_success"]
+    if share < 1 or not informative:
         return share
     done = round(final["reward"] / reward)
     counts = {int(count) for count in parameters["command_count"]}
-    # All were carried out, or all but the last one of a longer sequence.
+    # Either all commands were executed, or all but the last of a longer sequence.
     return 1.0 if done in counts else done / (done + 1)
 
 
 def _tiles(parameters: Mapping[str, Any], final: Mapping[str, float], path: int) -> float:
-    """Mystery Path. Each tile is rewarded once, the goal in its own way; without a reward for tiles, success counts."""
+    """Mystery Path. Each tile is rewarded once, and the goal has its own reward; without a tile reward, success is returned."""
     tile, success = parameters["reward_path_progress"], final["success"]
     if tile <= 0 or parameters["reward_fall_off"] or parameters["reward_step"] or not path:
         return success
@@ -104,7 +105,7 @@ def _tiles(parameters: Mapping[str, Any], final: Mapping[str, float], path: int)
 
 
 def _coins(parameters: Mapping[str, Any], final: Mapping[str, float]) -> float:
-    """Searing Spotlights. With several numbers of coins to choose from, the share is of the largest."""
+    """Searing Spotlights. If `num_coins` has several values, the fraction refers to the largest."""
     coins = max(int(count) for count in parameters["num_coins"])
     share = min(1.0, final["coins_collected"] / coins) if coins else 1.0
     return (share + final["success"]) / 2 if parameters["use_exit"] else share

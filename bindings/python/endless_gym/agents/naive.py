@@ -1,15 +1,13 @@
-"""The paper's naive baselines, which change what the agent observes instead of giving it a memory.
+"""Observation transforms: the paper's naive baselines, which extend the observation instead of adding a memory.
 
-An observer turns the environments' observation into the agent's: as it is, with the last grey frames stacked, or with
-the number of the step in the episode, encoded. What it keeps between two steps it keeps as the memories do; see
-`memory`.
+A transform turns the environments' observation into the agent's: unchanged, with the last grey frames stacked, or with the
+encoded step number of the episode. Its state is kept between steps like that of a memory; see `memory`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,62 +15,91 @@ from torch import Tensor
 from endless_gym.agents.encoders import FRAME, Observation, Shapes
 from endless_gym.agents.settings import Settings
 
-#: Entries of the encoded step, and steps that are told apart.
+#: Entries of the encoded step number, and the number of steps with an encoding of their own.
 POSITION_WIDTH, POSITIONS = 16, 512
+#: Key of the encoded step number in the observation.
 POSITION = "position"
 
 
 @dataclass
-class ObserverState:
-    """What an observer keeps: tensors of n environments by name."""
+class TransformState:
+    """What a transform keeps of n environments between two steps.
 
-    kept: dict[str, Tensor] = field(default_factory=dict)
+    Attributes:
+        tensors: Tensors (n, ...) by name.
+    """
+
+    tensors: dict[str, Tensor] = field(default_factory=dict)
 
 
-class Observer(ABC):
-    """See the module's text."""
+class ObservationTransform(ABC):
+    """Turns the environments' observation into the agent's."""
 
     #: Shapes of the agent's observation.
     shapes: Shapes
 
     @abstractmethod
-    def initial_state(self, num_envs: int) -> ObserverState:
-        """The state of environments that have shown nothing."""
+    def initial_state(self, num_envs: int) -> TransformState:
+        """The state of `num_envs` environments before their first step."""
 
     @abstractmethod
-    def observe(self, observation: Observation, state: ObserverState, first: Tensor) -> tuple[Observation, Any]:
-        """The agent's observation, and what `remember` takes; `first` tells where an episode starts, bool (n,)."""
+    def apply(
+        self, observation: Observation, state: TransformState, reset_mask: Tensor
+    ) -> tuple[Observation, dict[str, Tensor]]:
+        """Transform one observation of n environments without changing the state.
 
-    def remember(self, state: ObserverState, news: dict[str, Tensor]) -> None:
-        """Bring the state up to date."""
-        state.kept = news
+        Args:
+            observation: The environments' observation.
+            state: State of the same environments.
+            reset_mask: Whether the observation is the first of an episode, bool (n,).
+
+        Returns:
+            The agent's observation, and the update for `update_state`.
+        """
+
+    def update_state(self, state: TransformState, update: dict[str, Tensor]) -> None:
+        """Write the update that `apply` returned into the state."""
+        state.tensors = update
 
 
-class AsItIs(Observer):
+class Identity(ObservationTransform):
     """The environments' own observation."""
 
     def __init__(self, shapes: Shapes) -> None:
+        """Make the transform for observations of these shapes."""
         self.shapes = shapes
 
-    def initial_state(self, num_envs: int) -> ObserverState:
+    def initial_state(self, num_envs: int) -> TransformState:
         del num_envs
-        return ObserverState()
+        return TransformState()
 
-    def observe(self, observation: Observation, state: ObserverState, first: Tensor) -> tuple[Observation, Any]:
-        del state, first
+    def apply(
+        self, observation: Observation, state: TransformState, reset_mask: Tensor
+    ) -> tuple[Observation, dict[str, Tensor]]:
+        del state, reset_mask
         return observation, {}
 
 
-class Stacked(Observer):
-    """The last `count` observations, the newest last; frames are grey. An episode's first observation fills the stack."""
+class FrameStack(ObservationTransform):
+    """The last `count` observations along the last axis, oldest first; frames become grey.
+
+    The first observation of an episode fills the whole stack.
+    """
 
     def __init__(self, shapes: Shapes, count: int, device: torch.device) -> None:
+        """Make the transform.
+
+        Args:
+            shapes: Shapes of one environment's observation.
+            count: Number of stacked observations.
+            device: Device of the state.
+        """
         self.count, self.device = count, device
         self.single = {key: (*shape[:-1], 1) if key == FRAME else shape for key, shape in shapes.items()}
         self.shapes = {key: (*shape[:-1], shape[-1] * count) for key, shape in self.single.items()}
 
-    def initial_state(self, num_envs: int) -> ObserverState:
-        return ObserverState(
+    def initial_state(self, num_envs: int) -> TransformState:
+        return TransformState(
             {
                 key: torch.zeros(
                     (num_envs, *shape), dtype=torch.uint8 if key == FRAME else torch.float32, device=self.device
@@ -81,46 +108,60 @@ class Stacked(Observer):
             }
         )
 
-    def observe(self, observation: Observation, state: ObserverState, first: Tensor) -> tuple[Observation, Any]:
+    def apply(
+        self, observation: Observation, state: TransformState, reset_mask: Tensor
+    ) -> tuple[Observation, dict[str, Tensor]]:
         stacks = {}
-        for key, now in observation.items():
-            now = grey(now) if key == FRAME else now
-            shifted = torch.cat([state.kept[key][..., self.single[key][-1] :], now], dim=-1)
-            filled = now.repeat(*(1 for _ in now.shape[:-1]), self.count)
-            stacks[key] = torch.where(first.view(-1, *(1 for _ in now.shape[1:])), filled, shifted)
+        for key, newest in observation.items():
+            newest = grey(newest) if key == FRAME else newest
+            shifted = torch.cat([state.tensors[key][..., self.single[key][-1] :], newest], dim=-1)
+            filled = newest.repeat(*(1 for _ in newest.shape[:-1]), self.count)
+            stacks[key] = torch.where(reset_mask.view(-1, *(1 for _ in newest.shape[1:])), filled, shifted)
         return stacks, stacks
 
 
-class Positioned(Observer):
-    """The observation, and the step's number in the episode as sines and cosines; they end with step 511."""
+class PositionalEncoding(ObservationTransform):
+    """Adds the sinusoidal encoding of the step number in the episode, under the key `position`, float32 (n, 16).
+
+    All steps from number 511 on have the same encoding.
+    """
 
     def __init__(self, shapes: Shapes, device: torch.device) -> None:
+        """Make the transform for observations of these shapes; `device` is the device of the state."""
         self.shapes = {**shapes, POSITION: (POSITION_WIDTH,)}
         self.device = device
         steps = torch.arange(POSITIONS, dtype=torch.float64).unsqueeze(1)
         angles = steps / 1e4 ** (torch.arange(0, POSITION_WIDTH, 2) / POSITION_WIDTH)
-        # Sine and cosine of each frequency stand next to each other.
+        # Sine and cosine of each frequency alternate.
         self.table = torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1).float().to(device)
 
-    def initial_state(self, num_envs: int) -> ObserverState:
-        return ObserverState({"next": torch.zeros(num_envs, dtype=torch.long, device=self.device)})
+    def initial_state(self, num_envs: int) -> TransformState:
+        return TransformState({"next": torch.zeros(num_envs, dtype=torch.long, device=self.device)})
 
-    def observe(self, observation: Observation, state: ObserverState, first: Tensor) -> tuple[Observation, Any]:
-        now = state.kept["next"].masked_fill(first, 0)
-        encoded = self.table[now.clamp(max=POSITIONS - 1)]
-        return {**observation, POSITION: encoded}, {"next": now + 1}
+    def apply(
+        self, observation: Observation, state: TransformState, reset_mask: Tensor
+    ) -> tuple[Observation, dict[str, Tensor]]:
+        position = state.tensors["next"].masked_fill(reset_mask, 0)
+        encoded = self.table[position.clamp(max=POSITIONS - 1)]
+        return {**observation, POSITION: encoded}, {"next": position + 1}
 
 
 def grey(frames: Tensor) -> Tensor:
-    """Luminance of frames uint8 (..., 3) as uint8 (..., 1), in whole numbers: 0.299 red, 0.587 green, 0.114 blue."""
+    """Luminance (ITU-R BT.601) of frames uint8 (..., 3) as uint8 (..., 1), in integer arithmetic."""
     red, green, blue = frames.int().unbind(-1)
     return ((4899 * red + 9617 * green + 1868 * blue + 8192) >> 14).to(torch.uint8).unsqueeze(-1)
 
 
-def make_observer(settings: Settings, shapes: Shapes, device: torch.device) -> Observer:
-    """The observer of the agent that the settings name."""
+def make_observation_transform(settings: Settings, shapes: Shapes, device: torch.device) -> ObservationTransform:
+    """The observation transform of the agent that the settings name.
+
+    Args:
+        settings: Settings of the agent.
+        shapes: Shapes of one environment's observation.
+        device: Device of the state.
+    """
     if settings.agent == "stack":
-        return Stacked(shapes, settings.model.stack, device)
+        return FrameStack(shapes, settings.model.stack, device)
     if settings.agent == "position":
-        return Positioned(shapes, device)
-    return AsItIs(shapes)
+        return PositionalEncoding(shapes, device)
+    return Identity(shapes)

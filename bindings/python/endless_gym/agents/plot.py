@@ -1,12 +1,12 @@
-"""`endless-plot`: learning curves, and the paper's aggregated, normalised plot, beside the paper's own curves.
+"""`endless-plot`: plot learning curves together with the curves of the paper, per environment or aggregated and normalised.
 
-Each plot is a PNG; beside it are a CSV file with the curves as they are drawn and a JSON file with the score of each run.
+Each plot is a PNG file, with a CSV file of the plotted values and a JSON file of the scores of each run.
 
 ```console
-endless-plot                                         # the paper's curves
-endless-plot results.json --published gru trxl       # an evaluation beside them, each environment by itself
+endless-plot                                         # the curves of the paper
+endless-plot results.json --published gru trxl       # an evaluation and the paper's curves, one plot per environment
 endless-plot results.json --aggregate endless        # all endless environments in one plot
-endless-plot runs/mine                               # the rewards of a run's training
+endless-plot runs/mine                               # the training rewards of a run
 ```
 """
 
@@ -40,29 +40,29 @@ Spread = Literal["std", "iqm", "runs"]
 
 
 @dataclass(frozen=True)
-class Plots:
-    """What to draw."""
+class PlotArguments:
+    """Arguments of `endless-plot`."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """files of `endless-eval --json`, and runs' folders for the rewards of their training"""
+    """files of `endless-eval --json`, and folders of runs for their training rewards"""
     out: Path = Path("plots")
-    """folder for the plots and their data"""
+    """output folder for the plots and their data"""
     published: tuple[str, ...] = ("gru", "trxl", "gru_rec", "trxl_rec")
-    """the paper's agents that are drawn, too, where it has them; none for `--published` alone"""
+    """agents of the paper to include, where the paper has them; `--published` without a value for none"""
     env: tuple[str, ...] = ()
-    """environments that are drawn; those of the given results, or without results all of the paper's"""
+    """environments to plot; by default those of the given results, or without results all of the paper"""
     aggregate: Literal["no", "finite", "endless"] = "no"
-    """draw these environments in one plot, in place of one plot for each: finite ones by their task progress, endless ones
-    divided by the best mean of the paper's GRU"""
+    """one plot over all environments of this kind instead of one plot per environment; scores are the task progress in finite
+    environments, and divided by the best mean of the paper's GRU in endless ones"""
     spread: Spread = "std"
-    """std: the mean over the runs and one standard deviation, as the paper's aggregated plots; iqm: the interquartile mean and
-    its 95 % bootstrap interval; runs: each run by itself, as the paper's other plots"""
+    """std: mean over the runs and one standard deviation, as in the aggregated plots of the paper; iqm: interquartile mean and
+    its 95 % bootstrap interval; runs: one line per run, as in the other plots of the paper"""
     max_steps: int = 0
-    """draw no further than this number of environment steps; 0 for all"""
+    """largest number of environment steps to plot; 0 for all"""
 
 
 def estimates(curve: Curve, spread: Spread) -> list[tuple[float, ...]]:
-    """A row for each checkpoint: steps, then centre, low and high, or with `runs` each run's score."""
+    """A row for each checkpoint: steps, then centre, low and high; or for the spread `runs`, steps and the score of each run."""
     columns: list[Floats] = list(curve.scores)
     if spread != "runs":
         columns = list(curve.mean() if spread == "std" else curve.interquartile_mean())
@@ -73,10 +73,17 @@ def estimates(curve: Curve, spread: Spread) -> list[tuple[float, ...]]:
 
 
 def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Path) -> Path:
-    """Write NAME.png, NAME.csv and NAME.json.
+    """Plot curves, and write NAME.png, NAME.csv and NAME.json.
+
+    Args:
+        name: Title of the plot and stem of the file names.
+        axis: Label of the score axis.
+        curves: The curves.
+        spread: What is shown of the runs.
+        out: Output folder; created if it does not exist.
 
     Returns:
-        The picture's file.
+        Path of the PNG file.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -85,7 +92,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     figure = Figure(figsize=(9, 5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for place, curve in enumerate(curves):
+    for number, curve in enumerate(curves):
         rows = estimates(curve, spread)
         steps = [row[0] / 1e6 for row in rows]
         style = "--" if curve.source == "published" else "-"
@@ -95,12 +102,12 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
             for run in range(len(curve.scores)):
                 values = [row[1 + run] for row in rows]
                 axes.plot(
-                    steps, values, style, marker=marker, color=f"C{place}", alpha=0.8, label=title if not run else ""
+                    steps, values, style, marker=marker, color=f"C{number}", alpha=0.8, label=title if not run else ""
                 )
         else:
-            axes.plot(steps, [row[1] for row in rows], style, marker=marker, color=f"C{place}", label=title)
+            axes.plot(steps, [row[1] for row in rows], style, marker=marker, color=f"C{number}", label=title)
             axes.fill_between(
-                steps, [row[2] for row in rows], [row[3] for row in rows], color=f"C{place}", alpha=0.2, lw=0
+                steps, [row[2] for row in rows], [row[3] for row in rows], color=f"C{number}", alpha=0.2, lw=0
             )
     axes.set(title=name, xlabel="Steps (in millions)", ylabel=axis)
     axes.grid(alpha=0.3)
@@ -129,74 +136,87 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     return out / f"{name}.png"
 
 
-def given_curves(paths: Sequence[Path]) -> list[Curve]:
-    """The curves of results' files and runs' folders.
+def read_curves(paths: Sequence[Path]) -> list[Curve]:
+    """Read the curves from result files and folders of runs.
 
     Raises:
-        FileNotFoundError: A path does not exist.
-        ValueError: A file is something else.
+        FileNotFoundError: A path does not exist, or a folder contains no run.
+        ValueError: A file has another format, or contains no curve.
     """
     curves: list[Curve] = []
     for path in paths:
         if not path.exists():
-            raise FileNotFoundError(f"no file or folder {path}; give a file of `endless-eval --json` or a run's folder")
+            raise FileNotFoundError(
+                f"no such file or folder: {path}; expected a file of `endless-eval --json` or the folder of a run"
+            )
         curves += [training(path)] if path.is_dir() else [evaluated(one) for one in read(path)]
     return curves
 
 
-def draw_all(given: Plots) -> list[Path]:
-    """Draw all that is wanted.
+def draw_all(arguments: PlotArguments) -> list[Path]:
+    """Draw all requested plots.
 
     Returns:
-        The pictures' files.
+        Paths of the PNG files.
+
+    Raises:
+        FileNotFoundError: A path does not exist.
+        ValueError: There are no curves for an environment, or too few for an aggregated plot.
     """
-    own = given_curves(given.paths)
+    own = read_curves(arguments.paths)
     known = published_environments()
-    for env in given.env:
+    for env in arguments.env:
         if env not in known and env not in {curve.env for curve in own}:
-            raise ValueError(f"no curves of environment `{env}`; the paper has {', '.join(known)}")
-    pictures = []
-    if given.aggregate != "no":
-        theirs = [curve for env in FAMILIES[given.aggregate] for curve in published(env, given.published)]
-        curves = aggregate(given.aggregate, [*own, *theirs])
+            raise ValueError(f"no curves of environment `{env}`; the paper has curves of {', '.join(known)}")
+    plots = []
+    if arguments.aggregate != "no":
+        paper = [curve for env in FAMILIES[arguments.aggregate] for curve in published(env, arguments.published)]
+        curves = aggregate(arguments.aggregate, [*own, *paper])
         complete = {curve.label for curve in curves if curve.source == "evaluated"}
-        partial = {curve.label for curve in own if curve.env in FAMILIES[given.aggregate]} - complete
-        # An agent with reconstruction may stand in for one without; see `aggregate`.
+        partial = {curve.label for curve in own if curve.env in FAMILIES[arguments.aggregate]} - complete
+        # An agent with reconstruction can complete one without; see `aggregate`.
         partial = {label for label in partial if label.removesuffix("_rec") not in complete}
         if partial or (own and not complete):
             raise ValueError(
-                f"{', '.join(sorted(partial)) or 'the results'}: the {given.aggregate} plot wants evaluations in all of "
-                f"{', '.join(FAMILIES[given.aggregate])}"
+                f"{', '.join(sorted(partial)) or 'the results'}: the {arguments.aggregate} plot needs evaluations in all of "
+                f"{', '.join(FAMILIES[arguments.aggregate])}"
             )
         if not curves:
             raise ValueError(
-                f"nothing to draw: the paper has no {', '.join(given.published)} in all {given.aggregate} tasks"
+                f"nothing to plot: no agent among --published ({', '.join(arguments.published) or 'empty'}) has curves in all "
+                f"{arguments.aggregate} environments"
             )
-        axis = "Task progress" if given.aggregate == "finite" else "Normalised score"
-        pictures.append(draw(given.aggregate, axis, _cut(curves, given.max_steps), given.spread, given.out))
+        axis = "Task progress" if arguments.aggregate == "finite" else "Normalised score"
+        plots.append(
+            draw(arguments.aggregate, axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out)
+        )
     else:
-        # The rewards of training are another measure than those of the evaluation, and get plots of their own.
+        # Training rewards are not comparable with evaluation metrics, and are drawn in separate plots.
         trained = [curve for curve in own if curve.source == "training"]
         measured = [curve for curve in own if curve.source != "training"]
         for env in dict.fromkeys(curve.env for curve in trained):
-            curves = [curve for curve in trained if curve.env == env and env in (given.env or (env,))]
+            curves = [curve for curve in trained if curve.env == env and env in (arguments.env or (env,))]
             if curves:
                 axis = "Reward of training episodes"
-                pictures.append(draw(f"{env}-training", axis, _cut(curves, given.max_steps), given.spread, given.out))
-        envs = given.env or tuple(dict.fromkeys(curve.env for curve in measured)) or (() if trained else tuple(known))
+                plots.append(
+                    draw(f"{env}-training", axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out)
+                )
+        envs = (
+            arguments.env or tuple(dict.fromkeys(curve.env for curve in measured)) or (() if trained else tuple(known))
+        )
         for env in envs:
-            curves = [curve for curve in measured if curve.env == env] + published(env, given.published)
+            curves = [curve for curve in measured if curve.env == env] + published(env, arguments.published)
             if curves:
                 _, axis = metrics.metric(env)
-                pictures.append(draw(env, axis, _cut(curves, given.max_steps), given.spread, given.out))
-    return pictures
+                plots.append(draw(env, axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out))
+    return plots
 
 
-def work(given: Plots) -> None:
-    """Draw, and tell."""
+def execute(arguments: PlotArguments) -> None:
+    """Draw all requested plots, and print their paths."""
     console = Console()
-    for picture in draw_all(given):
-        console.print(f"{picture}, with its data in .csv and .json", soft_wrap=True)
+    for plot in draw_all(arguments):
+        console.print(f"{plot}, with its data in .csv and .json", soft_wrap=True)
 
 
 def _cut(curves: Sequence[Curve], steps: int) -> list[Curve]:
@@ -204,9 +224,11 @@ def _cut(curves: Sequence[Curve], steps: int) -> list[Curve]:
 
 
 def main() -> int:
-    """The command `endless-plot`."""
-    given = tyro.cli(Plots, prog="endless-plot", description=command.description(__doc__), args=sys.argv[1:])
-    return command.run("endless-plot", lambda: work(given))
+    """Entry point of the command `endless-plot`; returns the exit status."""
+    arguments = tyro.cli(
+        PlotArguments, prog="endless-plot", description=command.description(__doc__), args=sys.argv[1:]
+    )
+    return command.run("endless-plot", lambda: execute(arguments))
 
 
 if __name__ == "__main__":

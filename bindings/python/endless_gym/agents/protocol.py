@@ -1,10 +1,10 @@
-"""`endless-eval`: the paper's evaluation of trained agents.
+"""`endless-eval`: evaluate trained agents with the protocol of the paper.
 
-Each checkpoint plays 50 seeds that no training has seen, three times each, drawing its actions. A run's score is the mean of
-these episodes; what is said of an agent is said over its runs.
+Each checkpoint plays 50 seeds that training never uses, three episodes each, with sampled actions. The score of a run is the
+mean over these episodes; statistics of an agent are computed over its runs.
 
 ```console
-endless-eval runs/mine                                   # the run's checkpoints
+endless-eval runs/mine                                   # all checkpoints of a run
 endless-eval runs --last --json results.json             # the last checkpoints of all runs below a folder
 ```
 """
@@ -31,73 +31,100 @@ from endless_gym.agents.train import choose_device
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """What to evaluate, and how; the defaults are the paper's protocol."""
+class EvalArguments:
+    """Arguments of `endless-eval`; the defaults are the protocol of the paper."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
-    """checkpoints' files, runs' folders, or folders with runs somewhere below them"""
+    """checkpoint files, folders of runs, or folders that contain runs at any depth"""
     last: bool = False
-    """only the last checkpoint of each run"""
+    """evaluate only the last checkpoint of each run"""
     first_seed: int = EVALUATION_SEEDS.start
-    """the seeds are this one and those that follow it"""
+    """first seed; the others are the consecutive numbers"""
     seeds: int = len(EVALUATION_SEEDS)
-    """how many seeds are played"""
+    """number of seeds"""
     repetitions: int = REPETITIONS
-    """how often each seed is played"""
-    draws: int = 0
-    """seed of the agent's draws: the same one gives the same numbers"""
+    """episodes per seed"""
+    action_seed: int = 0
+    """seed of the action sampling; the same seed gives the same results"""
     greedy: bool = False
-    """take the most likely actions instead of drawing them; not the paper's protocol"""
+    """take the most likely actions instead of sampling; not the protocol of the paper"""
     device: str = "auto"
-    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA where there is one"""
+    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
     threads: int = 0
-    """threads that PyTorch computes with on the CPU; 0 leaves that to PyTorch"""
+    """CPU threads of PyTorch; 0 for PyTorch's default"""
     engine_threads: int = 0
-    """threads that step the environments; 0 for one for each core"""
+    """threads that step the environments; 0 for one per core"""
     json: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
-    """write all results to this file, which `endless-plot` reads; `-`: to the standard output, in place of the table"""
+    """write the results to this file, for `endless-plot`; `-` for standard output, instead of the table"""
     episodes: bool = False
-    """write each episode, too"""
+    """include every episode in the file"""
 
 
 def find(paths: tuple[Path, ...], last: bool) -> list[tuple[Path, list[Path]]]:
-    """Runs, each with its checkpoints' files in order.
+    """Find runs and their checkpoints.
+
+    Args:
+        paths: Checkpoint files, folders of runs, or folders that contain runs.
+        last: Only the last checkpoint of each run.
+
+    Returns:
+        The folder of each run, with its checkpoint files in order.
 
     Raises:
-        FileNotFoundError: One of the paths does not exist, or there is no checkpoint below it.
+        FileNotFoundError: A path does not exist, or contains no checkpoint.
     """
     found: dict[Path, list[Path]] = {}
     if not paths:
-        raise FileNotFoundError("nothing to evaluate; give a checkpoint, a run's folder or a folder of runs")
+        raise FileNotFoundError(
+            "no path given; expected checkpoint files, folders of runs or folders that contain runs"
+        )
     for path in (path.parent if path.name == checkpoint.FOLDER else path for path in paths):
         if path.is_file():
             run = path.parent.parent if path.parent.name == checkpoint.FOLDER else path
-            given = found.setdefault(run, [])
-            given += [path] if path not in given else []
+            files = found.setdefault(run, [])
+            files += [path] if path not in files else []
             continue
         if not path.exists():
-            raise FileNotFoundError(f"no file or folder {path}; give a checkpoint, a run's folder or a folder of runs")
+            raise FileNotFoundError(
+                f"no such file or folder: {path}; expected a checkpoint file, the folder of a run or a folder that contains runs"
+            )
         below = sorted(folder.parent for folder in path.rglob(checkpoint.FOLDER) if any(folder.glob("*.pt")))
         if not below:
-            raise FileNotFoundError(f"no checkpoint in {path}; give a run's folder, as `endless-train` writes it")
+            raise FileNotFoundError(
+                f"no checkpoint in {path}; expected the folder of a run, as endless-train writes it"
+            )
         for run in below:
             found[run] = [run / checkpoint.FOLDER / checkpoint.LAST] if last else checkpoint.files(run)
     return list(found.items())
 
 
-def evaluate_runs(given: Evaluation, console: Console) -> list[Experiment]:
-    """Play the episodes of all checkpoints."""
-    if given.seeds < 1 or given.repetitions < 1:
-        raise ValueError(f"{given.seeds} seeds, {given.repetitions} times each: give 1 or more of both")
-    runs, device = find(given.paths, given.last), choose_device(given.device)
-    if given.threads:
-        torch.set_num_threads(given.threads)
-    seeds = range(given.first_seed, given.first_seed + given.seeds)
+def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment]:
+    """Evaluate all checkpoints.
+
+    Args:
+        arguments: The arguments.
+        console: Where the progress bar is shown.
+
+    Returns:
+        The results, with runs that differ only in their seeds grouped into experiments.
+
+    Raises:
+        FileNotFoundError: A path does not exist, or contains no checkpoint.
+        ValueError: A number is out of range, a file is not a checkpoint, or the device is not available.
+    """
+    if arguments.seeds < 1 or arguments.repetitions < 1:
+        raise ValueError(
+            f"--seeds and --repetitions must be 1 or more, got {arguments.seeds} and {arguments.repetitions}"
+        )
+    runs, device = find(arguments.paths, arguments.last), choose_device(arguments.device)
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     experiments = Experiments()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         checkpoints = bar.add_task("checkpoints", total=sum(len(files) for _, files in runs))
-        episodes = bar.add_task("episodes", total=given.seeds * given.repetitions)
+        episodes = bar.add_task("episodes", total=arguments.seeds * arguments.repetitions)
         for folder, files in runs:
             run: Run | None = None
             for file in files:
@@ -110,10 +137,10 @@ def evaluate_runs(given: Evaluation, console: Console) -> list[Experiment]:
                 results = evaluate(
                     loaded.agent,
                     seeds,
-                    given.repetitions,
-                    num_threads=given.engine_threads or None,
-                    draws=given.draws,
-                    greedy=given.greedy,
+                    arguments.repetitions,
+                    num_threads=arguments.engine_threads or None,
+                    action_seed=arguments.action_seed,
+                    greedy=arguments.greedy,
                     ended=lambda number: bar.advance(episodes, number),
                 )
                 run.add(loaded.steps, results)
@@ -122,60 +149,62 @@ def evaluate_runs(given: Evaluation, console: Console) -> list[Experiment]:
 
 
 def table(experiment: Experiment) -> Table:
-    """All metrics of the last checkpoint, and the paper's metric of those before it."""
+    """A table with all metrics of the last checkpoint, and the metric of the paper of the earlier ones."""
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())
     first, _ = metrics.metric(experiment.env)
     rows = [(first, *row) for row in experiment.summaries(first)]
     title = f"{experiment.env}, {experiment.label}, over {rows[0][-1]}{options}"
-    drawn = Table(title=title, title_justify="left", box=box.SIMPLE)
+    result = Table(title=title, title_justify="left", box=box.SIMPLE)
     for name in ("steps", "metric", "mean", "std", "IQM", "95 % interval"):
-        drawn.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
+        result.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]
     for name, step, summary, _ in rows:
         interval = f"{summary.low:.4f} {summary.high:.4f}"
-        drawn.add_row(f"{step:,}", name, f"{summary.mean:.4f}", f"{summary.std:.4f}", f"{summary.iqm:.4f}", interval)
-    return drawn
+        result.add_row(f"{step:,}", name, f"{summary.mean:.4f}", f"{summary.std:.4f}", f"{summary.iqm:.4f}", interval)
+    return result
 
 
-def protocol(given: Evaluation) -> dict[str, Any]:
-    """How it was evaluated, for the results."""
+def protocol(arguments: EvalArguments) -> dict[str, Any]:
+    """The evaluation protocol, for the results file."""
     return {
-        "first_seed": given.first_seed,
-        "seeds": given.seeds,
-        "repetitions": given.repetitions,
-        "draws": given.draws,
-        "greedy": given.greedy,
+        "first_seed": arguments.first_seed,
+        "seeds": arguments.seeds,
+        "repetitions": arguments.repetitions,
+        "action_seed": arguments.action_seed,
+        "greedy": arguments.greedy,
     }
 
 
-def work(given: Evaluation) -> None:
-    """Evaluate, and tell."""
-    if given.json not in ("", "-") and not Path(given.json).resolve().parent.is_dir():
-        raise FileNotFoundError(f"no folder {Path(given.json).parent} to write {given.json} to; make it first")
+def execute(arguments: EvalArguments) -> None:
+    """Evaluate the checkpoints, and write or print the results."""
+    if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
     messages = Console(stderr=True)
-    experiments = evaluate_runs(given, messages)
+    experiments = evaluate_runs(arguments, messages)
     for experiment in experiments:
         if not experiment.common_steps():
             raise ValueError(
-                f"the {len(experiment.runs)} runs of {experiment.env}, {experiment.label}, have no checkpoint at the same number "
-                "of steps; evaluate them one by one, or train with one --checkpoint-interval and --keep-checkpoints"
+                f"the {len(experiment.runs)} runs of {experiment.env}, {experiment.label}, have no checkpoints at a common "
+                "number of steps; evaluate them separately, or train with the same --checkpoint-interval and --keep-checkpoints"
             )
-    written = to_json(experiments, protocol(given), given.episodes)
-    if given.json == "-":
+    written = to_json(experiments, protocol(arguments), arguments.episodes)
+    if arguments.json == "-":
         print(json.dumps(written, indent=1))
         return
-    if given.json:
-        Path(given.json).write_text(json.dumps(written) + "\n")
+    if arguments.json:
+        Path(arguments.json).write_text(json.dumps(written) + "\n")
     console = Console()
     for experiment in experiments:
         console.print(table(experiment))
 
 
 def main() -> int:
-    """The command `endless-eval`."""
-    given = tyro.cli(Evaluation, prog="endless-eval", description=command.description(__doc__), args=sys.argv[1:])
-    return command.run("endless-eval", lambda: work(given))
+    """Entry point of the command `endless-eval`; returns the exit status."""
+    arguments = tyro.cli(
+        EvalArguments, prog="endless-eval", description=command.description(__doc__), args=sys.argv[1:]
+    )
+    return command.run("endless-eval", lambda: execute(arguments))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Memory in a hidden state: GRU and LSTM.
+"""Recurrent memory: GRU and LSTM, trained with truncated backpropagation through time.
 
-While learning, segments are cut where episodes start, and where gradients are to stop. The pieces are packed: the steps
-number t of all that are long enough stand next to each other. No time is spent on padding, and as many steps have to wait
-for one another as the longest piece has.
+For learning, a segment is cut into sequences at the start of each episode and after every `sequence_length` steps. A sequence
+starts from the hidden state that was stored while acting (there is no burn-in), and gradients stop at its start. Sequences are
+packed (`PackedSequence`): no step is padded, and the number of sequential steps is the length of the longest sequence.
 """
 
 from __future__ import annotations
@@ -16,51 +16,66 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym.agents.encoders import orthogonal
-from endless_gym.agents.memory import Memory, Plan, State, shares
+from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split
 from endless_gym.agents.settings import Recurrence
 
 
-class RecurrentState(State):
-    """The hidden state, and those of the running segment that sequences start from.
+class RecurrentState(MemoryState):
+    """The hidden state, and the stored states that the sequences of the current segment start from.
 
     Attributes:
-        hidden: (parts, layers, n, hidden size); a GRU's state has one part, an LSTM's two: hidden and cell state.
-        starts: The hidden states before steps 0, L, 2L, ... of the segment, for sequences of length L.
+        hidden: float32 (parts, layers, n, hidden size). A GRU has one part, an LSTM two: hidden state and cell state.
+        stored: The hidden states before steps 0, L, 2L, ... of the segment, for sequences of length L; shaped as `hidden`.
         time: Steps since the segment began.
-        steps: Steps of the segment; 0 where nothing is recorded.
+        steps: Length of the segment in steps; 0 if no segment is recorded.
     """
 
     def __init__(self, hidden: Tensor) -> None:
+        """Make a state with the given hidden state, outside a segment."""
         self.hidden = hidden
-        self.starts: list[Tensor] = []
+        self.stored: list[Tensor] = []
         self.time = self.steps = 0
 
-    def tensors(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {"hidden": self.hidden}
 
-    def load(self, tensors: dict[str, Any]) -> None:
-        self.hidden = tensors["hidden"].to(self.hidden.device)
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.hidden = state_dict["hidden"].to(self.hidden.device)
 
 
 @dataclass
-class RecurrentPlan(Plan):
-    """Packed sequences, the longest first.
+class RecurrentMinibatch(Minibatch):
+    """Packed sequences, in decreasing order of length.
 
     Attributes:
-        batch_sizes: How many sequences have a step number t, int64 on the CPU (longest,).
-        start: Their states before their first steps, (parts, layers, sequences, hidden size).
+        batch_sizes: Number of sequences that have a step t, int64 (longest,), on the CPU; as in `PackedSequence`.
+        initial_hidden: States before the first steps of the sequences, float32 (parts, layers, sequences, hidden size).
     """
 
     batch_sizes: Tensor
-    start: Tensor
+    initial_hidden: Tensor
 
 
-class RecurrentMemory(Memory):
-    """An optional fully connected layer, then GRU or LSTM layers."""
+class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
+    """An optional fully connected layer, followed by GRU or LSTM layers.
+
+    The update that `step` returns is the next hidden state, float (parts, layers, n, hidden size).
+    """
 
     def __init__(
         self, kind: Literal["gru", "lstm"], input_width: int, settings: Recurrence, device: torch.device
     ) -> None:
+        """Make the layers with orthogonal weights and zero biases.
+
+        Args:
+            kind: The kind of the recurrent layers.
+            input_width: Size of the encoded observations.
+            settings: Number and size of the layers, and the length of a sequence.
+            device: Device of the states.
+
+        Raises:
+            ValueError: A residual connection without embedding, with inputs that do not have the hidden size.
+        """
         super().__init__()
         self.settings = settings
         self.width = settings.hidden_size
@@ -68,8 +83,8 @@ class RecurrentMemory(Memory):
         self.device = device
         if settings.residual and not settings.embedding and input_width != self.width:
             raise ValueError(
-                f"a residual connection needs inputs of the hidden size, {self.width}, not {input_width}; "
-                "use --recurrence.embedding"
+                f"--recurrence.residual needs inputs of the hidden size {self.width}, got an input width of {input_width}; "
+                "add --recurrence.embedding"
             )
         self.embedding = None
         if settings.embedding:
@@ -86,73 +101,69 @@ class RecurrentMemory(Memory):
         shape = (self.parts, self.settings.layers, num_envs, self.width)
         return RecurrentState(torch.zeros(shape, device=self.device))
 
-    def begin_segment(self, state: State, steps: int) -> None:
-        assert isinstance(state, RecurrentState)
-        state.starts, state.time, state.steps = [], 0, steps
+    def begin_segment(self, state: RecurrentState, steps: int) -> None:
+        state.stored, state.time, state.steps = [], 0, steps
 
-    def step(self, x: Tensor, state: State, first: Tensor) -> tuple[Tensor, Tensor]:
-        assert isinstance(state, RecurrentState)
-        hidden = state.hidden.masked_fill(first[:, None], 0.0)
-        x = self._embedded(x).float()
-        with self._precisely():
-            y, after = self.recurrent(x.unsqueeze(0), self._split(hidden))
+    def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor) -> tuple[Tensor, Tensor]:
+        hidden = state.hidden.masked_fill(reset_mask[:, None], 0.0)
+        x = self._embed(x).float()
+        with self._float32():
+            y, next_hidden = self.recurrent(x.unsqueeze(0), self._split(hidden))
         y = y.squeeze(0)
-        return y + x if self.settings.residual else y, self._joined(after)
+        return y + x if self.settings.residual else y, self._join(next_hidden)
 
-    def remember(self, state: State, news: Tensor) -> None:
-        assert isinstance(state, RecurrentState)
+    def update_state(self, state: RecurrentState, update: Tensor) -> None:
         if state.time < state.steps and state.time % self.settings.sequence_length == 0:
-            state.starts.append(state.hidden)
-        # A new tensor each time, never written into: the states of sequences' starts stay as they were.
-        state.hidden, state.time = news.float(), state.time + 1
+            state.stored.append(state.hidden)
+        # Hidden states are replaced and never written in place, so the stored ones stay valid without a copy.
+        state.hidden, state.time = update.float(), state.time + 1
 
-    def plan(
-        self, states: Sequence[State], first: Tensor, minibatches: int, generator: torch.Generator
-    ) -> Sequence[RecurrentPlan]:
-        length, (steps, envs) = self.settings.sequence_length, first.shape
+    def minibatches(
+        self, states: Sequence[RecurrentState], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+    ) -> Sequence[RecurrentMinibatch]:
+        length, (steps, envs) = self.settings.sequence_length, reset_mask.shape
         stored = torch.stack(
-            [
-                torch.cat([state.starts[cut] for state in states if isinstance(state, RecurrentState)], dim=2)
-                for cut in range(-(-steps // length))
-            ]
+            [torch.cat([state.stored[cut] for state in states], dim=2) for cut in range(-(-steps // length))]
         )  # (cuts, parts, layers, N, hidden size)
-        # Sequences start at every `length` steps and with each episode. In the order of environments, then of steps:
-        starts = first.t().clone()
+        # A sequence starts every `length` steps and with each episode. Sequences are ordered by environment, then by step.
+        starts = reset_mask.t().clone()
         starts[:, ::length] = True
         env, time = starts.nonzero(as_tuple=True)
-        at = env * steps + time
-        lengths = torch.cat([at[1:], torch.tensor([envs * steps])]) - at
-        plans = []
-        for chosen in shares(lengths.tolist(), minibatches, generator):
+        start = env * steps + time
+        lengths = torch.cat([start[1:], torch.tensor([envs * steps])]) - start
+        minibatches = []
+        for chosen in balanced_split(lengths.tolist(), num_minibatches, generator):
             chosen = chosen[lengths[chosen].argsort(descending=True, stable=True)]
-            n, t, own = env[chosen], time[chosen], lengths[chosen]
-            later = torch.arange(int(own[0])).unsqueeze(1)  # (longest, 1)
-            exists = later < own
-            packed = ((t + later) * envs + n)[exists]
-            state = stored[(t // length).to(stored.device), :, :, n.to(stored.device)]
-            state = state.permute(1, 2, 0, 3).masked_fill(first[t, n].to(stored.device)[:, None], 0.0)
-            plans.append(RecurrentPlan(packed.to(self.device), exists.sum(1), state.contiguous()))
-        return plans
+            n, t, sizes = env[chosen], time[chosen], lengths[chosen]
+            offset = torch.arange(int(sizes[0])).unsqueeze(1)  # (longest, 1)
+            exists = offset < sizes
+            packed = ((t + offset) * envs + n)[exists]
+            hidden = stored[(t // length).to(stored.device), :, :, n.to(stored.device)]
+            hidden = hidden.permute(1, 2, 0, 3).masked_fill(reset_mask[t, n].to(stored.device)[:, None], 0.0)
+            minibatches.append(RecurrentMinibatch(packed.to(self.device), exists.sum(1), hidden.contiguous()))
+        return minibatches
 
-    def forward(self, x: Tensor, plan: RecurrentPlan) -> Tensor:
-        x = self._embedded(x).float()
-        with self._precisely():
-            packed, _ = self.recurrent(PackedSequence(x, plan.batch_sizes), self._split(plan.start))
+    def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
+        x = self._embed(x).float()
+        with self._float32():
+            sequences = PackedSequence(x, minibatch.batch_sizes)
+            packed, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
         y: Tensor = packed.data
         return y + x if self.settings.residual else y
 
-    def _precisely(self) -> torch.autocast:
-        """In float32: PyTorch would give cuDNN's layers float16 where bfloat16 is asked for."""
+    def _float32(self) -> torch.autocast:
+        """Disables autocast, which would run cuDNN's recurrent layers in float16 where bfloat16 is requested."""
         return torch.autocast(self.device.type, enabled=False)
 
-    def _embedded(self, x: Tensor) -> Tensor:
+    def _embed(self, x: Tensor) -> Tensor:
         if self.embedding is not None:
             x = self.embedding(x)
         return x
 
     def _split(self, hidden: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """As PyTorch's layers take it."""
+        """Convert (parts, layers, n, hidden size) to what `nn.GRU` or `nn.LSTM` takes."""
         return hidden[0] if self.parts == 1 else (hidden[0], hidden[1])
 
-    def _joined(self, hidden: Tensor | tuple[Tensor, Tensor]) -> Tensor:
+    def _join(self, hidden: Tensor | tuple[Tensor, Tensor]) -> Tensor:
+        """The inverse of `_split`."""
         return hidden.unsqueeze(0) if isinstance(hidden, Tensor) else torch.stack(hidden)

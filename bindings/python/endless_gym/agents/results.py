@@ -1,4 +1,4 @@
-"""What an evaluation has found: the episodes of runs' checkpoints, summed up, in files that `endless-plot` reads."""
+"""Results of an evaluation: metrics of the checkpoints of runs, and the JSON files that `endless-plot` reads."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from endless_gym.agents import metrics
 from endless_gym.agents.settings import Recurrence, Settings, to_dict
 from endless_gym.agents.statistics import Summary, summarise
 
-#: Settings that tell runs of one experiment apart, or change nothing of what is learned.
-_OF_THE_RUN = (
+#: Settings that may differ between the runs of an experiment: the seed, and settings that do not affect learning.
+_PER_RUN = (
     "seed",
     "run",
     "resume",
@@ -32,14 +32,14 @@ _OF_THE_RUN = (
 
 @dataclass
 class Run:
-    """One run's checkpoints.
+    """The evaluated checkpoints of a run.
 
     Attributes:
-        run: Its name, such as its folder.
-        seed: Of its training.
-        steps: Environment steps that each checkpoint has learned from, in order.
-        metrics: Means over the episodes of each checkpoint, by name.
-        episodes: The infos of each checkpoint's episodes, if they are kept.
+        run: Name of the run, such as its folder.
+        seed: Seed of its training.
+        steps: Environment steps before each checkpoint, ascending.
+        metrics: Mean over the episodes of each checkpoint, by name of the metric.
+        episodes: Final infos of the episodes of each checkpoint; empty if they were not stored.
     """
 
     run: str
@@ -49,7 +49,7 @@ class Run:
     episodes: list[list[dict[str, float]]] = field(default_factory=list)
 
     def add(self, steps: int, episodes: Sequence[Mapping[str, float]]) -> None:
-        """Take in a checkpoint's episodes."""
+        """Append a checkpoint with its number of environment steps and the final infos of its episodes."""
         self.steps.append(steps)
         self.episodes.append([dict(episode) for episode in episodes])
         for name in episodes[0]:
@@ -60,13 +60,13 @@ class Run:
 
 @dataclass
 class Experiment:
-    """Runs that differ in nothing but their seeds.
+    """Runs that differ only in their seeds.
 
     Attributes:
         env: Environment id.
-        label: What plots and tables call it, such as `gru_rec`.
+        label: Name in plots and tables, such as `gru_rec`.
         options: Reset parameters.
-        runs: Its runs.
+        runs: The runs.
     """
 
     env: str
@@ -75,17 +75,21 @@ class Experiment:
     runs: list[Run] = field(default_factory=list)
 
     def common_steps(self) -> list[int]:
-        """Steps at which every run has a checkpoint."""
+        """Numbers of environment steps at which every run has a checkpoint, ascending."""
         steps = set(self.runs[0].steps).intersection(*(run.steps for run in self.runs))
         return sorted(steps)
 
     def scores(self, metric: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        """The metric's means, float64 (runs, common steps)."""
+        """Mean of a metric for each run and checkpoint, float64 (runs, common steps)."""
         steps = self.common_steps()
         return np.array([[run.metrics[metric][run.steps.index(step)] for step in steps] for run in self.runs])
 
     def summaries(self, metric: str) -> list[tuple[int, Summary, str]]:
-        """Steps, estimates, and what they are over: the runs; or of a single run, its episodes."""
+        """Estimates of a metric for each checkpoint: over the runs, or over the episodes if there is a single run.
+
+        Returns:
+            Number of environment steps, estimates, and a description of the sample such as `5 runs`, for each checkpoint.
+        """
         if len(self.runs) > 1:
             columns = self.scores(metric).T
             over = f"{len(self.runs)} runs"
@@ -98,7 +102,7 @@ class Experiment:
 
 
 def label(settings: Settings) -> str:
-    """The agent's name with its additions, as the published curves have it; their `_lr` is a learning rate of its own."""
+    """Name of an agent and its variations, as in the published curves (where `_lr` marks a different learning rate)."""
     trxl = settings.agent in ("trxl", "gtrxl")
     agents = {"none": "ppo", "stack": f"{settings.model.stack}stack", "position": "pos_enc"}
     name = agents.get(settings.agent, settings.agent)
@@ -117,18 +121,19 @@ def label(settings: Settings) -> str:
 
 
 class Experiments:
-    """Sorts runs into experiments by their settings."""
+    """Groups runs into experiments by their settings."""
 
     def __init__(self) -> None:
+        """Start without experiments."""
         self._found: dict[str, Experiment] = {}
 
     def of(self, settings: Settings) -> Experiment:
-        """The experiment that a run with these settings belongs to."""
-        values = {name: value for name, value in to_dict(settings).items() if name not in _OF_THE_RUN}
+        """The experiment of a run with these settings; created if it does not exist."""
+        values = {name: value for name, value in to_dict(settings).items() if name not in _PER_RUN}
         values["preset"] = ""
-        # Where environments are stepped changes nothing.
+        # The engine and its threads do not affect learning.
         values["environment"] = {**values["environment"], "engine": "", "num_threads": 0}
-        # Runs of any length are of one experiment.
+        # Runs of different lengths belong to one experiment.
         values["ppo"] = {name: value for name, value in values["ppo"].items() if name != "updates"}
         key = json.dumps(values, sort_keys=True)
         if key not in self._found:
@@ -139,14 +144,20 @@ class Experiments:
         return self._found[key]
 
     def all(self) -> list[Experiment]:
-        """All experiments, in the order in which they came."""
+        """All experiments, in the order of their creation."""
         return list(self._found.values())
 
 
 def to_json(
     experiments: Sequence[Experiment], protocol: Mapping[str, Any], with_episodes: bool = False
 ) -> dict[str, Any]:
-    """Everything that was found, as JSON has it."""
+    """Convert results to JSON-serialisable values.
+
+    Args:
+        experiments: The experiments.
+        protocol: The evaluation protocol.
+        with_episodes: Include the infos of every episode.
+    """
     written = []
     for experiment in experiments:
         values = asdict(experiment)
@@ -163,11 +174,11 @@ def to_json(
 
 
 def read(file: Path) -> list[Experiment]:
-    """The experiments of a file that `endless-eval --json` wrote.
+    """Read the experiments from a file that `endless-eval --json` wrote.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is something else.
+        ValueError: The file has another format.
     """
     try:
         written = json.loads(file.read_text())["experiments"]

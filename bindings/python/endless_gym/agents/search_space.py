@@ -1,7 +1,7 @@
-"""The choices of the paper's hyperparameter search, from its table.
+"""The search space of the paper's hyperparameter search, from its table.
 
-A parameter is named as its flag of `endless-train` is, with underscores. Its first choice is the value that the search starts
-from; the table's other values follow.
+A parameter has the name of its flag of `endless-train`, with underscores. Its first choice is the value that the search starts
+from; the other values of the table follow.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from typing import Any
 
 from endless_gym.agents.settings import Settings
 
+#: A value of a parameter.
 Choice = str | int | float | bool
+#: Choices by parameter.
 Space = dict[str, tuple[Choice, ...]]
 
 _ALL: Space = {
@@ -25,7 +27,7 @@ _ALL: Space = {
     "ppo.entropy_coefficient": (1.0e-4, 1.0e-3, 1.0e-2),
     "ppo.max_gradient_norm": (0.25, 0.35, 0.5, 1.0),
 }
-#: Where observations are reconstructed.
+#: Only with observation reconstruction.
 _RECONSTRUCTION: Space = {"ppo.reconstruction_coefficient": (0.1, 0.5, 1.0)}
 _RECURRENCE: Space = {
     "agent": ("gru", "lstm"),
@@ -43,14 +45,14 @@ _TRANSFORMER: Space = {
 
 
 def space(base: Settings, only: Sequence[str] = ()) -> Space:
-    """The choices around some settings.
+    """The search space for given settings.
 
     Args:
-        base: Where the search starts; the memory decides which parameters there are.
-        only: Names to keep; all of them if there are none.
+        base: Settings that the search starts from; the agent determines which parameters exist.
+        only: Names of the parameters to include; empty for all.
 
     Raises:
-        ValueError: A name is not among the parameters.
+        ValueError: An unknown parameter name.
     """
     choices = dict(_ALL)
     if base.ppo.reconstruction_coefficient:
@@ -62,7 +64,7 @@ def space(base: Settings, only: Sequence[str] = ()) -> Space:
     names = [name.replace("-", "_") for name in only]
     for name in names:
         if name not in choices:
-            raise ValueError(f"`{name}` is not searched for {base.agent}; there are {', '.join(choices)}")
+            raise ValueError(f"--parameters for {base.agent} must be among {', '.join(choices)}; got `{name}`")
     return {
         name: (value(base, name), *(choice for choice in listed if choice != value(base, name)))
         for name, listed in choices.items()
@@ -71,7 +73,7 @@ def space(base: Settings, only: Sequence[str] = ()) -> Space:
 
 
 def value(settings: Settings, name: str) -> Choice:
-    """A parameter's value."""
+    """The value of a parameter in the settings."""
     found: Any = settings
     for part in name.split("."):
         found = getattr(found, part)
@@ -80,7 +82,7 @@ def value(settings: Settings, name: str) -> Choice:
 
 
 def with_choices(settings: Settings, choices: Mapping[str, Choice]) -> Settings:
-    """The settings with other values of some parameters."""
+    """The settings with the given values of parameters."""
     for name, choice in choices.items():
         group, _, entry = name.rpartition(".")
         changed: dict[str, Any] = {entry: choice}
@@ -91,7 +93,7 @@ def with_choices(settings: Settings, choices: Mapping[str, Choice]) -> Settings:
 
 
 def single_changes(choices: Space) -> list[dict[str, Choice]]:
-    """The base, and then every choice by itself, all else as in the base."""
+    """The base values, followed by every change of a single parameter from the base values."""
     base = {name: listed[0] for name, listed in choices.items()}
     changes = [{**base, name: choice} for name, listed in choices.items() for choice in listed[1:]]
     return [base, *changes]

@@ -1,7 +1,7 @@
-"""All settings of a training run, and the presets that fill them.
+"""The settings of a training run, and their presets.
 
-Every field is a command-line flag of `endless-train`; `--preset` chooses the defaults that the other flags change. The names are
-those of the paper's hyperparameter table where it has them.
+Every field is a command-line flag of `endless-train`. `--preset` selects the defaults, which the other flags override. Names
+follow the hyperparameter table of the paper where it has one.
 """
 
 from __future__ import annotations
@@ -17,130 +17,131 @@ from endless_gym.specs import spec
 AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
 PresetName = Literal["paper", "old", "throughput", "quick"]
 
-#: The seeds that training draws an episode's seed from. Evaluation uses seeds from 200,000 on: levels that no training has seen.
+#: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
 TRAINING_SEEDS = range(100_000)
 
 
 @dataclass(frozen=True)
 class Environment:
-    """What the agent plays."""
+    """Training environments."""
 
     option: tuple[str, ...] = ()
-    """reset parameters, each as NAME=VALUE with the value as JSON, such as `command_count=[2]`"""
+    """reset parameters, each as NAME=VALUE with a JSON value, such as `command_count=[2]`"""
     observation: Literal["rgb", "features"] = "rgb"
-    """`rgb`: frames, as in the paper. `features`: a short vector of what the frame shows, for small machines"""
+    """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
     num_envs: int = 32
-    """environments in all groups together; the paper's number of workers"""
+    """number of environments in all groups together; the number of workers in the paper"""
     groups: int = 2
-    """groups of environments; one is stepped while the agent decides for another"""
+    """groups of environments; one group is stepped while the agent computes the actions of another"""
     engine: Literal["thread", "process"] = "thread"
-    """`thread`: environments in this process. `process`: in an engine's process, over shared memory"""
+    """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
     num_threads: int = 0
-    """the engine's threads; 0 for one for each core"""
+    """threads that step the environments; 0 for one per core"""
 
 
 @dataclass(frozen=True)
 class Recurrence:
-    """GRU and LSTM."""
+    """Memory of the agents gru and lstm."""
 
     hidden_size: int = 512
     """size of the hidden state"""
     layers: int = 1
-    """recurrent layers, one upon the other"""
+    """number of stacked recurrent layers"""
     residual: bool = False
-    """add the recurrent layers' input to their output"""
+    """residual connection around the recurrent layers"""
     embedding: bool = True
-    """a fully connected layer in front of the recurrent layers"""
+    """fully connected layer before the recurrent layers"""
     sequence_length: int = 512
-    """steps that gradients flow back through, at most; longer segments are cut and go on from stored states"""
+    """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states"""
 
 
 @dataclass(frozen=True)
 class Transformer:
-    """Transformer-XL, and with `gating` GTrXL."""
+    """Memory of the agents trxl (Transformer-XL) and gtrxl (GTrXL)."""
 
     layers: int = 3
-    """attention blocks, one upon the other"""
+    """number of blocks"""
     width: int = 384
-    """size of the vectors between the blocks"""
+    """embedding dimension of the blocks"""
     heads: int = 4
-    """attention heads"""
+    """attention heads per block"""
     window: int = 0
-    """length of the sliding memory window: the current step and those before it that it can attend to; 0 for the longest episode,
-    and 256 in endless environments, as in the paper"""
+    """length of the sliding attention window: the current step and the past steps that it can attend to; 0 for the length of the
+    longest episode, or 256 in endless environments, as in the paper"""
     positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
-    """how attention knows the time of a memory"""
+    """positional encoding of the cached steps"""
     positions: int = 0
-    """rows of the absolute or learned encoding's table; 0 for the longest episode, and 2048 in endless environments, as in the
-    paper"""
+    """rows of the table of the absolute or learned encoding; 0 for the length of the longest episode, or 2048 in endless
+    environments, as in the paper"""
     query_encoding: bool = False
-    """add the absolute or learned encoding of the current step to the queries, too"""
+    """add the absolute or learned encoding to the queries as well"""
     shared_heads: bool = True
-    """one matrix for all heads of a block, for queries, keys and values each, as in the paper's experiments"""
+    """share the query, key and value projections among the heads of a block, as in the experiments of the paper"""
     gating: bool = False
-    """GTrXL's gates in place of the residual connections; set by the agent `gtrxl`"""
+    """GRU-type gates of GTrXL in place of the residual connections; set by the agent `gtrxl`"""
     gate_bias: float = 0.0
-    """bias of the gates; the larger, the closer a fresh block is to the identity. The paper tries 0 and 2"""
+    """initial bias of the gates; the larger, the closer a block is to the identity at the start. The paper uses 0 and 2"""
     initialisation: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
-    """weights of a fresh block"""
+    """weight initialisation of the blocks"""
     sequence_length: int = 64
-    """consecutive steps that are learned from together; their keys and values are projected once for all of them"""
+    """length of a training sequence in steps; keys and values are projected once for a whole sequence"""
 
 
 @dataclass(frozen=True)
 class Model:
-    """The network around the memory."""
+    """Layers before and after the memory."""
 
     vector_width: int = 128
-    """units of the encoder of vectors (features, vector observations, positions)"""
+    """units of the encoder of vector observations (features, vector observation, position)"""
     body_width: int = 0
-    """units of the layer after the memory; 0 for the memory's width, and without a memory for `recurrence.hidden-size`"""
+    """units of the layer after the memory; 0 for the memory's output size, or `recurrence.hidden-size` without a memory"""
     head_width: int = 512
-    """units of the hidden layer of the policy's and the value's head"""
+    """units of the hidden layers of the policy and value heads"""
     value_gain: float = 1.0
-    """scale of the value head's first weights; with rewards of 0.1, small ones save the first updates"""
+    """gain of the initial weights of the value head's output layer; a small gain speeds up the first updates if rewards are
+    small"""
     stack: int = 4
-    """grey frames that the agent `stack` observes; the paper stacks 4 and 16"""
+    """number of stacked grey frames of the agent `stack`; the paper uses 4 and 16"""
 
 
 @dataclass(frozen=True)
 class PPO:
-    """Proximal policy optimisation, and the coefficients of the losses."""
+    """Proximal policy optimisation and loss coefficients."""
 
     updates: int = 10_000
-    """updates of a whole run; one update sees `num_envs * steps` steps"""
+    """number of updates of the run; one update uses `num_envs * steps` environment steps"""
     decay_updates: int = 10_000
-    """updates over which learning rate and entropy coefficient decay linearly; the final value holds from then on"""
+    """updates over which learning rate and entropy coefficient decay linearly to their final values"""
     steps: int = 512
-    """steps in each environment between two updates; the paper's worker steps"""
+    """rollout length: steps of each environment per update; the worker steps of the paper"""
     epochs: int = 3
-    """how often an update sees each step"""
+    """epochs per update"""
     minibatches: int = 8
-    """parts that an epoch is divided into"""
+    """minibatches per epoch"""
     gamma: float = 0.995
     """discount factor"""
     gae_lambda: float = 0.95
     """lambda of generalised advantage estimation"""
     clip_range: float = 0.1
-    """epsilon of the clipped surrogate, and of the clipped value loss"""
+    """clip range epsilon of the policy loss and of the value loss"""
     advantage_normalisation: Literal["none", "batch", "minibatch"] = "none"
-    """over what advantages are brought to mean 0 and standard deviation 1"""
+    """normalise advantages over the whole batch, over each minibatch, or not at all"""
     value_coefficient: float = 0.5
-    """weight of the value loss"""
+    """coefficient of the value loss"""
     learning_rate: float = 2.75e-4
-    """AdamW's learning rate at the start"""
+    """initial learning rate of AdamW"""
     final_learning_rate: float = 1.0e-5
-    """and at the end of its decay"""
+    """learning rate after its decay"""
     entropy_coefficient: float = 1.0e-4
-    """weight of the entropy bonus at the start"""
+    """initial coefficient of the entropy bonus"""
     final_entropy_coefficient: float = 1.0e-6
-    """and at the end of its decay"""
+    """coefficient of the entropy bonus after its decay"""
     reconstruction_coefficient: float = 0.0
-    """weight of the observation reconstruction; 0 for none. The paper uses 0.1 where it uses it"""
+    """coefficient of the observation reconstruction loss; 0 for no reconstruction head. The paper uses 0.1"""
     ground_truth_coefficient: float = 0.0
-    """weight of the ground-truth estimation; 0 for none. Only for environments whose `info` has the ground truth"""
+    """coefficient of the ground-truth estimation loss; 0 for no such head. Only for environments with `ground_truth` in `info`"""
     max_gradient_norm: float = 0.25
-    """gradients are scaled down to this norm"""
+    """gradient clipping: largest global norm of the gradients"""
 
 
 @dataclass(frozen=True)
@@ -148,37 +149,37 @@ class Settings:
     """Train an agent with PPO on one of the Memory Gym environments."""
 
     env: str = "Endless-MortarMayhem-v0"
-    """environment id; `endless list` shows them"""
+    """environment id; `endless list` lists them"""
     agent: AgentName = "gru"
-    """the memory: gru, lstm, trxl (Transformer-XL), gtrxl (with gates); or one of the naive baselines: none, stack (grey frames),
-    position (the step's number, encoded, as an observation)"""
+    """gru, lstm, trxl (Transformer-XL) or gtrxl (gated Transformer-XL); or a baseline without memory: none, stack (stacked grey
+    frames) or position (encoded step number as an observation)"""
     preset: PresetName = "paper"
-    """the defaults of all other settings. paper: the paper's final hyperparameters; old: those of its previous study; throughput:
-    many environments, short segments; quick: small networks on feature observations, minutes on two cores"""
+    """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
+    throughput: many environments, short rollouts; quick: small networks and feature observations, minutes on two CPU cores"""
     seed: int = 1
-    """fixes the network's first weights, the episodes' seeds and all draws"""
+    """seed of the initial weights, the episode seeds and all sampling"""
     device: str = "auto"
-    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA where there is one"""
+    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
     threads: int = 0
-    """threads that PyTorch computes with on the CPU; 0 leaves that to PyTorch"""
+    """CPU threads of PyTorch; 0 for PyTorch's default"""
     compile: bool = False
-    """compile the network with torch.compile; the first updates take minutes longer"""
+    """compile the network with `torch.compile`; the first updates then take minutes longer"""
     bf16: bool = False
-    """compute the network in bfloat16 (autocast); weights and losses stay float32"""
+    """bfloat16 autocast for the network; weights and losses stay float32"""
     run: str = ""
-    """the run's folder; empty for runs/ENV/AGENT-SEED-TIME"""
+    """folder of the run; empty for runs/ENV/AGENT-SEED-TIME"""
     resume: str = ""
-    """go on with the run in this folder, from its last checkpoint; its settings are the defaults of the other flags"""
+    """resume the run in this folder from its last checkpoint; its settings are the defaults of the other flags"""
     checkpoint_interval: int = 100
-    """updates between two checkpoints; the last update always writes one"""
+    """updates between two checkpoints; the last update always writes a checkpoint"""
     keep_checkpoints: bool = False
-    """keep one file for each checkpoint, for evaluation, and not the last one only"""
+    """keep all checkpoints, for evaluation, instead of the last one only"""
     time_limit: float = 0.0
-    """minutes after which training stops, with a checkpoint; 0 for none"""
+    """minutes after which training stops with a checkpoint; 0 for no limit"""
     target_reward: float | None = None
-    """stop when the mean reward of the last 100 episodes is at least this"""
+    """stop when the mean reward of the last 100 episodes reaches this value"""
     wandb: bool = False
-    """log to Weights & Biases, too, if it is installed"""
+    """also log to Weights & Biases, if it is installed"""
     environment: Environment = field(default_factory=Environment)
     recurrence: Recurrence = field(default_factory=Recurrence)
     transformer: Transformer = field(default_factory=Transformer)
@@ -186,10 +187,10 @@ class Settings:
     ppo: PPO = field(default_factory=PPO)
 
     def options(self) -> dict[str, Any]:
-        """The reset parameters as a dict.
+        """The reset parameters by name.
 
         Raises:
-            ValueError: One is not NAME=VALUE, or its value is not JSON.
+            ValueError: A parameter is not NAME=VALUE, or its value is not JSON.
         """
         options = {}
         for given in self.environment.option:
@@ -200,18 +201,18 @@ class Settings:
                 equals = ""
             if not equals:
                 raise ValueError(
-                    f"reset parameter `{given}`: give NAME=VALUE with the value as JSON, as command_count=[2]"
+                    f"--environment.option must be NAME=VALUE with a JSON value, such as command_count=[2], got `{given}`"
                 )
         return options
 
-    def checked(self) -> Settings:
-        """These settings with the environment's own id, once nothing speaks against them.
+    def validated(self) -> Settings:
+        """These settings, validated, with the canonical environment id.
 
         Raises:
-            ValueError: A number or a combination is not possible; the message says which, and what to do.
+            ValueError: A value is out of range, or a combination is not supported.
         """
-        described = spec(self.env)
-        described.max_episode_steps(self.options())  # window and positions follow from it, or it says what is wrong
+        env_spec = spec(self.env)
+        env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
         positive = {
             "environment.num-envs": environment.num_envs,
@@ -235,7 +236,7 @@ class Settings:
         }
         for name, number in positive.items():
             if number < 1:
-                raise ValueError(f"--{name} is {number}; give 1 or more")
+                raise ValueError(f"--{name} must be 1 or more, got {number}")
         for name, number in {
             "threads": self.threads,
             "environment.num-threads": environment.num_threads,
@@ -244,46 +245,53 @@ class Settings:
             "transformer.window": transformer.window,
         }.items():
             if number < 0:
-                raise ValueError(f"--{name} is {number}; give 0 or more")
+                raise ValueError(f"--{name} must be 0 or more, got {number}")
         if environment.num_envs % environment.groups:
             raise ValueError(
-                f"{environment.num_envs} environments do not divide into {environment.groups} groups of one size; "
-                "change --environment.num-envs or --environment.groups"
+                f"--environment.num-envs must be a multiple of --environment.groups, got {environment.num_envs} environments and "
+                f"{environment.groups} groups"
             )
         if transformer.window == 1:
-            raise ValueError(f"--transformer.window is {transformer.window}; a window of 1 has no past, give 2 or more")
+            raise ValueError(
+                "--transformer.window must be 0 (automatic) or 2 or more, got 1: no past step to attend to"
+            )
         if transformer.width % (2 * transformer.heads):
             raise ValueError(
-                f"--transformer.width is {transformer.width}; it must be a multiple of twice the {transformer.heads} heads"
+                f"--transformer.width must be a multiple of twice --transformer.heads, got width {transformer.width} and "
+                f"{transformer.heads} heads"
             )
         if self.agent in ("trxl", "gtrxl") and ppo.steps % min(transformer.sequence_length, ppo.steps):
             raise ValueError(
-                f"segments of {ppo.steps} steps do not divide into sequences of {transformer.sequence_length}; "
-                "change --ppo.steps or --transformer.sequence-length"
+                f"--ppo.steps must be a multiple of --transformer.sequence-length, got {ppo.steps} steps and sequences of "
+                f"{transformer.sequence_length}"
             )
         if self.environment.observation == "features" and self.ppo.reconstruction_coefficient:
-            raise ValueError("reconstruction is of frames; drop --ppo.reconstruction-coefficient or observe `rgb`")
+            raise ValueError(
+                "--ppo.reconstruction-coefficient needs frames, got --environment.observation features; "
+                "use rgb or the coefficient 0"
+            )
         if transformer.query_encoding and transformer.positional_encoding not in ("absolute", "learned"):
             raise ValueError(
-                f"--transformer.query-encoding needs an absolute or learned encoding, not {transformer.positional_encoding}"
+                "--transformer.query-encoding needs --transformer.positional-encoding absolute or learned, got "
+                f"{transformer.positional_encoding}"
             )
-        return dataclasses.replace(self, env=described.id)
+        return dataclasses.replace(self, env=env_spec.id)
 
     def positions(self) -> int:
-        """Rows of the positional encoding's table."""
+        """Rows of the table of positional encodings, with the default resolved."""
         return self.transformer.positions or self._longest_episode() or 2048
 
     def window(self) -> int:
-        """Length of the memory window."""
+        """Length of the attention window, with the default resolved."""
         return self.transformer.window or max(2, self._longest_episode() or 256)
 
     def _longest_episode(self) -> int:
-        """Steps; 0 in endless environments, and where there is no limit."""
+        """Longest possible episode in steps; 0 in endless environments and without step limit."""
         return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
 
 
 def _replace(settings: Settings, **groups: dict[str, Any]) -> Settings:
-    """Settings with some fields of some groups replaced."""
+    """Replace fields in groups of settings."""
     changed = {name: dataclasses.replace(getattr(settings, name), **fields) for name, fields in groups.items()}
     return dataclasses.replace(settings, **changed)
 
@@ -304,7 +312,7 @@ def _presets() -> dict[str, Settings]:
         },
         recurrence={"embedding": False},
     )
-    # The same number of steps in an update; segments go on from stored states.
+    # The same number of environment steps per update as `paper`; sequences start from stored states.
     throughput = _replace(
         dataclasses.replace(paper, preset="throughput"),
         environment={"num_envs": 512},
@@ -335,20 +343,21 @@ def _presets() -> dict[str, Settings]:
     return {"paper": paper, "old": old, "throughput": throughput, "quick": quick}
 
 
-#: The settings that `--preset` starts from.
+#: Default settings by preset name.
 PRESETS = _presets()
 
 
 def to_dict(settings: Settings) -> dict[str, Any]:
-    """Plain dicts, numbers and strings, for JSON."""
+    """The settings as nested dicts of JSON-serialisable values."""
     return dataclasses.asdict(settings)
 
 
 def from_dict(values: dict[str, Any]) -> Settings:
-    """The reverse of `to_dict`.
+    """Convert what `to_dict` returned back to settings.
 
     Raises:
-        TypeError: There is a field that these settings do not have.
+        TypeError: An unknown field.
+        KeyError: A group is missing.
     """
     values = dict(values)
     groups = {

@@ -1,7 +1,7 @@
-"""Point and interval estimates of a few runs' scores, after Agarwal et al., "Deep Reinforcement Learning at the Edge of the
-Statistical Precipice" (2021).
+"""Point and interval estimates of the scores of few runs, as recommended by Agarwal et al., "Deep Reinforcement Learning at the
+Edge of the Statistical Precipice" (2021).
 
-Scores are arrays (runs, tasks): each column has the scores of one task's independent runs. A single task is one column.
+Scores are arrays (runs, tasks): each column contains the scores of the independent runs of one task. A single task is one column.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 Scores = NDArray[np.float64]
 
-#: The share of scores that the interquartile mean leaves out, at each end.
+#: Fraction of the scores that the interquartile mean discards at each end.
 TRIMMED = 0.25
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
-    """The mean of the middle half of all scores, of any shape.
+    """Mean of the middle half of all scores, of any shape.
 
-    Of n scores the floor(n / 4) lowest and as many of the highest are left out: less swayed by outliers than the mean, and by
-    luck than the median.
+    The floor(n / 4) lowest and the floor(n / 4) highest of n scores are discarded. The interquartile mean is more robust to
+    outliers than the mean, and has less variance than the median.
     """
     ordered = np.sort(np.asarray(scores, dtype=np.float64), axis=None)
     cut = int(TRIMMED * ordered.size)
@@ -30,7 +30,7 @@ def interquartile_mean(scores: ArrayLike) -> float:
 
 
 def _interquartile_means(samples: Scores) -> Scores:
-    """Of many samples at once, (samples, scores) -> (samples,)."""
+    """The interquartile mean of each row: (samples, scores) to (samples,)."""
     ordered = np.sort(samples, axis=1)
     cut = int(TRIMMED * ordered.shape[1])
     means: Scores = ordered[:, cut : ordered.shape[1] - cut].mean(axis=1)
@@ -45,19 +45,20 @@ def stratified_bootstrap(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """A percentile interval of an estimate over runs and tasks.
+    """Percentile confidence interval of an estimate by stratified bootstrap.
 
-    Runs are drawn anew, with replacement, as many as there are, for each task by itself: each sample has all tasks.
+    Each bootstrap sample draws as many runs as there are, with replacement, for each task independently.
 
     Args:
         scores: (runs, tasks) or (runs,).
-        estimate: From samples (repetitions, runs * tasks) to (repetitions,); the interquartile mean.
-        repetitions: Samples that are drawn.
-        confidence: Share of the samples' estimates that lies in the interval.
-        seed: Of the draws.
+        estimate: Function from samples (repetitions, runs * tasks) to estimates (repetitions,); the interquartile mean by
+            default.
+        repetitions: Number of bootstrap samples.
+        confidence: Confidence level, between 0 and 1.
+        seed: Seed of the resampling.
 
     Returns:
-        The lower and the upper end.
+        The lower and the upper end of the interval.
     """
     table = np.asarray(scores, dtype=np.float64)
     table = table[:, None] if table.ndim == 1 else table
@@ -70,14 +71,14 @@ def stratified_bootstrap(
 
 @dataclass(frozen=True)
 class Summary:
-    """What is said of some scores.
+    """Estimates of a set of scores.
 
     Attributes:
-        mean: Their mean.
-        std: Their standard deviation, over all scores, with n in the denominator as in the paper's plots.
-        iqm: Their interquartile mean.
-        low: Lower end of its 95 % bootstrap interval.
-        high: Upper end.
+        mean: Mean.
+        std: Population standard deviation of all scores, as in the paper's plots.
+        iqm: Interquartile mean.
+        low: Lower end of the 95 % bootstrap interval of the interquartile mean.
+        high: Upper end of that interval.
     """
 
     mean: float
@@ -87,14 +88,18 @@ class Summary:
     high: float
 
     def to_dict(self) -> dict[str, float]:
-        """For JSON."""
+        """The estimates by name, for JSON."""
         return asdict(self)
 
 
 def summarise(scores: ArrayLike) -> Summary:
-    """All estimates of scores (runs, tasks) or (runs,)."""
+    """Compute all estimates of scores (runs, tasks) or (runs,).
+
+    Raises:
+        ValueError: There are no scores.
+    """
     table = np.asarray(scores, dtype=np.float64)
     if not table.size:
-        raise ValueError("there are no scores; evaluate one run or more")
+        raise ValueError("scores must contain at least one number, got none")
     low, high = stratified_bootstrap(table)
     return Summary(float(table.mean()), float(table.std()), interquartile_mean(table), low, high)

@@ -27,35 +27,41 @@ from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.logs import Episodes, Logger
 from endless_gym.agents.ppo import learn
-from endless_gym.agents.rollout import Player
+from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
 
 
 def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | None = None) -> Path:
-    """Train, from the start or from a run's last checkpoint.
+    """Train an agent: a new run, or from the last checkpoint of a run.
 
     Args:
-        settings: Of the run.
-        watch: Is told, after each update, its number and the means of the last episodes, and may stop the run.
+        settings: Settings of the run.
+        watch: Called after each update with its number and the means of the last 100 episodes; the run stops if it returns true.
 
     Returns:
-        The run's folder, with `settings.json`, `progress.jsonl`, TensorBoard's files and `checkpoints`.
+        The folder of the run, with `settings.json`, `progress.jsonl`, the TensorBoard files and `checkpoints`.
+
+    Raises:
+        ValueError: The settings are invalid, or do not fit the run to resume.
+        FileExistsError: The folder already contains a run.
+        FileNotFoundError: There is no run to resume.
     """
-    settings, resumed = settings.checked(), None
+    settings, resumed = settings.validated(), None
     if settings.resume:
         run = Path(settings.resume)
         resumed = command.load_checkpoint(run, "cpu").state
-        same_network(settings, checkpoint.read_settings(run))
+        check_resumable(settings, checkpoint.read_settings(run))
         settings = dataclasses.replace(settings, resume="", run=str(run))
     else:
         run = Path(
             settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         )
         if (run / checkpoint.SETTINGS).exists():
-            raise FileExistsError(f"{run} has a run already; go on with --resume {run}, or name another folder")
+            raise FileExistsError(
+                f"{run} already contains a run; continue it with --resume {run}, or choose another folder"
+            )
         run.mkdir(parents=True, exist_ok=True)
 
-    # Everything random follows from the seed.
     device = choose_device(settings.device)
     if settings.threads:
         torch.set_num_threads(settings.threads)
@@ -71,16 +77,16 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         if settings.compile:
             agent.compile_parts()
         optimizer = torch.optim.AdamW(agent.parameters(), lr=ppo.learning_rate)
-        player = Player(agent, environments, ppo.steps, generators["actions"])
+        collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"])
         episodes, update, steps = Episodes(), 0, 0
         if resumed is not None:
             update, steps = resumed["update"], resumed["steps"]
             agent.load_state_dict(resumed["model"])
             optimizer.load_state_dict(resumed["optimizer"])
             for name, generator in generators.items():
-                go_on_drawing(generator, resumed["generators"][name], settings.seed + update)
+                restore_generator(generator, resumed["generators"][name], settings.seed + update)
             episodes.add(resumed["episodes"])
-            player.load(resumed["player"])
+            collector.load_state_dict(resumed["player"])
 
         def save() -> None:
             state: dict[str, Any] = {
@@ -90,33 +96,33 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
                 "model": agent.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "generators": {name: generator.get_state() for name, generator in generators.items()},
-                "player": player.state(),
+                "player": collector.state_dict(),
                 "episodes": list(episodes.recent),
             }
             checkpoint.save(run, state, settings.keep_checkpoints)
 
         logger = Logger(run, settings, update)
-        # Now that nothing has failed: what was changed to go on holds from here on.
+        # Written only after everything above has succeeded; the changed settings of a resumed run are its settings from now on.
         (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
         if resumed is None:
             save()
-        logger.say(
-            f"{settings.env}: {settings.agent} with {agent.num_parameters:,} parameters on {device}, in {run}; Ctrl-C stops it"
+        logger.print(
+            f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {device}, in {run}; Ctrl-C stops the run"
         )
 
         clock = Clock((lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None)
         while update < ppo.updates and not stop.requested:
             start = time.perf_counter()
-            segment, ended = player.play(clock)
+            segment, ended = collector.collect(clock)
             with clock.measure("learning"):
-                states = [memory.state for memory in player.memories]
-                measures = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"])
+                states = [memory.state for memory in collector.memories]
+                learning = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"])
             new_steps = environments.groups * environments.per_group * ppo.steps
             update, steps = update + 1, steps + new_steps
             episodes.add(ended)
             means = episodes.means()
             rate = new_steps / (time.perf_counter() - start)
-            logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | measures, clock.take())
+            logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | learning, clock.take())
 
             minutes = (time.monotonic() - started) / 60
             if settings.time_limit and minutes >= settings.time_limit:
@@ -128,22 +134,27 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
                 stop.requested = True
             if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
                 save()
-        logger.say(f"{update} of {ppo.updates} updates are done; go on with: endless-train --resume {run}")
+        logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
         logger.close()
     return run
 
 
 class Interrupt:
-    """Lets an update finish when Ctrl-C is pressed; pressed again, it interrupts at once."""
+    """Context manager that turns the first SIGINT into a request to stop; the second one raises `KeyboardInterrupt`.
+
+    Attributes:
+        requested: Whether the run is to stop after the current update.
+    """
 
     def __init__(self) -> None:
+        """Make the handler; it is installed on entry."""
         self.requested = False
         self._before: Any = None
 
     def __enter__(self) -> Interrupt:
         try:
             self._before = signal.signal(signal.SIGINT, self._on_signal)
-        except ValueError:  # Only the main thread may; others are not interrupted.
+        except ValueError:  # Only the main thread can install handlers, and only it is interrupted.
             self._before = None
         return self
 
@@ -156,36 +167,48 @@ class Interrupt:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        print("\nstopping after this update, with a checkpoint; press Ctrl-C again to stop at once", file=sys.stderr)
+        print(
+            "\nstopping after this update, with a checkpoint; press Ctrl-C again to stop immediately", file=sys.stderr
+        )
 
 
-def same_network(settings: Settings, before: Settings) -> None:
-    """Refuses to go on with another network, other environments or another seed than a run began with.
+def check_resumable(settings: Settings, before: Settings) -> None:
+    """Check that a run can be resumed with other settings: network, environments and seed must not change.
+
+    Args:
+        settings: The new settings.
+        before: The settings of the run.
 
     Raises:
-        ValueError: Something differs.
+        ValueError: A setting that must not change differs.
     """
-    # Where environments are stepped may change, and all of PPO but the losses that have a head of their own.
+    # The engine and its threads may change, and so may all of PPO except whether the auxiliary heads exist.
     had = before.environment
-    place = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
-    settings = dataclasses.replace(settings, environment=place)
+    environment = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
+    settings = dataclasses.replace(settings, environment=environment)
     for name in ("env", "agent", "preset", "seed", "environment", "model", "recurrence", "transformer"):
         given, had = getattr(settings, name), getattr(before, name)
         if given != had:
             raise ValueError(
-                f"the run to resume began with {name} {had}, not {given}; leave it as it was, or start a run"
+                f"a resumed run must keep its {name}: expected {had}, got {given}; omit the flag, or start a new run"
             )
     for name in ("reconstruction", "ground_truth"):
-        wants, has = (getattr(each.ppo, f"{name}_coefficient") for each in (settings, before))
-        if bool(wants) != bool(has):
+        given, had = (getattr(each.ppo, f"{name}_coefficient") for each in (settings, before))
+        if bool(given) != bool(had):
             raise ValueError(
-                f"--ppo.{name.replace('_', '-')}-coefficient {wants:g} adds or takes away a head, and the run to resume began "
-                f"with {has:g}; leave it as it was, or start a run"
+                f"a resumed run must keep its heads: --ppo.{name.replace('_', '-')}-coefficient must stay "
+                f"{'positive' if had else '0'} (it was {had:g}), got {given:g}; omit the flag, or start a new run"
             )
 
 
-def go_on_drawing(generator: torch.Generator, state: torch.Tensor, seed: int) -> None:
-    """Puts a generator into a checkpoint's state; one of another kind of device starts anew with `seed`."""
+def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int) -> None:
+    """Restore the state of a generator; seed it instead if the state, uint8 (bytes,), is of another type of device.
+
+    Args:
+        generator: The generator.
+        state: State from a checkpoint.
+        seed: Seed for a state that does not fit.
+    """
     if state.shape == generator.get_state().shape:
         generator.set_state(state)
     else:
@@ -193,27 +216,27 @@ def go_on_drawing(generator: torch.Generator, state: torch.Tensor, seed: int) ->
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; `auto` is CUDA where there is one.
+    """The device with the name `cpu`, `cuda` or `cuda:INDEX`, or for `auto` CUDA if available, else the CPU.
 
     Raises:
-        ValueError: There is no such device.
+        ValueError: The name is invalid, or the device is not available.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise ValueError(f"no device `{name}`; give auto, cpu, cuda or cuda:NUMBER") from None
+        raise ValueError(f"--device must be auto, cpu, cuda or cuda:INDEX, got `{name}`") from None
     if device.type == "cuda":
         if not torch.cuda.is_available():
-            raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; give cpu or auto")
+            raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; use cpu or auto")
         if (device.index or 0) >= torch.cuda.device_count():
-            raise ValueError(f"device `{name}`: there are cuda:0 to cuda:{torch.cuda.device_count() - 1}")
+            raise ValueError(f"device `{name}`: the index must be 0 to {torch.cuda.device_count() - 1}")
     return device
 
 
 def parse(arguments: list[str]) -> Settings:
-    """Settings from the command line: the preset's, or the resumed run's, changed by the other flags."""
+    """Parse command-line arguments; the defaults are those of `--preset`, or the settings of the run to `--resume`."""
     import tyro
 
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -223,14 +246,14 @@ def parse(arguments: list[str]) -> Settings:
     if chosen.resume:
         defaults = dataclasses.replace(checkpoint.read_settings(chosen.resume), time_limit=0.0)
     else:
-        # tyro tells what presets there are if there is none of that name.
+        # tyro reports an unknown preset.
         defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
     description = "Train one of the paper's agents with PPO: endless-train --env Endless-MortarMayhem-v0 --agent gru"
     return tyro.cli(Settings, prog="endless-train", description=description, args=arguments, default=defaults)
 
 
 def main() -> int:
-    """The command `endless-train`."""
+    """Entry point of the command `endless-train`; returns the exit status."""
     return command.run("endless-train", lambda: train(parse(sys.argv[1:])))
 
 

@@ -3,7 +3,7 @@
 use super::block::Block;
 use super::frames::Frames;
 use super::layout::{Dtype, Element, Layout};
-use crate::envs::Spec;
+use crate::envs::EnvSpec;
 
 /// Which sections a batch has where there is a choice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,7 +17,7 @@ pub struct Contents {
 }
 
 /// The sections of an observation, which same-step auto-reset keeps a second time for the episode that ended.
-fn observation_sections(spec: &Spec, contents: Contents) -> Vec<(&'static str, Dtype, Vec<usize>)> {
+fn observation_sections(spec: &EnvSpec, contents: Contents) -> Vec<(&'static str, Dtype, Vec<usize>)> {
     let mut sections = Vec::new();
     if let Some(frames) = contents.frames {
         sections.push(("observation", Dtype::Uint8, frames.shape()));
@@ -35,7 +35,7 @@ fn observation_sections(spec: &Spec, contents: Contents) -> Vec<(&'static str, D
 }
 
 /// The layout of a batch of `num_envs` environments.
-pub fn batch_layout(spec: &Spec, num_envs: usize, contents: Contents) -> Layout {
+pub fn batch_layout(spec: &EnvSpec, num_envs: usize, contents: Contents) -> Layout {
     let mut sections = observation_sections(spec, contents);
     sections.extend([
         ("reward", Dtype::Float64, vec![]),
@@ -70,7 +70,7 @@ pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 /// for a reset, where `reset` is 0 (leave alone), 1 (start the next episode) or 2 (start an episode with `seed`); `options` for a
 /// reset with other reset parameters, JSON text that runs on over the rows, at least [`OPTIONS_BYTES`] in all; `snapshot` for an
 /// environment that is to go on from one, likewise.
-pub fn action_layout(spec: &Spec, num_envs: usize) -> Layout {
+pub fn action_layout(spec: &EnvSpec, num_envs: usize) -> Layout {
     let over_rows = |bytes: usize| vec![bytes.div_ceil(num_envs.max(1))];
     Layout::new(
         num_envs,

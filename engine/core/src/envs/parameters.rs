@@ -10,7 +10,7 @@ const MAX_LIST: usize = 4096;
 /// Type, default and limits of a reset parameter.
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
-pub enum Kind {
+pub enum ParameterKind {
     Bool {
         default: bool,
     },
@@ -37,7 +37,7 @@ pub enum Kind {
 pub struct Parameter {
     pub name: &'static str,
     #[serde(flatten)]
-    pub kind: Kind,
+    pub kind: ParameterKind,
     pub description: &'static str,
 }
 
@@ -47,17 +47,17 @@ const MAX_REWARD: f64 = 1e6;
 impl Parameter {
     /// A flag.
     pub const fn bool(name: &'static str, default: bool, description: &'static str) -> Self {
-        Parameter { name, kind: Kind::Bool { default }, description }
+        Parameter { name, kind: ParameterKind::Bool { default }, description }
     }
 
     /// An integer in `min..=max`.
     pub const fn int(name: &'static str, default: i64, min: i64, max: i64, description: &'static str) -> Self {
-        Parameter { name, kind: Kind::Int { default, min, max }, description }
+        Parameter { name, kind: ParameterKind::Int { default, min, max }, description }
     }
 
     /// A number in `min..=max`.
     pub const fn float(name: &'static str, default: f64, min: f64, max: f64, description: &'static str) -> Self {
-        Parameter { name, kind: Kind::Float { default, min, max }, description }
+        Parameter { name, kind: ParameterKind::Float { default, min, max }, description }
     }
 
     /// A reward or, with a negative number, a punishment.
@@ -73,36 +73,36 @@ impl Parameter {
         max: i64,
         description: &'static str,
     ) -> Self {
-        Parameter { name, kind: Kind::IntList { default, min, max }, description }
+        Parameter { name, kind: ParameterKind::IntList { default, min, max }, description }
     }
 
     /// The default as JSON text.
     pub fn default_text(&self) -> String {
         match self.kind {
-            Kind::Bool { default } => default.to_string(),
-            Kind::Int { default, .. } => default.to_string(),
-            Kind::Float { default, .. } => format!("{default:?}"),
-            Kind::IntList { default, .. } => format!("{default:?}"),
+            ParameterKind::Bool { default } => default.to_string(),
+            ParameterKind::Int { default, .. } => default.to_string(),
+            ParameterKind::Float { default, .. } => format!("{default:?}"),
+            ParameterKind::IntList { default, .. } => format!("{default:?}"),
         }
     }
 
     /// Type and limits in words.
     pub fn allowed(&self) -> String {
         match self.kind {
-            Kind::Bool { .. } => "true or false".to_owned(),
-            Kind::Int { min: i64::MIN, max: i64::MAX, .. } => "integer".to_owned(),
-            Kind::Int { min, max, .. } => format!("integer, {min} to {max}"),
-            Kind::Float { min, max, .. } => format!("number, {min} to {max}"),
-            Kind::IntList { min, max, .. } => format!("list of 1 to {MAX_LIST} integers, {min} to {max}"),
+            ParameterKind::Bool { .. } => "true or false".to_owned(),
+            ParameterKind::Int { min: i64::MIN, max: i64::MAX, .. } => "integer".to_owned(),
+            ParameterKind::Int { min, max, .. } => format!("integer, {min} to {max}"),
+            ParameterKind::Float { min, max, .. } => format!("number, {min} to {max}"),
+            ParameterKind::IntList { min, max, .. } => format!("list of 1 to {MAX_LIST} integers, {min} to {max}"),
         }
     }
 
     fn default_value(&self) -> Value {
         match self.kind {
-            Kind::Bool { default } => Value::Bool(default),
-            Kind::Int { default, .. } => Value::Int(default),
-            Kind::Float { default, .. } => Value::Float(default),
-            Kind::IntList { default, .. } => Value::IntList(default.to_vec()),
+            ParameterKind::Bool { default } => Value::Bool(default),
+            ParameterKind::Int { default, .. } => Value::Int(default),
+            ParameterKind::Float { default, .. } => Value::Float(default),
+            ParameterKind::IntList { default, .. } => Value::IntList(default.to_vec()),
         }
     }
 
@@ -112,16 +112,16 @@ impl Parameter {
         let out_of_range =
             || ParameterError::OutOfRange { name: self.name, value: given.to_string(), allowed: self.allowed() };
         match self.kind {
-            Kind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong_type),
-            Kind::Int { min, max, .. } => {
+            ParameterKind::Bool { .. } => given.as_bool().map(Value::Bool).ok_or_else(wrong_type),
+            ParameterKind::Int { min, max, .. } => {
                 let value = integer(given).ok_or_else(wrong_type)?;
                 (min..=max).contains(&value).then_some(Value::Int(value)).ok_or_else(out_of_range)
             }
-            Kind::Float { min, max, .. } => {
+            ParameterKind::Float { min, max, .. } => {
                 let value = given.as_f64().ok_or_else(wrong_type)?;
                 (min..=max).contains(&value).then_some(Value::Float(value)).ok_or_else(out_of_range)
             }
-            Kind::IntList { min, max, .. } => {
+            ParameterKind::IntList { min, max, .. } => {
                 let items = given.as_array().ok_or_else(wrong_type)?;
                 let values: Vec<i64> = items.iter().map(integer).collect::<Option<_>>().ok_or_else(wrong_type)?;
                 let fits = (1..=MAX_LIST).contains(&values.len()) && values.iter().all(|v| (min..=max).contains(v));

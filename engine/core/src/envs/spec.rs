@@ -2,14 +2,8 @@
 
 use serde::Serialize;
 
-use super::Family;
+use super::family::Family;
 use super::parameters::Parameter;
-
-/// Width and height of an observation in pixels.
-pub const SCREEN: usize = 84;
-
-/// Bytes of one observation: 84x84 RGB.
-pub const FRAME_BYTES: usize = SCREEN * SCREEN * 3;
 
 /// Actions of an environment, as the original's Gymnasium space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -39,32 +33,37 @@ impl std::fmt::Display for ActionSpace {
     }
 }
 
-/// A number with a name and a meaning: a column of the info or of the feature observation.
+/// A column of the feature observation (float32).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Column {
+    /// Name, unique within the environment.
     pub name: &'static str,
+    /// Meaning and unit.
     pub description: &'static str,
 }
 
-/// A column of the final info.
+/// A column of the final info (float64).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct InfoColumn {
+    /// The original's key in the final info.
     pub name: &'static str,
     /// Whether the original's number is a Python int; otherwise it is a float.
     pub is_integer: bool,
+    /// Meaning and unit.
     pub description: &'static str,
 }
 
 /// Everything that is fixed about an environment id.
 #[derive(Debug, Serialize)]
-pub struct Spec {
+pub struct EnvSpec {
     /// The original's id, such as `MortarMayhem-v0`.
     pub id: &'static str,
-    /// One line on what the agent has to do.
+    /// The agent's task in one line.
     pub summary: &'static str,
-    /// The rules that the id plays by.
+    /// The family and the variant of its rules.
     #[serde(skip)]
     pub family: Family,
+    /// The original's action space.
     pub action_space: ActionSpace,
     /// Numbers in the vector observation (float32 in 0..=1), 0 if there is none.
     pub vector_observation: usize,
@@ -72,10 +71,10 @@ pub struct Spec {
     pub ground_truth: usize,
     /// Columns of the final info beside `reward` and `length`.
     pub info: &'static [InfoColumn],
-    /// Columns of the feature observation (float32), an option of ours.
+    /// Columns of the feature observation (float32), which the original does not have.
     pub features: &'static [Column],
     /// Reset parameters with the original's names and defaults.
     pub parameters: &'static [Parameter],
-    /// Frames a second at which a person would watch.
+    /// Frames per second for a human viewer.
     pub render_fps: u32,
 }

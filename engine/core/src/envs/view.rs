@@ -2,7 +2,8 @@
 //!
 //! They are indexed \[row\]\[column\]\[channel\], as image libraries want it, while observations are indexed \[x\]\[y\]\[channel\].
 
-use super::{Environment, FRAME_BYTES, SCREEN};
+use super::environment::Environment;
+use super::screen::{FRAME_BYTES, SCREEN};
 use crate::raster::Canvas;
 
 /// How much larger than an observation the ground-truth view is.

@@ -5,9 +5,6 @@
 
 use std::sync::atomic::{Ordering, fence};
 
-use rand::TryRng;
-use rand::rngs::SysRng;
-
 use crate::batch::{Block, Layout, Stamp};
 
 /// Most buffers that are known at a time. A trainer and its observers hold fewer.
@@ -33,16 +30,10 @@ pub(super) struct Buffer {
 }
 
 impl Buffers {
-    /// No buffer is known.
-    ///
-    /// # Panics
-    ///
-    /// If the operating system has no entropy to give, as for unseeded generators.
-    pub fn new() -> Self {
-        let mut pool = [0; size_of::<u64>()];
-        SysRng.try_fill_bytes(&mut pool).expect("entropy from the operating system");
-        // No stamp at all is not to be ours.
-        Buffers { pool: u64::from_le_bytes(pool) | 1, writes: Vec::new(), last_write: 0 }
+    /// No buffer is known. `identity` tells this pool's stamps from all others'.
+    pub fn new(identity: u64) -> Self {
+        // All zeros are no stamp.
+        Buffers { pool: identity | 1, writes: Vec::new(), last_write: 0 }
     }
 
     /// Takes the stamp off a buffer that is about to be written into: until [`finish`](Buffers::finish), nobody knows it.
@@ -95,7 +86,7 @@ mod tests {
 
     #[test]
     fn a_buffer_is_known_from_its_second_write_on() {
-        let (mut buffers, layout) = (Buffers::new(), layout());
+        let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batches = [zeroed(layout.blocks()), zeroed(layout.blocks())];
         for known in [false, true, true] {
             for (slot, batch) in batches.iter_mut().enumerate() {
@@ -106,7 +97,7 @@ mod tests {
 
     #[test]
     fn copies_and_other_pools_buffers_are_not_known() {
-        let (mut buffers, mut others, layout) = (Buffers::new(), Buffers::new(), layout());
+        let (mut buffers, mut others, layout) = (Buffers::new(1), Buffers::new(3), layout());
         let mut batch = zeroed(layout.blocks());
         write(&mut buffers, &layout, &mut batch);
         assert!(!write(&mut others, &layout, &mut batch).known);
@@ -121,7 +112,7 @@ mod tests {
 
     #[test]
     fn a_buffer_whose_write_was_not_finished_is_not_known() {
-        let (mut buffers, layout) = (Buffers::new(), layout());
+        let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batch = zeroed(layout.blocks());
         write(&mut buffers, &layout, &mut batch);
         assert!(buffers.begin(&layout, &mut batch).known);
@@ -130,7 +121,7 @@ mod tests {
 
     #[test]
     fn the_least_recently_written_buffer_is_forgotten() {
-        let (mut buffers, layout) = (Buffers::new(), layout());
+        let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batches = vec![zeroed(layout.blocks()); MOST + 1];
         batches.iter_mut().for_each(|batch| assert!(!write(&mut buffers, &layout, batch).known));
         assert!(write(&mut buffers, &layout, &mut batches[1]).known);

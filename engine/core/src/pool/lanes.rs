@@ -11,7 +11,7 @@ use super::snapshot::{Saved, SnapshotError};
 use super::threads::{Threads, lock};
 use super::{Autoreset, ResetRequest};
 use crate::batch::BatchMut;
-use crate::envs::{Environment, ParameterError, ResetParameters, Spec, view};
+use crate::envs::{EnvSpec, Environment, ParameterError, ResetParameters, view};
 use crate::random::Generator;
 
 /// One environment with all that belongs to it alone.
@@ -58,7 +58,7 @@ impl<E: Environment> Lane<E> {
         let transition = self.env.step(action, &mut self.random);
         self.history.push(|| self.env.scene());
         self.episode_return += transition.reward;
-        self.episode_length += 1;
+        self.episode_length = self.episode_length.saturating_add(1);
         self.ended = transition.terminated;
         self.write_transition(out, row, transition.reward, transition.terminated);
         if transition.terminated {
@@ -174,23 +174,23 @@ pub(super) struct FamilyLanes<E: Environment> {
     shown: Vec<Vec<Shown<E>>>,
     /// Frames in an observation.
     stack: usize,
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     variant: E::Variant,
 }
 
 impl<E: Environment> FamilyLanes<E> {
     /// Environments with the given assets and seeds, none of them reset yet.
     pub(super) fn new(
-        spec: &'static Spec,
+        spec: &'static EnvSpec,
         variant: E::Variant,
         stack: usize,
-        environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds)>,
+        environments: impl Iterator<Item = (Arc<E::Assets>, Arc<Options>, Seeds, Generator)>,
     ) -> Self {
         let lanes = environments
-            .map(|(assets, options, seeds)| Lane {
+            .map(|(assets, options, seeds, random)| Lane {
                 env: E::new(&assets),
                 assets,
-                random: Generator::from_entropy(),
+                random,
                 seeds,
                 episode_return: 0.0,
                 episode_length: 0,

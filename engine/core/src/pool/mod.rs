@@ -20,12 +20,13 @@ use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
-use crate::envs::{self, Environment, Family, ParameterError, ResetParameters, Spec, UnknownEnvironment};
+use crate::envs::{self, EnvSpec, Environment, Family, ParameterError, ResetParameters, UnknownEnvironment};
+use crate::random::EntropyError;
 use crate::raster::PixelFormat;
 use buffers::Buffers;
 use lanes::{FamilyLanes, Lanes, Work};
 pub use seeding::Seeding;
-use seeding::Seeds;
+use seeding::{Seeds, Unseeded};
 use shown::Drawing;
 pub use shown::WrongFrame;
 pub use snapshot::{SNAPSHOT_VERSION, SnapshotError};
@@ -128,7 +129,7 @@ impl ResetRequest<'_> {
 
 /// Environments of one id in lockstep.
 pub struct Pool {
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     layout: Layout,
     lanes: Box<dyn Lanes>,
     buffers: Buffers,
@@ -159,10 +160,13 @@ impl Pool {
             }
             _ => {}
         }
+        let unseeded = Unseeded::draw(&config.seeding)?;
         let lanes: Box<dyn Lanes> = match spec.family {
-            Family::MortarMayhem(variant) => Box::new(family_lanes::<MortarMayhem>(spec, variant, config)?),
-            Family::MysteryPath(variant) => Box::new(family_lanes::<MysteryPath>(spec, variant, config)?),
-            Family::SearingSpotlights(variant) => Box::new(family_lanes::<SearingSpotlights>(spec, variant, config)?),
+            Family::MortarMayhem(variant) => Box::new(family_lanes::<MortarMayhem>(spec, variant, config, unseeded)?),
+            Family::MysteryPath(variant) => Box::new(family_lanes::<MysteryPath>(spec, variant, config, unseeded)?),
+            Family::SearingSpotlights(variant) => {
+                Box::new(family_lanes::<SearingSpotlights>(spec, variant, config, unseeded)?)
+            }
         };
         Ok(Pool {
             spec,
@@ -176,7 +180,7 @@ impl Pool {
                 },
             ),
             lanes,
-            buffers: Buffers::new(),
+            buffers: Buffers::new(unseeded.identity()),
             format: config.frames.unwrap_or_default().format,
             check_drawing: config.check_drawing,
             autoreset: config.autoreset,
@@ -187,7 +191,7 @@ impl Pool {
     }
 
     /// What is fixed about the environment id.
-    pub fn spec(&self) -> &'static Spec {
+    pub fn spec(&self) -> &'static EnvSpec {
         self.spec
     }
 
@@ -309,7 +313,7 @@ impl Pool {
 }
 
 /// Whether `actions` fit `num_envs` environments: the right count, each in its branch's range.
-pub fn check_actions(spec: &Spec, num_envs: usize, actions: &[i32]) -> Result<(), PoolError> {
+pub fn check_actions(spec: &EnvSpec, num_envs: usize, actions: &[i32]) -> Result<(), PoolError> {
     let branches = spec.action_space.branches();
     if actions.len() != num_envs * branches.len() {
         return Err(PoolError::ActionCount { given: actions.len(), num_envs, branches: branches.len() });
@@ -327,9 +331,10 @@ pub fn check_actions(spec: &Spec, num_envs: usize, actions: &[i32]) -> Result<()
 
 /// Makes the environments of one family; those with the same options share their assets.
 fn family_lanes<E: Environment>(
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     variant: E::Variant,
     config: &PoolConfig,
+    unseeded: Unseeded,
 ) -> Result<FamilyLanes<E>, PoolError> {
     // The options of an environment, and what is made from them.
     let make = |given: &Map<String, Json>| -> Result<(Arc<lanes::Options>, Arc<E::Assets>), ParameterError> {
@@ -359,7 +364,9 @@ fn family_lanes<E: Environment>(
         _ => [].into(),
     };
     let environments = made.into_iter().enumerate().map(|(env, (options, assets))| {
-        (assets, options, Seeds::new(&config.seeding, &list, config.first_env + env, config.total_envs))
+        let number = config.first_env + env;
+        let seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        (assets, options, seeds, unseeded.environment(number))
     });
     let stack = config.frames.unwrap_or_default().stack;
     Ok(FamilyLanes::new(spec, variant, stack, environments))
@@ -372,6 +379,8 @@ pub enum PoolError {
     UnknownEnvironment(#[from] UnknownEnvironment),
     #[error(transparent)]
     Parameters(#[from] ParameterError),
+    #[error(transparent)]
+    Entropy(#[from] EntropyError),
     #[error("options of environment {env}: {source}")]
     ParametersOf { env: usize, source: ParameterError },
     #[error("{given} sets of options for {num_envs} environments; give one for each, or one for all")]

@@ -1,8 +1,10 @@
 //! Which seed each episode of each environment gets.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use serde::{Deserialize, Serialize};
 
-use crate::random::{Generator, SeedSequence};
+use crate::random::{EntropyError, Generator, SeedSequence, entropy};
 
 /// How episodes are seeded. Environments are counted over all groups of an engine, so that results depend neither on the
 /// number of threads nor on how the environments are divided.
@@ -17,6 +19,47 @@ pub enum Seeding {
     List(Vec<u64>),
 }
 
+impl Seeding {
+    /// Whether every episode follows from given seeds, so that no entropy is needed.
+    fn is_seeded(&self) -> bool {
+        !matches!(self, Seeding::Continue { seed: None } | Seeding::Range { seed: None, .. })
+    }
+}
+
+/// The randomness of a pool that no seed fixes. One draw of the system's entropy serves all environments: each gets a stream
+/// of its own by a spawn key, as with numpy's `SeedSequence.spawn`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Unseeded(SeedSequence);
+
+impl Unseeded {
+    /// Draws entropy. Without a source of it, only pools whose episodes all are seeded can be made.
+    pub(super) fn draw(seeding: &Seeding) -> Result<Self, EntropyError> {
+        let bits = match entropy() {
+            Err(error) if !seeding.is_seeded() => return Err(error),
+            bits => bits.unwrap_or(0),
+        };
+        Ok(Unseeded(SeedSequence::from_u128(bits)))
+    }
+
+    /// The generator that environment number `env` starts with.
+    pub(super) fn environment(self, env: usize) -> Generator {
+        Generator::from_seed_sequence(&self.0.with_spawn_key(&[env as u32, 0]))
+    }
+
+    /// The generator that draws the seeds of environment number `env`.
+    fn seeds(self, env: usize) -> Generator {
+        Generator::from_seed_sequence(&self.0.with_spawn_key(&[env as u32, 1]))
+    }
+
+    /// A number that no other pool has, neither of this process nor, where there is entropy, of another.
+    pub(super) fn identity(self) -> u64 {
+        static POOLS: AtomicU32 = AtomicU32::new(0);
+        let number = POOLS.fetch_add(1, Ordering::Relaxed);
+        let [identity] = self.0.with_spawn_key(&[number, 0, 0]).generate_state_u64();
+        identity
+    }
+}
+
 /// The seeds of one environment's episodes.
 #[derive(Debug)]
 pub(super) enum Seeds {
@@ -27,7 +70,13 @@ pub(super) enum Seeds {
 
 impl Seeds {
     /// The seeds of environment number `env` of `total`.
-    pub(super) fn new(seeding: &Seeding, list: &std::sync::Arc<[u64]>, env: usize, total: usize) -> Self {
+    pub(super) fn new(
+        seeding: &Seeding,
+        list: &std::sync::Arc<[u64]>,
+        env: usize,
+        total: usize,
+        unseeded: Unseeded,
+    ) -> Self {
         match seeding {
             Seeding::Continue { seed } => Seeds::Continue { first: seed.map(|seed| seed.wrapping_add(env as u64)) },
             Seeding::Range { start, end, seed } => Seeds::Range {
@@ -37,7 +86,7 @@ impl Seeds {
                     Some(seed) => {
                         Generator::from_seed_sequence(&SeedSequence::new(*seed).with_spawn_key(&[env as u32]))
                     }
-                    None => Generator::from_entropy(),
+                    None => unseeded.seeds(env),
                 },
             },
             Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env, stride: total },

@@ -57,7 +57,11 @@ impl<S: DeserializeOwned> Saved<S> {
         if number(8) != crc32fast::hash(content) {
             return Err(SnapshotError::Damaged);
         }
-        postcard::from_bytes(content).map_err(|error| SnapshotError::Content(error.to_string()))
+        let saved: Self = postcard::from_bytes(content).map_err(|error| SnapshotError::Content(error.to_string()))?;
+        if saved.episode_length < 0 || !saved.episode_return.is_finite() {
+            return Err(InvalidState.into());
+        }
+        Ok(saved)
     }
 }
 

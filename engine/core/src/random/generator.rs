@@ -2,18 +2,18 @@
 
 use std::fmt;
 
-use rand::rngs::SysRng;
-use rand::{Rng, TryRng};
+use rand::Rng;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 
-use super::SeedSequence;
+use super::{EntropyError, SeedSequence, entropy};
 
 /// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
 ///
 /// Sources: `numpy/random/_generator.pyx`, `src/distributions/distributions.c` and
 /// `src/pcg64/pcg64.h` (numpy 1.26 and 2.x).
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "UncheckedGenerator")]
 pub struct Generator {
     /// The bit generator, 64 bits a step.
     bits: Pcg64,
@@ -36,17 +36,13 @@ impl Generator {
     }
 
     /// An unseeded generator, `Generator(PCG64())`: from 128 bits of the operating system's
-    /// entropy, as Gymnasium takes where a reset brings no seed.
+    /// [`entropy`], as Gymnasium takes where a reset brings no seed.
     ///
-    /// # Panics
+    /// # Errors
     ///
-    /// If the operating system has no entropy to give, as `rand`'s own generators do.
-    // Straight from the system: a generator kept by the process would repeat itself in the
-    // children of a fork, which is how Python starts parallel environments.
-    pub fn from_entropy() -> Self {
-        let mut entropy = [0; size_of::<u128>()];
-        SysRng.try_fill_bytes(&mut entropy).expect("entropy from the operating system");
-        Self::from_seed_sequence(&SeedSequence::from_u128(u128::from_le_bytes(entropy)))
+    /// If there is no entropy; see [`entropy`].
+    pub fn from_entropy() -> Result<Self, EntropyError> {
+        Ok(Self::from_seed_sequence(&SeedSequence::from_u128(entropy()?)))
     }
 
     /// `integers(low, high)`: a uniform whole number of `low..high`, by numpy's `int64` path.
@@ -149,6 +145,28 @@ impl Generator {
             self.kept = Some((word >> 32) as u32);
             word as u32
         })
+    }
+}
+
+/// A deserialised generator before the check of its increment.
+#[derive(Deserialize)]
+struct UncheckedGenerator {
+    bits: Pcg64,
+    kept: Option<u32>,
+}
+
+impl TryFrom<UncheckedGenerator> for Generator {
+    type Error = &'static str;
+
+    /// Refuses an even increment. It shortens the period, down to a generator that only gives zeros, on which the rejection
+    /// sampling of [`Generator::integers`] does not end.
+    fn try_from(unchecked: UncheckedGenerator) -> Result<Self, Self::Error> {
+        let UncheckedGenerator { bits, kept } = unchecked;
+        // `from_state` makes the increment odd.
+        if Pcg64::from_state(bits.state(), bits.stream()) != bits {
+            return Err("the increment of PCG64 must be odd");
+        }
+        Ok(Self { bits, kept })
     }
 }
 

@@ -5,9 +5,11 @@
 //! here, so the draws follow numpy 1.26 and 2.x (which agree) exactly, down to how many bits each
 //! of them consumes.
 
+mod entropy;
 mod generator;
 mod seed_sequence;
 
+pub use entropy::{EntropyError, entropy};
 pub use generator::Generator;
 pub use seed_sequence::SeedSequence;
 
@@ -134,9 +136,23 @@ mod tests {
         assert_eq!(format!("{restored:?}"), format!("{rng:?}"));
     }
 
+    #[cfg(feature = "entropy")]
+    #[test]
+    fn an_even_increment_is_refused() {
+        let text = |increment: u128| format!(r#"{{"bits":{{"state":5,"increment":{increment}}},"kept":null}}"#);
+        let read = |increment| serde_json::from_str::<Generator>(&text(increment));
+        for increment in [0, 2, u128::MAX - 1] {
+            let error = read(increment).unwrap_err().to_string();
+            assert!(error.contains("must be odd"), "{increment}: {error}");
+        }
+        for increment in [1, 3, u128::MAX] {
+            assert!(read(increment).is_ok(), "{increment}");
+        }
+    }
+
     #[test]
     fn unseeded_generators_differ() {
-        assert_ne!(Generator::from_entropy(), Generator::from_entropy());
+        assert_ne!(Generator::from_entropy().unwrap(), Generator::from_entropy().unwrap());
     }
 
     #[test]

@@ -1,24 +1,25 @@
 //! A scripted player that remembers the commands.
 
 use super::commands::{COMMANDS, Command};
-use super::drawing::TILE;
+use super::config::TILE;
 use super::features::{AGENT, ARENA_SIZE, BURNING, COMMAND, HEADING, LARGEST_ARENA};
 use super::parameters::{Locomotion, Variant};
+use crate::envs::expert::Expert;
+use crate::envs::screen::SCREEN;
 use crate::envs::steering::turn_or_walk;
-use crate::envs::{Expert, SCREEN};
 
-/// Pixels that the agent may be off a tile's centre before it walks on.
+/// Distance in pixels from a tile's centre within which the agent stops.
 const DEAD_ZONE: i32 = 2;
 
-/// Plays Mortar Mayhem from what a frame shows. It tells one command from the next by the pause between them or by their
-/// difference, and knows that a command is done when the fire goes out; so it wants `visual_feedback`, and a
+/// Plays Mortar Mayhem from the feature and vector observations. It recognises a new command by the pause before it or by a
+/// difference, and knows that a command is finished when the fire goes out. It therefore needs `visual_feedback`, and a
 /// `command_show_delay` of at least 1.
 #[derive(Debug)]
 pub struct MortarExpert {
     variant: Variant,
     commands: Vec<Command>,
     last_shown: Option<Command>,
-    /// Number of the command to execute; `None` until the fire that is burning has gone out.
+    /// Index of the command to execute; `None` until the current fire has gone out.
     current: Option<usize>,
     target: Option<(i32, i32)>,
     was_burning: bool,
@@ -49,7 +50,7 @@ impl MortarExpert {
             && let Some(command) = shown
         {
             self.commands.push(command);
-            // A command shown while the last one still burns starts the sequence over once the fire is out.
+            // A command shown while tiles still burn restarts the sequence when the fire is out.
             if features[BURNING] == 1.0 {
                 self.current = None;
             }
@@ -58,7 +59,7 @@ impl MortarExpert {
     }
 
     fn tile_after(&self, (x, y): (i32, i32), arena_size: i32) -> (i32, i32) {
-        let command = self.current.and_then(|number| self.commands.get(number));
+        let command = self.current.and_then(|index| self.commands.get(index));
         let (x, y) = command.map_or((x, y), |command| command.apply((x, y)));
         if self.variant.endless { (x.rem_euclid(arena_size), y.rem_euclid(arena_size)) } else { (x, y) }
     }
@@ -80,13 +81,13 @@ impl Expert for MortarExpert {
         self.remember(features, vector_observation);
         let target = match self.target {
             Some(target) => target,
-            // The first frame shows the first command and where the walk begins.
+            // The first frame shows the first command and the start tile.
             None => self.tile_after(tile, arena_size),
         };
         self.target = Some(target);
         let burning = features[BURNING] == 1.0;
         if self.was_burning && !burning {
-            self.current = Some(self.current.map_or(0, |number| number + 1));
+            self.current = Some(self.current.map_or(0, |index| index + 1));
             self.target = Some(self.tile_after(target, arena_size));
         }
         self.was_burning = burning;

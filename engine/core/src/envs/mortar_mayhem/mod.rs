@@ -1,22 +1,43 @@
 //! Mortar Mayhem: memorise a sequence of commands, then execute it on an arena whose other tiles burn.
 
+mod command_sprites;
 mod commands;
+mod config;
+mod display_schedule;
 mod drawing;
 pub mod expert;
 mod features;
 mod parameters;
+mod registry;
 mod rules;
+mod scene;
+mod state;
 
 use std::sync::Arc;
 
 pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
-pub use drawing::{Assets, Scene};
-pub use parameters::{Locomotion, Parameters, SPECS, Variant};
-pub use rules::{MortarMayhem, State};
+pub use config::Config;
+pub use drawing::Assets;
+pub use parameters::{Locomotion, Parameters, Variant};
+pub use registry::SPECS;
+pub use scene::Scene;
+pub use state::State;
 
-use crate::envs::{Environment, InvalidState, ResetParameters, Transition};
+use super::character_sprites::CharacterSprites;
+use super::environment::{Environment, InvalidState, Transition};
+use super::parameters::ResetParameters;
 use crate::random::Generator;
 use crate::raster::Canvas;
+use state::DisplayedCharacter;
+
+/// One environment of the family.
+#[derive(Clone, Debug)]
+pub struct MortarMayhem {
+    assets: Arc<Assets>,
+    state: State,
+    /// Pictures of [`DisplayedCharacter::Earlier`].
+    earlier_sprites: Arc<CharacterSprites>,
+}
 
 impl Environment for MortarMayhem {
     type Variant = Variant;
@@ -29,15 +50,22 @@ impl Environment for MortarMayhem {
     }
 
     fn new(assets: &Arc<Assets>) -> Self {
-        MortarMayhem::unplayed(assets)
+        MortarMayhem { assets: Arc::clone(assets), state: State::new(), earlier_sprites: Arc::clone(&assets.character) }
     }
 
     fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
-        self.start(assets, random);
+        if self.state.displayed == DisplayedCharacter::Current {
+            self.earlier_sprites = Arc::clone(&self.assets.character);
+        }
+        let last_scale = self.assets.config.parameters.agent_scale;
+        if !Arc::ptr_eq(&self.assets, assets) {
+            self.assets = Arc::clone(assets);
+        }
+        self.state.reset(&assets.config, last_scale, random);
     }
 
     fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
-        self.play(action, random)
+        self.state.step(&self.assets.config, action, random)
     }
 
     fn shared(&self) -> &Arc<Assets> {
@@ -45,7 +73,7 @@ impl Environment for MortarMayhem {
     }
 
     fn scene(&self) -> Scene {
-        self.shown_scene()
+        Scene::new(&self.state, &self.assets.config, &self.assets.character, &self.earlier_sprites)
     }
 
     fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
@@ -57,7 +85,7 @@ impl Environment for MortarMayhem {
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
-        self.draw_debug_frame(canvas);
+        self.assets.draw_ground_truth(&mut self.state, &self.earlier_sprites, canvas);
     }
 
     fn vector_observation(&self, out: &mut [f32]) {
@@ -68,7 +96,7 @@ impl Environment for MortarMayhem {
     }
 
     fn features(&self, out: &mut [f32]) {
-        self.write_features(out);
+        self.state.write_features(&self.assets.config, out);
     }
 
     fn ground_truth(&self, out: &mut [f64]) {
@@ -81,10 +109,17 @@ impl Environment for MortarMayhem {
     }
 
     fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
-        self.resume(assets, state)
+        if !state.is_valid(&assets.config) {
+            return Err(InvalidState);
+        }
+        self.assets = Arc::clone(assets);
+        self.earlier_sprites = assets.displayed_sprites(&state);
+        self.state = state;
+        Ok(())
     }
 
     fn info(&self, out: &mut [f64]) {
-        out.copy_from_slice(&if self.assets.variant.endless { self.endless_info() } else { self.finite_info() });
+        let endless = self.assets.config.variant.endless;
+        out.copy_from_slice(&if endless { self.state.endless_info() } else { self.state.finite_info() });
     }
 }

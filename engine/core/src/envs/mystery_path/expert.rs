@@ -1,23 +1,24 @@
-//! A scripted player that finds the path by trying, and remembers what it tried.
+//! A scripted player that finds the path by trial and error, and remembers every result.
 
 use std::collections::VecDeque;
 
 use super::belief::Belief;
-use super::drawing::TILE;
+use super::config::TILE;
 use super::features::{AGENT, FALLEN, HEADING};
 use super::parameters::Variant;
 use super::path::{GRID, Tile};
 use super::route::SEGMENT;
+use crate::envs::expert::Expert;
+use crate::envs::screen::SCREEN;
 use crate::envs::steering::turn_or_walk;
-use crate::envs::{Expert, SCREEN};
 
-/// Pixels that the endless agent moves in a step, which cannot be seen on a screen that moves with it.
+/// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so that the frames do not show it.
 const ENDLESS_SPEED: i32 = 3;
 
-/// How much less likely a tile may be for each tile that it is nearer.
+/// Probability that one tile of distance is worth.
 const WALK: f64 = 0.01;
 
-/// What to think of an unknown tile where nothing else tells: beside the last tile found, and beside others.
+/// Prior probability that an unknown tile is on the path: beside the last tile found, and beside others.
 const TIP: f64 = 0.5;
 const ELSEWHERE: f64 = 0.03;
 
@@ -28,28 +29,28 @@ enum Known {
     OffPath,
 }
 
-/// Plays Mystery Path from what a frame shows, all of its ids. It walks to the tile that is most likely on the path, and when it
-/// falls off it remembers where, walks back and tries the next best. In the endless id it tries nothing before the farthest
-/// column if it can, for that would end the episode.
+/// Plays all ids of Mystery Path from the feature observation. It walks to the tile that is most likely on the path. When it falls
+/// off, it remembers the tile, walks back and tries the next best. In the endless id it avoids tiles before the farthest column,
+/// since a fall there ends the episode.
 ///
-/// It wants `visual_feedback`, the default `agent_scale`, and an `agent_speed` of less than a tile; in the endless id the default
-/// one, since it counts its steps to know how far it is. It needs no ground truth: only a fall before the farthest column ends an
-/// endless episode, so that everything can be tried once at the end of the known way. What it cannot pass is the rare way that
-/// leads back to the left.
+/// It needs `visual_feedback`, the default `agent_scale`, and an `agent_speed` of less than a tile; in the endless id the default
+/// speed, since it counts its steps to know its position. It needs no ground truth: only a fall before the farthest column ends an
+/// endless episode, so that every tile at the end of the known path can be tried once. It cannot pass the rare paths that lead back
+/// to the left.
 #[derive(Debug)]
 pub struct PathExpert {
     variant: Variant,
-    /// What is known of each column of the way, by row.
+    /// What is known of each column, by row.
     columns: Vec<[Option<Known>; GRID as usize]>,
-    /// What is expected of each segment that was entered.
+    /// The belief about each segment that was entered.
     beliefs: Vec<Belief>,
-    /// Horizontal centre of the endless agent in pixels of the way.
+    /// Horizontal centre of the endless agent in pixels of the path's coordinates.
     endless_x: i32,
     fallen: bool,
-    /// The tiles to walk along, the next one first.
+    /// The tiles to walk along, starting with the next one.
     plan: VecDeque<Tile>,
     farthest: i32,
-    /// The tile of the path that was found last.
+    /// The last tile of the path that was found.
     tip: Tile,
 }
 
@@ -72,7 +73,7 @@ impl PathExpert {
         *self.columns.get(usize::try_from(x).ok()?)?.get(usize::try_from(y).ok()?)?
     }
 
-    /// Remembers whether a tile is on the path: whether that is news.
+    /// Remembers whether a tile is on the path. Returns whether that was unknown.
     fn learn(&mut self, (x, y): Tile, known: Known) -> bool {
         let (Ok(column), Ok(row)) = (usize::try_from(x), usize::try_from(y)) else { return false };
         if self.variant != Variant::Endless && x >= GRID {
@@ -88,7 +89,7 @@ impl PathExpert {
             self.beliefs.push(Belief::new(self.variant, (x % SEGMENT, y)));
         }
         if let Some(belief) = self.beliefs.get_mut(segment) {
-            belief.learn((x % SEGMENT, y), known == Known::OnPath);
+            belief.observe((x % SEGMENT, y), known == Known::OnPath);
         }
         true
     }
@@ -101,22 +102,22 @@ impl PathExpert {
         })
     }
 
-    /// The chance that an unknown tile beside `tile` is on the path.
-    fn chance(&self, (x, y): Tile, tile: Tile) -> f64 {
-        // From the last tile of a segment the way always leads on.
+    /// The probability that an unknown tile beside `tile` is on the path.
+    fn probability(&self, (x, y): Tile, tile: Tile) -> f64 {
+        // The tile after the last tile of a segment is always on the path.
         let Some(belief) = self.beliefs.get((x / SEGMENT) as usize) else { return 1.0 };
         let (tip_x, tip_y) = self.tip;
-        let guess = match () {
-            // The path goes on where it was last found, rather than beside some tile before.
+        let prior = match () {
+            // The path most likely continues beside the last tile found.
             _ if tile == self.tip => TIP,
-            // The endless agent cannot go left, where a path that ends for it must go on. There may be another way to it.
+            // If the path has no other continuation, it leads left, where the endless agent cannot go. There may be a detour.
             _ if (x, y) == (tip_x - 1, tip_y) && self.reachable(self.tip).all(|next| self.known(next).is_some()) => 1.0,
             _ => ELSEWHERE,
         };
-        belief.chance((x % SEGMENT, y), guess)
+        belief.probability((x % SEGMENT, y), prior)
     }
 
-    /// Looks for the unknown tile to try, and for the way along the known path that leads there.
+    /// Plans the unknown tile to try next, and the shortest walk there along known tiles.
     fn make_plan(&mut self, from: Tile) {
         let mut queue = VecDeque::from([(from, 0, usize::MAX)]);
         let mut visited: Vec<(Tile, usize)> = Vec::new();
@@ -136,7 +137,7 @@ impl PathExpert {
                         }
                     }
                     None => {
-                        let mut score = self.chance(next, tile) - WALK * f64::from(distance);
+                        let mut score = self.probability(next, tile) - WALK * f64::from(distance);
                         if self.variant == Variant::Endless && next.0 < self.farthest {
                             score -= 2.0;
                         }
@@ -176,15 +177,15 @@ impl Expert for PathExpert {
             self.learn(tile, Known::OffPath);
             return;
         }
-        let news = self.learn(tile, Known::OnPath);
-        if news {
+        let is_new = self.learn(tile, Known::OnPath);
+        if is_new {
             self.tip = tile;
         }
         self.farthest = self.farthest.max(tile.0);
         if self.plan.front() == Some(&tile) {
             self.plan.pop_front();
         }
-        if news || came_back || self.plan.is_empty() {
+        if is_new || came_back || self.plan.is_empty() {
             self.make_plan(tile);
         }
         let Some(next) = self.plan.front() else { return };

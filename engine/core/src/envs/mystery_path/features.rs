@@ -1,30 +1,32 @@
-//! What a frame of Mystery Path shows, in numbers. The path itself is not among them: it is to be remembered.
+//! The feature observation of Mystery Path: what a frame shows, as numbers. It does not contain the path, which the agent must
+//! remember.
 
-use super::drawing::{Assets, TILE};
+use super::config::{Config, TILE};
 use super::parameters::Variant;
 use super::path::GRID;
-use super::rules::State;
-use crate::envs::{Column, SCREEN};
+use super::state::State;
+use crate::envs::screen::SCREEN;
+use crate::envs::spec::Column;
 
-/// Places of the columns that all ids have.
+/// Indices of the columns that all ids have.
 pub(super) const AGENT: usize = 0;
 pub(super) const HEADING: usize = 2;
 pub(super) const FALLEN: usize = 4;
 const SHARED: usize = FALLEN + 1;
-/// Places in [`FINITE_FEATURES`].
+/// Indices in [`FINITE_FEATURES`].
 const ORIGIN: usize = SHARED;
 const GOAL: usize = ORIGIN + 3;
-/// Places in [`ENDLESS_FEATURES`].
+/// Indices in [`ENDLESS_FEATURES`].
 pub(super) const STAMINA: usize = SHARED;
 pub(super) const BACKGROUND: usize = STAMINA + 2;
 pub(super) const PAST_SHIFT: usize = BACKGROUND + 1;
 pub(super) const PAST_PATH: usize = PAST_SHIFT + 1;
 
-/// Columns of tiles that the screen shows, whole or in part.
+/// Columns of tiles that are on the screen in whole or in part.
 const SCREEN_COLUMNS: usize = GRID as usize + 1;
 const SCREEN_TILES: usize = SCREEN_COLUMNS * GRID as usize;
 
-/// By how much the numbers of a tile are divided.
+/// Divisor of the numbers of a tile.
 const LAST_TILE: f32 = GRID as f32 - 1.0;
 
 const fn column(name: &'static str, description: &'static str) -> Column {
@@ -34,15 +36,15 @@ const fn column(name: &'static str, description: &'static str) -> Column {
 const SHARED_COLUMNS: [Column; SHARED] = [
     column("agent_x", "horizontal centre of the agent on the screen, divided by 84"),
     column("agent_y", "vertical centre of the agent on the screen, divided by 84"),
-    column("heading_x", "where the agent faces: horizontal part of a unit vector"),
-    column("heading_y", "where the agent faces: vertical part of a unit vector, down is positive"),
+    column("heading_x", "direction of the agent: horizontal part of a unit vector"),
+    column("heading_y", "direction of the agent: vertical part of a unit vector, down is positive"),
     column("fallen", "1 while the red cross is seen: the agent fell off the path"),
 ];
 
-/// What the frames of the finite ids show.
+/// The columns of the finite ids.
 pub const FINITE_FEATURES: &[Column] = &FINITE;
 
-/// What the frames of the endless id show.
+/// The columns of the endless id.
 pub const ENDLESS_FEATURES: &[Column] = &ENDLESS;
 
 const FINITE: [Column; GOAL + 3] = with_shared([
@@ -54,7 +56,7 @@ const FINITE: [Column; GOAL + 3] = with_shared([
     column("goal_y", "row of the goal, divided by 6; 0 if it is not seen"),
 ]);
 
-/// The shared columns, then an id's own, then room for more.
+/// The shared columns, then an id's own columns, then empty columns for the rest.
 const fn with_shared<const OWN: usize, const ALL: usize>(own: [Column; OWN]) -> [Column; ALL] {
     let mut all = [column("", ""); ALL];
     let mut place = 0;
@@ -96,18 +98,19 @@ macro_rules! past_names {
 const PAST_NAMES: [[&str; GRID as usize]; SCREEN_COLUMNS] = past_names!(0 1 2 3 4 5 6 7);
 
 impl State {
-    pub(super) fn write_features(&self, assets: &Assets, out: &mut [f32]) {
+    /// Writes the feature observation.
+    pub(super) fn write_features(&self, config: &Config, out: &mut [f32]) {
         out.fill(0.0);
-        let character = self.shown_agent(assets);
+        let character = self.shown_agent(config);
         out[AGENT] = character.position.0 as f32 / SCREEN as f32;
         out[AGENT + 1] = character.position.1 as f32 / SCREEN as f32;
         out[HEADING..HEADING + 2].copy_from_slice(&character.heading());
         out[FALLEN] = f32::from(u8::from(self.cross.is_some()));
-        if assets.variant == Variant::Endless {
-            self.write_endless(assets, out);
+        if config.variant == Variant::Endless {
+            self.write_endless(config, out);
             return;
         }
-        let parameters = &assets.parameters;
+        let parameters = &config.parameters;
         let tiles =
             [(ORIGIN, parameters.show_origin, self.route.start()), (GOAL, parameters.show_goal, self.route.end())];
         for (place, _, (x, y)) in tiles.into_iter().filter(|(_, shown, _)| *shown) {
@@ -115,18 +118,18 @@ impl State {
         }
     }
 
-    fn write_endless(&self, assets: &Assets, out: &mut [f32]) {
-        let parameters = &assets.parameters;
+    fn write_endless(&self, config: &Config, out: &mut [f32]) {
+        let parameters = &config.parameters;
         if parameters.show_stamina {
             out[STAMINA] = 1.0;
-            out[STAMINA + 1] = self.journey.stamina_share(parameters.stamina_level).max(0.0) as f32;
+            out[STAMINA + 1] = self.endless.stamina_share(parameters.stamina_level).max(0.0) as f32;
         }
         if parameters.show_background {
-            out[BACKGROUND] = self.journey.background() as f32 / TILE as f32;
+            out[BACKGROUND] = self.endless.background() as f32 / TILE as f32;
         }
         if parameters.show_past_path {
-            let camera = self.journey.camera() / f64::from(TILE);
-            for (_, (x, row)) in self.past_tiles(assets) {
+            let camera = self.endless.camera() / f64::from(TILE);
+            for (_, (x, row)) in self.past_tiles(config) {
                 let column = (x - camera.floor() as i32).clamp(0, GRID);
                 out[PAST_SHIFT] = (camera - camera.floor()) as f32;
                 out[PAST_PATH + (column * GRID + row) as usize] = 1.0;

@@ -1,37 +1,44 @@
 //! Mystery Path: find an invisible path, and remember it after each fall.
 //!
-//! In the finite ids the agent crosses the screen from one side to the goal on the other. Whoever steps off the path starts over.
-//! In the endless id path after path leads to the right; an episode ends when the agent falls off before the farthest column that
-//! it was on, falls twice at one place, or runs out of stamina.
+//! In the finite ids the agent crosses the screen from one side to the goal on the other. An agent that steps off the path starts
+//! over. In the endless id paths are joined to the right without end. An episode ends when the agent falls off before the farthest
+//! column that it was on, falls twice at one tile, or runs out of stamina.
 //!
-//! Where the original fails or its option has no effect:
+//! Where the original raises an error or an option has no effect:
 //!
-//! - `stamina_level` below 1 makes it divide by zero or never ends; here it is at least 1.
-//! - `agent_speed` above the screen's width leads it beyond the path that it has generated; here it is at most that width.
-//! - `show_origin` of the endless id has no effect, and so it is here; the observations have to be equal.
-//! - `agent_scale` of the grid id has no effect either.
+//! - `stamina_level` below 1 makes the original divide by zero, or the stamina never runs out; here it is at least 1.
+//! - `agent_speed` above the screen's width moves the original's agent beyond the generated path; here it is at most that width.
+//! - `show_origin` of the endless id and `agent_scale` of the grid id have no effect in the original, nor here.
 
 mod belief;
+mod config;
 mod drawing;
+mod endless;
 pub mod expert;
 mod features;
-mod journey;
 mod parameters;
 mod path;
+mod registry;
 mod route;
 mod rules;
+mod scene;
+mod state;
 
 #[cfg(test)]
 mod tests;
 
 use std::sync::Arc;
 
-pub use drawing::{Assets, Scene};
-pub use journey::Direction;
-pub use parameters::{Parameters, SPECS, Variant};
-pub use rules::State;
+pub use config::Config;
+pub use drawing::Assets;
+pub use endless::Direction;
+pub use parameters::{Parameters, Variant};
+pub use registry::SPECS;
+pub use scene::Scene;
+pub use state::State;
 
-use crate::envs::{Environment, InvalidState, ResetParameters, Transition};
+use super::environment::{Environment, InvalidState, Transition};
+use super::parameters::ResetParameters;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
@@ -60,11 +67,11 @@ impl Environment for MysteryPath {
         if !Arc::ptr_eq(&self.assets, assets) {
             self.assets = Arc::clone(assets);
         }
-        self.state.start(assets, random);
+        self.state.reset(&assets.config, random);
     }
 
     fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
-        self.state.play(&self.assets, action, random)
+        self.state.step(&self.assets.config, action, random)
     }
 
     fn shared(&self) -> &Arc<Assets> {
@@ -72,7 +79,7 @@ impl Environment for MysteryPath {
     }
 
     fn scene(&self) -> Scene {
-        self.state.scene(&self.assets)
+        self.state.scene(&self.assets.config)
     }
 
     fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
@@ -84,17 +91,17 @@ impl Environment for MysteryPath {
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
-        self.state.draw_truth(&self.assets, canvas);
+        self.assets.draw_ground_truth(&self.state, canvas);
     }
 
     fn features(&self, out: &mut [f32]) {
-        self.state.write_features(&self.assets, out);
+        self.state.write_features(&self.assets.config, out);
     }
 
     fn ground_truth(&self, out: &mut [f64]) {
         out.fill(0.0);
-        if self.assets.variant == Variant::Endless {
-            out[self.state.journey.direction() as usize] = 1.0;
+        if self.assets.config.variant == Variant::Endless {
+            out[self.state.endless.direction() as usize] = 1.0;
         }
     }
 
@@ -112,7 +119,7 @@ impl Environment for MysteryPath {
     }
 
     fn info(&self, out: &mut [f64]) {
-        match self.assets.variant {
+        match self.assets.config.variant {
             Variant::Free | Variant::Grid => out.copy_from_slice(&self.state.finite_info()),
             Variant::Endless => out.copy_from_slice(&self.state.endless_info()),
         }

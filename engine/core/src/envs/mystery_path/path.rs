@@ -1,9 +1,9 @@
-//! How a path is generated: walls at random, then a walk around them.
+//! Generation of paths: random walls, then a search for a path around them.
 //!
-//! Source: `Node` and `MysteryPath` of the original's `pygame_assets.py`. It is an A* search with habits of its own, and all of
-//! them are kept, as is the order of the random draws: the search takes the first tile of the open list that promises more than
-//! the list's first, prices each step by a random number, and lets a cheaper way to an open tile change where the tile was
-//! reached from, but not its price.
+//! Source: `Node` and `MysteryPath` of the original's `pygame_assets.py`. The original's A* search deviates from the textbook, and
+//! this one reproduces that together with the order of the random draws: the search expands the first tile of the open list with
+//! a lower score than the list's first tile, the cost of each step is a random number, and a cheaper path to an open tile changes
+//! the tile's parent but not its cost.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,19 +14,19 @@ pub const GRID: i32 = 7;
 
 /// Chance in percent that an inner tile is a wall.
 const WALL_PERCENT: i64 = 33;
-/// How many walls are added on the grid's border, if there is room: one of these.
+/// Numbers of walls that are added on the grid's border, if there is room; one of them is drawn.
 const BORDER_WALLS: [u32; 2] = [4, 8];
-/// A step of the search costs `LOWEST_PRICE..PRICE_END`.
-const LOWEST_PRICE: i64 = 1;
-const PRICE_END: i64 = 9;
+/// A step of the search costs `LOWEST_COST..COST_END`.
+const LOWEST_COST: i64 = 1;
+const COST_END: i64 = 9;
 
 /// Column and row, from the top left.
 pub type Tile = (i32, i32);
 
 /// A set of tiles, column by column: the tile `(x, y)` is the bit `8 x + y`.
 ///
-/// A grid has seven rows; the eighth is empty, so that no step leads from one column's end to the next one's start. The eighth
-/// column is free for the tile that joins two grids.
+/// A grid has seven rows. The eighth row is always empty, so that no step leads from one column's end to the next column's start.
+/// The eighth column holds the tile that joins two grids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TileSet(u64);
 
@@ -75,7 +75,7 @@ impl TileSet {
         TileSet((columns | columns << 1 | columns >> 1) & TileSet::GRID.0)
     }
 
-    /// Takes out the tile of that number, counted column by column.
+    /// Removes and returns the tile with that index, counted column by column.
     fn take(&mut self, number: u32) -> TileSet {
         let mut rest = self.0;
         for _ in 0..number {
@@ -87,7 +87,7 @@ impl TileSet {
     }
 }
 
-/// Most tiles of a path.
+/// Largest number of tiles of a path.
 const MAX_LENGTH: usize = (GRID * GRID) as usize;
 
 fn index((x, y): Tile) -> u8 {
@@ -101,6 +101,7 @@ fn tile(index: u8) -> Tile {
 /// A generated path and the walls that it goes around.
 #[derive(Clone, Debug)]
 pub struct Path {
+    /// The walls, which the finite ids' ground-truth view shows.
     pub walls: TileSet,
     /// Tiles from the end back to the start.
     backwards: [u8; MAX_LENGTH],
@@ -136,8 +137,22 @@ impl Path {
     }
 }
 
-/// Walks around the walls. There always is a way: a wall on the border has no inner wall about it, so that the way along the
-/// border can go around each.
+/// Draws the first and the last tile of a path: on the given side of the grid (0 left, 1 right, 2 top, others bottom), and on the
+/// opposite side.
+pub fn draw_ends(side: i64, random: &mut Generator) -> (Tile, Tile) {
+    let first = random.integers(0, i64::from(GRID)) as i32;
+    let second = random.integers(0, i64::from(GRID)) as i32;
+    let last = GRID - 1;
+    match side {
+        0 => ((0, first), (last, second)),
+        1 => ((last, first), (0, second)),
+        2 => ((first, 0), (second, last)),
+        _ => ((first, last), (second, 0)),
+    }
+}
+
+/// Searches for a path around the walls. There always is one: a wall on the border has no inner wall next to it, so that a path
+/// along the border can go around each.
 fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Path {
     const NOWHERE: u8 = u8::MAX;
     let (start, end, goal) = (index(start), index(end), end);
@@ -145,19 +160,19 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
         let (x, y) = tile(index);
         f64::from((x - goal.0).pow(2) + (y - goal.1).pow(2)).sqrt()
     };
-    let mut price = [0_i64; 64];
-    let mut reached_from = [NOWHERE; 64];
-    // Each tile with what it promises, side by side, since every search of the list reads all promises.
+    let mut costs = [0_i64; 64];
+    let mut parent = [NOWHERE; 64];
+    // Score and tile side by side, since every search of the list reads all scores.
     let mut open_list = [(0.0_f64, 0_u8); MAX_LENGTH];
     open_list[0] = (0.0, start);
     let mut open_count = 1;
     let mut open = TileSet(1 << start);
-    // Walls and tiles outside of the grid are never entered, like tiles that are done with.
+    // Walls and tiles outside of the grid count as closed, so that they are never entered.
     let mut closed = TileSet(walls.0 | !TileSet::GRID.0);
     while open_count > 0 {
         let list = &open_list[..open_count];
         let (first, _) = list[0];
-        let winner = list.iter().position(|(promise, _)| *promise < first).unwrap_or(0);
+        let winner = list.iter().position(|(score, _)| *score < first).unwrap_or(0);
         let (_, current) = list[winner];
         if current == end {
             break;
@@ -166,22 +181,22 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
         open_count -= 1;
         open.0 &= !(1 << current);
         closed.0 |= 1 << current;
-        // Beyond the first column and row the number leaves 0..64 or falls into the empty row.
+        // A step off the grid gives an index outside of 0..64 or in the empty row.
         for next in [current + 8, current.wrapping_sub(8), current + 1, current.wrapping_sub(1)] {
             if next >= 64 || closed.holds(next) {
                 continue;
             }
             let place = usize::from(next);
-            let cost = price[usize::from(current)] + random.integers(LOWEST_PRICE, PRICE_END);
+            let cost = costs[usize::from(current)] + random.integers(LOWEST_COST, COST_END);
             if !open.holds(next) {
-                price[place] = cost;
+                costs[place] = cost;
                 open.0 |= 1 << next;
                 open_list[open_count] = (cost as f64 + distance(next), next);
                 open_count += 1;
-            } else if cost >= price[place] {
+            } else if cost >= costs[place] {
                 continue;
             }
-            reached_from[place] = current;
+            parent[place] = current;
         }
     }
     let mut path = Path { walls, backwards: [0; MAX_LENGTH], length: 0 };
@@ -189,7 +204,7 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
     while at != NOWHERE && path.length < MAX_LENGTH {
         path.backwards[path.length] = at;
         path.length += 1;
-        at = reached_from[usize::from(at)];
+        at = parent[usize::from(at)];
     }
     path
 }
@@ -218,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn every_path_joins_its_ends_and_keeps_off_the_walls() {
+    fn every_path_joins_its_ends_and_avoids_the_walls() {
         let mut random = Generator::from_seed(3);
         for _ in 0..20_000 {
             let (start, end) = ((0, random.integers(0, 7) as i32), (6, random.integers(0, 7) as i32));

@@ -1,4 +1,4 @@
-//! The way that an episode's agent has to find: one generated path, or ever more of them in a row.
+//! The route of an episode: one generated path, or a growing row of joined paths.
 //!
 //! Source: `EndlessMysteryPath` of the original's `pygame_assets.py`, and the visits that its nodes remember.
 
@@ -7,40 +7,41 @@ use serde::{Deserialize, Serialize};
 use super::path::{GRID, Path, Tile, TileSet};
 use crate::random::Generator;
 
-/// Columns of a segment of the endless way: a grid, and a column with the one tile that leads to the next grid.
+/// Columns of a segment of the endless route: a grid, and a column with the one tile that leads to the next grid.
 pub const SEGMENT: i32 = GRID + 1;
 
-/// One path and what has happened on it.
+/// One path and its visited tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct Segment {
     tiles: TileSet,
     walls: TileSet,
-    /// Number of the first tile, counted along the whole way.
+    /// Index of the first tile along the whole route.
     first: usize,
-    /// Tiles that the agent has been on, in the episode and since its last fall. The way's first tile always counts as one.
+    /// Tiles that the agent has visited in the episode. The route's first tile always counts as visited.
     seen: TileSet,
+    /// Tiles that the agent has visited since its last fall, likewise.
     seen_since_fall: TileSet,
 }
 
-/// The way from its first tile on, and which of its tiles the agent has been on.
+/// The tiles of the route, and which of them the agent has visited.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Route {
     segments: Vec<Segment>,
-    /// All tiles in their order.
+    /// All tiles in order.
     tiles: Vec<Tile>,
 }
 
-/// What is new about a tile that the agent stands on.
+/// The result of a visit to a tile of the route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Visit {
     /// It is the first visit in the episode.
     pub first: bool,
-    /// It is the first visit since the agent last fell off.
+    /// It is the first visit since the last fall.
     pub first_since_fall: bool,
 }
 
 impl Route {
-    /// Whether the segments number tiles that are there, all of them within the segments.
+    /// Whether every index and every tile is in its range. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
         let columns = self.segments.len() as i64 * i64::from(SEGMENT);
         self.segments.len() < 1 << 24
@@ -49,19 +50,19 @@ impl Route {
             && self.segments.iter().all(|segment| segment.first < self.tiles.len())
     }
 
-    /// Forgets the way, but keeps its memory.
+    /// Removes all paths, and keeps the allocated memory.
     pub fn clear(&mut self) {
         self.segments.clear();
         self.tiles.clear();
     }
 
-    /// Makes the way one path from `start` to `end`.
+    /// Replaces the route by one path from `start` to `end`.
     pub fn set_path(&mut self, start: Tile, end: Tile, random: &mut Generator) {
         self.clear();
         self.add(Path::generate(start, end, random), None);
     }
 
-    /// Adds a path from the left to the right that begins where the last one ended, or, if it is the first one, in any row.
+    /// Adds a path from left to right that starts in the row where the last one ended; the first one starts in a random row.
     pub fn extend(&mut self, random: &mut Generator) {
         let mut row = || random.integers(0, i64::from(GRID)) as i32;
         let start = self.tiles.last().map_or_else(&mut row, |(_, y)| *y);
@@ -95,12 +96,12 @@ impl Route {
         }
     }
 
-    /// Number of paths in a row.
+    /// Number of joined paths.
     pub fn segments(&self) -> usize {
         self.segments.len()
     }
 
-    /// The tiles in their order.
+    /// The tiles in order.
     pub fn tiles(&self) -> &[Tile] {
         &self.tiles
     }
@@ -120,7 +121,7 @@ impl Route {
         self.segments.first().into_iter().flat_map(|segment| segment.walls.iter())
     }
 
-    /// Visits a tile: what is new about it, or nothing if it is not on the way.
+    /// Visits a tile. Returns `None` if it is not on the route.
     pub fn visit(&mut self, (x, y): Tile) -> Option<Visit> {
         let segment = self.segments.get_mut(usize::try_from(x / SEGMENT).ok()?)?;
         let tile = (x % SEGMENT, y);
@@ -134,16 +135,16 @@ impl Route {
         Some(visit)
     }
 
-    /// Forgets which tiles the agent has been on since its last fall.
+    /// Records a fall: no tile but the first has been visited since.
     pub fn fall(&mut self) {
         self.segments.iter_mut().for_each(|segment| segment.seen_since_fall = TileSet::default());
         self.mark_start();
     }
 
-    /// The number along the way of a tile that is on it.
-    pub fn number(&self, tile: Tile) -> Option<usize> {
+    /// The index along the route of a tile; `None` if it is not on the route.
+    pub fn index(&self, tile: Tile) -> Option<usize> {
         let first = self.segments.get(usize::try_from(tile.0 / SEGMENT).ok()?)?.first;
-        self.tiles[first..].iter().position(|on_way| *on_way == tile).map(|place| first + place)
+        self.tiles[first..].iter().position(|other| *other == tile).map(|place| first + place)
     }
 }
 
@@ -163,11 +164,11 @@ mod tests {
         let route = endless(50);
         assert!(route.tiles().windows(2).all(|w| (w[0].0 - w[1].0).abs() + (w[0].1 - w[1].1).abs() == 1));
         assert_eq!(route.end().0, 50 * SEGMENT - 1);
-        for (number, tile) in route.tiles().iter().enumerate() {
-            assert_eq!(route.number(*tile), Some(number));
+        for (index, tile) in route.tiles().iter().enumerate() {
+            assert_eq!(route.index(*tile), Some(index));
         }
-        assert_eq!(route.number((-1, 0)), None);
-        assert_eq!(route.number((50 * SEGMENT, 0)), None);
+        assert_eq!(route.index((-1, 0)), None);
+        assert_eq!(route.index((50 * SEGMENT, 0)), None);
     }
 
     #[test]

@@ -3,11 +3,11 @@ use std::sync::Arc;
 use proptest::prelude::*;
 use serde_json::{Map, Value as Json, json};
 
-use super::drawing::TILE;
+use super::config::TILE;
 use super::features::{BACKGROUND, FALLEN, PAST_PATH, PAST_SHIFT, STAMINA};
 use super::path::{GRID, Tile};
 use super::{MysteryPath, SPECS, State, Variant};
-use crate::envs::{Environment, FRAME_BYTES, Family, ResetParameters, SCREEN, Spec, Transition};
+use crate::envs::{EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters, SCREEN, Transition};
 use crate::random::Generator;
 
 /// Actions of the endless id.
@@ -17,7 +17,7 @@ const DOWN: i32 = 3;
 
 /// One environment with its generator.
 struct Game {
-    spec: &'static Spec,
+    spec: &'static EnvSpec,
     env: MysteryPath,
     random: Generator,
 }
@@ -65,7 +65,7 @@ impl Game {
         while self.state().tile != (x, y) && !self.state().off_path && !sum.terminated {
             let (from_x, from_y) = self.state().tile;
             let towards = |offset: i32| [1, 0, 2][(offset.signum() + 1) as usize];
-            let action = match self.env.assets.variant {
+            let action = match self.env.assets.config.variant {
                 Variant::Free => vec![towards(x - from_x), towards(y - from_y)],
                 Variant::Grid => panic!("the grid's agent turns"),
                 Variant::Endless => vec![[UP, RIGHT, DOWN][(y - from_y + 1) as usize]],
@@ -80,7 +80,7 @@ impl Game {
     /// A tile above or below the path's tile of that number that is not on the path.
     fn beside(&self, number: usize) -> Option<Tile> {
         let (x, y) = self.state().route.tiles()[number];
-        let free = |tile: &Tile| (0..GRID).contains(&tile.1) && self.state().route.number(*tile).is_none();
+        let free = |tile: &Tile| (0..GRID).contains(&tile.1) && self.state().route.index(*tile).is_none();
         [(x, y - 1), (x, y + 1)].into_iter().find(free)
     }
 }
@@ -148,7 +148,7 @@ fn the_endless_episode_ends_by_a_fall_before_the_farthest_column() {
         assert!(!game.walk_to((x, y - 1)).terminated);
     }
     game.step(&[0]);
-    assert_eq!(game.state().journey.farthest(), 2);
+    assert_eq!(game.state().endless.farthest(), 2);
     assert!(game.walk_to(first).terminated);
 }
 
@@ -183,7 +183,7 @@ fn the_way_goes_on_and_is_kept() {
     let mut game = endless_with_room(&json!({ "agent_speed": 12.0 }), &[]);
     let known = game.state().route.tiles().to_vec();
     let mut number = 0;
-    while game.state().journey.farthest() < 100 {
+    while game.state().endless.farthest() < 100 {
         number += 1;
         let next = game.state().route.tiles()[number];
         if next.0 < game.state().tile.0 {
@@ -193,7 +193,7 @@ fn the_way_goes_on_and_is_kept() {
     }
     assert!(number > 2 * GRID as usize);
     assert!(game.state().route.tiles().starts_with(&known));
-    assert_eq!(game.state().tiles_visited as usize, game.state().route.number(game.state().tile).unwrap());
+    assert_eq!(game.state().tiles_visited as usize, game.state().route.index(game.state().tile).unwrap());
 }
 
 #[test]

@@ -1,14 +1,15 @@
-//! What a frame of Searing Spotlights shows, in numbers.
+//! The feature observation of Searing Spotlights: what a frame shows, as numbers.
 
-use super::rules::{Exit, SearingSpotlights};
-use super::top_bar::HALF;
-use crate::envs::{Column, SCREEN};
+use super::config::{Config, HEALTH_WIDTH};
+use super::state::{Background, Exit, State};
+use crate::envs::screen::SCREEN;
+use crate::envs::spec::Column;
 
-/// Coins and spotlights that the features have room for; a frame may show more.
+/// Largest number of coins and spotlights in the features. A frame may show more.
 pub(super) const COINS: usize = 8;
 pub(super) const SPOTLIGHTS: usize = 16;
 
-/// Places of the columns in [`FEATURES`].
+/// Indices of the columns in [`FEATURES`].
 pub(super) const AGENT: usize = 0;
 pub(super) const HEALTH: usize = 5;
 pub(super) const HIT: usize = 6;
@@ -99,7 +100,7 @@ const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = [
 
 const COUNT: usize = SPOTLIGHT + 3 * SPOTLIGHTS;
 
-/// What the frame shows. A thing counts as seen if its centre is on the screen and either not in the dark or within a lit circle.
+/// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit circle.
 pub const FEATURES: &[Column] = &{
     let mut columns = [FIRST[0]; COUNT];
     let mut at = 0;
@@ -116,62 +117,62 @@ pub const FEATURES: &[Column] = &{
     columns
 };
 
-impl SearingSpotlights {
-    pub(super) fn write_features(&self, out: &mut [f32]) {
+impl State {
+    /// Writes the feature observation.
+    pub(super) fn write_features(&self, config: &Config, out: &mut [f32]) {
         out.fill(0.0);
-        let (state, parameters) = (&self.state, &self.assets.parameters);
-        let coins_shine = state.coins_shine(parameters);
-        // In the endless id without a coin, what would show the coin hides everything that is not visible in the dark.
-        let covered = self.assets.variant.endless && state.coins.is_empty() && coins_shine;
+        let parameters = &config.parameters;
+        let coins_visible = self.coins_visible(parameters);
+        // In the endless id without a coin, the surface of the coin hides everything that is not visible in the dark.
+        let blacked_out = config.variant.endless && self.coins.is_empty() && coins_visible;
         let share = |(x, y): (i32, i32)| [x as f32 / SCREEN as f32, y as f32 / SCREEN as f32];
 
-        let agent = state.shown_agent();
-        if self.is_seen(agent.position, parameters.agent_visible, covered) {
+        let agent = self.shown_agent();
+        if self.is_seen(agent.position, parameters.agent_visible, blacked_out) {
             out[AGENT] = 1.0;
             out[AGENT + 1..AGENT + 3].copy_from_slice(&share(agent.position));
             out[AGENT + 3..AGENT + 5].copy_from_slice(&agent.heading());
         }
-        out[HEALTH] = 1.0 - f32::from(self.state.red_columns.min(HALF as u8)) / HALF as f32;
+        out[HEALTH] = 1.0 - f32::from(self.red_columns.min(HEALTH_WIDTH as u8)) / HEALTH_WIDTH as f32;
         if parameters.show_last_action {
             let direction = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
-            out[LAST_ACTION..LAST_ACTION + 2].copy_from_slice(&state.shown_action.map(direction));
+            out[LAST_ACTION..LAST_ACTION + 2].copy_from_slice(&self.shown_action.map(direction));
         }
-        let shows_reward = parameters.show_last_positive_reward && state.shown_reward_positive;
+        let shows_reward = parameters.show_last_positive_reward && self.shown_reward_positive;
         out[LAST_REWARD] = f32::from(u8::from(shows_reward));
-        if let Some(Exit { location, open }) = state.exit
-            && self.is_seen(location, parameters.exit_visible, covered)
+        if let Some(Exit { location, open }) = self.exit
+            && self.is_seen(location, parameters.exit_visible, blacked_out)
         {
             out[EXIT] = 1.0;
             out[EXIT + 1..EXIT + 3].copy_from_slice(&share(location));
             out[EXIT + 3] = f32::from(u8::from(open));
         }
-        let seen_coins = state.coins.iter().filter(|coin| self.is_seen(**coin, coins_shine, covered));
+        let seen_coins = self.coins.iter().filter(|coin| self.is_seen(**coin, coins_visible, blacked_out));
         for (coin, out) in seen_coins.zip(out[COIN..SPOTLIGHT].chunks_exact_mut(3)) {
             let [x, y] = share(*coin);
             out.copy_from_slice(&[1.0, x, y]);
         }
-        if covered {
+        if blacked_out {
             return;
         }
-        out[LIGHT] = 1.0 - f32::from(state.darkness) / 255.0;
+        out[LIGHT] = 1.0 - f32::from(self.darkness) / 255.0;
         let mut lit = 0;
-        if state.darkness > 0 {
-            let circles = state.lit.iter().filter(|circle| circle.is_on_screen());
+        if self.darkness > 0 {
+            let circles = self.lit.iter().filter(|circle| circle.is_on_screen());
             for (circle, out) in circles.zip(out[SPOTLIGHT..].chunks_exact_mut(3)) {
                 let [x, y] = share(circle.centre());
                 out.copy_from_slice(&[f32::from(circle.radius) / SCREEN as f32, x, y]);
                 lit += 1;
             }
         }
-        let red = state.ground == super::drawing::Ground::Red && (lit > 0 || state.darkness < 255);
+        let red = self.background == Background::Red && (lit > 0 || self.darkness < 255);
         out[HIT] = f32::from(u8::from(red));
     }
 
-    /// Whether the frame shows the centre of a thing at `place`, which shines in the dark or not.
-    fn is_seen(&self, place: (i32, i32), shines: bool, covered: bool) -> bool {
+    /// Whether the frame shows the centre of an object at `place`, which may be visible in the dark.
+    fn is_seen(&self, place: (i32, i32), visible_in_dark: bool, blacked_out: bool) -> bool {
         let on_screen = |coordinate: i32| (0..SCREEN as i32).contains(&coordinate);
-        let state = &self.state;
-        let lit = || state.darkness < 255 || state.lit.iter().any(|circle| circle.contains(place));
-        on_screen(place.0) && on_screen(place.1) && (shines || (!covered && lit()))
+        let lit = || self.darkness < 255 || self.lit.iter().any(|circle| circle.contains(place));
+        on_screen(place.0) && on_screen(place.1) && (visible_in_dark || (!blacked_out && lit()))
     }
 }

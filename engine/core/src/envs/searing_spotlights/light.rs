@@ -1,104 +1,104 @@
-//! How the light on the ground changes from one frame to another.
+//! How the light on the background changes from one frame to another.
 //!
-//! A spotlight moves by a pixel or so at a time, and only the crescents that it leaves and enters differ. Those of every small move
-//! are known beforehand.
+//! A spotlight moves by about a pixel per step, so that only the crescents that it leaves and enters differ. The crescents of all
+//! small moves are precomputed.
 
 use std::ops::Range;
 
 use smallvec::SmallVec;
 
-use super::drawing::{Assets, Frame};
-use super::rules::BAR_HEIGHT;
+use super::circle::Circle;
+use super::config::BAR_HEIGHT;
+use super::pictures::Assets;
 use super::scene::Scene;
 use super::shape::{Crescent, REACH, Shape};
-use super::spotlight::Circle;
-use crate::envs::SCREEN;
+use crate::envs::screen::{Frame, SCREEN};
 use crate::raster::{Canvas, DiscColumn, Rect, copy_run};
 
-/// Where the light can be seen: the bar covers what is above.
+/// Where the light is visible: below the bar.
 const COLUMNS: Range<usize> = 0..SCREEN;
 const ROWS: Range<usize> = BAR_HEIGHT..SCREEN;
 
-/// How many circles may have come in between.
+/// Number of circles that are searched for one that has moved.
 const WINDOW: usize = 3;
 
 /// A circle that differs between two frames.
 #[derive(Clone, Copy, Debug)]
-enum Move {
-    Came(Circle),
-    Left(Circle),
-    /// It is the same circle but for its place, and the crescents of the move are known.
+enum CircleChange {
+    Appeared(Circle),
+    Disappeared(Circle),
+    /// The circle has moved from the first position to the second, and the crescents of the move are precomputed.
     Moved(Circle, Circle),
 }
 
-/// The circles that differ between two frames which are equally dark.
+/// The circles that differ between two frames of the same darkness.
 #[derive(Debug)]
-pub(super) struct Change<'a> {
+pub(super) struct LightChange<'a> {
     scene: &'a Scene,
-    moves: SmallVec<[Move; 16]>,
+    changes: SmallVec<[CircleChange; 16]>,
 }
 
-impl<'a> Change<'a> {
-    /// What changes a frame that shows `shown` into one that shows `scene`.
+impl<'a> LightChange<'a> {
+    /// The differences between a frame that shows `shown` and one that shows `scene`.
     pub fn new(shown: &Scene, scene: &'a Scene) -> Self {
-        let mut moves = SmallVec::new();
-        let new_ground = scene.ground != shown.ground;
-        // Circles keep their order.
+        let mut changes = SmallVec::new();
+        let new_background = scene.background != shown.background;
+        // Circles keep their order from frame to frame.
         let mut rest = scene.circles.as_slice();
         for from in &shown.circles {
-            let Some(came) = rest.iter().take(WINDOW).position(|to| is_moved(from, to)) else {
-                moves.push(Move::Left(*from));
+            let Some(skipped) = rest.iter().take(WINDOW).position(|to| is_moved(from, to)) else {
+                changes.push(CircleChange::Disappeared(*from));
                 continue;
             };
-            rest[..came].iter().for_each(|to| moves.push(Move::Came(*to)));
-            let to = rest[came];
+            rest[..skipped].iter().for_each(|to| changes.push(CircleChange::Appeared(*to)));
+            let to = rest[skipped];
             if *from != to {
-                moves.push(Move::Moved(*from, to));
+                changes.push(CircleChange::Moved(*from, to));
             }
-            if new_ground {
-                moves.push(Move::Came(to));
+            if new_background {
+                changes.push(CircleChange::Appeared(to));
             }
-            rest = &rest[came + 1..];
+            rest = &rest[skipped + 1..];
         }
-        rest.iter().for_each(|to| moves.push(Move::Came(*to)));
-        Change { scene, moves }
+        rest.iter().for_each(|to| changes.push(CircleChange::Appeared(*to)));
+        LightChange { scene, changes }
     }
 
-    /// Rectangles about all that changes.
+    /// Rectangles around everything that changes.
     #[inline]
     pub fn bounds(&self) -> impl Iterator<Item = Rect> {
-        self.moves.iter().map(|change| match change {
-            Move::Came(circle) | Move::Left(circle) => circle.bounds(),
-            Move::Moved(from, to) => from.bounds().union(&to.bounds()),
+        self.changes.iter().map(|change| match change {
+            CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => circle.bounds(),
+            CircleChange::Moved(from, to) => from.bounds().union(&to.bounds()),
         })
     }
 
     /// Whether anything within `rect` may change.
     #[inline]
     pub fn reaches(&self, rect: &Rect) -> bool {
-        self.moves.iter().any(|change| match change {
-            Move::Came(circle) | Move::Left(circle) => circle.reaches(rect),
-            // Along the diagonal of the longest known move.
-            Move::Moved(_, to) => to.comes_within(3 * i32::from(REACH) / 2, rect),
+        self.changes.iter().any(|change| match change {
+            CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => circle.reaches(rect),
+            // The diagonal of the longest precomputed move.
+            CircleChange::Moved(_, to) => to.comes_within(3 * i32::from(REACH) / 2, rect),
         })
     }
 
-    /// Paints what changes, as if there was nothing on the ground and no circle had an outline.
+    /// Paints the changes of the background, without objects and outlines.
     pub fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
-        if self.moves.is_empty() {
+        if self.changes.is_empty() {
             return;
         }
         if canvas.is_noting() {
             self.note(canvas);
         }
         let frame: &mut Frame = canvas.pixels_mut().try_into().expect("the canvas is a frame");
-        let lit = assets.lit.picture(self.scene.ground);
-        let dark = assets.dark(self.scene.darkness).picture(self.scene.ground);
-        // First what gets dark where no other circle shines, then what gets light.
-        for change in &self.moves {
+        let lit = assets.lit.background_frame(self.scene.background);
+        let dark = assets.dark(self.scene.darkness).background_frame(self.scene.background);
+        // First the pixels that become dark, except within other circles, then those that become light.
+        for change in &self.changes {
             match change {
-                Move::Came(_) => {}
-                Move::Left(circle) => {
+                CircleChange::Appeared(_) => {}
+                CircleChange::Disappeared(circle) => {
                     for_each_run(circle, |x, rows| copy_rows(x, rows, dark, frame));
                     let bounds = circle.bounds();
                     for other in self.scene.circles.iter().filter(|other| other.reaches(&bounds)) {
@@ -106,7 +106,7 @@ impl<'a> Change<'a> {
                         for_each_run(circle, |x, rows| copy_rows(x, disc.rows(other.centre(), x, &rows), lit, frame));
                     }
                 }
-                Move::Moved(from, to) => {
+                CircleChange::Moved(from, to) => {
                     let crescent = crescent(from, to);
                     copy_crescent(crescent, from, dark, frame);
                     let bounds = Rect { x: crescent.bounds.x + i32::from(from.x), ..crescent.bounds };
@@ -117,24 +117,26 @@ impl<'a> Change<'a> {
                 }
             }
         }
-        for change in &self.moves {
+        for change in &self.changes {
             match change {
-                Move::Came(circle) => for_each_run(circle, |x, rows| copy_rows(x, rows, lit, frame)),
-                Move::Left(_) => {}
-                // It enters what it would leave on its way back.
-                Move::Moved(from, to) => copy_crescent(crescent(to, from), to, lit, frame),
+                CircleChange::Appeared(circle) => for_each_run(circle, |x, rows| copy_rows(x, rows, lit, frame)),
+                CircleChange::Disappeared(_) => {}
+                // It enters the pixels that the opposite move would leave.
+                CircleChange::Moved(from, to) => copy_crescent(crescent(to, from), to, lit, frame),
             }
         }
     }
 }
 
-impl Change<'_> {
-    /// Notes the pixels that are painted.
+impl LightChange<'_> {
+    /// Marks the pixels to be painted as dirty.
     fn note(&self, canvas: &mut Canvas<'_>) {
-        for change in &self.moves {
+        for change in &self.changes {
             match change {
-                Move::Came(circle) | Move::Left(circle) => for_each_run(circle, |x, rows| canvas.note(x..x + 1, &rows)),
-                Move::Moved(from, to) => {
+                CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => {
+                    for_each_run(circle, |x, rows| canvas.note(x..x + 1, &rows))
+                }
+                CircleChange::Moved(from, to) => {
                     for (crescent, circle) in [(crescent(from, to), from), (crescent(to, from), to)] {
                         for (x, y) in crescent.pixels.iter().filter_map(|pixel| on_screen(pixel, circle)) {
                             canvas.note(x..x + 1, &(y..y + 1));
@@ -149,23 +151,23 @@ impl Change<'_> {
 /// Whether `to` may be the same circle as `from`, a few frames later.
 #[inline]
 fn is_moved(from: &Circle, to: &Circle) -> bool {
-    from == to || (from.radius == to.radius && Shape::is_known(from.radius, (to.x - from.x, to.y - from.y)))
+    from == to || (from.radius == to.radius && Shape::is_precomputed(from.radius, (to.x - from.x, to.y - from.y)))
 }
 
-/// What a circle leaves on its way; [`is_moved`] has told that it is known.
+/// The pixels that a circle leaves when it moves. The caller must have checked with [`is_moved`] that they are precomputed.
 #[inline]
 fn crescent(from: &Circle, to: &Circle) -> &'static Crescent {
     Shape::of(from.radius).crescent((to.x - from.x, to.y - from.y))
 }
 
-/// Hands out the rows of each column that a circle covers.
+/// Calls `paint` with each column that a circle covers, and its rows there.
 #[inline]
 fn for_each_run(circle: &Circle, mut paint: impl FnMut(usize, Range<usize>)) {
     let columns = Shape::of(circle.radius).disc.columns(circle.centre(), &COLUMNS, ROWS);
     columns.for_each(|DiscColumn { x, rows }| paint(x, rows));
 }
 
-/// Copies some rows of a column, as far as there are any.
+/// Copies rows of a column; an empty or reversed range copies nothing.
 #[inline]
 fn copy_rows(x: usize, rows: Range<usize>, from: &Frame, to: &mut Frame) {
     if rows.start < rows.end {
@@ -199,7 +201,7 @@ fn copy_crescent_within(crescent: &Crescent, circle: &Circle, other: &Circle, fr
     }
 }
 
-/// Copies a pixel at a place from a circle's centre, if it is on the screen.
+/// Copies a pixel at an offset from a circle's centre, if the light is visible there.
 #[inline]
 fn copy_pixel(pixel: &(i8, i8), circle: &Circle, from: &Frame, to: &mut Frame) {
     if let Some((x, y)) = on_screen(pixel, circle) {
@@ -208,7 +210,7 @@ fn copy_pixel(pixel: &(i8, i8), circle: &Circle, from: &Frame, to: &mut Frame) {
     }
 }
 
-/// The pixel at a place from a circle's centre, if it is where light can be seen.
+/// The pixel at an offset from a circle's centre, if the light is visible there.
 #[inline]
 fn on_screen((right, down): &(i8, i8), circle: &Circle) -> Option<(usize, usize)> {
     let (x, y) = (i32::from(circle.x) + i32::from(*right), i32::from(circle.y) + i32::from(*down));

@@ -1,50 +1,65 @@
-//! Searing Spotlights: collect coins in the dark, unseen by the spotlights that are the only light.
+//! Searing Spotlights: collect coins in the dark and avoid the spotlights, which are the only light.
 //!
-//! What the original does that looks like a mistake is kept, since it is part of what agents learn from:
+//! Behaviour of the original that looks like a mistake is reproduced, since agents learn from it:
 //!
-//! - A spotlight that has arrived is removed a step later, and the next one in the list then misses that step: it is neither
-//!   moved nor drawn, and does not burn. Likewise for a coin that follows a collected one.
-//! - Spotlights of the finite id come at a constant interval; `spawn_interval_decay` and `reward_max_steps` have no effect.
-//! - An episode's first frame shows the circles that the last episode lit, and turns the agent upwards.
-//! - A background once painted over by `hide_chessboard` or `black_background` stays so in later episodes of the environment.
+//! - A spotlight at the end of its path is removed one step later, and the next one in the list then misses that step: it is
+//!   neither moved nor drawn, and does no damage. Likewise, a coin that follows a collected one in the list misses that step.
+//! - Spotlights of the finite id appear at a constant interval; `spawn_interval_decay` and `reward_max_steps` have no effect.
+//! - An episode's first frame shows the last episode's lit circles, and the agent faces up.
+//! - A background that `hide_chessboard` or `black_background` has replaced stays replaced in later episodes of the environment.
 //! - The endless id without `coin_enabled` has a black background, and hides even the spotlights for `coin_show_duration` steps.
-//! - With `num_coins: [0]` the exit is open from the first step, and the share of coins in the info is not a number.
-//! - What is visible in the dark is drawn above the bar at the top, or below it, depending on what else is visible.
+//! - With `num_coins: [0]` the exit is open from the first step, and `coins_collected` in the info is NaN.
+//! - Objects that are visible in the dark are drawn above or below the bar at the top, depending on which others are visible.
 //!
-//! Where the original raises an error, the options do what their documentation promises:
+//! Where the original raises an error, the reset parameters have their documented meaning:
 //!
-//! - `use_exit: false`: there is no exit, not even one that an earlier episode left behind, and an episode is won with the last
-//!   coin. Without coins as well, it goes on until the agent dies or `max_steps` are over.
-//! - More coins than the screen has room for are placed regardless of each other.
+//! - `use_exit: false`: there is no exit, and the last coin wins the episode. If there are no coins either, the episode continues
+//!   until the agent dies or `max_steps` is reached.
+//! - If there are more coins than the minimum distance allows, further coins are placed without regard to the earlier ones.
 //! - The endless id's `show_last_action: false`: the bar does not show the action.
-//! - `spot_min_radius` above `spot_max_radius`: all spotlights have the former.
+//! - `spot_min_radius` above `spot_max_radius`: all spotlights have the radius `spot_min_radius`.
 //!
-//! There are limits that the original does not have: see [`parameters`].
+//! The number of spotlights is limited to [`MAX_SPOTLIGHTS`] and their radius to [`MAX_SPOT_RADIUS`].
 
+mod circle;
+mod config;
 mod drawing;
 pub mod expert;
 mod features;
 mod light;
-pub mod parameters;
+mod parameters;
+mod pictures;
+mod position_sampler;
+mod registry;
 mod rules;
 mod scene;
 mod shape;
-mod spawning;
 mod spotlight;
+mod state;
 #[cfg(test)]
 mod tests;
 mod top_bar;
 
 use std::sync::Arc;
 
-pub use drawing::Assets;
-pub use parameters::{Parameters, SPECS, Variant};
-pub use rules::{SearingSpotlights, State};
+pub use config::Config;
+pub use parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters, Variant};
+pub use pictures::Assets;
+pub use registry::SPECS;
 pub use scene::Scene;
+pub use state::State;
 
-use crate::envs::{Environment, InvalidState, ResetParameters, Transition};
+use super::environment::{Environment, InvalidState, Transition};
+use super::parameters::ResetParameters;
 use crate::random::Generator;
 use crate::raster::Canvas;
+
+/// One environment of the family.
+#[derive(Clone, Debug)]
+pub struct SearingSpotlights {
+    assets: Arc<Assets>,
+    state: State,
+}
 
 impl Environment for SearingSpotlights {
     type Variant = Variant;
@@ -57,18 +72,18 @@ impl Environment for SearingSpotlights {
     }
 
     fn new(assets: &Arc<Assets>) -> Self {
-        SearingSpotlights { assets: Arc::clone(assets), state: State::unplayed() }
+        SearingSpotlights { assets: Arc::clone(assets), state: State::new() }
     }
 
     fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
         if !Arc::ptr_eq(&self.assets, assets) {
             self.assets = Arc::clone(assets);
         }
-        self.state.start(assets, random);
+        self.state.reset(&assets.config, random);
     }
 
     fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
-        self.state.play(&self.assets, action, random)
+        self.state.step(&self.assets.config, action, random)
     }
 
     fn shared(&self) -> &Arc<Assets> {
@@ -76,7 +91,7 @@ impl Environment for SearingSpotlights {
     }
 
     fn scene(&self) -> Scene {
-        self.shown_scene()
+        Scene::new(&self.state, &self.assets.config)
     }
 
     fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
@@ -88,15 +103,15 @@ impl Environment for SearingSpotlights {
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
-        self.draw_truth(canvas);
+        self.assets.draw_ground_truth(&self.state, canvas);
     }
 
     fn features(&self, out: &mut [f32]) {
-        self.write_features(out);
+        self.state.write_features(&self.assets.config, out);
     }
 
     fn ground_truth(&self, out: &mut [f64]) {
-        if self.assets.variant.endless {
+        if self.assets.config.variant.endless {
             out.copy_from_slice(&self.state.ground_truth());
         }
     }
@@ -115,8 +130,8 @@ impl Environment for SearingSpotlights {
     }
 
     fn info(&self, out: &mut [f64]) {
-        let parameters = &self.assets.parameters;
-        if self.assets.variant.endless {
+        let parameters = &self.assets.config.parameters;
+        if self.assets.config.variant.endless {
             out.copy_from_slice(&self.state.endless_info(parameters));
         } else {
             out.copy_from_slice(&self.state.finite_info(parameters));

@@ -1,49 +1,48 @@
-//! The circles that spotlights light up, made once for the whole process.
+//! Precomputed shapes of the lit circles, created once per process.
 
 use std::sync::OnceLock;
 
-use super::drawing::Frame;
 use super::parameters::MAX_SPOT_RADIUS;
-use crate::envs::{FRAME_BYTES, SCREEN};
+use crate::envs::screen::{FRAME_BYTES, Frame, SCREEN};
 use crate::raster::{Canvas, Disc, Rect, blend_keyed, circle_outline};
 
-/// How far a circle may have moved for what changes to be known beforehand, in pixels along each axis.
+/// Longest move along each axis whose crescents are precomputed, in pixels.
 pub(super) const REACH: i16 = 3;
 
-/// Moves along one axis.
+/// Number of different moves along one axis.
 const MOVES: usize = 2 * REACH as usize + 1;
 
-/// Largest radius whose moves are known beforehand; what a larger circle lights is painted anew.
+/// Largest radius whose crescents are precomputed. Larger circles are repainted in full.
 const MAX_MOVED_RADIUS: i16 = 24;
 
-/// A circle of some radius.
+/// The shape of all circles of one radius.
 #[derive(Debug)]
 pub(super) struct Shape {
     pub disc: Disc,
     outline: Vec<(i32, i32)>,
-    /// By how far the circle moves along both axes.
+    /// By the move along both axes.
     crescents: Vec<Crescent>,
 }
 
 /// The pixels that a circle leaves when it moves.
 #[derive(Debug, Default)]
 pub(super) struct Crescent {
-    /// From the circle's centre.
+    /// Relative to the circle's centre.
     pub pixels: Vec<(i8, i8)>,
-    /// The smallest rectangle about them, from the circle's centre.
+    /// The smallest rectangle around them, relative to the circle's centre.
     pub bounds: Rect,
-    /// The same pixels as blocks, 1 to [`LONGEST`] pixels one below another, those of each length together. A block is the
-    /// place of its first byte on a screen with the circle's bounds in its corner.
+    /// The same pixels as vertical blocks of 1 to [`LONGEST`] pixels, grouped by length. A block is the byte offset of its first
+    /// pixel in a frame whose corner is the corner of the circle's bounds.
     blocks: Vec<u16>,
-    /// Where the blocks of each length end.
+    /// The end of the blocks of each length in `blocks`.
     ends: [usize; LONGEST],
 }
 
-/// Pixels of the longest block. A longer run is several blocks, the last of which overlaps the one before it.
+/// Length of the longest block in pixels. A longer run is several blocks, the last of which may overlap the one before it.
 const LONGEST: usize = 4;
 
 impl Crescent {
-    /// What a disc leaves that moves by `to`.
+    /// The pixels that a disc leaves when it moves by `to`.
     fn new(disc: &Disc, to: (i32, i32)) -> Self {
         let radius = disc.radius();
         let columns = -radius..radius;
@@ -72,11 +71,11 @@ impl Crescent {
         crescent
     }
 
-    /// Copies the pixels from a picture, for a circle all of whose rows are on the screen and whose bounds have their corner
-    /// there. Columns to the left and to the right of the screen would lie before and behind the frame, and are left out.
+    /// Copies the pixels from one frame to another, for a circle whose bounds have the given corner and whose rows are all on the
+    /// screen. Columns off the screen are skipped, since their offsets are outside of the frame.
     #[inline]
     pub fn copy(&self, (x, y): (i32, i32), from: &Frame, to: &mut Frame) {
-        // Less than zero wraps to what no frame holds, and back with the blocks that are on the screen.
+        // A negative offset wraps around to a value outside of the frame, and back for the blocks that are on the screen.
         let corner = ((x * SCREEN as i32 + y) * 3) as usize;
         let [ones, twos, threes, fours] = self.ends;
         copy_blocks::<3>(&self.blocks[..ones], corner, from, to);
@@ -97,7 +96,11 @@ fn copy_blocks<const N: usize>(blocks: &[u16], corner: usize, from: &Frame, to: 
 }
 
 impl Shape {
-    /// The circle of some radius, 0 to [`MAX_SPOT_RADIUS`].
+    /// The shape for a radius of 0 to [`MAX_SPOT_RADIUS`].
+    ///
+    /// # Panics
+    ///
+    /// For any other radius.
     #[inline]
     pub fn of(radius: i16) -> &'static Shape {
         static SHAPES: [OnceLock<Shape>; MAX_SPOT_RADIUS as usize + 1] =
@@ -117,20 +120,20 @@ impl Shape {
         Shape { disc, outline: circle_outline(radius), crescents }
     }
 
-    /// Whether the crescent of a move is known beforehand.
+    /// Whether the crescent of a move is precomputed.
     #[inline]
-    pub fn is_known(radius: i16, (x, y): (i16, i16)) -> bool {
-        let is_near = |way: i16| (-REACH..=REACH).contains(&way);
+    pub fn is_precomputed(radius: i16, (x, y): (i16, i16)) -> bool {
+        let is_near = |distance: i16| (-REACH..=REACH).contains(&distance);
         is_near(x) && is_near(y) && radius <= MAX_MOVED_RADIUS
     }
 
-    /// What a circle leaves which moves so far; [`is_known`](Shape::is_known) tells whether there is such a crescent.
+    /// The pixels that the circle leaves when it moves. The caller must have checked [`is_precomputed`](Shape::is_precomputed).
     #[inline]
     pub fn crescent(&self, (x, y): (i16, i16)) -> &Crescent {
         &self.crescents[(x + REACH) as usize * MOVES + (y + REACH) as usize]
     }
 
-    /// Draws the white outline of a half transparent surface over what the circle has brought back.
+    /// Draws the white outline, which the original paints on the translucent dark surface.
     pub fn draw_outline(&self, canvas: &mut Canvas<'_>, centre: (i32, i32), alpha: u8) {
         let (columns, rows) = (canvas.columns(), canvas.rows());
         for (x, y) in &self.outline {
@@ -153,10 +156,10 @@ mod tests {
         assert!(shape.crescent((0, 0)).pixels.is_empty());
         assert_eq!(shape.crescent((0, 1)).pixels.len(), 18, "a pixel in each column");
         assert_eq!(shape.crescent((-2, 3)).pixels.len(), shape.crescent((2, -3)).pixels.len());
-        assert!(Shape::is_known(9, (REACH, -REACH)));
-        assert!(!Shape::is_known(9, (REACH + 1, 0)));
-        assert!(!Shape::is_known(9, (0, -REACH - 1)));
-        assert!(!Shape::is_known(MAX_SPOT_RADIUS as i16, (1, 0)));
+        assert!(Shape::is_precomputed(9, (REACH, -REACH)));
+        assert!(!Shape::is_precomputed(9, (REACH + 1, 0)));
+        assert!(!Shape::is_precomputed(9, (0, -REACH - 1)));
+        assert!(!Shape::is_precomputed(MAX_SPOT_RADIUS as i16, (1, 0)));
         assert!(Shape::of(0).crescent((1, 0)).pixels.is_empty());
     }
 

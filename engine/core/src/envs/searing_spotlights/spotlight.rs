@@ -1,39 +1,39 @@
-//! The spotlights: where they come from, how they move.
+//! The spotlights: how they appear and move.
 //!
 //! Source: `Spotlight` of the original's `pygame_assets.py`.
 
 use serde::{Deserialize, Serialize};
 
+use super::circle::Circle;
+use super::config::MAX_COORDINATE;
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
-use super::rules::{BAR_HEIGHT, FAR};
-use crate::envs::SCREEN;
+use crate::envs::screen::SCREEN;
 use crate::envs::vector::{lerp, rotate};
 use crate::random::Generator;
-use crate::raster::Rect;
 
-/// A spotlight on its way across the screen, along a parabola from one place off the screen to another.
+/// A spotlight that moves across the screen along a parabola, from one position off the screen to another.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Spotlight {
     /// In pixels.
     pub radius: i32,
     /// Centre in pixels, as of the last step that it moved in.
     pub location: [f64; 2],
-    /// Share of the way that one step goes.
+    /// Share of the path per step.
     speed: f64,
-    /// Share of the way behind it.
+    /// Share of the path that it has moved, 0 to 1.
     progress: f64,
-    /// It has arrived.
+    /// It has reached the end of its path.
     pub done: bool,
     start: [f64; 2],
-    /// It sets out towards the target, but ends at the bend.
+    /// It starts towards the target, but ends at the bend.
     target: [f64; 2],
     bend: [f64; 2],
 }
 
 impl Spotlight {
-    /// Draws a spotlight that waits just off the screen.
+    /// Draws a spotlight just off the screen.
     pub fn spawn(parameters: &Parameters, random: &mut Generator) -> Self {
-        // numpy cuts the fractions of both ends off.
+        // numpy truncates both ends.
         let (low, high) = (parameters.spot_min_radius, parameters.spot_max_radius + 1.0);
         let radius = random.integers(low as i64, high as i64) as i32;
         let speed = random.uniform(parameters.spot_min_speed, parameters.spot_max_speed);
@@ -58,16 +58,17 @@ impl Spotlight {
         }
     }
 
-    /// Whether every number is in its range.
+    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
-        let near = |place: &[f64; 2]| place.iter().all(|coordinate| coordinate.abs() < f64::from(FAR) / 4.0);
+        let near =
+            |position: &[f64; 2]| position.iter().all(|coordinate| coordinate.abs() < f64::from(MAX_COORDINATE) / 4.0);
         (0..=MAX_SPOT_RADIUS).contains(&self.radius)
             && [self.location, self.start, self.target, self.bend].iter().all(near)
             && (0.0..=1.0).contains(&self.progress)
             && self.speed >= 0.0
     }
 
-    /// Goes on to the place for this step, where it shines and burns, and gets ready for the next.
+    /// Moves to the position of this step.
     pub fn advance(&mut self) {
         let towards = lerp(self.target, self.bend, self.progress);
         self.location = lerp(self.start, towards, self.progress);
@@ -78,104 +79,9 @@ impl Spotlight {
         }
     }
 
-    /// The circle that it lights up.
+    /// The circle that it lights.
     pub fn circle(&self) -> Circle {
         let [x, y] = self.location;
         Circle { x: x as i16, y: y as i16, radius: self.radius as i16 }
-    }
-}
-
-/// A lit circle, in pixels of the screen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Circle {
-    pub x: i16,
-    pub y: i16,
-    pub radius: i16,
-}
-
-impl Circle {
-    /// Its centre.
-    pub fn centre(&self) -> (i32, i32) {
-        (self.x.into(), self.y.into())
-    }
-
-    /// The smallest rectangle about it.
-    #[inline]
-    pub fn bounds(&self) -> Rect {
-        let ((x, y), radius) = (self.centre(), i32::from(self.radius));
-        Rect::new(x - radius, y - radius, 2 * radius, 2 * radius)
-    }
-
-    /// Whether a part of it may be seen: on the screen, and not only behind the bar at the top.
-    #[inline]
-    pub fn is_on_screen(&self) -> bool {
-        let (low, high) = (-self.radius, SCREEN as i16 + self.radius);
-        let is_within = |at: i16, low: i16| low < at && at < high;
-        is_within(self.x, low) && is_within(self.y, BAR_HEIGHT as i16 + low) && self.radius > 0
-    }
-
-    /// Whether none of its rows is above or below the screen or behind the bar.
-    #[inline]
-    pub fn has_all_rows(&self) -> bool {
-        (BAR_HEIGHT as i16 + self.radius..=SCREEN as i16 - self.radius).contains(&self.y)
-    }
-
-    /// Whether it may light a pixel of a rectangle: whether the rectangle's nearest point is within its radius.
-    #[inline]
-    pub fn reaches(&self, rect: &Rect) -> bool {
-        self.comes_within(0, rect)
-    }
-
-    /// Whether it would reach a rectangle with a radius of so much more.
-    #[inline]
-    pub fn comes_within(&self, more: i32, rect: &Rect) -> bool {
-        let radius = i32::from(self.radius) + more;
-        // Below zero where the centre is within.
-        let gap = |at: i16, low: i32, length: i32| (low - i32::from(at)).max(i32::from(at) - low - length);
-        let x = gap(self.x, rect.x, rect.width);
-        if x >= radius {
-            return false;
-        }
-        let y = gap(self.y, rect.y, rect.height);
-        y < radius && x.max(0).pow(2) + y.max(0).pow(2) < radius * radius
-    }
-
-    /// Whether a place is within its radius.
-    pub fn contains(&self, (x, y): (i32, i32)) -> bool {
-        let (x, y, radius) = (x - i32::from(self.x), y - i32::from(self.y), i32::from(self.radius));
-        x * x + y * y < radius * radius
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::envs::searing_spotlights::shape::Shape;
-
-    #[test]
-    fn circles_are_seen_up_to_the_last_pixel() {
-        let circle = |x, y| Circle { x, y, radius: 10 };
-        for (x, y) in [(-9, 40), (93, 40), (40, 93), (40, -5), (42, 42)] {
-            assert!(circle(x, y).is_on_screen(), "{x}, {y}");
-        }
-        for (x, y) in [(-10, 40), (94, 40), (40, 94), (40, -6)] {
-            assert!(!circle(x, y).is_on_screen(), "{x}, {y}");
-        }
-        assert!(!Circle { x: 40, y: 40, radius: 0 }.is_on_screen());
-        assert!(circle(0, 14).has_all_rows() && circle(84, 74).has_all_rows());
-        assert!(!circle(40, 13).has_all_rows() && !circle(40, 75).has_all_rows());
-        assert!(circle(40, 40).contains((49, 40)));
-        assert!(!circle(40, 40).contains((50, 40)));
-    }
-
-    #[test]
-    fn circles_reach_what_they_light() {
-        for radius in 0..=MAX_SPOT_RADIUS {
-            let (circle, disc) = (Circle { x: 0, y: 0, radius: radius as i16 }, &Shape::of(radius as i16).disc);
-            for (x, y) in (-radius..radius).flat_map(|x| (-radius..radius).map(move |y| (x, y))) {
-                let pixel = Rect::new(x, y, 1, 1);
-                assert!(circle.reaches(&pixel) || !disc.contains((x, y)), "radius {radius}: {x}, {y}");
-            }
-        }
     }
 }

@@ -6,24 +6,22 @@ use proptest::prelude::*;
 use serde_json::{Map, Value as Json, json};
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLIGHT};
-use super::parameters::{MAX_SPOTLIGHTS, SPECS};
-use super::rules::State;
-use super::{Assets, SearingSpotlights, Variant};
-use crate::envs::{Environment, FRAME_BYTES, Kind, Parameter, ResetParameters, SCREEN, Spec};
+use super::{Assets, MAX_SPOTLIGHTS, SPECS, SearingSpotlights, State, Variant};
+use crate::envs::{EnvSpec, Environment, FRAME_BYTES, Parameter, ParameterKind, ResetParameters, SCREEN};
 use crate::random::Generator;
 use crate::raster::Surface;
 
-const FINITE: &Spec = &SPECS[0];
-const ENDLESS: &Spec = &SPECS[1];
+const FINITE: &EnvSpec = &SPECS[0];
+const ENDLESS: &EnvSpec = &SPECS[1];
 
-fn assets(spec: &'static Spec, options: &Map<String, Json>) -> Arc<Assets> {
+fn assets(spec: &'static EnvSpec, options: &Map<String, Json>) -> Arc<Assets> {
     let parameters = ResetParameters::new(spec.id, spec.parameters, options).unwrap();
     let variant = Variant { endless: spec.id == ENDLESS.id };
     Arc::new(SearingSpotlights::assets(variant, &parameters))
 }
 
 /// An environment after its reset, and its generator.
-fn started(spec: &'static Spec, options: &Json, seed: u64) -> (SearingSpotlights, Generator) {
+fn started(spec: &'static EnvSpec, options: &Json, seed: u64) -> (SearingSpotlights, Generator) {
     let assets = assets(spec, options.as_object().unwrap());
     let mut environment = SearingSpotlights::new(&assets);
     let mut random = Generator::from_seed(seed);
@@ -66,18 +64,18 @@ fn walk(environment: &mut SearingSpotlights, random: &mut Generator, to: (i32, i
 /// An option within its limits, often at one of them.
 fn any_value(parameter: &Parameter) -> BoxedStrategy<Json> {
     match parameter.kind {
-        Kind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
-        Kind::Int { default, min, max } => {
+        ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
+        ParameterKind::Int { default, min, max } => {
             prop_oneof![Just(min), Just(max), Just(default), (min.max(-9)..=max.min(9))].prop_map(Json::from).boxed()
         }
-        Kind::Float { default, min, max } => {
+        ParameterKind::Float { default, min, max } => {
             prop_oneof![Just(min), Just(max), Just(default), min..=max].prop_map(Json::from).boxed()
         }
-        Kind::IntList { min, max, .. } => prop::collection::vec(min..=max, 1..4).prop_map(Json::from).boxed(),
+        ParameterKind::IntList { min, max, .. } => prop::collection::vec(min..=max, 1..4).prop_map(Json::from).boxed(),
     }
 }
 
-fn any_options(spec: &'static Spec) -> impl Strategy<Value = Map<String, Json>> {
+fn any_options(spec: &'static EnvSpec) -> impl Strategy<Value = Map<String, Json>> {
     let options: Vec<_> = spec
         .parameters
         .iter()
@@ -87,7 +85,7 @@ fn any_options(spec: &'static Spec) -> impl Strategy<Value = Map<String, Json>> 
         .prop_map(|options| options.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect())
 }
 
-fn any_episodes() -> impl Strategy<Value = (&'static Spec, Vec<Map<String, Json>>)> {
+fn any_episodes() -> impl Strategy<Value = (&'static EnvSpec, Vec<Map<String, Json>>)> {
     prop_oneof![Just(FINITE), Just(ENDLESS)]
         .prop_flat_map(|spec| (Just(spec), prop::collection::vec(any_options(spec), 1..4)))
 }
@@ -163,7 +161,8 @@ fn without_coins_the_exit_is_open() {
     let mut info = [f64::NAN; 3];
     environment.info(&mut info);
     assert_eq!((info[0], info[2]), (1.0, 1.0));
-    assert!(info[1].is_nan(), "no share of no coins, as in the original");
+    assert!(info[1].is_nan(), "0 of 0 coins, which is NaN in the original");
+    assert!(FINITE.info[1].description.ends_with("; NaN if the episode had no coins"));
 }
 
 #[test]

@@ -1,10 +1,11 @@
-//! The bar at the top of the screen: health, the last action, whether the last reward was positive.
+//! The drawing of the bar at the top of the screen: health, the last action, and whether the last reward was positive.
 
 use std::ops::Range;
 
+use super::config::{BAR_HEIGHT, HEALTH_WIDTH};
 use super::parameters::Variant;
-use super::rules::{BAR_HEIGHT, SearingSpotlights};
-use crate::envs::SCREEN;
+use super::scene::Bar;
+use crate::envs::screen::SCREEN;
 use crate::raster::{Canvas, Rect, Rgb};
 
 const BLACK: Rgb = [0, 0, 0];
@@ -16,45 +17,19 @@ const ACTIONS: [Rgb; 3] = [[120, 120, 120], [116, 1, 113], [255, 94, 14]];
 
 /// The health takes the left half, and each branch of the action one of the other quarters.
 const QUARTER: usize = SCREEN / 4;
-pub(super) const HALF: usize = 2 * QUARTER;
+const HALF: usize = HEALTH_WIDTH;
 
 /// Columns of the action's branches.
 const ACTION_FIELDS: [Range<usize>; 2] = [HALF..HALF + QUARTER, HALF + QUARTER..SCREEN];
 
-/// Columns of the reward's field between the fields of the action, and of the field without them.
+/// Columns of the reward's field between the fields of the action, and of the field if the action is not shown.
 const REWARD_BETWEEN: Range<usize> = QUARTER * 11 / 4..QUARTER * 11 / 4 + QUARTER / 2;
 const REWARD_ALONE: Range<usize> = HALF..SCREEN;
-
-/// What the bar shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Bar {
-    /// Columns that have turned red; beyond [`HALF`] for health below zero.
-    damage: u8,
-    /// The red beyond the half covers the fields of the action.
-    overflows: bool,
-    /// By the branches of the action; `None` where it is not shown.
-    action: Option<[u8; 2]>,
-    /// Whether the reward was positive; `None` where that is not shown.
-    reward: Option<bool>,
-}
-
-impl SearingSpotlights {
-    pub(super) fn bar(&self) -> Bar {
-        let (state, parameters) = (&self.state, &self.assets.parameters);
-        let shows_reward = parameters.show_last_positive_reward && !state.first_frame;
-        Bar {
-            damage: state.red_columns,
-            overflows: state.hit && usize::from(state.red_columns) > HALF,
-            action: parameters.show_last_action.then(|| state.shown_action.map(|branch| branch as u8)),
-            reward: shows_reward.then_some(state.shown_reward_positive),
-        }
-    }
-}
 
 impl Bar {
     /// Paints the bar, which covers the screen's first [`BAR_HEIGHT`] rows.
     pub fn paint(&self, variant: Variant, canvas: &mut Canvas<'_>) {
-        // In the order in which the original paints, each field over what earlier steps left behind.
+        // In the original's drawing order.
         let damage = usize::from(self.damage);
         fill(canvas, HALF.min(damage)..HALF, HEALTH);
         match self.action {
@@ -75,7 +50,7 @@ impl Bar {
         self.paint_reward(canvas);
     }
 
-    /// Changes a bar that shows `shown`.
+    /// Changes a painted bar from `shown` to this one.
     pub fn repaint(&self, shown: &Bar, variant: Variant, canvas: &mut Canvas<'_>) {
         let (Some(action), Some(shown_action), true) = (self.action, shown.action, self.differs_by_fields(shown))
         else {
@@ -84,7 +59,7 @@ impl Bar {
         let (damage, shown_damage) = (usize::from(self.damage), usize::from(shown.damage));
         fill(canvas, damage..shown_damage.min(HALF), HEALTH);
         fill(canvas, shown_damage..damage.min(HALF), DAMAGE);
-        // The field of the reward covers a part of both.
+        // The field of the reward covers a part of both fields.
         let covered = if self.reward.is_some() { REWARD_BETWEEN } else { HALF + QUARTER..HALF + QUARTER };
         let fields = [HALF..covered.start, covered.end..SCREEN];
         for ((now, before), field) in action.into_iter().zip(shown_action).zip(fields) {
@@ -103,12 +78,12 @@ impl Bar {
         }
     }
 
-    /// Whether only some fields have to be painted to change a bar that shows `shown`.
+    /// Whether the bar can be changed from `shown` to this one field by field.
     fn differs_by_fields(&self, shown: &Bar) -> bool {
         self.reward.is_some() == shown.reward.is_some() && !self.overflows && !shown.overflows
     }
 
-    /// Rectangles about what differs from a bar that shows `shown`.
+    /// The rectangles in which this bar differs from `shown`.
     pub fn changes_since(&self, shown: &Bar) -> impl Iterator<Item = Rect> {
         let mut changes = [0..SCREEN, 0..0, 0..0, 0..0];
         if let (Some(action), Some(shown_action), true) = (self.action, shown.action, self.differs_by_fields(shown)) {
@@ -130,7 +105,7 @@ impl Bar {
     }
 }
 
-/// Paints some columns of the bar, as far as they may change.
+/// Paints columns of the bar within the canvas' clip.
 #[inline]
 fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: Rgb) {
     let (clip, rows) = (canvas.columns(), canvas.rows());
@@ -142,7 +117,7 @@ fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: Rgb) {
     canvas.note(columns.clone(), &rows);
     let columns = &mut canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0[columns];
     if rows.len() == BAR_HEIGHT {
-        // A column's part of the bar is a block of its own, which is a store or two.
+        // A block of constant size compiles to one or two stores for each column.
         let block: [Rgb; BAR_HEIGHT] = [color; BAR_HEIGHT];
         columns.iter_mut().for_each(|column| column[..BAR_HEIGHT].copy_from_slice(&block));
     } else if !rows.is_empty() {

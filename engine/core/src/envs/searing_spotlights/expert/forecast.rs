@@ -1,7 +1,7 @@
 //! Where a spotlight will be, from where it was seen.
 
 use super::plan::Place;
-use crate::envs::SCREEN;
+use crate::envs::screen::SCREEN;
 
 /// How far a seen centre is off, in pixels: it is cut to whole pixels.
 const NOISE: f64 = 0.3;

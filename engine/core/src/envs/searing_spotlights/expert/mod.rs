@@ -5,7 +5,8 @@ mod plan;
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, SPOTLIGHT};
 use super::parameters::Variant;
-use crate::envs::{Expert, SCREEN};
+use crate::envs::expert::Expert;
+use crate::envs::screen::SCREEN;
 use forecast::Forecast;
 use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, Plan, after, choose, dash};
 

@@ -2,7 +2,7 @@
 //!
 //! Sets of places are rows of bits, so that one operation moves a whole row of agents.
 
-use crate::envs::SCREEN;
+use crate::envs::screen::SCREEN;
 
 /// A place in pixels: x, y.
 pub(super) type Place = [i32; 2];

@@ -1,62 +1,68 @@
-//! What only the endless id has: a way that goes on, a screen that scrolls, stamina, and the ways to fail.
+//! State and rules of the endless id only: the growing path, the scrolling screen, stamina, and the ends of an episode.
 //!
 //! Source: the original's `endless_mystery_path.py`.
 
 use serde::{Deserialize, Serialize};
 
-use super::drawing::{Assets, TILE};
+use super::config::{Config, TILE};
+use super::parameters::MAX_STAMINA;
 use super::path::Tile;
 use super::route::{Route, SEGMENT};
 use crate::random::Generator;
 
-/// Paths that the way begins with.
+/// Number of paths at the start of an episode.
 const FIRST_SEGMENTS: usize = 3;
 
-/// Where the way leads next. A way can also lead left, where the agent cannot go; then the last direction remains.
+/// Direction of the next tile of the path. Where the path leads left, where the agent cannot go, the last direction remains.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Direction {
+    /// To the next column.
     #[default]
     Right,
+    /// To the row above.
     Up,
+    /// To the row below.
     Down,
 }
 
-/// State of the endless id beside what it shares with the finite ones, whose screen stands still.
+/// State of the endless id beside what it shares with the finite ids. In the finite ids it keeps its default, a screen that does
+/// not scroll.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Journey {
-    /// Left edge of the screen in pixels of the way. Summed up step by step, as floats round.
+pub struct EndlessState {
+    /// Left edge of the screen in pixels of the path's coordinates. Summed step by step, which decides how it is rounded.
     camera: f64,
     /// Pixels that the background has scrolled to the left, less than a tile.
     background: i32,
     stamina: i64,
-    /// The farthest column of the way that the agent was on.
+    /// The farthest column of the path that the agent was on.
     farthest: i32,
-    /// Where the agent fell off in that column or beyond: a second fall there ends the episode.
+    /// Tiles in that column or beyond where the agent fell off. A second fall at one of them ends the episode.
     falls: Vec<Tile>,
-    /// Number along the way of the last tile that the agent was on.
+    /// Index along the route of the last tile that the agent was on.
     at: usize,
     direction: Direction,
 }
 
-impl Journey {
-    /// Starts an episode with a new way.
-    pub(super) fn start(&mut self, route: &mut Route, assets: &Assets, random: &mut Generator) {
+impl EndlessState {
+    /// Starts an episode with a new route.
+    pub(super) fn reset(&mut self, route: &mut Route, config: &Config, random: &mut Generator) {
         route.clear();
         (0..FIRST_SEGMENTS).for_each(|_| route.extend(random));
-        self.scroll_back(assets);
-        self.stamina = assets.parameters.stamina_level;
+        self.scroll_back(config);
+        self.stamina = config.parameters.stamina_level;
         self.farthest = 0;
         self.falls.clear();
         self.at = 0;
-        self.look_ahead(route);
+        self.update_direction(route);
     }
 
-    /// Whether every number is in its range.
+    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self, route: &Route) -> bool {
         const FAR: i32 = 1 << 28;
         self.camera.abs() < f64::from(FAR)
             && (0..TILE).contains(&self.background)
-            && self.stamina.checked_abs().is_some_and(|stamina| stamina < i64::MAX / 2)
+            // Negative while an episode is played on after its end.
+            && (-MAX_STAMINA..=MAX_STAMINA).contains(&self.stamina)
             && (0..FAR).contains(&self.farthest)
             && self.at < route.tiles().len()
     }
@@ -65,15 +71,15 @@ impl Journey {
     pub(super) fn scroll(&mut self, x: i32) {
         self.camera += f64::from(x);
         self.background += x;
-        // Always to 0: the original keeps the remainder by the agent's speed, but all steps are equally long.
+        // The original keeps the remainder modulo the agent's speed, which is always 0 as all steps are equally long.
         if self.background >= TILE {
             self.background = 0;
         }
     }
 
-    /// Moves the screen back to where it was at first.
-    pub(super) fn scroll_back(&mut self, assets: &Assets) {
-        self.camera = assets.camera;
+    /// Moves the screen back to the start.
+    pub(super) fn scroll_back(&mut self, config: &Config) {
+        self.camera = config.camera;
         self.background = 0;
     }
 
@@ -84,7 +90,7 @@ impl Journey {
         }
     }
 
-    /// Falls off at `tile`: whether that ends the episode.
+    /// Records a fall at `tile`, and restores the stamina. Returns whether the fall ends the episode.
     pub(super) fn fall(&mut self, tile: Tile, stamina: i64) -> bool {
         self.stamina = stamina;
         if tile.0 < self.farthest || self.falls.contains(&tile) {
@@ -94,20 +100,20 @@ impl Journey {
         false
     }
 
-    /// Has reached a tile of the way.
+    /// Records that the agent is on a tile of the route.
     pub(super) fn arrive(&mut self, tile: Tile, route: &Route) {
         if route.tiles().get(self.at) != Some(&tile) {
-            self.at = route.number(tile).unwrap_or(self.at);
-            self.look_ahead(route);
+            self.at = route.index(tile).unwrap_or(self.at);
+            self.update_direction(route);
         }
         if tile.0 > self.farthest {
             self.farthest = tile.0;
-            // A fall before the farthest column ends the episode anyway.
+            // Any fall before the farthest column ends the episode.
             self.falls.retain(|(x, _)| *x >= tile.0);
         }
     }
 
-    fn look_ahead(&mut self, route: &Route) {
+    fn update_direction(&mut self, route: &Route) {
         let Some(&[(from_x, from_y), (x, y)]) = route.tiles().get(self.at..).and_then(|tiles| tiles.first_chunk())
         else {
             return;
@@ -120,23 +126,23 @@ impl Journey {
         };
     }
 
-    /// Regains all stamina.
-    pub(super) fn rest(&mut self, stamina: i64) {
+    /// Restores all stamina.
+    pub(super) fn restore_stamina(&mut self, stamina: i64) {
         self.stamina = stamina;
     }
 
-    /// Spends stamina on a step: whether none is left.
-    pub(super) fn tire(&mut self) -> bool {
+    /// Spends one unit of stamina. Returns whether none is left.
+    pub(super) fn spend_stamina(&mut self) -> bool {
         self.stamina -= 1;
         self.stamina == 0
     }
 
-    /// Where a pixel of the way is on the screen, rounded as pygame rounds a rectangle's centre.
+    /// Position on the screen of a position in the path's coordinates, rounded as pygame rounds a rectangle's centre.
     pub(super) fn on_screen(&self, (x, y): (i32, i32)) -> (i32, i32) {
         ((f64::from(x) - self.camera).round() as i32, y)
     }
 
-    /// Left edge of the screen in pixels of the way.
+    /// Left edge of the screen in pixels of the path's coordinates.
     pub(super) fn camera(&self) -> f64 {
         self.camera
     }
@@ -146,17 +152,17 @@ impl Journey {
         self.background
     }
 
-    /// The share of the stamina that is left; negative if the episode is played on after its end.
+    /// The share of the stamina that is left, at most 1. Negative if the episode is played on after its end.
     pub(super) fn stamina_share(&self, full: i64) -> f64 {
         self.stamina.min(full) as f64 / full as f64
     }
 
-    /// The farthest column of the way that the agent was on.
+    /// The farthest column of the path that the agent was on.
     pub(super) fn farthest(&self) -> i32 {
         self.farthest
     }
 
-    /// Where the way leads from the last tile that the agent was on.
+    /// Direction of the path from the last tile that the agent was on.
     pub(super) fn direction(&self) -> Direction {
         self.direction
     }
@@ -164,8 +170,8 @@ impl Journey {
     /// The tiles before the last one that the agent was on, backwards until one in the column `depth` columns before the
     /// agent's neighbour column.
     ///
-    /// As in the original: a way that turns back can be cut short, and for an agent off the path the columns count from where it
-    /// fell.
+    /// As in the original, a path that turns back can be cut short, and if the agent is off the path, the columns count from where
+    /// it fell.
     pub(super) fn past_path<'a>(
         &self,
         (x, _): Tile,

@@ -1,0 +1,137 @@
+"""Videos of episodes: GIF with Pillow, MP4 with ffmpeg.
+
+A frame of a video shows the agent's observation on the left, the ground-truth view on the right, and a line of text below.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+#: A frame of a video, uint8 (HEIGHT, WIDTH, 3), indexed [row][column][channel].
+Frame = NDArray[np.uint8]
+
+#: Side of both views, gap between them and height of the line of text, in pixels.
+SIDE, GAP, TEXT = 336, 8, 24
+WIDTH, HEIGHT = 2 * SIDE + GAP, SIDE + TEXT
+#: Supported file name suffixes.
+SUFFIXES = (".gif", ".mp4")
+_BACKGROUND, _TEXT_COLOUR = 24, (230, 230, 230)
+
+
+def compose(observation: NDArray[np.uint8], view: NDArray[np.uint8], text: str) -> Frame:
+    """Compose a frame of a video.
+
+    Args:
+        observation: The observation, uint8 (84, 84, 3), indexed [x][y][channel].
+        view: The ground-truth view, uint8 (336, 336, 3), indexed [row][column][channel].
+        text: One line of text.
+
+    Returns:
+        uint8 (HEIGHT, WIDTH, 3).
+    """
+    frame = np.full((HEIGHT, WIDTH, 3), _BACKGROUND, dtype=np.uint8)
+    scale = SIDE // observation.shape[0]
+    frame[:SIDE, :SIDE] = observation.swapaxes(0, 1).repeat(scale, 0).repeat(scale, 1)
+    frame[:SIDE, SIDE + GAP :] = view
+    strip = Image.new("RGB", (WIDTH, TEXT), (_BACKGROUND,) * 3)
+    draw = ImageDraw.Draw(strip)
+    draw.fontmode = "1"  # No antialiasing, which would need more than the 256 colours of a GIF.
+    draw.text((6, 5), text, fill=_TEXT_COLOUR, font=ImageFont.load_default())
+    frame[SIDE:] = np.asarray(strip)
+    return frame
+
+
+def check(file: Path) -> None:
+    """Check that `write` can write this file.
+
+    Raises:
+        ValueError: The suffix is not supported, or ffmpeg is not installed.
+        FileNotFoundError: The folder does not exist.
+    """
+    if file.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--out must end in {' or '.join(SUFFIXES)}, got `{file.name}`")
+    if not file.resolve().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {file}: no folder {file.parent}")
+    if file.suffix.lower() == ".mp4":
+        _ffmpeg()
+
+
+def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
+    """Write a video; if this is interrupted, no partial file is left.
+
+    Args:
+        file: Output file, with the suffix `.gif` or `.mp4`.
+        frames: At least one frame, uint8 (HEIGHT, WIDTH, 3) each.
+        fps: Frames per second.
+
+    Raises:
+        ValueError: As for `check`.
+        FileNotFoundError: As for `check`.
+        OSError: ffmpeg has failed; the message contains its error.
+    """
+    check(file)
+    partial = file.with_name(f".{file.name}.partial{file.suffix.lower()}")
+    try:
+        (_gif if file.suffix.lower() == ".gif" else _mp4)(partial, iter(frames), fps)
+        partial.replace(file)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _gif(file: Path, frames: Iterator[Frame], fps: int) -> None:
+    images = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames)
+    next(images).save(file, save_all=True, append_images=images, duration=round(1000 / fps), loop=0)
+
+
+def _mp4(file: Path, frames: Iterator[Frame], fps: int) -> None:
+    first = next(frames)
+    height, width, _ = first.shape
+    arguments = [
+        _ffmpeg(),
+        "-y",
+        "-loglevel",
+        "error",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{width}x{height}",
+    ]
+    arguments += ["-r", str(fps), "-i", "-", "-pix_fmt", "yuv420p", str(file)]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        try:
+            for frame in chain([first], frames):
+                process.stdin.write(frame.tobytes())
+            _, errors = process.communicate()
+        except BrokenPipeError:
+            _, errors = process.communicate()
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        raise OSError(f"ffmpeg failed to write {file.name}: {errors.decode(errors='replace').strip()}")
+
+
+def _ffmpeg() -> str:
+    """Path of ffmpeg: the system's, or that of the package imageio-ffmpeg."""
+    found = shutil.which("ffmpeg")
+    if found:
+        return found
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise ValueError(
+            "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg, or use .gif"
+        ) from None
+    program: str = imageio_ffmpeg.get_ffmpeg_exe()
+    return program

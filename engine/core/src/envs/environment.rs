@@ -1,0 +1,106 @@
+//! The trait that every family of environments implements.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use serde::{Serialize, de::DeserializeOwned};
+use thiserror::Error;
+
+use super::parameters::ResetParameters;
+use super::screen::SCREEN;
+use crate::random::Generator;
+use crate::raster::Canvas;
+
+/// Rules and pictures of one family of environments.
+///
+/// [`step`](Environment::step) changes the state, [`scene`](Environment::scene) describes what the state looks like, and
+/// [`paint`](Environment::paint) and [`repaint`](Environment::repaint) paint scenes. One object plays many episodes. As in the
+/// original, some of the state is kept from one episode to the next.
+pub trait Environment: Send + Sync {
+    /// What distinguishes the ids of the family.
+    type Variant: Copy + Send + Sync;
+
+    /// What all environments with the same reset parameters share: the parameters, and the pictures made from them.
+    type Assets: Send + Sync;
+
+    /// Everything that changes during play; the part of an environment that a snapshot stores.
+    type State: Serialize + DeserializeOwned;
+
+    /// What a frame shows, as a small value. Together with the assets it determines every pixel, so that a comparison of two
+    /// scenes finds what has changed.
+    type Scene: Clone + PartialEq + Debug + Send + Sync;
+
+    /// Creates the shared assets for one set of reset parameters.
+    fn assets(variant: Self::Variant, parameters: &ResetParameters) -> Self::Assets;
+
+    /// Creates an environment. The caller must [`reset`](Environment::reset) it before any other call.
+    fn new(assets: &Arc<Self::Assets>) -> Self;
+
+    /// Starts an episode with these assets, which may differ from the last episode's.
+    fn reset(&mut self, assets: &Arc<Self::Assets>, random: &mut Generator);
+
+    /// Plays one step. `action` has one number for each branch of the action space, each within its range.
+    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition;
+
+    /// The assets of the current episode.
+    fn shared(&self) -> &Arc<Self::Assets>;
+
+    /// What the observation shows.
+    fn scene(&self) -> Self::Scene;
+
+    /// Paints every pixel of a scene within the canvas' clip, independent of what the canvas showed before.
+    fn paint(assets: &Self::Assets, scene: &Self::Scene, canvas: &mut Canvas<'_>);
+
+    /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ.
+    fn repaint(assets: &Self::Assets, shown: &Self::Scene, scene: &Self::Scene, canvas: &mut Canvas<'_>);
+
+    /// Draws the observation in full. `frame` has [`FRAME_BYTES`](super::FRAME_BYTES) bytes, indexed \[x\]\[y\]\[channel\].
+    ///
+    /// # Panics
+    ///
+    /// If `frame` has another length.
+    fn draw(&self, frame: &mut [u8]) {
+        Self::paint(self.shared(), &self.scene(), &mut Canvas::new(frame, SCREEN, SCREEN));
+    }
+
+    /// Draws the original's ground-truth view on a canvas of the observation's size, before the original scales it up. The
+    /// state changes where the original advances an animation with every view.
+    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
+
+    /// Writes the vector observation; an environment without one writes nothing.
+    fn vector_observation(&self, _out: &mut [f32]) {}
+
+    /// Writes what the current frame shows as numbers, in the order of [`EnvSpec::features`](super::EnvSpec::features).
+    fn features(&self, out: &mut [f32]);
+
+    /// Writes the ground truth; an environment without one writes nothing.
+    fn ground_truth(&self, _out: &mut [f64]) {}
+
+    /// The state, for a snapshot.
+    fn state(&self) -> &Self::State;
+
+    /// Continues from a state that an environment with these assets was in.
+    ///
+    /// # Errors
+    ///
+    /// [`InvalidState`] if a number of the state is out of its range. The environment is then unchanged.
+    fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
+
+    /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended the
+    /// episode.
+    fn info(&self, out: &mut [f64]);
+}
+
+/// What one step returns beside the observation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Transition {
+    /// The reward, in the precision of the original's Python float.
+    pub reward: f64,
+    /// Whether the episode ended. The original reports every end, also that by the step limit, as `terminated`.
+    pub terminated: bool,
+}
+
+/// A state with a number that is out of its range.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+#[error("the state has a number that is out of its range")]
+pub struct InvalidState;

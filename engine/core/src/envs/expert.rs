@@ -1,0 +1,13 @@
+//! The interface of the scripted experts.
+
+/// Plays an environment from its feature and vector observations, and remembers what an agent would need to remember.
+pub trait Expert: Send {
+    /// Forgets the last episode.
+    fn reset(&mut self);
+
+    /// Chooses an action. The caller must call it once for each observation, including the first of an episode.
+    ///
+    /// `features` and `vector_observation` are as the environment writes them; `action` has one number for each branch of the
+    /// action space.
+    fn act(&mut self, features: &[f32], vector_observation: &[f32], action: &mut [i32]);
+}

@@ -1,0 +1,274 @@
+//! Worker threads that join the calling thread in a step.
+//!
+//! A step takes tens of microseconds, less than waking a thread takes. So the caller starts at once and waits only for workers
+//! that have joined: a running worker joins, one that wakes too late finds the call closed. After a call, a worker spins, then
+//! yields, then parks.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crossbeam_utils::sync::{Parker, Unparker};
+use crossbeam_utils::{Backoff, CachePadded};
+
+use super::lock;
+
+/// A worker that was not called for this long parks. Most trainers call the next step sooner.
+const PARK_AFTER: Duration = Duration::from_millis(3);
+
+/// Threads that wait for calls. They end when this is dropped.
+#[derive(Debug)]
+pub(super) struct Workers {
+    shared: Arc<Shared>,
+    unparkers: Vec<Unparker>,
+    /// Held during a call, so that callers take turns.
+    turn: Mutex<()>,
+}
+
+/// A function of the thread's number. It is borrowed for the time of one call.
+type Task = &'static (dyn Fn(usize) + Sync);
+
+/// What the caller and its workers share. Counters that different threads write lie in cache lines of their own.
+#[derive(Default)]
+struct Shared {
+    /// Generation counter of calls: incremented when a call opens and when it closes, so odd while workers may join.
+    generation: CachePadded<AtomicU64>,
+    /// Number of the last worker that may join the open call.
+    helpers: AtomicUsize,
+    /// The open call's task.
+    open: Mutex<Option<Task>>,
+    /// Workers that have joined and not finished.
+    joined: CachePadded<AtomicUsize>,
+    panic: Mutex<Option<Box<dyn Any + Send>>>,
+    stop: AtomicBool,
+}
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shared")
+            .field("generation", &self.generation)
+            .field("joined", &self.joined)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Workers {
+    /// Starts `count` workers, numbered from 1.
+    pub(super) fn new(count: usize) -> std::io::Result<Self> {
+        let mut workers = Workers { shared: Arc::default(), unparkers: Vec::new(), turn: Mutex::default() };
+        for number in 1..=count {
+            let shared = Arc::clone(&workers.shared);
+            let parker = Parker::new();
+            workers.unparkers.push(parker.unparker().clone());
+            let name = format!("endless-worker-{number}");
+            thread::Builder::new().name(name).spawn(move || shared.serve(number, &parker))?;
+        }
+        Ok(workers)
+    }
+
+    /// How many workers there are.
+    pub(super) fn count(&self) -> usize {
+        self.unparkers.len()
+    }
+
+    /// See [`Threads::run`](super::Threads::run).
+    pub(super) fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
+        let _turn = lock(&self.turn);
+        // SAFETY: only the lifetime changes. Workers take the reference only from `open`, and increment `joined` before they
+        // release its lock; dropping `Call` clears `open` and waits until `joined` is 0 before this function returns or unwinds.
+        let task = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Task>(work) };
+        let call = Call::open(&self.shared, task, helpers);
+        self.unparkers.iter().take(helpers).for_each(Unparker::unpark);
+        work(0);
+        drop(call);
+        if let Some(panic) = lock(&self.shared.panic).take() {
+            resume_unwind(panic);
+        }
+    }
+}
+
+/// The workers end by themselves. They are not joined: in the child of a fork they do not exist.
+impl Drop for Workers {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::SeqCst);
+        self.unparkers.iter().for_each(Unparker::unpark);
+    }
+}
+
+/// A call that workers may join until it is dropped.
+struct Call<'a>(&'a Shared);
+
+impl<'a> Call<'a> {
+    fn open(shared: &'a Shared, task: Task, helpers: usize) -> Self {
+        // A panic is left over where the caller of an earlier call panicked as well.
+        *lock(&shared.panic) = None;
+        shared.helpers.store(helpers, Ordering::SeqCst);
+        *lock(&shared.open) = Some(task);
+        shared.generation.fetch_add(1, Ordering::SeqCst);
+        Call(shared)
+    }
+}
+
+impl Drop for Call<'_> {
+    fn drop(&mut self) {
+        self.0.generation.fetch_add(1, Ordering::SeqCst);
+        *lock(&self.0.open) = None;
+        let backoff = Backoff::new();
+        while self.0.joined.load(Ordering::Acquire) > 0 {
+            backoff.snooze();
+        }
+    }
+}
+
+/// A worker that has joined a call.
+struct Joined<'a>(&'a Shared);
+
+impl Drop for Joined<'_> {
+    fn drop(&mut self) {
+        self.0.joined.fetch_sub(1, Ordering::Release);
+    }
+}
+
+impl Shared {
+    /// The loop of worker `number`.
+    fn serve(&self, number: usize, parker: &Parker) {
+        let (mut last, mut since) = (0, Instant::now());
+        while let Some(generation) = self.next_call(last, since, parker) {
+            last = generation;
+            if number > self.helpers.load(Ordering::SeqCst) {
+                continue;
+            }
+            if let Some((task, _joined)) = self.join(generation)
+                && let Err(panic) = catch_unwind(AssertUnwindSafe(|| task(number)))
+            {
+                *lock(&self.panic) = Some(panic);
+            }
+            since = Instant::now();
+        }
+    }
+
+    /// Waits for a call other than `last` and returns its generation; `None` when there will be no more. The worker parks
+    /// [`PARK_AFTER`] after `since`, the last time that it was called.
+    fn next_call(&self, last: u64, since: Instant, parker: &Parker) -> Option<u64> {
+        let backoff = Backoff::new();
+        while !self.stop.load(Ordering::SeqCst) {
+            let generation = self.generation.load(Ordering::SeqCst);
+            if generation % 2 == 1 && generation != last {
+                return Some(generation);
+            }
+            if since.elapsed() < PARK_AFTER {
+                backoff.snooze();
+            } else {
+                parker.park();
+            }
+        }
+        None
+    }
+
+    /// The task of the call of that generation, if it still is open; the worker then has joined.
+    fn join(&self, generation: u64) -> Option<(Task, Joined<'_>)> {
+        let open = lock(&self.open);
+        let task = open.filter(|_| self.generation.load(Ordering::SeqCst) == generation)?;
+        self.joined.fetch_add(1, Ordering::Relaxed);
+        Some((task, Joined(self)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+    use crate::pool::Threads;
+
+    #[test]
+    fn all_is_done_when_it_returns_and_no_thread_comes_twice() {
+        let threads = Threads::new(4).unwrap();
+        for round in 0..2_000 {
+            let left = Mutex::new((0..64).collect::<Vec<usize>>());
+            let done = Mutex::new(Vec::new());
+            let callers = Mutex::new(Vec::new());
+            threads.run(2, &|number| {
+                lock(&callers).push(number);
+                while let Some(next) = { lock(&left).pop() } {
+                    std::hint::black_box((0..500).sum::<usize>());
+                    lock(&done).push(next);
+                }
+            });
+            let mut done = done.into_inner().unwrap();
+            done.sort_unstable();
+            assert_eq!(done, (0..64).collect::<Vec<_>>(), "round {round}");
+            let callers = callers.into_inner().unwrap();
+            assert_eq!(callers.iter().collect::<HashSet<_>>().len(), callers.len(), "{callers:?}");
+            assert!(callers.contains(&0), "{callers:?}");
+            assert!(callers.iter().all(|number| *number < 3), "{callers:?}");
+        }
+    }
+
+    #[test]
+    fn workers_that_sleep_wake_up() {
+        let threads = Threads::new(2).unwrap();
+        for _ in 0..5 {
+            thread::sleep(PARK_AFTER * 20);
+            let came = AtomicBool::new(false);
+            threads.run(1, &|number| match number {
+                0 => {
+                    let start = Instant::now();
+                    while !came.load(Ordering::SeqCst) && start.elapsed() < Duration::from_secs(30) {
+                        thread::yield_now();
+                    }
+                }
+                _ => came.store(true, Ordering::SeqCst),
+            });
+            assert!(came.into_inner());
+        }
+    }
+
+    #[test]
+    fn callers_take_turns() {
+        let threads = Threads::new(3).unwrap();
+        let total = AtomicUsize::new(0);
+        thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    for _ in 0..500 {
+                        let mine = AtomicUsize::new(0);
+                        threads.run(2, &|number| {
+                            mine.fetch_add(1 + number, Ordering::Relaxed);
+                        });
+                        total.fetch_add(usize::from((1..=6).contains(&mine.into_inner())), Ordering::Relaxed);
+                    }
+                });
+            }
+        });
+        assert_eq!(total.into_inner(), 2_000);
+    }
+
+    #[test]
+    fn a_panic_reaches_the_caller_and_the_next_call_works() {
+        let threads = Threads::new(2).unwrap();
+        for culprits in [vec![0], vec![1], vec![0, 1]] {
+            let here = AtomicBool::new(false);
+            let start = Instant::now();
+            let outcome = catch_unwind(AssertUnwindSafe(|| {
+                threads.run(1, &|number| {
+                    here.fetch_or(number == 1, Ordering::SeqCst);
+                    while !here.load(Ordering::SeqCst) && start.elapsed() < Duration::from_secs(30) {
+                        thread::yield_now();
+                    }
+                    assert!(!culprits.contains(&number), "by {number}");
+                });
+            }));
+            let panic = outcome.unwrap_err();
+            assert_eq!(panic.downcast_ref::<String>(), Some(&format!("by {}", culprits[0])));
+        }
+        let calls = AtomicUsize::new(0);
+        threads.run(1, &|_| {
+            calls.fetch_add(1, Ordering::Relaxed);
+        });
+        assert!(calls.into_inner() >= 1);
+    }
+}

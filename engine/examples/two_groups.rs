@@ -1,0 +1,53 @@
+//! Two groups in flight: the engine steps one group while the trainer computes the other's actions.
+//!
+//! ```console
+//! cargo run --release --example two_groups
+//! ```
+
+use std::error::Error;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use endless_gym::pool::{PoolConfig, ResetRequest, Threads};
+use endless_gym::service::{ConnectConfig, Engine, EngineConfig, ServiceError, Trainer};
+
+const SERVICE: &str = "two-groups";
+const ID: &str = "MortarMayhem-v0";
+const NUM_ENVS: usize = 64;
+const STEPS: usize = 500;
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// What a policy's forward pass takes.
+const THINKING: Duration = Duration::from_micros(100);
+
+fn main() -> Result<(), Box<dyn Error>> {
+    // Usually a process of its own: `endless serve --groups 2 --service two-groups ...`.
+    let config = EngineConfig::new(SERVICE, PoolConfig::new(ID, NUM_ENVS), Threads::new(1)?);
+    let mut engine = Engine::new(&EngineConfig { groups: 2, ..config })?;
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let running = scope.spawn(|| engine.run(&stop));
+        let played = play();
+        stop.store(true, Ordering::Relaxed);
+        let summary = running.join().map_err(|_| "the engine panicked")??;
+        let rate = (2 * STEPS * NUM_ENVS) as f64 / played?.as_secs_f64();
+        println!("{rate:.0} steps per second with two groups; the engine sent {} batches", summary.batches);
+        Ok(())
+    })
+}
+
+/// Plays both groups and returns how long it took.
+fn play() -> Result<Duration, ServiceError> {
+    let mut trainer = Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(SERVICE) })?;
+    let actions = vec![0; NUM_ENVS * trainer.specification().action_space.branches().len()];
+    for group in 0..2 {
+        trainer.reset(group, ResetRequest::Seed(0))?;
+    }
+    let start = Instant::now();
+    for _ in 0..2 * STEPS {
+        // The group that is ready first.
+        let group = trainer.receive_any(TIMEOUT)?.group();
+        std::thread::sleep(THINKING);
+        trainer.send(group, &actions)?;
+    }
+    Ok(start.elapsed())
+}
