@@ -42,7 +42,7 @@ impl Room {
 
     fn wait_for_engine(&self) {
         let start = Instant::now();
-        while endless_gym::service::engines(&Namespace::at(&self.root)).unwrap().is_empty() {
+        while endless_gym::service::running_engines(&Namespace::at(&self.root)).unwrap().is_empty() {
             assert!(start.elapsed() < Duration::from_secs(20), "no engine starts");
             std::thread::sleep(Duration::from_millis(50));
         }
@@ -221,11 +221,14 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["serve", "--env-options", "3"], "expected a JSON object"),
         (vec!["serve", "--num-envs", "2", "--env-options", "{}"], "1 "),
         (vec!["serve", "--num-envs", "0"], "0 environments"),
-        (vec!["serve", "--groups", "0"], "0 groups"),
-        (vec!["serve", "--service", "a/b"], "`a/b` cannot name an engine"),
+        (vec!["serve", "--groups", "0"], "groups must be 1 to 64, got 0"),
+        (vec!["serve", "--batches-held", "20"], "batches_held must be 1 to 16, got 20"),
+        (vec!["serve", "--service", "a/b"], "engine name must be 1 to 64 letters, digits, `.`, `_` or `-`, got `a/b`"),
         (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["demo", "--num-envs", "0"], "0 environments"),
         (vec!["demo", "--option", "arena_size=7"], "`arena_size` must be an integer, 2 to 6, got 7"),
+        (vec!["demo", "--seconds=-1"], "--seconds must be finite and not negative, got -1"),
+        (vec!["bench", "--seconds=nan"], "--seconds must be finite and not negative, got NaN"),
         (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "/no/python: "),
     ] {

@@ -1,6 +1,6 @@
-//! The frames that come through the service, whoever holds which of them for how long, and whoever dies.
+//! Frames received through the service, while batches are held for random times and processes are killed.
 //!
-//! The engines check what they draw; what arrives is compared with what a pool of our own draws in full.
+//! The engines check their incremental drawing; the received frames are compared with those of a pool that draws in full.
 
 mod service_support;
 
@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use endless_gym::batch::{Batch, zeroed};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
-use endless_gym::service::{Observer, Received, Trainer};
+use endless_gym::service::{BatchLease, Observer, Trainer};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use service_support::{ID, Place, play_role};
@@ -17,21 +17,22 @@ const SECONDS: Duration = Duration::from_secs(5);
 const NUM_ENVS: usize = 4;
 
 #[test]
+#[ignore = "a child process of the other tests"]
 fn role() {
     play_role();
 }
 
-/// Batches that somebody holds, with what was in them when they came.
+/// Batches that are held, with a copy of their frames from when they were received.
 #[derive(Default)]
-struct Held(Vec<(Received, Vec<u8>)>);
+struct Held(Vec<(BatchLease, Vec<u8>)>);
 
 impl Held {
-    fn keep(&mut self, received: Received) {
+    fn keep(&mut self, received: BatchLease) {
         let frames = received.batch().observation().to_vec();
         self.0.push((received, frames));
     }
 
-    /// Gives some back, and any that are one too many.
+    /// Checks all batches and drops some at random, so that at most two are left.
     fn release(&mut self, random: &mut SmallRng) {
         for (received, frames) in &self.0 {
             assert!(received.batch().observation() == frames, "a held batch changed");
@@ -42,13 +43,13 @@ impl Held {
     }
 }
 
-/// Plays beside a pool that draws everything in full, while two observers watch now and then.
+/// Steps the engine and a pool that draws in full, and compares the frames. Observers receive batches at random.
 fn play(trainer: &mut Trainer, observers: &mut [Observer], steps: u64, random: &mut SmallRng) {
     let mut pool = Pool::new(&PoolConfig::new(ID, NUM_ENVS), &Threads::new(1).unwrap()).unwrap();
     let mut held: Vec<Held> = (0..=observers.len()).map(|_| Held::default()).collect();
     let seed = random.random_range(0..1000);
     trainer.reset(0, ResetRequest::Seed(seed)).unwrap();
-    // Memory that nobody has written into is drawn in full.
+    // A new buffer is drawn in full.
     let mut expected = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::Seed(seed), &mut expected).unwrap();
     for step in 0..=steps {
@@ -75,7 +76,7 @@ fn play(trainer: &mut Trainer, observers: &mut [Observer], steps: u64, random: &
 }
 
 #[test]
-fn frames_are_right_whoever_holds_them_and_whoever_is_restarted() {
+fn frames_are_correct_while_batches_are_held_and_processes_restart() {
     let place = Place::new();
     let mut random = SmallRng::seed_from_u64(2);
     let mut engine = place.engine("gym", NUM_ENVS, 1);
@@ -86,7 +87,7 @@ fn frames_are_right_whoever_holds_them_and_whoever_is_restarted() {
         play(&mut trainer, &mut observers, 150, &mut random);
         drop(observers);
         if round % 2 == 0 {
-            // The trainer goes, and its successor finds what it left behind.
+            // The next trainer receives chunks that the last one returned.
             drop(trainer);
             trainer = place.trainer("gym").unwrap();
         } else {

@@ -1,4 +1,4 @@
-//! Snapshots of environments in another process: they are those of this process, and go on in both.
+//! Snapshots through the service: they equal those of a pool in this process and can be restored in both.
 
 mod service_support;
 
@@ -9,13 +9,14 @@ use endless_gym::batch::{Block, SNAPSHOT_BYTES, zeroed};
 use endless_gym::pool::{Options, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
-use service_support::foreign::{ActionHeader, Foreign};
+use service_support::foreign::{Foreign, RequestHeader};
 use service_support::{ID, Place, play_role};
 
 const SECONDS: Duration = Duration::from_secs(5);
 const NUM_ENVS: usize = 3;
 
 #[test]
+#[ignore = "a child process of the other tests"]
 fn role() {
     play_role();
 }
@@ -26,7 +27,7 @@ fn actions(trainer: &Trainer, step: usize) -> Vec<i32> {
     (0..NUM_ENVS).flat_map(|env| branches.iter().map(move |n| ((step * 7 + env * 3) % *n as usize) as i32)).collect()
 }
 
-/// Steps an engine's environments and those of a pool, and compares all that they yield.
+/// Steps an engine's environments and those of a pool, and compares the batches.
 fn play_both(trainer: &mut Trainer, pool: &mut Pool, steps: std::ops::Range<usize>) {
     let mut blocks = zeroed(pool.layout().blocks());
     for step in steps {
@@ -51,7 +52,7 @@ fn reset(trainer: &mut Trainer, seed: u64) {
 }
 
 #[test]
-fn they_go_on_identically_in_both_directions() {
+fn restored_environments_continue_identically_in_both_directions() {
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -61,14 +62,14 @@ fn they_go_on_identically_in_both_directions() {
     pool.reset(ResetRequest::Seed(7), &mut blocks).unwrap();
     play_both(&mut trainer, &mut pool, 0..40);
 
-    // The engine's are the pool's, and taking them changes nothing.
+    // The engine's snapshots equal the pool's, and taking them changes no state.
     let taken: Vec<_> = (0..NUM_ENVS).map(|env| trainer.snapshot(0, env, SECONDS).unwrap()).collect();
     for (env, snapshot) in taken.iter().enumerate() {
         assert_eq!(*snapshot, pool.snapshot(env).unwrap());
     }
     play_both(&mut trainer, &mut pool, 40..200);
 
-    // Both go back to where they were taken, the environments in another order.
+    // Both are restored, with the environments in reverse order.
     for (env, snapshot) in taken.iter().rev().enumerate() {
         trainer.restore(0, env, snapshot, SECONDS).unwrap();
         pool.restore(env, snapshot).unwrap();
@@ -77,7 +78,7 @@ fn they_go_on_identically_in_both_directions() {
     let shown = trainer.receive(0, SECONDS).unwrap();
     pool.observe(&mut blocks).unwrap();
     same(&shown.batch(), &pool, &blocks);
-    assert_eq!(shown.step(), 202, "a snapshot is no batch");
+    assert_eq!(shown.step(), 202, "a snapshot is not counted as a batch");
     drop(shown);
     play_both(&mut trainer, &mut pool, 200..300);
 }
@@ -105,25 +106,25 @@ fn mistakes_are_typed_errors() {
     assert!(matches!(trainer.snapshot(0, 0, SECONDS), Err(ServiceError::AnswerPending { group: 0 })));
     trainer.receive(0, SECONDS).unwrap();
 
-    // Whoever has only just come must reset first.
+    // A new trainer must reset first.
     drop(trainer);
     let mut next = place.trainer("gym").unwrap();
     rejected(next.restore(0, 0, &snapshot, SECONDS).unwrap_err(), "reset", Rejection::NotReset);
     let specification = next.specification().clone();
     drop(next);
 
-    // A length that the payload does not have.
+    // Lengths beyond the payload.
     let foreign = Foreign::new(place.namespace(), &specification);
-    let good = ActionHeader::reset_all(&specification);
+    let good = RequestHeader::reset_all(&specification);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
     for bytes in [u64::MAX, 1 << 40] {
-        let (status, text) = foreign.ask(ActionHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
+        let (status, text) = foreign.ask(RequestHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
         assert!(status != 0 && text.contains("no snapshot"), "{text}");
     }
 }
 
 #[test]
-fn one_that_is_late_is_waited_for_by_the_same_call() {
+fn a_late_snapshot_is_returned_by_the_same_call() {
     let place = Place::new();
     let engine = place.engine("gym", NUM_ENVS, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -139,7 +140,7 @@ fn one_that_is_late_is_waited_for_by_the_same_call() {
     assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingSent { .. })));
     assert_eq!(trainer.snapshot(0, 1, SECONDS).unwrap(), expected);
 
-    // Another call takes its place: an environment, a snapshot, a step.
+    // Another request replaces it: another environment, another snapshot, a step.
     let other = trainer.snapshot(0, 2, SECONDS).unwrap();
     kill_process(pid, Signal::STOP).unwrap();
     std::thread::sleep(Duration::from_millis(50));

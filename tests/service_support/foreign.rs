@@ -1,10 +1,10 @@
-//! Engines and trainers that are not ours: written against the protocol, not with the library.
+//! Engines and trainers that are written against the protocol and do not use the library. They can send invalid messages.
 
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym::batch::{Block, LAYOUT_VERSION};
-use endless_gym::service::{Namespace, Specification};
+use endless_gym::service::{Namespace, ServiceSpecification};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
@@ -21,12 +21,12 @@ unsafe impl ZeroCopySend for PayloadBlock {
 }
 
 #[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
-#[type_name("endless_gym::ActionHeader")]
+#[type_name("endless_gym::RequestHeader")]
 #[repr(C)]
-pub struct ActionHeader {
+pub struct RequestHeader {
     pub layout_version: u32,
     pub kind: u32,
-    pub epoch: u64,
+    pub incarnation: u64,
     pub trainer: u64,
     pub request: u64,
     pub seed: u64,
@@ -34,20 +34,20 @@ pub struct ActionHeader {
     pub bytes: u64,
 }
 
-impl ActionHeader {
-    pub fn reset_all(specification: &Specification) -> Self {
-        let (layout_version, epoch) = (LAYOUT_VERSION, specification.epoch);
-        ActionHeader { layout_version, kind: 2, epoch, trainer: 42, request: 1, seed: 0, env: 0, bytes: 0 }
+impl RequestHeader {
+    pub fn reset_all(specification: &ServiceSpecification) -> Self {
+        let (layout_version, incarnation) = (LAYOUT_VERSION, specification.incarnation);
+        RequestHeader { layout_version, kind: 2, incarnation, trainer: 42, request: 1, seed: 0, env: 0, bytes: 0 }
     }
 }
 
 #[derive(Clone, Copy, Debug, ZeroCopySend)]
-#[type_name("endless_gym::ObservationHeader")]
+#[type_name("endless_gym::ResponseHeader")]
 #[repr(C)]
-pub struct ObservationHeader {
+pub struct ResponseHeader {
     layout_version: u32,
     group: u32,
-    epoch: u64,
+    incarnation: u64,
     step: u64,
     trainer: u64,
     request: u64,
@@ -80,24 +80,41 @@ fn node(namespace: &Namespace) -> Node<ipc::Service> {
     NodeBuilder::new().config(&config).create().unwrap()
 }
 
-/// A trainer that sends what it likes.
+impl Default for ResponseHeader {
+    fn default() -> Self {
+        ResponseHeader {
+            layout_version: LAYOUT_VERSION,
+            group: 0,
+            incarnation: 0,
+            step: 0,
+            trainer: 0,
+            request: 0,
+            status: 0,
+            text_length: 0,
+            text: [0; 192],
+            snapshot: 0,
+        }
+    }
+}
+
+/// A trainer that can send any message.
 pub struct Foreign {
-    publisher: Publisher<ipc::Service, [PayloadBlock], ActionHeader>,
-    subscriber: Subscriber<ipc::Service, [PayloadBlock], ObservationHeader>,
+    publisher: Publisher<ipc::Service, [PayloadBlock], RequestHeader>,
+    subscriber: Subscriber<ipc::Service, [PayloadBlock], ResponseHeader>,
     blocks: usize,
     _node: Node<ipc::Service>,
 }
 
 impl Foreign {
-    pub fn new(namespace: &Namespace, specification: &Specification) -> Self {
+    pub fn new(namespace: &Namespace, specification: &ServiceSpecification) -> Self {
         let node = node(namespace);
         let name = |what: &str| {
-            let name = format!("endless-gym/{}/{:016x}/{what}/0", specification.service, specification.epoch);
+            let name = format!("endless-gym/{}/{:016x}/{what}/0", specification.service, specification.incarnation);
             ServiceName::new(&name).unwrap()
         };
         let blocks = specification.action.blocks();
         let act =
-            node.service_builder(&name("act")).publish_subscribe::<[PayloadBlock]>().user_header::<ActionHeader>();
+            node.service_builder(&name("act")).publish_subscribe::<[PayloadBlock]>().user_header::<RequestHeader>();
         let publisher = act.open().unwrap().publisher_builder().initial_max_slice_len(blocks).create().unwrap();
         let obs = node.service_builder(&name("obs")).publish_subscribe::<[PayloadBlock]>().user_header();
         let subscriber = obs.open().unwrap().subscriber_builder().create().unwrap();
@@ -108,8 +125,8 @@ impl Foreign {
         self.blocks
     }
 
-    /// Sends a message and returns status and text of the answer, `None` if there is none.
-    pub fn ask(&self, header: ActionHeader, blocks: usize, fill: impl FnOnce(&mut [Block])) -> Option<(u32, String)> {
+    /// Sends a request and returns the status and the text of the response; `None` if there is no response.
+    pub fn ask(&self, header: RequestHeader, blocks: usize, fill: impl FnOnce(&mut [Block])) -> Option<(u32, String)> {
         let zero = vec![PayloadBlock::zeroed(); blocks];
         let mut message = self.publisher.loan_slice_uninit(blocks).unwrap().write_from_slice(&zero);
         *message.user_header_mut() = header;
@@ -129,7 +146,84 @@ impl Foreign {
     }
 }
 
-/// Publishes a specification as an engine would; it is there for as long as the value.
+/// Opens a specification without the namespace's lock. Its service exists until the returned value is dropped, even if its engine
+/// dies.
+pub fn reader(namespace: &Namespace, service: &str) -> Box<dyn std::any::Any> {
+    let node = node(namespace);
+    let name = ServiceName::new(&format!("endless-gym/{service}")).unwrap();
+    let board = node.service_builder(&name).blackboard_opener::<u32>().open().unwrap();
+    Box::new((board, node))
+}
+
+/// Removes the specification of a dead engine.
+pub fn force_remove(namespace: &Namespace, service: &str) {
+    let name = ServiceName::new(&format!("endless-gym/{service}")).unwrap();
+    // SAFETY: its engine is dead, and it has no readers.
+    unsafe { node(namespace).force_remove_service(&name, MessagingPattern::Blackboard) }.unwrap();
+}
+
+/// An engine of one group that can send any batch and does not answer requests.
+pub struct Engine {
+    observations: Publisher<ipc::Service, [PayloadBlock], ResponseHeader>,
+    specification: ServiceSpecification,
+    _parts: Box<dyn std::any::Any>,
+}
+
+/// The header in shared memory of a message that was sent.
+pub struct SentHeader(*mut ResponseHeader);
+
+impl SentHeader {
+    /// Changes group and step after the message was received.
+    pub fn overwrite(&mut self, group: u32, step: u64) {
+        // SAFETY: the chunk is mapped as long as the publisher exists, which the tests guarantee. Its receiver holds it, so the
+        // publisher does not reuse it.
+        unsafe {
+            (&raw mut (*self.0).group).write_volatile(group);
+            (&raw mut (*self.0).step).write_volatile(step);
+        }
+    }
+}
+
+impl Engine {
+    /// Publishes `specification` under the name `service`.
+    pub fn new(namespace: &Namespace, service: &str, specification: &ServiceSpecification) -> Self {
+        let node = node(namespace);
+        let specification = ServiceSpecification { service: service.to_owned(), ..specification.clone() };
+        let name = format!("endless-gym/{service}/{:016x}/obs/0", specification.incarnation);
+        let service = node
+            .service_builder(&ServiceName::new(&name).unwrap())
+            .publish_subscribe::<[PayloadBlock]>()
+            .user_header::<ResponseHeader>()
+            .enable_safe_overflow(true)
+            .history_size(0)
+            .subscriber_max_buffer_size(1)
+            .subscriber_max_borrowed_samples(specification.batches_held)
+            .max_publishers(1)
+            .max_subscribers(1 + specification.observers)
+            .max_nodes(64)
+            .create()
+            .unwrap();
+        let observations =
+            service.publisher_builder().initial_max_slice_len(specification.batch.blocks()).create().unwrap();
+        let text = serde_json::to_vec(&specification).unwrap();
+        let published = publish(&node, &specification.service, LAYOUT_VERSION, &text);
+        Engine { observations, specification, _parts: Box::new((published, service, node)) }
+    }
+
+    /// Sends a batch of zeros from group 0.
+    pub fn send(&mut self, step: u64) -> SentHeader {
+        let zero = vec![PayloadBlock::zeroed(); self.specification.batch.blocks()];
+        let mut message = self.observations.loan_slice_uninit(zero.len()).unwrap().write_from_slice(&zero);
+        let header = message.user_header_mut();
+        let incarnation = self.specification.incarnation;
+        *header = ResponseHeader { incarnation, step, trainer: 42, request: 1, ..ResponseHeader::default() };
+        let header = SentHeader(header);
+        assert_eq!(message.send().unwrap(), 1);
+        header
+    }
+}
+
+/// Publishes a specification like an engine does. It is removed when the returned value is dropped.
 fn publish(node: &Node<ipc::Service>, service: &str, layout_version: u32, text: &[u8]) -> Box<dyn std::any::Any> {
     let mut package = [0; 32];
     package[..5].copy_from_slice(b"0.0.9");
@@ -149,19 +243,31 @@ fn publish(node: &Node<ipc::Service>, service: &str, layout_version: u32, text: 
 /// An engine of another layout version.
 pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u32) -> Box<dyn std::any::Any> {
     let node = node(namespace);
-    let published = publish(&node, service, layout_version, b"whatever it is");
+    let published = publish(&node, service, layout_version, b"not JSON");
     Box::new((published, node))
 }
 
-/// An engine that claims to be ours, but whose actions are of another type.
+/// Publishes a specification under the name `service`, without the services that it describes.
+pub fn specification(
+    namespace: &Namespace,
+    service: &str,
+    specification: &ServiceSpecification,
+) -> Box<dyn std::any::Any> {
+    let node = node(namespace);
+    let text = serde_json::to_vec(specification).unwrap();
+    let published = publish(&node, service, LAYOUT_VERSION, &text);
+    Box::new((published, node))
+}
+
+/// An engine of the right version whose requests have another type.
 pub fn engine_of_other_type(
     namespace: &Namespace,
     service: &str,
-    specification: &Specification,
+    specification: &ServiceSpecification,
 ) -> Box<dyn std::any::Any> {
     let node = node(namespace);
-    let specification = Specification { service: service.to_owned(), ..specification.clone() };
-    let name = format!("endless-gym/{service}/{:016x}/act/0", specification.epoch);
+    let specification = ServiceSpecification { service: service.to_owned(), ..specification.clone() };
+    let name = format!("endless-gym/{service}/{:016x}/act/0", specification.incarnation);
     let act = node.service_builder(&ServiceName::new(&name).unwrap()).publish_subscribe::<[u8]>().create().unwrap();
     let text = serde_json::to_vec(&specification).unwrap();
     let published = publish(&node, service, LAYOUT_VERSION, &text);

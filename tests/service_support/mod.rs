@@ -17,7 +17,10 @@ use endless_gym::service::{ConnectConfig, Engine, EngineConfig, Namespace, Servi
 pub const ID: &str = "MortarMayhem-Grid-v0";
 const ROLE: &str = "ENDLESS_TEST_ROLE";
 
-/// A namespace of its own for one test, with all that was started in it. It goes away with the test.
+/// Arguments with which a test program runs its ignored test `role`, and no other.
+pub const ROLE_ARGUMENTS: [&str; 4] = ["role", "--exact", "--ignored", "--nocapture"];
+
+/// A namespace for one test. It is removed at the end of the test.
 pub struct Place {
     namespace: Namespace,
 }
@@ -33,17 +36,17 @@ impl Place {
         &self.namespace
     }
 
-    /// Starts an engine in a process of its own.
+    /// Starts an engine in a child process.
     pub fn engine(&self, service: &str, num_envs: usize, groups: usize) -> Running {
         self.role("engine", service, &[&num_envs.to_string(), &groups.to_string()])
     }
 
-    /// Connects to an engine that may still be starting.
+    /// Connects to an engine; waits for it to start.
     pub fn trainer(&self, service: &str) -> Result<Trainer, ServiceError> {
         Trainer::connect(&self.connect_config(service))
     }
 
-    /// Connects to an engine that must be there.
+    /// Connects to an engine that must be running.
     pub fn trainer_now(&self, service: &str) -> Result<Trainer, ServiceError> {
         Trainer::connect(&ConnectConfig { timeout: Duration::ZERO, ..self.connect_config(service) })
     }
@@ -53,10 +56,10 @@ impl Place {
         ConnectConfig { service: service.to_owned(), namespace: self.namespace.clone(), timeout }
     }
 
-    /// Starts this test binary in another role.
+    /// Starts this test program in another role.
     pub fn role(&self, role: &str, service: &str, arguments: &[&str]) -> Running {
         let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["role", "--exact", "--nocapture"])
+            .args(ROLE_ARGUMENTS)
             .envs(self.role_environment(role, service, arguments))
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
@@ -71,7 +74,7 @@ impl Place {
         [(ROLE, value), ("ENDLESS_GYM_ROOT", self.namespace.root().display().to_string())]
     }
 
-    /// Files in the namespace's directory and its segments in shared memory.
+    /// The files in the namespace's directory, and its shared memory segments.
     pub fn leftovers(&self) -> Vec<PathBuf> {
         let mut found = Vec::new();
         files(self.namespace.root(), &mut found);
@@ -102,7 +105,7 @@ fn files(directory: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// A process of a test, killed at the latest when it goes out of scope.
+/// A child process of a test. It is killed when this is dropped.
 pub struct Running {
     child: Child,
     stdin: Option<ChildStdin>,
@@ -113,13 +116,13 @@ impl Running {
         self.child.id()
     }
 
-    /// Ends it without any chance to clean up.
+    /// Kills the process, which cannot clean up.
     pub fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
 
-    /// Ends it as Ctrl-C would.
+    /// Ends the process regularly.
     pub fn end(mut self) {
         drop(self.stdin.take());
         assert!(self.child.wait().unwrap().success());
@@ -139,7 +142,7 @@ pub fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, grou
     EngineConfig { namespace: namespace.clone(), groups, ..config }
 }
 
-/// What a process does that was started in a role. Returns at once in the process of the tests.
+/// Runs in the role that the environment names; does nothing if there is none.
 pub fn play_role() {
     let Ok(role) = std::env::var(ROLE) else { return };
     let words: Vec<&str> = role.split(' ').collect();
@@ -162,11 +165,11 @@ pub fn play_role() {
                 trainer.send_with(group, |actions| actions.fill(0)).unwrap();
             }
         }
-        _ => panic!("no such role: {role}"),
+        _ => panic!("unknown role {role}"),
     }
 }
 
-/// A flag that is set when the parent closes our standard input.
+/// A flag that is set when the parent process closes standard input.
 fn stop_at_end_of_input() -> Arc<AtomicBool> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);

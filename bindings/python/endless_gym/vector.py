@@ -105,8 +105,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` is seeded with `seed + i`, or with item `i` of a list. `None` uses the seeds that the
-                environments were made with, and after that continues with their generators.
+            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` uses
+                the seeds that the environments were made with, and after that continues with their generators.
             options: Reset parameters of these and all later episodes, which override those that the environments were made
                 with; and `reset_mask`, bool (n,), the environments that start an episode. Not supported if the environments
                 were made with a sequence of options.
@@ -116,14 +116,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             The observations and the info.
         """
         given = dict(options or {})
-        request = self._request(seed, given.pop("reset_mask", None))
+        mask = given.pop("reset_mask", None)
         text = None
         if given or self._changed_options:
             text = options_text({**self._options, **given})
             self._changed_options = bool(given)
         if group is not None or self.num_groups == 1:
-            return self._start_of(self._backend.reset(group or 0, request, text))
-        first, *others = (self._backend.reset(number, request, text) for number in range(self.num_groups))
+            return self._start_of(self._backend.reset(group or 0, self._request(seed, mask, group or 0), text))
+        requests = [self._request(seed, mask, number) for number in range(self.num_groups)]
+        first, *others = (self._backend.reset(number, request, text) for number, request in enumerate(requests))
         del others
         return self._start_of(first)
 
@@ -157,7 +158,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return step
 
     def send_reset(self, group: int = 0, *, seed: int | None = None) -> None:
-        """Reset a group without waiting for the result; `recv` returns its first observations with rewards of 0."""
+        """Reset a group without waiting for the result; `recv` returns its first observations with rewards of 0.
+
+        Environment `i` of the group is seeded with `seed + group * num_envs + i`.
+        """
         self._backend.send_reset(group, seed)
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
@@ -207,7 +211,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             raise ValueError(f"no environment {given}: the index must be 0 to {self.num_envs - 1}")
         return given
 
-    def _request(self, seed: int | Sequence[int | None] | None, mask: Any) -> _native.Reset | None:
+    def _request(self, seed: int | Sequence[int | None] | None, mask: Any, group: int) -> _native.Reset | None:
         if mask is None and (seed is None or isinstance(seed, (int, np.integer))):
             return None if seed is None else int(seed)
         if mask is None:
@@ -218,14 +222,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 raise ValueError(
                     f"`reset_mask` must be bool of shape ({self.num_envs},), got {chosen.dtype} of shape {chosen.shape}"
                 )
-        seeds = seed if isinstance(seed, Sequence) else self._seeds(seed)
+        seeds = seed if isinstance(seed, Sequence) else self._seeds(seed, group)
         if len(seeds) != self.num_envs:
             raise ValueError(f"{len(seeds)} seeds given for {self.num_envs} environments")
         reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
         return reset, [given or 0 for given in seeds]
 
-    def _seeds(self, seed: int | None) -> list[int | None]:
-        return [None if seed is None else seed + env for env in range(self.num_envs)]
+    def _seeds(self, seed: int | None, group: int) -> list[int | None]:
+        first = group * self.num_envs
+        return [None if seed is None else seed + first + env for env in range(self.num_envs)]
 
     def _observation(self, arrays: _native.Arrays, places: list[tuple[str, int]]) -> Any:
         if len(places) == 1:
@@ -360,7 +365,7 @@ class _InProcess(_Backend):
     def _received(self, group: int) -> _native.Pool:
         """The pool of a group without pending `send`."""
         if group in self._sent:
-            raise RuntimeError(f"group {group} still owes the answer to the last message; `recv` it first")
+            raise RuntimeError(f"group {group} has a pending answer; `recv` it first")
         return self._group(group)
 
     def _group(self, group: int) -> _native.Pool:

@@ -3,7 +3,9 @@
 use std::time::{Duration, Instant};
 
 use endless_gym::batch::Block;
-use endless_gym::service::{ConnectConfig, Namespace, Received, ServiceError, Trainer, engines};
+use endless_gym::service::{
+    BatchLease, ConnectConfig, Namespace, ServiceError, Trainer, running_engines as list_engines, timeout_from_seconds,
+};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
@@ -17,7 +19,7 @@ const SIGNALS_EVERY: Duration = Duration::from_millis(50);
 
 /// A batch in shared memory. The engine gets it back once the arrays that look into it are all gone.
 #[pyclass(frozen)]
-struct Lent(Received);
+struct Lent(BatchLease);
 
 impl Owner for Lent {
     fn blocks(&self) -> &[Block] {
@@ -38,9 +40,9 @@ impl Connection {
     /// Connects to the engine of that name, waiting up to `timeout` seconds for it to appear.
     #[new]
     fn new(py: Python<'_>, service: &str, timeout: f64) -> PyResult<Self> {
-        let end = Instant::now() + seconds(timeout)?;
+        let (timeout, start) = (seconds(timeout)?, Instant::now());
         loop {
-            let left = end.saturating_duration_since(Instant::now());
+            let left = timeout.saturating_sub(start.elapsed());
             let config = ConnectConfig { timeout: left.min(SIGNALS_EVERY), ..ConnectConfig::new(service) };
             match py.detach(|| Trainer::connect(&config)) {
                 Ok(trainer) => return Ok(Connection { trainer, actions: Vec::new(), process: std::process::id() }),
@@ -149,12 +151,11 @@ impl Connection {
 }
 
 fn seconds(given: f64) -> PyResult<Duration> {
-    Duration::try_from_secs_f64(given)
-        .map_err(|_| pyo3::exceptions::PyValueError::new_err(format!("{given} is no number of seconds to wait")))
+    timeout_from_seconds(given).map_err(errors::service)
 }
 
 /// Names of the engines that this user's processes can connect to.
 #[pyfunction]
 pub fn running_engines(py: Python<'_>) -> PyResult<Vec<String>> {
-    py.detach(|| engines(&Namespace::default())).map_err(errors::service)
+    py.detach(|| list_engines(&Namespace::default())).map_err(errors::service)
 }

@@ -50,6 +50,7 @@ pub fn service(error: ServiceError) -> PyErr {
         E::Rejected { reason: Rejection::NotReset, .. } => PyRuntimeError::new_err(text),
         E::TimedOut { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
+        | E::InvalidTimeout { .. }
         | E::NoSuchGroup { .. }
         | E::ActionCount { .. }
         | E::ActionRange { .. }

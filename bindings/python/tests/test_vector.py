@@ -74,9 +74,9 @@ def test_snapshots_go_on_identically_here_and_elsewhere(where, elsewhere) -> Non
             with pytest.raises(ValueError, match=f"no environment {env}"):
                 others.restore({env: snapshots[0]})
         others.send(np.zeros((3, 2), np.int64), 1)
-        with pytest.raises(RuntimeError, match="still owes the answer"):
+        with pytest.raises(RuntimeError, match="pending answer"):
             others.snapshot(0, group=1)
-        with pytest.raises(RuntimeError, match="still owes the answer"):
+        with pytest.raises(RuntimeError, match="pending answer"):
             others.restore({0: snapshots[0]}, group=1)
         others.recv(1)
     with made(where, ID, 1) as envs, pytest.raises(RuntimeError, match="reset"):
@@ -153,11 +153,34 @@ def test_groups_are_stepped_independently(where) -> None:
         with pytest.raises(RuntimeError, match="nothing was sent to group 1"):
             envs.recv(1)
         envs.send(np.zeros((2, 2), dtype=np.int64), 1)
-        with pytest.raises(RuntimeError, match="owes"):
+        with pytest.raises(RuntimeError, match="pending answer"):
             envs.send(np.zeros((2, 2), dtype=np.int64), 1)
         assert envs.recv()[4]["group"] == 1
         with pytest.raises(ValueError, match="group 7"):
             envs.send(np.zeros((2, 2), dtype=np.int64), 7)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_seeds_count_the_environments_of_all_groups(where) -> None:
+    with made(where, ID, 2, groups=2) as envs, endless_gym.make_vec(ID, 4) as all_envs:
+        whole, _ = all_envs.reset(seed=7)
+        assert (whole[:2] != whole[2:]).any()
+        for group in range(2):
+            envs.send_reset(group, seed=7)
+            np.testing.assert_array_equal(envs.recv(group)[0], whole[2 * group : 2 * group + 2])
+        np.testing.assert_array_equal(envs.reset(seed=7)[0], whole[:2])
+        np.testing.assert_array_equal(envs.reset(seed=7, group=1)[0], whole[2:])
+        everything = {"reset_mask": np.ones(2, dtype=bool)}
+        np.testing.assert_array_equal(envs.reset(seed=7, group=1, options=everything)[0], whole[2:])
+
+
+def test_timeouts_are_checked() -> None:
+    for timeout in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="timeout must be finite and not negative, got"):
+            endless_gym.connect("nobody", timeout=timeout)
+    with endless_gym.serve(ID, 1) as served, pytest.raises(ConnectionError, match="already has a trainer"):
+        # So long a timeout overflows the clock; the engine is there, so that nothing waits.
+        endless_gym.connect(served._backend._engine.service, timeout=1e19)
 
 
 @pytest.mark.parametrize("where", WHERE)

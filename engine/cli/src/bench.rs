@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use endless_gym_core::batch::{Batch, zeroed};
 use endless_gym_core::envs::{self, EnvSpec};
 use endless_gym_core::pool::{Pool, ResetRequest, Threads};
+use endless_gym_service::timeout_from_seconds;
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;
@@ -80,6 +81,8 @@ struct Measurement {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode, Failure> {
+    timeout_from_seconds(args.seconds)
+        .map_err(|_| format!("--seconds must be finite and not negative, got {}", args.seconds))?;
     let stop = stop::on_signal()?;
     let specs: Vec<&EnvSpec> = if args.id == "all" { envs::specs().collect() } else { vec![envs::spec(&args.id)?] };
     let cores = Threads::new(0)?.count();

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use clap::Parser;
 use endless_gym_core::envs::{self, EnvSpec, Family};
 use endless_gym_core::pool::ResetRequest;
+use endless_gym_service::timeout_from_seconds;
 use serde_json::{Map, Value as Json, json};
 
 use super::engine_process::EngineProcess;
@@ -63,7 +64,8 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 pub fn run(args: &Args) -> Result<ExitCode, Failure> {
     let spec = envs::spec(&args.id)?;
-    let seconds = Duration::try_from_secs_f64(args.seconds).map_err(|error| format!("--seconds: {error}"))?;
+    let seconds = timeout_from_seconds(args.seconds)
+        .map_err(|_| format!("--seconds must be finite and not negative, got {}", args.seconds))?;
     let stop = stop::on_signal()?;
     let num_envs = args.num_envs.unwrap_or(match (spec.family, args.policy) {
         (Family::SearingSpotlights(_), Policy::Expert) => 16,

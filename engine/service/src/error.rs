@@ -1,122 +1,311 @@
-//! What can go wrong between an engine, its trainer and its observers.
+//! Errors of engines, trainers and observers.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-use thiserror::Error;
-
 use endless_gym_core::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use endless_gym_core::pool::PoolError;
+use thiserror::Error;
 
-/// Version of this package, as a message names it.
-pub(super) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
+/// Version of this package, for messages about versions that differ.
+pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// An engine, trainer or observer that cannot be made, or a call that cannot be carried out.
+/// Why an engine, trainer or observer could not be created, or a call on one failed.
 #[derive(Debug, Error)]
 pub enum ServiceError {
-    #[error("`{given}` cannot name an engine; give 1 to {longest} letters, digits, `.`, `_` or `-`")]
-    InvalidName { given: String, longest: usize },
+    /// An engine name is malformed.
+    #[error("engine name must be 1 to {max_length} letters, digits, `.`, `_` or `-`, got `{given}`")]
+    InvalidName {
+        /// The name that was given.
+        given: String,
+        /// Maximum length in bytes.
+        max_length: usize,
+    },
+    /// The root directory of the namespace cannot be used.
+    #[error("root directory {} cannot be used: {reason}; set ENDLESS_GYM_ROOT to another directory", path.display())]
+    Root {
+        /// The root directory.
+        path: PathBuf,
+        /// Why it cannot be used.
+        reason: String,
+    },
+    /// Another process held the namespace's lock for too long.
     #[error(
-        "cannot use {} as the directory where engines and trainers meet: {reason}; another one can be given in ENDLESS_GYM_ROOT",
+        "root directory {} has been locked for {waited:?} by another process that starts, ends or looks for an engine; try again, \
+         or end a process that is stopped",
         path.display()
     )]
-    Root { path: PathBuf, reason: String },
+    NamespaceLocked {
+        /// The namespace's root directory.
+        path: PathBuf,
+        /// How long this process waited for the lock.
+        waited: Duration,
+    },
+    /// No engine of that name is running.
     #[error(
-        "no engine `{service}` under {}; there {known}. Start one, or set ENDLESS_GYM_ROOT to the same directory for both",
-        root.display()
+        "no engine `{service}` is running in {}; running engines: {}; start it, or set ENDLESS_GYM_ROOT to the same directory for both \
+         processes",
+        root.display(), names(running)
     )]
-    UnknownEngine { service: String, root: PathBuf, known: String },
-    #[error("an engine `{service}` is already running{}; stop it or give this one another name", of_process(*pid))]
-    EngineExists { service: String, pid: Option<u32> },
+    UnknownEngine {
+        /// The name that was looked for.
+        service: String,
+        /// The namespace's root directory.
+        root: PathBuf,
+        /// Names of the engines that are running in the namespace, sorted.
+        running: Vec<String>,
+    },
+    /// An engine of that name is already running.
+    #[error("engine `{service}` is already running{}; stop it, or choose another name", in_process(*pid))]
+    EngineExists {
+        /// The engine's name.
+        service: String,
+        /// Its process id, if known.
+        pid: Option<u32>,
+    },
+    /// The engine already has a trainer.
     #[error(
-        "engine `{service}` already has a trainer{}, and takes one only; stop that trainer, or watch with an observer",
-        of_process(*pid)
+        "engine `{service}` already has a trainer{} and accepts only one; stop that trainer, or connect as an observer",
+        in_process(*pid)
     )]
-    TrainerExists { service: String, pid: Option<u32> },
+    TrainerExists {
+        /// The engine's name.
+        service: String,
+        /// Process id of the trainer, if known.
+        pid: Option<u32>,
+    },
+    /// The engine already has as many observers as it accepts.
     #[error(
-        "engine `{service}` has no room for another observer; stop one, or start the engine with more than {limit}"
+        "engine `{service}` already has {limit} observers; stop one, or start the engine with a larger `observers`"
     )]
-    TooManyObservers { service: String, limit: usize },
+    TooManyObservers {
+        /// The engine's name.
+        service: String,
+        /// Number of observers that the engine accepts.
+        limit: usize,
+    },
+    /// The engine uses another version of the memory layout or of iceoryx2.
     #[error(
-        "engine `{service}` speaks layout version {layout} (endless-gym {package}), this process layout version \
-         {LAYOUT_VERSION} (endless-gym {PACKAGE_VERSION}); install the same version for both"
+        "engine `{service}` must have layout version {LAYOUT_VERSION} (endless-gym {PACKAGE_VERSION}), got {layout} (endless-gym \
+         {package}); install the same version for both processes"
     )]
-    Version { service: String, layout: String, package: String },
-    #[error("engine `{service}` sends messages of another type; install the same version of endless-gym for both")]
-    IncompatibleTypes { service: String },
-    #[error("the specification of engine `{service}` cannot be read: {reason}")]
-    Specification { service: String, reason: String },
-    #[error("{given} groups asked for; an engine serves 1 to {limit}")]
-    Groups { given: usize, limit: usize },
-    #[error("{given} is not a number of {what}; give {lowest} to {highest}")]
-    Limit { what: &'static str, given: usize, lowest: usize, highest: usize },
+    Version {
+        /// The engine's name.
+        service: String,
+        /// Its layout version, or `unknown`.
+        layout: String,
+        /// Its package version, or what is known of it.
+        package: String,
+    },
+    /// The engine's messages have another type.
+    #[error("engine `{service}` uses other message types; install the same version of endless-gym for both processes")]
+    IncompatibleTypes {
+        /// The engine's name.
+        service: String,
+    },
+    /// The engine's specification is malformed.
     #[error(
-        "the batches need {} MB of shared memory and {path} has {} MB left; run fewer environments or groups, or make it \
-         larger (`docker run --shm-size`, `mount -o remount,size=... /dev/shm`)",
+        "specification of engine `{service}` is invalid: {reason}; install the same version of endless-gym for both processes"
+    )]
+    Specification {
+        /// The engine's name.
+        service: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A number of an [`EngineConfig`](crate::EngineConfig) is out of range.
+    #[error("{name} must be {lowest} to {highest}, got {given}")]
+    OutOfRange {
+        /// The field's name.
+        name: &'static str,
+        /// The number that was given.
+        given: usize,
+        /// Smallest valid number.
+        lowest: usize,
+        /// Largest valid number.
+        highest: usize,
+    },
+    /// A timeout is negative or not finite.
+    #[error("timeout must be finite and not negative, got {given}")]
+    InvalidTimeout {
+        /// The timeout that was given, in seconds.
+        given: f64,
+    },
+    /// There is not enough free shared memory for the batches.
+    #[error(
+        "batches need {} MB of shared memory, and {path} has {} MB free; use fewer environments or groups, or enlarge it \
+         (`docker run --shm-size`, `mount -o remount,size=... /dev/shm`)",
         megabytes(*needed), available / 1_000_000
     )]
-    SharedMemoryTooSmall { needed: u64, available: u64, path: &'static str },
-    #[error("there is no group {given}; engine `{service}` has groups 0 to {}", groups.saturating_sub(1))]
-    NoSuchGroup { service: String, given: usize, groups: usize },
-    #[error("{given} action numbers for {num_envs} environments of {branches} branches; give {}", num_envs * branches)]
-    ActionCount { given: usize, num_envs: usize, branches: usize },
-    #[error("action {given:?} of environment {env} is not in {space}")]
-    ActionRange { env: usize, given: Vec<i32>, space: String },
-    #[error("a reset with {given} flags or seeds asked of {num_envs} environments; give one of both for each")]
-    ResetCount { given: usize, num_envs: usize },
+    SharedMemoryTooSmall {
+        /// Bytes that are needed.
+        needed: u64,
+        /// Bytes that are free.
+        available: u64,
+        /// The file system.
+        path: &'static str,
+    },
+    /// The engine has no group of that number.
+    #[error("group must be 0 to {} in engine `{service}`, got group {given}", groups.saturating_sub(1))]
+    NoSuchGroup {
+        /// The engine's name.
+        service: String,
+        /// The group that was given.
+        given: usize,
+        /// Number of groups of the engine.
+        groups: usize,
+    },
+    /// There are too few or too many actions.
     #[error(
-        "reset parameters of {given} bytes as JSON; a message takes {OPTIONS_BYTES}, so give lists with fewer items"
+        "actions must be {} numbers for {num_envs} environments with {branches} branches each, got {given}",
+        num_envs * branches
     )]
-    OptionsTooLong { given: usize },
-    #[error("a snapshot of {given} bytes; a message to an engine takes {SNAPSHOT_BYTES}, so restore it in a pool")]
-    SnapshotTooLong { given: usize },
-    #[error("group {group} still owes the answer to the last message; receive it before the next reset or step")]
-    AnswerPending { group: usize },
+    ActionCount {
+        /// Number of integers that were given.
+        given: usize,
+        /// Environments in the group.
+        num_envs: usize,
+        /// Branches of the action space.
+        branches: usize,
+    },
+    /// An action is not in the action space. No environment has been stepped.
+    #[error("action of environment {env} must be in {space}, got {given:?}")]
+    ActionRange {
+        /// The first environment whose action is invalid.
+        env: usize,
+        /// Its action.
+        given: Vec<i32>,
+        /// The action space.
+        space: String,
+    },
+    /// A reset has too few or too many flags or seeds.
+    #[error("reset must have {num_envs} flags and {num_envs} seeds, one for each environment, got {given}")]
+    ResetCount {
+        /// Number of flags or seeds that were given.
+        given: usize,
+        /// Environments in the group.
+        num_envs: usize,
+    },
+    /// Reset parameters do not fit into a message.
+    #[error("reset parameters must have at most {OPTIONS_BYTES} bytes as JSON, got {given}; use shorter lists")]
+    OptionsTooLong {
+        /// Bytes of the JSON text.
+        given: usize,
+    },
+    /// A snapshot does not fit into a message.
+    #[error(
+        "snapshot must have at most {SNAPSHOT_BYTES} bytes, got {given}; restore it with `Pool::restore` in this process"
+    )]
+    SnapshotTooLong {
+        /// Bytes of the snapshot.
+        given: usize,
+    },
+    /// The group has not answered the last request yet.
+    #[error("group {group} has a pending answer; receive it before the next request")]
+    AnswerPending {
+        /// The group.
+        group: usize,
+    },
+    /// The group has no request to answer.
     #[error("nothing was sent to group {group}; reset or step it before receiving")]
-    NothingSent { group: usize },
+    NothingSent {
+        /// The group.
+        group: usize,
+    },
+    /// The caller holds as many batches of the group as the engine lends.
     #[error(
-        "{limit} batches of group {group} are held and no more can be lent; drop one, or copy what you want to keep"
+        "{limit} batches of group {group} are held, the maximum of this engine; drop one, or copy the data to keep"
     )]
-    TooManyBatchesHeld { group: usize, limit: usize },
-    #[error("no answer of engine `{service}` within {waited:?}; it is alive, so wait longer for large batches")]
-    TimedOut { service: String, waited: Duration },
-    #[error("engine `{service}`{} has ended; start it again and reconnect", of_process(Some(*pid)))]
-    EngineLost { service: String, pid: u32 },
-    #[error("engine `{service}` was restarted, and its episodes are gone; reconnect, then reset")]
-    EngineRestarted { service: String },
-    #[error("engine `{service}` was restarted with another {what}; connect anew")]
-    SpecificationChanged { service: String, what: &'static str },
-    #[error("engine `{service}` rejected the message for group {group}: {message}")]
-    Rejected { service: String, group: usize, reason: Rejection, message: String },
+    TooManyBatchesHeld {
+        /// The group.
+        group: usize,
+        /// Number of batches that may be held at a time.
+        limit: usize,
+    },
+    /// No answer has arrived in time from an engine that is running.
+    #[error("no answer from engine `{service}` within {waited:?}; the engine is running, use a longer timeout")]
+    TimedOut {
+        /// The engine's name.
+        service: String,
+        /// How long the caller waited.
+        waited: Duration,
+    },
+    /// The engine's process has ended.
+    #[error("engine `{service}`{} has ended; start it again and reconnect", in_process(Some(*pid)))]
+    EngineLost {
+        /// The engine's name.
+        service: String,
+        /// Its process id.
+        pid: u32,
+    },
+    /// The engine was replaced by another one of the same name.
+    #[error("engine `{service}` was restarted, and its episodes are lost; reconnect and reset")]
+    EngineRestarted {
+        /// The engine's name.
+        service: String,
+    },
+    /// The engine was replaced by one that serves something else.
+    #[error("engine `{service}` was restarted with another {what}; create a new connection")]
+    SpecificationChanged {
+        /// The engine's name.
+        service: String,
+        /// The first property that differs.
+        what: &'static str,
+    },
+    /// The engine rejected a request. No environment has changed.
+    #[error("engine `{service}` rejected the request for group {group}: {message}")]
+    Rejected {
+        /// The engine's name.
+        service: String,
+        /// The group.
+        group: usize,
+        /// The kind of fault.
+        reason: Rejection,
+        /// The engine's explanation.
+        message: String,
+    },
+    /// The environments could not be created.
     #[error(transparent)]
     Pool(#[from] PoolError),
+    /// An unexpected error of iceoryx2.
     #[error("{action}: {reason}")]
-    Middleware { action: &'static str, reason: String },
+    Middleware {
+        /// What failed.
+        action: &'static str,
+        /// iceoryx2's error.
+        reason: String,
+    },
 }
 
 impl ServiceError {
-    /// Wraps an error of the middleware that has no case of its own.
-    pub(super) fn middleware(action: &'static str) -> impl Fn(String) -> Self {
+    /// Wraps an iceoryx2 error that has no variant of its own.
+    pub(crate) fn middleware(action: &'static str) -> impl Fn(String) -> Self {
         move |reason| ServiceError::Middleware { action, reason }
+    }
+
+    /// The error for an engine that was built with another version of iceoryx2.
+    pub(crate) fn other_iceoryx2(service: &str) -> Self {
+        let package = "with another version of iceoryx2".to_owned();
+        ServiceError::Version { service: service.to_owned(), layout: "unknown".to_owned(), package }
     }
 }
 
-/// Why an engine rejected a message. No environment has moved.
+/// Why an engine rejected a request. No environment has changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rejection {
-    /// The message is of another layout version.
+    /// The request has another layout version.
     Version,
-    /// The engine does not know this kind of message.
+    /// The engine does not know the kind of the request.
     Kind,
-    /// The payload is shorter than the layout says.
+    /// The payload is shorter than the layout.
     Payload,
-    /// This trainer has not reset all environments of the group yet.
+    /// This trainer has not yet reset all environments of the group.
     NotReset,
-    /// An action is out of range, or another error of the pool.
+    /// An action is out of range, or the pool reports another error.
     Pool,
-    /// The reset parameters are no JSON object.
+    /// The reset parameters are not a JSON object.
     Options,
-    /// A snapshot cannot be taken or gone on from.
+    /// A snapshot cannot be taken or restored.
     Snapshot,
 }
 
@@ -131,22 +320,26 @@ impl Rejection {
         Rejection::Snapshot,
     ];
 
-    /// The status in a header: 0 is for batches.
-    pub(super) fn status(self) -> u32 {
+    /// The status in a response header. 0 is the status of a batch.
+    pub(crate) fn status(self) -> u32 {
         self as u32 + 1
     }
 
-    /// The rejection that a header's status stands for.
-    pub(super) fn from_status(status: u32) -> Option<Self> {
+    /// The rejection of a status in a response header.
+    pub(crate) fn from_status(status: u32) -> Option<Self> {
         Rejection::ALL.into_iter().find(|rejection| rejection.status() == status)
     }
 }
 
-fn of_process(pid: Option<u32>) -> String {
+fn in_process(pid: Option<u32>) -> String {
     pid.map_or_else(String::new, |pid| format!(" (process {pid})"))
 }
 
-/// Rounded up, so that a need never reads as being met.
+fn names(engines: &[String]) -> String {
+    if engines.is_empty() { "none".to_owned() } else { engines.join(", ") }
+}
+
+/// Rounded up, so that the need never appears smaller than the free space.
 fn megabytes(bytes: u64) -> u64 {
     bytes.div_ceil(1_000_000)
 }
@@ -156,7 +349,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_rejection_survives_the_header() {
+    fn every_rejection_has_its_own_status() {
         for rejection in Rejection::ALL {
             assert_eq!(Rejection::from_status(rejection.status()), Some(rejection));
         }
@@ -165,10 +358,10 @@ mod tests {
     }
 
     #[test]
-    fn messages_say_both_versions() {
+    fn messages_name_both_versions() {
         let text =
             ServiceError::Version { service: "a".into(), layout: "7".into(), package: "9.9.9".into() }.to_string();
-        for part in ["layout version 7", "9.9.9", &format!("layout version {LAYOUT_VERSION}"), PACKAGE_VERSION] {
+        for part in ["got 7", "9.9.9", &format!("layout version {LAYOUT_VERSION}"), PACKAGE_VERSION] {
             assert!(text.contains(part), "{text}");
         }
     }

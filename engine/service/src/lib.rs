@@ -1,63 +1,77 @@
-//! The service: one engine, its trainer and observers, in shared memory.
+//! Memory Gym environments in shared memory: an engine, its trainer and its observers.
 //!
-//! An **engine** serves groups of environments under a name; a **trainer** acts in them; **observers** watch. They are
-//! processes of one user on one host, and meet in a [`Namespace`]. The middleware is iceoryx2: a message is written once,
-//! where its reader reads it.
+//! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** read along. They are
+//! processes of one user on one host and find each other in a [`Namespace`]. The transport is iceoryx2: a message is written
+//! once, into the memory where its receiver reads it.
 //!
 //! # Services
 //!
-//! | service | kind | from → to | content |
+//! | iceoryx2 service | messaging pattern | direction | content |
 //! | --- | --- | --- | --- |
-//! | `endless-gym/NAME` | blackboard | engine → all | the [`Specification`], for whoever comes whenever |
-//! | `endless-gym/NAME/EPOCH/act/GROUP` | publish/subscribe | trainer → engine | actions or a reset |
-//! | `endless-gym/NAME/EPOCH/obs/GROUP` | publish/subscribe | engine → trainer, observers | a batch or a rejection |
-//! | `endless-gym/NAME/EPOCH/to_engine` | event | trainer → engine | number of the group that has a message |
-//! | `endless-gym/NAME/EPOCH/to_trainer` | event | engine → trainer | number of the group that has a batch |
+//! | `endless-gym/NAME` | blackboard | engine → all | the [`ServiceSpecification`] as JSON |
+//! | `endless-gym/NAME/INCARNATION/act/GROUP` | publish/subscribe | trainer → engine | requests |
+//! | `endless-gym/NAME/INCARNATION/obs/GROUP` | publish/subscribe | engine → trainer, observers | responses |
+//! | `endless-gym/NAME/INCARNATION/to_engine` | event | trainer → engine | number of a group with a request |
+//! | `endless-gym/NAME/INCARNATION/to_trainer` | event | engine → trainer | number of a group with a response |
 //!
-//! The epoch is drawn when an engine starts, so that one that starts after a crash shares nothing with what the dead one left.
+//! The incarnation is a random number that an engine draws when it starts, so that an engine shares no service with a dead
+//! predecessor of the same name.
 //!
 //! # Messages
 //!
-//! The payload of `act` and `obs` is `[Block]`, laid out as the specification says. All else is in the user header:
+//! The payload of `act` and `obs` is `[Block]`, in the layouts of the specification. The user headers hold the remaining fields:
 //!
 //! | header | fields |
 //! | --- | --- |
-//! | action | layout version, kind (step, reset all, reset from a seed, reset each, snapshot, restore), epoch, trainer, request, seed, environment, bytes of options or of a snapshot |
-//! | observation | layout version, group, epoch, step, trainer and request that it answers, status, text of a rejection, bytes of a snapshot |
+//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore), incarnation, trainer, request number, seed, environment, length of the options or snapshot |
+//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, text of a rejection, length of a snapshot |
 //!
 //! # Protocol
 //!
-//! | situation | what happens |
+//! | situation | behaviour |
 //! | --- | --- |
-//! | a message arrives | it is answered by exactly one batch, snapshot or rejection of the same group; a rejection moves no environment |
-//! | a trainer asks for a snapshot, or to restore one | the answer holds its bytes, or none, in place of a batch; observers pass it over, and may have missed the batch before it |
-//! | a group owes a batch | its trainer may not send to it again; other groups are not concerned |
-//! | a trainer is new | it resets all environments of a group before it steps them |
-//! | a second trainer | is refused: `act` takes one publisher |
-//! | a trainer dies | the engine removes its leftovers when it has nothing to do; the next trainer does so too when it connects |
-//! | an engine dies or ends | the trainer notices when it hears nothing for a while, and may reconnect to a new one |
-//! | an observer is slow | it misses batches; its one place in the buffer is overwritten |
-//! | a message of another epoch | is dropped |
+//! | the engine receives a request | it sends exactly one response of the same group: a batch, a snapshot or a rejection; a rejected request changes no environment |
+//! | the trainer requests a snapshot or a restore | the response holds a snapshot or nothing in place of a batch; observers skip it, and may miss the batch before it |
+//! | a group has a pending answer | the trainer must receive it before its next request to this group; other groups are independent |
+//! | a new trainer connects | it must reset all environments of a group before it steps them |
+//! | a second trainer connects | it is refused, because `act` accepts one publisher |
+//! | a trainer dies | the engine removes its resources when idle, or the next trainer does when it connects |
+//! | an engine dies or ends | the trainer's liveness check reports it; the trainer may reconnect to a new engine |
+//! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
+//! | a request names another incarnation | the engine ignores it |
+//! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |
 
-mod config;
+#![warn(missing_docs)]
+
+mod blackboard;
+mod cleanup;
+mod connect;
+mod connection;
 mod engine;
+mod engine_config;
 mod error;
-mod here;
+mod fork_guard;
+mod group;
+mod lease;
+mod lock;
+mod memory;
 mod message;
+mod namespace;
 mod node;
 mod observer;
+mod pending;
 mod ports;
-mod preflight;
-mod received;
 mod specification;
-mod sweep;
 mod trainer;
 mod wait;
 
-pub use config::{Namespace, ROOT_VARIABLE};
-pub use engine::{Engine, EngineConfig, MAX_GROUPS, Summary};
+pub use blackboard::running_engines;
+pub use connect::{ConnectConfig, timeout_from_seconds};
+pub use engine::{Engine, EngineSummary};
+pub use engine_config::{EngineConfig, MAX_GROUPS};
 pub use error::{Rejection, ServiceError};
+pub use lease::BatchLease;
+pub use namespace::{Namespace, ROOT_VARIABLE};
 pub use observer::Observer;
-pub use received::Received;
-pub use specification::{Actions, Specification, engines};
-pub use trainer::{ConnectConfig, Trainer};
+pub use specification::{Actions, ServiceSpecification};
+pub use trainer::Trainer;

@@ -1,117 +1,147 @@
-//! The headers of the messages between trainer and engine. Their payload is `[Block]`: actions, a batch or a snapshot.
+//! The headers of requests and responses. The payload of both is `[Block]`: actions, a batch or a snapshot.
+//!
+//! A header in shared memory may be changed by its sender at any time. A receiver must copy it once with [`copied`], check the
+//! copy, and use nothing but the copy.
 
 use bytemuck::{Pod, Zeroable};
+use endless_gym_core::batch::{Block, LAYOUT_VERSION};
 use iceoryx2::prelude::ZeroCopySend;
 
-use super::error::Rejection;
-use endless_gym_core::batch::{Block, LAYOUT_VERSION};
+use crate::error::Rejection;
 
-/// A [`Block`] as the payload of a message.
+/// A [`Block`] as the payload element of a message.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(transparent)]
-pub(super) struct PayloadBlock(Block);
+pub(crate) struct PayloadBlock(Block);
 
-// SAFETY: a block is 64 plain bytes in `repr(C)`, without pointers or handles, alike in every process.
+// SAFETY: a block is 64 plain bytes in `repr(C)` without pointers or handles, so every process reads the same value.
 unsafe impl ZeroCopySend for PayloadBlock {
     unsafe fn type_name() -> &'static str {
         "endless_gym::Block"
     }
 }
 
-/// What a trainer asks for.
+/// Copies a header out of shared memory.
+pub(crate) fn copied<H: Copy>(header: &H) -> H {
+    // Without the barrier, the compiler may replace a use of the copy by another read of shared memory.
+    std::hint::black_box(*header)
+}
+
+/// What a trainer requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
-    /// A step with the payload's `action`.
+pub(crate) enum RequestKind {
+    /// Step all environments with the payload's `action`.
     Step,
-    /// An episode for every environment, seeded by the engine's policy.
+    /// Start an episode in every environment, seeded by the pool's seeding.
     ResetAll,
-    /// An episode for every environment, seeded from the header's `seed` on.
+    /// Start an episode in every environment; environment `i` of the engine is seeded with the header's `seed + i`.
     ResetSeed,
-    /// Episodes as the payload's `reset` and `seed` say.
+    /// Start episodes as given by the payload's `reset` and `seed`.
     ResetEach,
-    /// The state of environment `env`, for its snapshot.
+    /// Return a snapshot of environment `env`.
     Snapshot,
-    /// Environment `env` goes on from the payload's `snapshot`.
+    /// Restore environment `env` from the payload's `snapshot`.
     Restore,
 }
 
-impl Kind {
-    const ALL: [Kind; 6] =
-        [Kind::Step, Kind::ResetAll, Kind::ResetSeed, Kind::ResetEach, Kind::Snapshot, Kind::Restore];
+impl RequestKind {
+    const ALL: [RequestKind; 6] = [
+        RequestKind::Step,
+        RequestKind::ResetAll,
+        RequestKind::ResetSeed,
+        RequestKind::ResetEach,
+        RequestKind::Snapshot,
+        RequestKind::Restore,
+    ];
 
-    /// The number in the header; 0 is none of them.
-    pub(super) fn code(self) -> u32 {
+    /// The code in the header. 0 is not a code.
+    pub(crate) fn code(self) -> u32 {
         self as u32 + 1
     }
 
-    pub(super) fn from_code(code: u32) -> Option<Self> {
-        Kind::ALL.into_iter().find(|kind| kind.code() == code)
+    /// The kind with that code.
+    pub(crate) fn from_code(code: u32) -> Option<Self> {
+        RequestKind::ALL.into_iter().find(|kind| kind.code() == code)
     }
 
-    /// Whether the answer is a batch, and not a snapshot.
-    pub(super) fn yields_batch(self) -> bool {
-        !matches!(self, Kind::Snapshot | Kind::Restore)
+    /// Whether the response holds a batch and not a snapshot.
+    pub(crate) fn returns_batch(self) -> bool {
+        !matches!(self, RequestKind::Snapshot | RequestKind::Restore)
     }
 }
 
 /// Header of a message from the trainer.
 #[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
-#[type_name("endless_gym::ActionHeader")]
+#[type_name("endless_gym::RequestHeader")]
 #[repr(C)]
-pub(super) struct ActionHeader {
+pub(crate) struct RequestHeader {
     pub layout_version: u32,
-    /// A [`Kind`].
+    /// Code of a [`RequestKind`].
     pub kind: u32,
-    /// The engine's epoch that the trainer knows; the engine drops messages of any other.
-    pub epoch: u64,
-    /// Number of the trainer, drawn when it connects.
+    /// Incarnation of the engine that the trainer is connected to. The engine drops requests for another one.
+    pub incarnation: u64,
+    /// Random number of the trainer, drawn when it connects.
     pub trainer: u64,
-    /// Number of the message; the answer repeats it.
+    /// Number of the request; the response repeats it.
     pub request: u64,
-    /// First seed of a [`Kind::ResetSeed`].
+    /// First seed of a [`RequestKind::ResetSeed`].
     pub seed: u64,
-    /// Environment of a [`Kind::Snapshot`] or a [`Kind::Restore`].
+    /// Environment of a [`RequestKind::Snapshot`] or a [`RequestKind::Restore`].
     pub env: u64,
-    /// Bytes of the payload's `options` (JSON text, for a reset with other reset parameters; 0: with the same) or `snapshot`.
+    /// Length in bytes of the payload's `options` (JSON text of a reset; 0: keep the reset parameters) or `snapshot`.
     pub bytes: u64,
 }
 
-/// Bytes of the text in an [`ObservationHeader`].
+/// Capacity in bytes of the text in a [`ResponseHeader`].
 const TEXT_BYTES: usize = 192;
 
-/// The status of an answer that holds a batch.
+/// Status of a response that holds a batch.
 const BATCH: u32 = 0;
 
-/// The status of an answer whose payload starts with a snapshot. All others are rejections.
+/// Status of a response whose payload starts with a snapshot. All other numbers are rejections.
 const SNAPSHOT: u32 = u32::MAX;
 
-/// Header of a batch from the engine, of a snapshot, or of a rejection.
+/// What a response holds.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum ResponseContent {
+    Batch,
+    /// A snapshot of that many bytes; 0 bytes in the response to a [`RequestKind::Restore`].
+    Snapshot {
+        bytes: usize,
+    },
+    Rejection {
+        reason: Rejection,
+        message: String,
+    },
+}
+
+/// Header of a message from the engine.
 #[derive(Clone, Copy, Debug, ZeroCopySend)]
-#[type_name("endless_gym::ObservationHeader")]
+#[type_name("endless_gym::ResponseHeader")]
 #[repr(C)]
-pub(super) struct ObservationHeader {
+pub(crate) struct ResponseHeader {
     pub layout_version: u32,
     pub group: u32,
-    pub epoch: u64,
-    /// Batches that the group has yielded since the engine started, this one included.
+    pub incarnation: u64,
+    /// Batches that the group has returned since the engine started, including this one.
     pub step: u64,
-    /// Trainer and number of the message that this answers.
+    /// The trainer and the number of the request that this message answers.
     pub trainer: u64,
     pub request: u64,
-    /// [`BATCH`], [`SNAPSHOT`] or a [`Rejection`], whose payload means nothing.
+    /// [`BATCH`], [`SNAPSHOT`] or the status of a [`Rejection`], whose payload is undefined.
     status: u32,
     text_length: u32,
     text: [u8; TEXT_BYTES],
-    /// Bytes of a snapshot; none answer a [`Kind::Restore`].
+    /// Length of the snapshot in bytes.
     snapshot: u64,
 }
 
-impl Default for ObservationHeader {
+impl Default for ResponseHeader {
     fn default() -> Self {
-        ObservationHeader {
+        ResponseHeader {
             layout_version: LAYOUT_VERSION,
             group: 0,
-            epoch: 0,
+            incarnation: 0,
             step: 0,
             trainer: 0,
             request: 0,
@@ -123,29 +153,20 @@ impl Default for ObservationHeader {
     }
 }
 
-impl ObservationHeader {
+impl ResponseHeader {
     /// The header of the batch that answers `request`.
-    pub(super) fn answering(request: &ActionHeader, group: usize, epoch: u64, step: u64) -> Self {
+    pub(crate) fn answering(request: &RequestHeader, group: usize, incarnation: u64, step: u64) -> Self {
         let (trainer, request) = (request.trainer, request.request);
-        ObservationHeader { group: group as u32, epoch, step, trainer, request, ..ObservationHeader::default() }
+        ResponseHeader { group: group as u32, incarnation, step, trainer, request, ..ResponseHeader::default() }
     }
 
-    /// Makes a snapshot of that many bytes the answer.
-    pub(super) fn hold_snapshot(&mut self, bytes: usize) {
+    /// Turns the response into a snapshot of that many bytes.
+    pub(crate) fn set_snapshot(&mut self, bytes: usize) {
         (self.status, self.snapshot) = (SNAPSHOT, bytes as u64);
     }
 
-    pub(super) fn is_batch(&self) -> bool {
-        self.status == BATCH
-    }
-
-    /// Bytes of the snapshot, if the answer is one.
-    pub(super) fn snapshot(&self) -> Option<usize> {
-        (self.status == SNAPSHOT).then_some(self.snapshot as usize)
-    }
-
-    /// Turns the answer into a rejection.
-    pub(super) fn reject(&mut self, reason: Rejection, message: &str) {
+    /// Turns the response into a rejection. The message is cut at the capacity of the header.
+    pub(crate) fn set_rejection(&mut self, reason: Rejection, message: &str) {
         let longest = message.len().min(TEXT_BYTES);
         let end = (0..=longest).rev().find(|end| message.is_char_boundary(*end)).unwrap_or(0);
         self.status = reason.status();
@@ -153,12 +174,18 @@ impl ObservationHeader {
         self.text[..end].copy_from_slice(&message.as_bytes()[..end]);
     }
 
-    /// Why the engine rejected the message, if it did.
-    pub(super) fn rejection(&self) -> Option<(Rejection, String)> {
-        let text = self.text.get(..self.text_length as usize).unwrap_or_default();
-        let message = String::from_utf8_lossy(text).into_owned();
-        let rejected = self.status != BATCH && self.status != SNAPSHOT;
-        rejected.then(|| (Rejection::from_status(self.status).unwrap_or(Rejection::Kind), message))
+    /// What the response holds. Does not allocate for a batch.
+    pub(crate) fn content(&self) -> ResponseContent {
+        match self.status {
+            BATCH => ResponseContent::Batch,
+            SNAPSHOT => ResponseContent::Snapshot { bytes: usize::try_from(self.snapshot).unwrap_or(usize::MAX) },
+            status => {
+                let text = self.text.get(..self.text_length as usize).unwrap_or_default();
+                let message = String::from_utf8_lossy(text).into_owned();
+                let reason = Rejection::from_status(status).unwrap_or(Rejection::Kind);
+                ResponseContent::Rejection { reason, message }
+            }
+        }
     }
 }
 
@@ -167,20 +194,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn kinds_survive_the_header() {
-        for kind in Kind::ALL {
-            assert_eq!(Kind::from_code(kind.code()), Some(kind));
+    fn every_kind_has_its_own_code() {
+        for kind in RequestKind::ALL {
+            assert_eq!(RequestKind::from_code(kind.code()), Some(kind));
         }
-        assert_eq!(Kind::from_code(0), None);
+        assert_eq!(RequestKind::from_code(0), None);
     }
 
     #[test]
-    fn a_rejection_keeps_what_fits_of_its_text() {
-        let mut header = ObservationHeader::default();
-        assert_eq!(header.rejection(), None);
-        header.reject(Rejection::Pool, &"ä".repeat(200));
-        assert_eq!(header.rejection(), Some((Rejection::Pool, "ä".repeat(TEXT_BYTES / 2))));
+    fn the_message_of_a_rejection_is_cut_between_characters() {
+        let rejection = |message: &str| ResponseContent::Rejection { reason: Rejection::Pool, message: message.into() };
+        let mut header = ResponseHeader::default();
+        assert_eq!(header.content(), ResponseContent::Batch);
+        header.set_rejection(Rejection::Pool, &"ä".repeat(200));
+        assert_eq!(header.content(), rejection(&"ä".repeat(TEXT_BYTES / 2)));
         header.text_length = u32::MAX;
-        assert_eq!(header.rejection(), Some((Rejection::Pool, String::new())));
+        assert_eq!(header.content(), rejection(""));
     }
 }

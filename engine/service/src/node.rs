@@ -1,48 +1,53 @@
-//! This process among those of its namespace, and whether others live.
+//! The iceoryx2 node of this process in a namespace, and the state of other processes' nodes.
 
 use std::ops::Deref;
+use std::path::{Path, PathBuf};
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{
-    CallbackProgression, LogLevel, Node, NodeBuilder, NodeState, SignalHandlingMode, ipc_threadsafe,
-    set_log_level_from_env_or,
+    CallbackProgression, LogLevel, Node, NodeBuilder, NodeState, SignalHandlingMode, set_log_level_from_env_or,
 };
 
-use super::config::Namespace;
-use super::error::ServiceError;
-use super::here::Here;
-use super::sweep;
+use crate::cleanup;
+use crate::error::ServiceError;
+use crate::fork_guard::ForkGuard;
+use crate::lock::NamespaceLock;
+use crate::namespace::{Ipc, Namespace};
 
-/// The kind of services. Its ports and samples may be moved to and dropped in any thread, which a binding to a garbage
-/// collected language needs. It costs half a microsecond a step against the kind for one thread.
-pub(super) type Ipc = ipc_threadsafe::Service;
-
-/// This process as a member of a namespace. Goes after all ports that were made with it.
-pub(super) struct Member {
-    node: Here<Node<Ipc>>,
+/// This process's node in a namespace. Must be dropped after all ports that were created with it.
+pub(crate) struct NamespaceNode {
+    node: ForkGuard<Node<Ipc>>,
+    root: PathBuf,
 }
 
-impl Member {
-    /// Joins the namespace. That also removes what dead processes left there.
-    pub(super) fn join(namespace: &Namespace) -> Result<Self, ServiceError> {
+impl NamespaceNode {
+    /// Registers this process in the namespace. Also removes what dead processes left there.
+    pub(crate) fn join(namespace: &Namespace) -> Result<Self, ServiceError> {
         set_log_level_from_env_or(LogLevel::Error);
         let config = namespace.prepare()?;
-        sweep::unsized_segments(&config);
+        cleanup::remove_unsized_segments(&config);
         let node = NodeBuilder::new()
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create()
             .map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))?;
-        let member = Member { node: Here::new(node) };
-        member.clean();
-        sweep::services(&config);
-        sweep::members(&config);
-        Ok(member)
+        let node = NamespaceNode { node: ForkGuard::new(node), root: namespace.root().to_owned() };
+        node.remove_dead_nodes();
+        if let Some(lock) = NamespaceLock::try_acquire(&node.root) {
+            cleanup::remove_incomplete_services(&config, &lock);
+        }
+        cleanup::remove_incomplete_nodes(&config);
+        Ok(node)
     }
 
-    /// Removes what processes left that have died.
-    pub(super) fn clean(&self) {
+    /// The namespace's directory.
+    pub(crate) fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Removes the resources of processes that have died. Does nothing while another process holds the namespace's lock.
+    pub(crate) fn remove_dead_nodes(&self) {
         let mut dead = Vec::new();
         let listed = Node::<Ipc>::list(self.config(), |state| {
             if let NodeState::Dead(node) = state {
@@ -51,29 +56,28 @@ impl Member {
             CallbackProgression::Continue
         });
         if let Err(e) = listed {
-            tracing::debug!(error = %e, "cannot look for dead processes");
+            tracing::debug!(error = %e, "cannot list the nodes");
         }
         if dead.is_empty() {
             return;
         }
-        // After their death and before the middleware looks at what they left: it would wait for a size for ever.
-        sweep::unsized_segments(self.config());
+        // Before iceoryx2 opens the dead nodes' segments: it would wait forever for one without a size.
+        cleanup::remove_unsized_segments(self.config());
+        let Some(_lock) = NamespaceLock::try_acquire(&self.root) else { return };
         for node in dead.into_iter().filter(|node| node.details().is_some()) {
-            // That another process is at it is no error.
             if let Err(e) = node.try_remove_stale_resources() {
-                tracing::debug!(error = %e, "a dead process is not removed");
+                tracing::debug!(error = %e, "cannot remove a dead node");
             }
         }
     }
 
-    /// Whether the process that owns a node still runs. `false` is certain; where the state cannot be read, it counts as
-    /// running.
-    pub(super) fn is_alive(&self, node: UniqueNodeId) -> bool {
+    /// Whether the process that owns a node is running. `false` is certain; a node whose state cannot be read counts as running.
+    pub(crate) fn is_alive(&self, node: UniqueNodeId) -> bool {
         !matches!(Node::<Ipc>::state_of(self.config(), node), Ok(None | Some(NodeState::Dead(_))))
     }
 
-    /// The process that owns a running node.
-    pub(super) fn process_of(&self, node: UniqueNodeId) -> Option<u32> {
+    /// The process id of the owner of a running node.
+    pub(crate) fn process_id_of(&self, node: UniqueNodeId) -> Option<u32> {
         match Node::<Ipc>::state_of(self.config(), node) {
             Ok(Some(NodeState::Alive(view))) => {
                 view.details().as_ref().and_then(|details| u32::try_from(details.process_id().value()).ok())
@@ -83,7 +87,7 @@ impl Member {
     }
 }
 
-impl Deref for Member {
+impl Deref for NamespaceNode {
     type Target = Node<Ipc>;
 
     fn deref(&self) -> &Node<Ipc> {
@@ -91,11 +95,11 @@ impl Deref for Member {
     }
 }
 
-impl Drop for Member {
+impl Drop for NamespaceNode {
     fn drop(&mut self) {
         let config = self.config().clone();
-        if self.node.leave() {
-            sweep::deserted(&config);
+        if self.node.drop_now() {
+            cleanup::remove_orphans(&config);
         }
     }
 }

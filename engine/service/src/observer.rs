@@ -1,71 +1,98 @@
-//! The observer's side: watches a group without anyone noticing.
+//! The observer: reads a group's batches beside the trainer.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::error::ServiceError;
-use super::node::Member;
-use super::ports::{Names, Open, Services};
-use super::received::{ObservationPort, Received};
-use super::specification::Specification;
-use super::trainer::{ConnectConfig, find};
+use crate::connect::{ConnectConfig, connect_to_engine};
+use crate::error::ServiceError;
+use crate::lease::{BatchLease, Response, ResponsePort};
+use crate::node::NamespaceNode;
+use crate::ports::{EngineServices, OpenMode, ServiceNames};
+use crate::specification::ServiceSpecification;
 
-/// How often a waiting observer looks.
-const POLL: Duration = Duration::from_millis(1);
+/// How often a waiting observer polls.
+const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
-/// Reads a group's batches beside the trainer. The engine never waits for an observer: batches that it does not fetch in time
-/// are replaced by newer ones.
+/// Reads the batches of one group while a trainer steps it.
+///
+/// The engine does not wait for observers. An observer sees the newest batch and misses those before it that it did not receive
+/// in time.
+///
+/// ```no_run
+/// use std::time::Duration;
+///
+/// use endless_gym_service::{ConnectConfig, Observer};
+///
+/// let mut observer = Observer::connect(&ConnectConfig::new("endless"), 0)?;
+/// loop {
+///     let lease = observer.next(Duration::from_secs(10))?;
+///     println!("step {}: rewards {:?}", lease.step(), lease.batch().reward());
+/// }
+/// # #[allow(unreachable_code)]
+/// # Ok::<(), endless_gym_service::ServiceError>(())
+/// ```
 pub struct Observer {
-    port: Arc<ObservationPort>,
-    specification: Arc<Specification>,
-    node: Arc<Member>,
+    port: Arc<ResponsePort>,
+    specification: Arc<ServiceSpecification>,
+    node: Arc<NamespaceNode>,
 }
 
 impl Observer {
-    /// Watches a group of the engine that `config` names.
+    /// Connects to a group of an engine.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::NoSuchGroup`] if it
+    /// has no such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts, and
+    /// [`ServiceError::Version`] or [`ServiceError::IncompatibleTypes`] for an engine of another version.
     pub fn connect(config: &ConnectConfig, group: usize) -> Result<Self, ServiceError> {
-        let (node, port, specification) = find(config, |node, specification| {
+        let (node, port, specification) = connect_to_engine(config, |node, specification| {
             let (service, groups) = (specification.service.clone(), specification.groups);
             if group >= groups {
                 return Err(ServiceError::NoSuchGroup { service, given: group, groups });
             }
-            let names = Names::new(&service, specification.epoch);
-            let services = Services { node, names, open: Open::Existing };
-            ObservationPort::open(&services, node, group, specification)
+            let names = ServiceNames::new(&service, specification.incarnation);
+            let services = EngineServices { node, names, mode: OpenMode::Open };
+            ResponsePort::open(&services, node, group, specification)
         })?;
         Ok(Observer { port: Arc::new(port), specification: Arc::new(specification), node })
     }
 
-    /// What the engine serves.
-    pub fn specification(&self) -> &Specification {
+    /// The engine's specification.
+    pub fn specification(&self) -> &ServiceSpecification {
         &self.specification
     }
 
-    /// The newest batch since the last call, or none if there was no other.
-    pub fn newest(&mut self) -> Result<Option<Received>, ServiceError> {
-        Ok(self.port.receive(&self.specification)?.filter(Received::is_batch))
+    /// The newest batch, or `None` if there has been none since the last call.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held.
+    pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
+        Ok(self.port.receive(&self.specification)?.and_then(Response::into_batch))
     }
 
-    /// The next batch, waiting for it up to `timeout`.
-    pub fn next(&mut self, timeout: Duration) -> Result<Received, ServiceError> {
+    /// The next batch. Waits for it up to `timeout`.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] if the engine has ended, and the
+    /// errors of [`newest`](Observer::newest).
+    pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
         loop {
-            if let Some(received) = self.newest()? {
-                return Ok(received);
+            if let Some(lease) = self.newest()? {
+                return Ok(lease);
             }
-            let service = || self.specification.service.clone();
             if start.elapsed() >= timeout {
-                return Err(if self.is_engine_alive() {
-                    ServiceError::TimedOut { service: service(), waited: timeout }
+                let service = self.specification.service.clone();
+                return Err(if self.node.is_alive(self.port.engine()) {
+                    ServiceError::TimedOut { service, waited: timeout }
                 } else {
-                    ServiceError::EngineLost { service: service(), pid: self.specification.engine_pid }
+                    ServiceError::EngineLost { service, pid: self.specification.engine_pid }
                 });
             }
-            std::thread::sleep(POLL.min(timeout));
+            std::thread::sleep(POLL_INTERVAL.min(timeout));
         }
-    }
-
-    fn is_engine_alive(&self) -> bool {
-        self.node.is_alive(self.port.engine())
     }
 }

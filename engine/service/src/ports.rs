@@ -1,6 +1,4 @@
-//! The middleware's nodes, services and ports, as this room uses them.
-
-use std::time::Duration;
+//! The iceoryx2 services and ports of an engine.
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::listener::Listener;
@@ -14,196 +12,226 @@ use iceoryx2::service::builder::event::EventOpenError;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
-use super::error::ServiceError;
-use super::message::{ActionHeader, ObservationHeader, PayloadBlock};
-use super::node::{Ipc, Member};
-use super::preflight::Resident;
+use crate::error::ServiceError;
+use crate::memory::PrefaultedChunks;
+use crate::message::{PayloadBlock, RequestHeader, ResponseHeader};
+use crate::namespace::Ipc;
+use crate::node::NamespaceNode;
 
-pub(super) type ActionService = publish_subscribe::PortFactory<Ipc, [PayloadBlock], ActionHeader>;
-pub(super) type BlockPublisher<H> = Publisher<Ipc, [PayloadBlock], H>;
-pub(super) type ActionPublisher = BlockPublisher<ActionHeader>;
-pub(super) type ActionSubscriber = Subscriber<Ipc, [PayloadBlock], ActionHeader>;
-pub(super) type ObservationService = publish_subscribe::PortFactory<Ipc, [PayloadBlock], ObservationHeader>;
-pub(super) type ObservationPublisher = BlockPublisher<ObservationHeader>;
-pub(super) type ObservationSubscriber = Subscriber<Ipc, [PayloadBlock], ObservationHeader>;
+pub(crate) type BlockService<H> = publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>;
+pub(crate) type BlockPublisher<H> = Publisher<Ipc, [PayloadBlock], H>;
+pub(crate) type RequestPublisher = BlockPublisher<RequestHeader>;
+pub(crate) type RequestSubscriber = Subscriber<Ipc, [PayloadBlock], RequestHeader>;
+pub(crate) type ResponsePublisher = BlockPublisher<ResponseHeader>;
+pub(crate) type ResponseSubscriber = Subscriber<Ipc, [PayloadBlock], ResponseHeader>;
 
-/// Nodes that may open a service at a time: the engine, its trainer, observers, and those about to be refused.
+/// Nodes that may open a service at a time: the engine, its trainer, observers, and processes that are about to be refused.
 const MAX_NODES: usize = 64;
 
-/// Names of one engine's services. All but the specification's carry the epoch, so that an engine that starts anew shares
-/// nothing with what a dead one left.
+/// Names of one engine's services. All names except the specification's contain the incarnation, so that a restarted engine
+/// shares nothing with the services that a dead one left.
 #[derive(Clone, Debug)]
-pub(super) struct Names {
+pub(crate) struct ServiceNames {
     service: String,
-    epoch: u64,
+    incarnation: u64,
 }
 
-/// What the name of every specification starts with.
-pub(super) const SPECIFICATION_PREFIX: &str = "endless-gym/";
+/// Prefix of the names of all specification services.
+pub(crate) const SPECIFICATION_PREFIX: &str = "endless-gym/";
 
-impl Names {
-    pub(super) fn new(service: &str, epoch: u64) -> Self {
-        Names { service: service.to_owned(), epoch }
+impl ServiceNames {
+    pub(crate) fn new(service: &str, incarnation: u64) -> Self {
+        ServiceNames { service: service.to_owned(), incarnation }
     }
 
-    pub(super) fn specification(service: &str) -> Result<ServiceName, ServiceError> {
+    pub(crate) fn specification(service: &str) -> Result<ServiceName, ServiceError> {
         Self::name(format!("{SPECIFICATION_PREFIX}{service}"))
     }
 
-    fn of_epoch(&self, what: &str) -> Result<ServiceName, ServiceError> {
-        Self::name(format!("{SPECIFICATION_PREFIX}{}/{:016x}/{what}", self.service, self.epoch))
+    fn of_incarnation(&self, what: &str) -> Result<ServiceName, ServiceError> {
+        Self::name(format!("{SPECIFICATION_PREFIX}{}/{:016x}/{what}", self.service, self.incarnation))
     }
 
     fn name(text: String) -> Result<ServiceName, ServiceError> {
-        ServiceName::new(&text).map_err(|e| ServiceError::middleware("cannot name a service")(e.to_string()))
+        ServiceName::new(&text).map_err(|e| ServiceError::middleware("cannot create a service name")(e.to_string()))
     }
 }
 
-/// How many batches a group's trainer and observers may hold, which fixes how many chunks of memory there are.
+/// How many batches of a group its trainer and observers may hold. This determines the number of chunks in shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Limits {
+pub(crate) struct LeaseLimits {
     pub batches_held: usize,
     pub observers: usize,
 }
 
-impl Limits {
-    /// Chunks that the trainer alone can bring into use: those it holds, one on its way and one being written.
-    pub(super) fn resident(self) -> usize {
+impl LeaseLimits {
+    /// Chunks in use without observers: those that the trainer holds, one in its queue and one being written.
+    pub(crate) fn trainer_chunks(self) -> usize {
         self.batches_held + 2
     }
 }
 
-/// Whether the services are made or must be there already.
+/// Whether services are created or opened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Open {
+pub(crate) enum OpenMode {
     Create,
-    Existing,
+    Open,
 }
 
-/// Makes or opens the services of one engine.
-pub(super) struct Services<'a> {
-    pub node: &'a Member,
-    pub names: Names,
-    pub open: Open,
+/// Creates or opens the services of one engine.
+pub(crate) struct EngineServices<'a> {
+    pub node: &'a NamespaceNode,
+    pub names: ServiceNames,
+    pub mode: OpenMode,
 }
 
-macro_rules! create_or_open {
-    ($self:ident, $builder:expr, $error:ident) => {
-        match $self.open {
-            Open::Create => {
-                $builder.create().map_err(|e| ServiceError::middleware("cannot create a service")(e.to_string()))
-            }
-            Open::Existing => $builder.open().map_err(|e| match e {
-                $error::DoesNotExist
-                | $error::IsMarkedForDestruction
-                | $error::HangsInCreation
-                | $error::ServiceInCorruptedState => {
-                    ServiceError::EngineRestarted { service: $self.names.service.clone() }
-                }
-                e => $self.open_error(&format!("{e:?}")),
-            }),
+impl EngineServices<'_> {
+    /// The service of one group's requests: from one trainer to one engine.
+    pub(crate) fn requests(&self, group: usize) -> Result<BlockService<RequestHeader>, ServiceError> {
+        self.block_service(&format!("act/{group}"), 1, 1)
+    }
+
+    /// The service of one group's responses: from one engine to its trainer and observers.
+    pub(crate) fn responses(
+        &self,
+        group: usize,
+        limits: LeaseLimits,
+    ) -> Result<BlockService<ResponseHeader>, ServiceError> {
+        self.block_service(&format!("obs/{group}"), limits.batches_held, 1 + limits.observers)
+    }
+
+    /// A service with one publisher and `subscribers` subscribers, each of which may borrow `borrowed` samples.
+    fn block_service<H: Default + std::fmt::Debug + ZeroCopySend>(
+        &self,
+        name: &str,
+        borrowed: usize,
+        subscribers: usize,
+    ) -> Result<BlockService<H>, ServiceError> {
+        let builder = self
+            .node
+            .service_builder(&self.names.of_incarnation(name)?)
+            .publish_subscribe::<[PayloadBlock]>()
+            .user_header::<H>()
+            .enable_safe_overflow(true)
+            .history_size(0)
+            .subscriber_max_buffer_size(1)
+            .subscriber_max_borrowed_samples(borrowed)
+            .max_publishers(1)
+            .max_subscribers(subscribers)
+            .max_nodes(MAX_NODES);
+        match self.mode {
+            OpenMode::Create => builder.create().map_err(create_error),
+            OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
         }
-    };
-}
-
-impl Services<'_> {
-    /// The service of one group's actions: one trainer, one engine.
-    pub(super) fn actions(&self, group: usize) -> Result<ActionService, ServiceError> {
-        let builder = self
-            .node
-            .service_builder(&self.names.of_epoch(&format!("act/{group}"))?)
-            .publish_subscribe::<[PayloadBlock]>()
-            .user_header::<ActionHeader>()
-            .enable_safe_overflow(true)
-            .history_size(0)
-            .subscriber_max_buffer_size(1)
-            .subscriber_max_borrowed_samples(1)
-            .max_publishers(1)
-            .max_subscribers(1)
-            .max_nodes(MAX_NODES);
-        create_or_open!(self, builder, PublishSubscribeOpenError)
     }
 
-    /// The service of one group's batches: one engine, its trainer and observers.
-    pub(super) fn observations(&self, group: usize, limits: Limits) -> Result<ObservationService, ServiceError> {
+    /// The events of one direction. The id of an event is the number of a group; `groups` is the number of groups.
+    pub(crate) fn events(&self, to: &str, groups: usize) -> Result<event::PortFactory<Ipc>, ServiceError> {
         let builder = self
             .node
-            .service_builder(&self.names.of_epoch(&format!("obs/{group}"))?)
-            .publish_subscribe::<[PayloadBlock]>()
-            .user_header::<ObservationHeader>()
-            .enable_safe_overflow(true)
-            .history_size(0)
-            .subscriber_max_buffer_size(1)
-            .subscriber_max_borrowed_samples(limits.batches_held)
-            .max_publishers(1)
-            .max_subscribers(1 + limits.observers)
-            .max_nodes(MAX_NODES);
-        create_or_open!(self, builder, PublishSubscribeOpenError)
-    }
-
-    /// The events of one direction; their number is the group's. `groups` is the number of groups.
-    pub(super) fn events(&self, to: &str, groups: usize) -> Result<event::PortFactory<Ipc>, ServiceError> {
-        let builder = self
-            .node
-            .service_builder(&self.names.of_epoch(to)?)
+            .service_builder(&self.names.of_incarnation(to)?)
             .event()
             .event_id_max_value(groups)
             .max_listeners(1)
             .max_notifiers(1)
             .max_nodes(MAX_NODES);
-        create_or_open!(self, builder, EventOpenError)
+        match self.mode {
+            OpenMode::Create => builder.create().map_err(create_error),
+            OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
+        }
     }
 
-    fn open_error(&self, error: &str) -> ServiceError {
+    fn open_error(&self, failure: OpenFailure) -> ServiceError {
         let service = self.names.service.clone();
-        match error {
-            "IncompatibleTypes" | "IncompatibleMessagingPattern" => ServiceError::IncompatibleTypes { service },
-            "VersionMismatch" => ServiceError::Version {
-                service,
-                layout: "unknown".to_owned(),
-                package: "with another version of iceoryx2".to_owned(),
-            },
-            _ => ServiceError::middleware("cannot open a service")(error.to_owned()),
+        match failure {
+            OpenFailure::Missing => ServiceError::EngineRestarted { service },
+            OpenFailure::OtherType => ServiceError::IncompatibleTypes { service },
+            OpenFailure::OtherVersion => ServiceError::other_iceoryx2(&service),
+            OpenFailure::Other(reason) => ServiceError::middleware("cannot open a service")(reason),
         }
     }
 }
 
-/// A publisher of messages of `blocks` blocks. `resident` chunks are brought into memory right away, so that too little of it
-/// is an error here and not a signal later.
-pub(super) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
-    service: &publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>,
+fn create_error(error: impl std::fmt::Display) -> ServiceError {
+    ServiceError::middleware("cannot create a service")(error.to_string())
+}
+
+/// Why a service could not be opened.
+#[derive(Debug, PartialEq, Eq)]
+enum OpenFailure {
+    /// It does not exist, or it is being removed.
+    Missing,
+    /// Its messages have another type.
+    OtherType,
+    /// It was created by another version of iceoryx2.
+    OtherVersion,
+    Other(String),
+}
+
+impl From<PublishSubscribeOpenError> for OpenFailure {
+    fn from(error: PublishSubscribeOpenError) -> Self {
+        use PublishSubscribeOpenError as E;
+        match error {
+            E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
+                OpenFailure::Missing
+            }
+            E::IncompatibleTypes | E::IncompatibleMessagingPattern => OpenFailure::OtherType,
+            E::VersionMismatch => OpenFailure::OtherVersion,
+            e => OpenFailure::Other(e.to_string()),
+        }
+    }
+}
+
+impl From<EventOpenError> for OpenFailure {
+    fn from(error: EventOpenError) -> Self {
+        use EventOpenError as E;
+        match error {
+            E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
+                OpenFailure::Missing
+            }
+            E::IncompatibleMessagingPattern => OpenFailure::OtherType,
+            E::VersionMismatch => OpenFailure::OtherVersion,
+            e => OpenFailure::Other(e.to_string()),
+        }
+    }
+}
+
+/// A publisher of messages of `blocks` blocks. Prefaults `prefaulted` chunks, so that missing memory is an error here and not a
+/// SIGBUS later.
+pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
+    service: &BlockService<H>,
     blocks: usize,
-    resident: usize,
-) -> Result<(BlockPublisher<H>, Resident), PortError> {
-    Resident::check_available(blocks, resident)?;
+    prefaulted: usize,
+) -> Result<(BlockPublisher<H>, PrefaultedChunks), PortError> {
+    PrefaultedChunks::check_available(blocks, prefaulted)?;
     let publisher = service
         .publisher_builder()
         .initial_max_slice_len(blocks)
         .allocation_strategy(AllocationStrategy::Static)
         .backpressure_strategy(BackpressureStrategy::DiscardData)
-        // Loans in excess of one serve only to visit the chunks; they ask for no memory of their own.
-        .max_loaned_samples(resident)
-        .override_sample_preallocation(move |chunks| chunks - (resident - 1))
+        // Loans beyond one serve only to prefault the chunks below; they need no chunks of their own.
+        .max_loaned_samples(prefaulted)
+        .override_sample_preallocation(move |chunks| chunks - (prefaulted - 1))
         .create()?;
-    let mut memory = Resident::default();
-    let mut loans = Vec::with_capacity(resident);
-    for _ in 0..resident {
-        Resident::check_available(blocks, 1)?;
+    let mut memory = PrefaultedChunks::default();
+    let mut loans = Vec::with_capacity(prefaulted);
+    for _ in 0..prefaulted {
+        PrefaultedChunks::check_available(blocks, 1)?;
         let mut loan = publisher
             .loan_slice_uninit(blocks)
-            .map_err(|e| ServiceError::middleware("cannot lend a batch")(e.to_string()))?;
-        memory.admit(loan.payload_mut())?;
+            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
+        memory.prefault(loan.payload_mut())?;
         loans.push(loan);
     }
-    // The list of free chunks is a stack: the first chunk is to be the next one again.
+    // The list of free chunks is a stack; after this the first chunk is on top again.
     while loans.pop().is_some() {}
     Ok((publisher, memory))
 }
 
-/// Why a port could not be made.
-pub(super) enum PortError {
-    /// There are as many of them as the service takes.
-    Taken,
+/// Why a port could not be created.
+pub(crate) enum PortError {
+    /// The service already has its maximum number of such ports.
+    LimitReached,
     Other(ServiceError),
 }
 
@@ -216,33 +244,33 @@ impl From<ServiceError> for PortError {
 impl From<PublisherCreateError> for PortError {
     fn from(error: PublisherCreateError) -> Self {
         match error {
-            PublisherCreateError::ExceedsMaxSupportedPublishers => PortError::Taken,
+            PublisherCreateError::ExceedsMaxSupportedPublishers => PortError::LimitReached,
             e => PortError::Other(ServiceError::middleware("cannot create a publisher")(e.to_string())),
         }
     }
 }
 
-/// The port that wakes the other side.
-pub(super) fn notifier(events: &event::PortFactory<Ipc>) -> Result<Notifier<Ipc>, ServiceError> {
+/// The port that wakes the waiter of the other process.
+pub(crate) fn notifier(events: &event::PortFactory<Ipc>) -> Result<Notifier<Ipc>, ServiceError> {
     let failed = |e: String| ServiceError::middleware("cannot create a notifier")(e);
     events.notifier_builder().create().map_err(|e| failed(e.to_string()))
 }
 
-/// The port that this side sleeps on.
-pub(super) fn listener(events: &event::PortFactory<Ipc>) -> Result<Listener<Ipc>, ServiceError> {
+/// The port that this process parks on.
+pub(crate) fn listener(events: &event::PortFactory<Ipc>) -> Result<Listener<Ipc>, ServiceError> {
     let failed = |e: String| ServiceError::middleware("cannot create a listener")(e);
     events.listener_builder().create().map_err(|e| failed(e.to_string()))
 }
 
-/// Wakes the other side. That it cannot be woken is no error: it looks by itself after a while, or it is dead.
-pub(super) fn notify(notifier: &Notifier<Ipc>, group: usize) {
+/// Wakes the waiter of the other process. A failure is not an error: a waiter also polls after a timeout.
+pub(crate) fn notify(notifier: &Notifier<Ipc>, group: usize) {
     if let Err(e) = notifier.notify_with_custom_event_id(EventId::new(group)) {
-        tracing::debug!(error = %e, group, "the other side cannot be woken");
+        tracing::debug!(error = %e, group, "cannot notify the other process");
     }
 }
 
-/// The first node among those that `list` reports.
-pub(super) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Option<UniqueNodeId> {
+/// The first node that `list` reports.
+pub(crate) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Option<UniqueNodeId> {
     let mut first = None;
     list(&mut |node| {
         first.get_or_insert(node);
@@ -251,9 +279,7 @@ pub(super) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Opt
 }
 
 /// The node that publishes on a service.
-pub(super) fn publishing_node<H: std::fmt::Debug + ZeroCopySend>(
-    service: &publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>,
-) -> Option<UniqueNodeId> {
+pub(crate) fn publisher_node<H: std::fmt::Debug + ZeroCopySend>(service: &BlockService<H>) -> Option<UniqueNodeId> {
     first_node(|found| {
         service.dynamic_config().list_publishers(|details| {
             found(details.node_id);
@@ -262,5 +288,18 @@ pub(super) fn publishing_node<H: std::fmt::Debug + ZeroCopySend>(
     })
 }
 
-/// How long a process that removes a dead one's leftovers may take before another gives up on it.
-pub(super) const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn open_errors_are_told_apart_by_their_variant() {
+        use PublishSubscribeOpenError as E;
+        assert_eq!(OpenFailure::from(E::IncompatibleTypes), OpenFailure::OtherType);
+        assert_eq!(OpenFailure::from(E::VersionMismatch), OpenFailure::OtherVersion);
+        assert_eq!(OpenFailure::from(E::HangsInCreation), OpenFailure::Missing);
+        assert!(matches!(OpenFailure::from(E::ExceedsMaxNumberOfNodes), OpenFailure::Other(_)));
+        assert_eq!(OpenFailure::from(EventOpenError::IncompatibleMessagingPattern), OpenFailure::OtherType);
+        assert_eq!(OpenFailure::from(EventOpenError::VersionMismatch), OpenFailure::OtherVersion);
+    }
+}

@@ -1,144 +1,134 @@
-//! The trainer's side: sends actions and receives batches, which it reads where the engine wrote them.
+//! The trainer: sends actions to an engine and receives batches, which it reads where the engine wrote them.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::port::listener::Listener;
-use iceoryx2::port::notifier::Notifier;
-use serde_json::{Map, Value as Json};
-
-use super::config::Namespace;
-use super::error::ServiceError;
-use super::here::Here;
-use super::message::{ActionHeader, Kind};
-use super::node::{Ipc, Member};
-use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Names, Open, PortError, Services};
-use super::received::{ObservationPort, Received};
-use super::specification::{self, Specification};
-use super::wait::wait;
 use endless_gym_core::batch::{Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use endless_gym_core::pool::ResetRequest;
+use serde_json::{Map, Value as Json};
 
-/// How long a trainer hears nothing before it looks whether the engine still lives.
-const QUIET: Duration = Duration::from_millis(200);
+use crate::blackboard;
+use crate::connect::ConnectConfig;
+use crate::connection::EngineConnection;
+use crate::error::ServiceError;
+use crate::fork_guard::ForkGuard;
+use crate::lease::{BatchLease, Response};
+use crate::message::{RequestHeader, RequestKind};
+use crate::pending::{PendingRequests, Request};
+use crate::ports;
+use crate::specification::ServiceSpecification;
+use crate::wait::wait;
 
-/// How often a trainer looks for an engine that is not there yet.
-const RETRY: Duration = Duration::from_millis(20);
+/// Liveness interval: how long a trainer waits for a response before it checks whether the engine is running.
+const LIVENESS_INTERVAL: Duration = Duration::from_millis(200);
 
-/// Chunks of an action publisher: one that the engine reads, one on its way, one being written.
-const ACTION_CHUNKS: usize = 3;
-
-/// Where a trainer or an observer finds its engine.
-#[derive(Clone, Debug)]
-pub struct ConnectConfig {
-    /// The engine's name.
-    pub service: String,
-    pub namespace: Namespace,
-    /// How long to wait for an engine of that name to appear. Zero: it must be there.
-    pub timeout: Duration,
-}
-
-impl ConnectConfig {
-    /// The engine of that name in the default namespace, which must be there.
-    pub fn new(service: &str) -> Self {
-        ConnectConfig { service: service.to_owned(), namespace: Namespace::default(), timeout: Duration::ZERO }
-    }
-}
-
-/// The one process that acts in an engine's environments.
+/// Steps the environments of an engine. An engine has one trainer at a time.
 ///
-/// Each [`reset`](Trainer::reset) or [`send`](Trainer::send) to a group is answered by one batch, which
-/// [`receive`](Trainer::receive) returns; several groups may owe an answer at a time.
+/// Every [`reset`](Trainer::reset) or [`send`](Trainer::send) to a group is answered by one batch, which
+/// [`receive`](Trainer::receive) returns. A group has at most one pending answer; several groups may have one each.
 ///
-/// A trainer outlives its engine: after [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] it goes on with an
-/// engine of the same name once [`reconnect`](Trainer::reconnect) succeeds. Batches that it still holds stay readable.
+/// A trainer can outlive its engine: after [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`],
+/// [`reconnect`](Trainer::reconnect) connects to a new engine of the same name. Batches that are still held remain readable.
+///
+/// ```no_run
+/// use std::time::Duration;
+///
+/// use endless_gym_core::pool::ResetRequest;
+/// use endless_gym_service::{ConnectConfig, Trainer};
+///
+/// let timeout = Duration::from_secs(10);
+/// let mut trainer = Trainer::connect(&ConnectConfig { timeout, ..ConnectConfig::new("endless") })?;
+/// trainer.reset(0, ResetRequest::All)?;
+/// for _ in 0..1000 {
+///     let lease = trainer.receive(0, timeout)?;
+///     let rewards = lease.batch().reward();
+///     println!("step {}: mean reward {}", lease.step(), rewards.iter().sum::<f64>() / rewards.len() as f64);
+///     trainer.send_with(0, |actions| actions.fill(0))?;
+/// }
+/// # Ok::<(), endless_gym_service::ServiceError>(())
+/// ```
 pub struct Trainer {
     config: ConnectConfig,
-    specification: Arc<Specification>,
-    link: Here<Link>,
-    trainer: u64,
-    request: u64,
-    /// The message that each group has not answered yet.
-    pending: Vec<Option<Pending>>,
-    /// When the last message was sent.
+    specification: Arc<ServiceSpecification>,
+    connection: ForkGuard<EngineConnection>,
+    /// Random number that identifies this trainer.
+    id: u64,
+    /// Number of the last request.
+    last_request: u64,
+    pending: PendingRequests,
+    /// When the last request was sent.
     sent: Instant,
 }
 
-/// A message that is to be answered.
-#[derive(Clone, Copy, Debug)]
-struct Pending {
-    request: u64,
-    asked: Asked,
-}
-
-/// What a message asks for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Asked {
-    kind: Kind,
-    /// First seed of a [`Kind::ResetSeed`].
-    seed: u64,
-    /// Environment of a [`Kind::Snapshot`] or a [`Kind::Restore`].
-    env: usize,
-    /// Checksum of a [`Kind::Restore`]'s snapshot.
-    snapshot: u32,
-}
-
-impl Asked {
-    fn of(kind: Kind) -> Self {
-        Asked { kind, seed: 0, env: 0, snapshot: 0 }
-    }
-}
-
-/// Ports to one engine, for the time that it runs.
-struct Link {
-    actions: Vec<ActionPublisher>,
-    observations: Vec<Arc<ObservationPort>>,
-    to_engine: Notifier<Ipc>,
-    to_trainer: Listener<Ipc>,
-    engine: UniqueNodeId,
-    node: Arc<Member>,
-}
-
 impl Trainer {
-    /// Connects to an engine by its name. Waits for it as long as `config` says.
+    /// Connects to an engine as its trainer.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::TrainerExists`] if
+    /// it has a trainer, [`ServiceError::Version`] or [`ServiceError::IncompatibleTypes`] for an engine of another version,
+    /// [`ServiceError::InvalidName`] or [`ServiceError::Root`] for an invalid configuration.
     pub fn connect(config: &ConnectConfig) -> Result<Self, ServiceError> {
-        let (link, specification) = Link::new(config)?;
-        let pending = vec![None; specification.groups];
-        let specification = Arc::new(specification);
-        let trainer = rand::random();
-        let (config, link, sent) = (config.clone(), Here::new(link), Instant::now());
-        Ok(Trainer { config, specification, link, trainer, request: 0, pending, sent })
+        let (connection, specification) = EngineConnection::open(config)?;
+        Ok(Trainer {
+            config: config.clone(),
+            pending: PendingRequests::new(specification.groups),
+            specification: Arc::new(specification),
+            connection: ForkGuard::new(connection),
+            id: rand::random(),
+            last_request: 0,
+            sent: Instant::now(),
+        })
     }
 
-    /// Connects to an engine of the same name that was started in place of the one that is lost, waiting for it up to
-    /// `timeout`. It must serve the same environments in the same layout, and wants a reset of each group. Where the engine is
-    /// not lost, the connection stays. In both cases answers that are still due are forgotten.
+    /// Connects to an engine of the same name that replaces a lost one. Waits for it up to `timeout`. It must serve the same
+    /// environments in the same layout, and each group must be reset before it is stepped.
+    ///
+    /// If the current engine is running, the connection is kept. In both cases pending answers are discarded.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::SpecificationChanged`] if the new engine serves something else, and the errors of
+    /// [`connect`](Trainer::connect).
     pub fn reconnect(&mut self, timeout: Duration) -> Result<(), ServiceError> {
-        if !self.link.node.is_alive(self.link.engine) {
-            let (link, specification) = Link::new(&ConnectConfig { timeout, ..self.config.clone() })?;
+        if !self.connection.is_engine_alive() {
+            let config = ConnectConfig { timeout, ..self.config.clone() };
+            let (connection, specification) = EngineConnection::open(&config)?;
             if let Some(what) = self.specification.difference(&specification) {
                 return Err(ServiceError::SpecificationChanged { service: self.config.service.clone(), what });
             }
             self.specification = Arc::new(specification);
-            self.link = Here::new(link);
+            self.connection = ForkGuard::new(connection);
         }
-        self.pending.fill(None);
+        self.pending.clear();
         Ok(())
     }
 
-    /// What the engine serves.
-    pub fn specification(&self) -> &Specification {
+    /// The engine's specification.
+    pub fn specification(&self) -> &ServiceSpecification {
         &self.specification
     }
 
-    /// Asks a group to start episodes; [`receive`](Trainer::receive) returns their first observations.
+    /// Requests new episodes in a group; [`receive`](Trainer::receive) returns their first observations.
+    ///
+    /// [`ResetRequest::Seed`] seeds environment `i` of the group with `seed + group * num_envs + i`: the environments of all
+    /// groups are numbered consecutively, as in one pool.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::NoSuchGroup`], [`ServiceError::AnswerPending`], [`ServiceError::ResetCount`], and
+    /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has ended.
     pub fn reset(&mut self, group: usize, request: ResetRequest<'_>) -> Result<(), ServiceError> {
         self.reset_with(group, request, None)
     }
 
-    /// As [`reset`](Trainer::reset), with other reset parameters for the environments that start an episode, from then on; see
-    /// [`Pool::reset_with`](endless_gym_core::pool::Pool::reset_with).
+    /// Like [`reset`](Trainer::reset), with new reset parameters for the environments that start an episode, which apply to all
+    /// their later episodes; see [`Pool::reset_with`](endless_gym_core::pool::Pool::reset_with).
+    ///
+    /// # Errors
+    ///
+    /// Those of [`reset`](Trainer::reset), and [`ServiceError::OptionsTooLong`].
     pub fn reset_with(
         &mut self,
         group: usize,
@@ -156,13 +146,15 @@ impl Trainer {
             Ok(options.len())
         };
         match request {
-            ResetRequest::All => self.post(group, Asked::of(Kind::ResetAll), write_options),
-            ResetRequest::Seed(seed) => self.post(group, Asked { seed, ..Asked::of(Kind::ResetSeed) }, write_options),
+            ResetRequest::All => self.post(group, Request::new(RequestKind::ResetAll), write_options),
+            ResetRequest::Seed(seed) => {
+                self.post(group, Request { seed, ..Request::new(RequestKind::ResetSeed) }, write_options)
+            }
             ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
                 let given = if reset.len() == num_envs { seed.len() } else { reset.len() };
                 Err(ServiceError::ResetCount { given, num_envs })
             }
-            ResetRequest::Each { reset, seed } => self.post(group, Asked::of(Kind::ResetEach), |message| {
+            ResetRequest::Each { reset, seed } => self.post(group, Request::new(RequestKind::ResetEach), |message| {
                 specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
                 specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
                 write_options(message)
@@ -170,8 +162,13 @@ impl Trainer {
         }
     }
 
-    /// Steps a group; [`receive`](Trainer::receive) returns what came of it. `actions` holds a row for each environment, one
-    /// number for each branch of the action space.
+    /// Requests a step of a group; [`receive`](Trainer::receive) returns its batch. `actions` has shape `(num_envs, branches)`.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::ActionCount`], [`ServiceError::ActionRange`], [`ServiceError::NoSuchGroup`],
+    /// [`ServiceError::AnswerPending`], and [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has
+    /// ended.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
         let expected = self.specification.num_envs * self.specification.action_space.branches().len();
         if actions.len() != expected {
@@ -184,48 +181,88 @@ impl Trainer {
         self.send_with(group, |message| message.copy_from_slice(actions))
     }
 
-    /// As [`Trainer::send`], for actions that `fill` writes where the engine reads them. Until then the slice holds an earlier
-    /// step's actions or zeros.
+    /// Like [`send`](Trainer::send), but `fill` writes the actions directly into shared memory. The slice has shape
+    /// `(num_envs, branches)` and holds zeros or the actions of an earlier step.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`send`](Trainer::send).
     pub fn send_with(&mut self, group: usize, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
-        self.post(group, Asked::of(Kind::Step), |message| {
+        self.post(group, Request::new(RequestKind::Step), |message| {
             let actions = specification.action.write::<i32>(message, "action");
             fill(actions);
             check_actions(&specification, actions).map(|()| 0)
         })
     }
 
-    /// The answer to the last message to `group`.
+    /// Receives the batch that answers the last request to `group`.
     ///
-    /// After [`ServiceError::TimedOut`] it is still due and may be received later. An engine that is slow is waited for; one
-    /// that is dead is noticed within half a second.
-    pub fn receive(&mut self, group: usize, timeout: Duration) -> Result<Received, ServiceError> {
+    /// # Errors
+    ///
+    /// [`ServiceError::TimedOut`] if there is no answer in time; it stays pending and can be received later.
+    /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] within half a second after the engine's process has
+    /// ended. [`ServiceError::Rejected`] if the engine rejected the request. [`ServiceError::NothingSent`],
+    /// [`ServiceError::NoSuchGroup`], and [`ServiceError::TooManyBatchesHeld`].
+    pub fn receive(&mut self, group: usize, timeout: Duration) -> Result<BatchLease, ServiceError> {
         self.check_group(group)?;
-        if !self.owes_batch(group) {
+        if !self.pending.has_batch(group) {
             return Err(ServiceError::NothingSent { group });
         }
-        self.receive_from(group..group + 1, true, timeout)
+        self.receive_batch(group..group + 1, timeout)
     }
 
-    /// The answer of whichever group has it first. [`Received::group`] tells which.
-    pub fn receive_any(&mut self, timeout: Duration) -> Result<Received, ServiceError> {
-        if !(0..self.pending.len()).any(|group| self.owes_batch(group)) {
+    /// Receives the first batch that arrives from any group with a pending answer; see [`BatchLease::group`].
+    ///
+    /// # Errors
+    ///
+    /// Those of [`receive`](Trainer::receive).
+    pub fn receive_any(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
+        if !self.pending.has_any_batch() {
             return Err(ServiceError::NothingSent { group: 0 });
         }
-        self.receive_from(0..self.pending.len(), true, timeout)
+        self.receive_batch(0..self.pending.groups(), timeout)
     }
 
-    /// The whole state of an environment of a group, for [`restore`](Trainer::restore) and
-    /// [`Pool::restore`](endless_gym_core::pool::Pool::restore). The group must owe no answer, and must have been reset by this trainer.
+    /// Takes a snapshot of an environment: its whole state, for [`restore`](Trainer::restore) or
+    /// [`Pool::restore`](endless_gym_core::pool::Pool::restore). This trainer must have reset the group before.
     ///
-    /// After [`ServiceError::TimedOut`] the same call goes on waiting, and any other takes its place; so for `restore`.
+    /// After [`ServiceError::TimedOut`], the same call continues to wait, and any other request replaces it.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::AnswerPending`] if the group has a pending batch, [`ServiceError::Rejected`] if there is no such
+    /// environment or the group was not reset, and the errors of [`receive`](Trainer::receive).
+    ///
+    /// ```no_run
+    /// # use std::time::Duration;
+    /// # use endless_gym_core::pool::ResetRequest;
+    /// # use endless_gym_service::{ConnectConfig, Trainer};
+    /// # let timeout = Duration::from_secs(10);
+    /// # let mut trainer = Trainer::connect(&ConnectConfig::new("endless"))?;
+    /// trainer.reset(0, ResetRequest::All)?;
+    /// trainer.receive(0, timeout)?;
+    /// let snapshot = trainer.snapshot(0, 3, timeout)?;
+    /// // Environment 5 continues where environment 3 was.
+    /// trainer.restore(0, 5, &snapshot, timeout)?;
+    /// // A reset of no environment returns the current observations.
+    /// let num_envs = trainer.specification().num_envs;
+    /// trainer.reset(0, ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] })?;
+    /// let lease = trainer.receive(0, timeout)?;
+    /// # Ok::<(), endless_gym_service::ServiceError>(())
+    /// ```
     pub fn snapshot(&mut self, group: usize, env: usize, timeout: Duration) -> Result<Vec<u8>, ServiceError> {
-        self.ask(group, Asked { env, ..Asked::of(Kind::Snapshot) }, timeout, |_| Ok(0))
+        self.transfer(group, Request { env, ..Request::new(RequestKind::Snapshot) }, timeout, |_| Ok(0))
     }
 
-    /// Puts an environment of a group into the state of a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of
-    /// no environment ([`ResetRequest::Each`]) then shows what it looks like. After [`ServiceError::TimedOut`] the engine may still
-    /// do it, before anything that it is asked for later.
+    /// Restores an environment from a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of no
+    /// environment ([`ResetRequest::Each`]) then returns its observation.
+    ///
+    /// After [`ServiceError::TimedOut`], the engine may still restore the environment, but not after a later request.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::SnapshotTooLong`], and the errors of [`snapshot`](Trainer::snapshot).
     pub fn restore(
         &mut self,
         group: usize,
@@ -242,60 +279,59 @@ impl Trainer {
             specification.action.write::<u8>(message, "snapshot")[..given].copy_from_slice(snapshot);
             Ok(given)
         };
-        let asked = Asked { env, snapshot: crc32fast::hash(snapshot), ..Asked::of(Kind::Restore) };
-        self.ask(group, asked, timeout, write).map(|_| ())
+        let request = Request { env, checksum: crc32fast::hash(snapshot), ..Request::new(RequestKind::Restore) };
+        self.transfer(group, request, timeout, write).map(|_| ())
     }
 
-    /// Posts a message that is not answered by a batch, unless it is already, and waits for the answer.
-    fn ask(
+    /// Sends a request about a snapshot, unless the same request is pending, and waits for the answer.
+    fn transfer(
         &mut self,
         group: usize,
-        asked: Asked,
+        request: Request,
         timeout: Duration,
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<Vec<u8>, ServiceError> {
         self.check_group(group)?;
-        if self.pending[group].is_none_or(|pending| pending.asked != asked) {
-            self.post(group, asked, write)?;
+        if !self.pending.has(group, request) {
+            self.post(group, request, write)?;
         }
-        let received = self.receive_from(group..group + 1, false, timeout)?;
-        let incompatible = || ServiceError::IncompatibleTypes { service: self.config.service.clone() };
-        received.snapshot().map(<[u8]>::to_vec).ok_or_else(incompatible)
+        let response = self.receive_response(group..group + 1, false, timeout)?;
+        response.to_snapshot().ok_or_else(|| self.incompatible())
     }
 
-    fn owes_batch(&self, group: usize) -> bool {
-        self.pending[group].is_some_and(|pending| pending.asked.kind.yields_batch())
+    fn receive_batch(&mut self, groups: Range<usize>, timeout: Duration) -> Result<BatchLease, ServiceError> {
+        let response = self.receive_response(groups, true, timeout)?;
+        response.into_batch().ok_or_else(|| self.incompatible())
     }
 
-    /// The first answer that one of `groups` owes, of those that are batches or of those that are not.
-    fn receive_from(
+    /// The first response to a pending request of `groups`, of those that return batches or of those that do not.
+    fn receive_response(
         &mut self,
-        groups: std::ops::Range<usize>,
+        groups: Range<usize>,
         batches: bool,
         timeout: Duration,
-    ) -> Result<Received, ServiceError> {
+    ) -> Result<Response, ServiceError> {
         let start = Instant::now();
         loop {
             let left = timeout.saturating_sub(start.elapsed());
-            let (link, pending) = (&*self.link, &self.pending);
-            let answer = wait(&link.to_trainer, left.min(QUIET), self.sent, || {
+            let (connection, pending) = (&*self.connection, &self.pending);
+            let received = wait(&connection.to_trainer, left.min(LIVENESS_INTERVAL), self.sent, || {
                 for group in groups.clone() {
-                    let due = pending[group].filter(|pending| pending.asked.kind.yields_batch() == batches);
-                    let Some(Pending { request, .. }) = due else { continue };
-                    // What is in the buffer may be the answer to an earlier trainer.
-                    while let Some(received) = link.observations[group].receive(&self.specification)? {
-                        if received.answers(self.trainer, request) {
-                            return Ok(Some(received));
+                    let Some(number) = pending.number(group, batches) else { continue };
+                    // The queue may hold the response to an earlier trainer.
+                    while let Some(response) = connection.responses[group].receive(&self.specification)? {
+                        if response.answers(self.id, number) {
+                            return Ok(Some((group, response)));
                         }
                     }
                 }
                 Ok(None)
             })?;
-            if let Some(received) = answer {
-                self.pending[received.group()] = None;
-                return received.or_rejection();
+            if let Some((group, response)) = received {
+                self.pending.remove(group);
+                return response.check_accepted();
             }
-            if !link.node.is_alive(link.engine) {
+            if !connection.is_engine_alive() {
                 return Err(self.lost());
             }
             if start.elapsed() >= timeout {
@@ -305,152 +341,72 @@ impl Trainer {
     }
 
     fn check_group(&self, group: usize) -> Result<(), ServiceError> {
-        if group < self.pending.len() {
+        let groups = self.pending.groups();
+        if group < groups {
             return Ok(());
         }
-        let (service, groups) = (self.config.service.clone(), self.pending.len());
+        let service = self.config.service.clone();
         Err(ServiceError::NoSuchGroup { service, given: group, groups })
     }
 
-    /// Writes a message in shared memory and sends it. `write` says how many bytes of options or of a snapshot it wrote.
+    /// Writes a request in shared memory and sends it. `write` fills the payload and returns the length of its options or
+    /// snapshot in bytes.
     fn post(
         &mut self,
         group: usize,
-        asked: Asked,
+        request: Request,
         write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
     ) -> Result<(), ServiceError> {
         self.check_group(group)?;
-        if self.owes_batch(group) {
+        if self.pending.has_batch(group) {
             return Err(ServiceError::AnswerPending { group });
         }
-        let failed = ServiceError::middleware("cannot send a message");
-        let message = self.link.actions[group]
+        let failed = ServiceError::middleware("cannot send a request");
+        let message = self.connection.requests[group]
             .loan_slice_uninit(self.specification.action.blocks())
             .map_err(|e| failed(e.to_string()))?;
-        // SAFETY: blocks are plain bytes, valid whatever they are, and the memory is initialised: the operating system zeroes
-        // fresh shared memory, and what a recycled chunk held before is a message.
+        // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
+        // memory, and a recycled chunk holds a request.
         let mut message = unsafe { message.assume_init() };
         let bytes = write(bytemuck::cast_slice_mut(message.payload_mut()))? as u64;
-        self.request += 1;
-        *message.user_header_mut() = ActionHeader {
+        self.last_request += 1;
+        *message.user_header_mut() = RequestHeader {
             layout_version: LAYOUT_VERSION,
-            kind: asked.kind.code(),
-            epoch: self.specification.epoch,
-            trainer: self.trainer,
-            request: self.request,
-            seed: asked.seed,
-            env: asked.env as u64,
+            kind: request.kind.code(),
+            incarnation: self.specification.incarnation,
+            trainer: self.id,
+            request: self.last_request,
+            seed: request.seed,
+            env: request.env as u64,
             bytes,
         };
         let receivers = message.send().map_err(|e| failed(e.to_string()))?;
-        if receivers == 0 && !self.link.node.is_alive(self.link.engine) {
+        if receivers == 0 && !self.connection.is_engine_alive() {
             return Err(self.lost());
         }
-        ports::notify(&self.link.to_engine, group);
-        self.pending[group] = Some(Pending { request: self.request, asked });
+        ports::notify(&self.connection.to_engine, group);
+        self.pending.insert(group, self.last_request, request);
         self.sent = Instant::now();
         Ok(())
     }
 
-    /// The error for an engine that does not live any more: whether another one has taken its place.
+    /// The error for an engine that has ended, which depends on whether another one has replaced it.
     fn lost(&self) -> ServiceError {
         let service = self.config.service.clone();
-        match specification::read(&self.link.node, &service) {
-            Ok(Some(other)) if other.epoch != self.specification.epoch => ServiceError::EngineRestarted { service },
+        match blackboard::read(&self.connection.node, &service) {
+            Ok(Some(other)) if other.incarnation != self.specification.incarnation => {
+                ServiceError::EngineRestarted { service }
+            }
             _ => ServiceError::EngineLost { service, pid: self.specification.engine_pid },
         }
     }
-}
 
-impl Link {
-    fn new(config: &ConnectConfig) -> Result<(Self, Specification), ServiceError> {
-        let (node, ports, specification) = find(config, |node, specification| {
-            let names = Names::new(&specification.service, specification.epoch);
-            let services = Services { node, names, open: Open::Existing };
-            let groups = 0..specification.groups;
-            // The publishers first: whoever has the first of them is the trainer.
-            let actions: Vec<_> = groups
-                .clone()
-                .map(|group| action_publisher(&services, group, specification))
-                .collect::<Result<_, _>>()?;
-            let observations: Vec<_> = groups
-                .map(|group| ObservationPort::open(&services, node, group, specification).map(Arc::new))
-                .collect::<Result<_, _>>()?;
-            let to_engine = ports::notifier(&services.events("to_engine", specification.groups)?)?;
-            let to_trainer = ports::listener(&services.events("to_trainer", specification.groups)?)?;
-            Ok((actions, observations, to_engine, to_trainer))
-        })?;
-        let (actions, observations, to_engine, to_trainer) = ports;
-        let engine = observations[0].engine();
-        Ok((Link { actions, observations, to_engine, to_trainer, engine, node }, specification))
+    fn incompatible(&self) -> ServiceError {
+        ServiceError::IncompatibleTypes { service: self.config.service.clone() }
     }
 }
 
-/// Looks for the engine until `connect` succeeds with what its specification says or time is up.
-pub(super) fn find<T>(
-    config: &ConnectConfig,
-    connect: impl Fn(&Arc<Member>, &Specification) -> Result<T, ServiceError>,
-) -> Result<(Arc<Member>, T, Specification), ServiceError> {
-    let start = Instant::now();
-    let node = Arc::new(Member::join(&config.namespace)?);
-    loop {
-        let result = match specification::read(&node, &config.service)? {
-            None => Err(ServiceError::UnknownEngine {
-                service: config.service.clone(),
-                root: config.namespace.root().to_owned(),
-                known: known(&specification::list(&node)?),
-            }),
-            Some(specification) => connect(&node, &specification).map(|ports| (ports, specification)),
-        };
-        match result {
-            Ok((ports, specification)) => return Ok((node, ports, specification)),
-            // The engine is not there yet, or was replaced while we connected.
-            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
-                if start.elapsed() < config.timeout =>
-            {
-                node.clean();
-                std::thread::sleep(RETRY);
-            }
-            Err(e) => return Err(e),
-        }
-    }
-}
-
-fn known(engines: &[String]) -> String {
-    match engines {
-        [] => "is none".to_owned(),
-        [one] => format!("is {one}"),
-        many => format!("are {}", many.join(", ")),
-    }
-}
-
-/// The port that makes a process the trainer of a group.
-fn action_publisher(
-    services: &Services<'_>,
-    group: usize,
-    specification: &Specification,
-) -> Result<ActionPublisher, ServiceError> {
-    let service = services.actions(group)?;
-    let start = Instant::now();
-    loop {
-        match ports::publisher(&service, specification.action.blocks(), ACTION_CHUNKS) {
-            Ok((publisher, _)) => return Ok(publisher),
-            Err(PortError::Other(e)) => return Err(e),
-            Err(PortError::Taken) => {}
-        }
-        // A dead trainer's port is there until someone has removed it; a living one's stays.
-        let owner = ports::publishing_node(&service);
-        let alive = owner.is_some_and(|owner| services.node.is_alive(owner));
-        if alive || start.elapsed() >= CLEANUP_TIMEOUT {
-            let pid = owner.and_then(|owner| services.node.process_of(owner));
-            return Err(ServiceError::TrainerExists { service: specification.service.clone(), pid });
-        }
-        services.node.clean();
-        std::thread::sleep(RETRY);
-    }
-}
-
-fn check_actions(specification: &Specification, actions: &[i32]) -> Result<(), ServiceError> {
+fn check_actions(specification: &ServiceSpecification, actions: &[i32]) -> Result<(), ServiceError> {
     let branches = specification.action_space.branches();
     let fits = |action: &[i32]| action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a));
     match actions.chunks_exact(branches.len().max(1)).enumerate().find(|(_, action)| !fits(action)) {

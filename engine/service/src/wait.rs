@@ -1,28 +1,29 @@
-//! Waiting for the other side: spin, yield, then sleep until an event or a time-out.
+//! Waiting for a message: spin, then yield, then park until an event or a timeout.
 //!
-//! The order is measured. A message that comes within a few microseconds is met by spinning. Spinning longer hurts where both
-//! processes share a core, so the processor is offered to others next. Only then does the waiter go to sleep, which costs the
-//! other side a system call to wake it.
+//! The order is based on measurements. Spinning receives a message that arrives within a few microseconds. Spinning longer slows
+//! the sender down if both processes share a core, so the waiter then yields. Parking comes last, because waking a parked waiter
+//! costs the sender a system call.
 //!
-//! A waiter that found its message while awake leaves the event pending. The sender's next notification then finds it set and
-//! returns without a system call: a busy pair of processes never enters the kernel.
+//! A waiter that receives its message before it parks leaves the event set. The sender's next notification finds the event set
+//! and returns without a system call, so a busy pair of processes does not enter the kernel.
 
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 
-use super::error::ServiceError;
-use super::node::Ipc;
+use crate::error::ServiceError;
+use crate::namespace::Ipc;
 
+/// How long a waiter spins.
 const SPIN: Duration = Duration::from_micros(3);
-/// As long as most trainers take between two steps, and most engines for one. Waking a sleeper takes up to half a millisecond on a
-/// virtual machine, in which the other side may fall asleep in turn.
+/// How long a waiter spins and yields before it parks: longer than most trainers need between two steps and most engines need for
+/// one. Waking a parked waiter takes up to half a millisecond on a virtual machine, during which the sender may park in turn.
 const YIELD: Duration = Duration::from_millis(3);
 
-/// Calls `poll` until it yields something or `timeout` has passed; sleeps on `listener` in between. How long it stays awake is
-/// counted from `since`, when there last was a message, so that one who waits in vain again and again sleeps. An interrupting
-/// signal counts as a time-out.
-pub(super) fn wait<T>(
+/// Calls `poll` until it returns a value or `timeout` has passed, and parks on `listener` between the calls. Spinning and
+/// yielding end a fixed time after `since`, the time of the last message, so that repeated calls without a message park at once.
+/// A signal ends the wait like the timeout.
+pub(crate) fn wait<T>(
     listener: &Listener<Ipc>,
     timeout: Duration,
     since: Instant,
@@ -43,7 +44,7 @@ pub(super) fn wait<T>(
             _ => match listener.timed_wait(|_| {}, timeout - waited) {
                 Ok(_) => {}
                 Err(ListenerWaitError::InterruptSignal) => return poll(),
-                Err(e) => return Err(ServiceError::middleware("cannot wait for the other side")(e.to_string())),
+                Err(e) => return Err(ServiceError::middleware("cannot wait for a message")(e.to_string())),
             },
         }
     }

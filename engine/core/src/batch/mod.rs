@@ -37,4 +37,7 @@ pub(crate) use stamp::Stamp;
 pub use view::{Batch, BatchMut, Contents, OPTIONS_BYTES, RowsMut, SNAPSHOT_BYTES, action_layout, batch_layout};
 
 /// Version of the sections' meaning and of the messages that carry batches. A trainer refuses an engine of another version.
-pub const LAYOUT_VERSION: u32 = 3;
+///
+/// Version 4: the specification's key `epoch` became `incarnation`, the message headers have new type names, and a reset with a seed
+/// counts the environments of all groups.
+pub const LAYOUT_VERSION: u32 = 4;

@@ -110,7 +110,8 @@ impl PoolConfig {
 pub enum ResetRequest<'a> {
     /// All, each with the seed that the seeding policy gives it.
     All,
-    /// All, environment `i` with `seed + i`.
+    /// All; environment `i` of the pool is seeded with `seed + first_env + i` (wrapping), where `first_env` is
+    /// [`PoolConfig::first_env`].
     Seed(u64),
     /// Each as its number says: 0 leaves it alone, 1 starts an episode by the seeding policy, 2 one with its own `seed`.
     Each { reset: &'a [u8], seed: &'a [u64] },
@@ -136,6 +137,7 @@ pub struct Pool {
     check_drawing: bool,
     autoreset: Autoreset,
     threads: Threads,
+    first_env: usize,
     was_reset: bool,
 }
 
@@ -183,6 +185,7 @@ impl Pool {
             check_drawing: config.check_drawing,
             autoreset: config.autoreset,
             threads: threads.clone(),
+            first_env: config.first_env,
             was_reset: false,
         })
     }
@@ -212,6 +215,10 @@ impl Pool {
         batch: &mut [Block],
     ) -> Result<(), PoolError> {
         let num_envs = self.layout.num_envs();
+        let request = match request {
+            ResetRequest::Seed(seed) => ResetRequest::Seed(seed.wrapping_add(self.first_env as u64)),
+            other => other,
+        };
         match request {
             ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
                 return Err(PoolError::ResetCount { given: reset.len().min(seed.len()), num_envs });

@@ -1,4 +1,4 @@
-//! Where the files of the middleware lie, and what its services are called.
+//! Namespaces: the directory and the prefix of iceoryx2's files and segments, and the rules for engine names.
 
 use std::fs::{self, DirBuilder};
 use std::os::unix::ffi::OsStrExt;
@@ -6,26 +6,38 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use iceoryx2::prelude::{Config, FileName, Path as IceoryxPath, SemanticString};
+use iceoryx2::prelude::{Config, FileName, Path as IceoryxPath, SemanticString, ipc_threadsafe};
 
-use super::error::ServiceError;
+use crate::error::ServiceError;
 
-/// Environment variable that replaces the default root of a [`Namespace`].
+/// The iceoryx2 service type. Its ports and samples may be moved to and dropped in any thread, which a binding to a garbage
+/// collected language needs. It costs half a microsecond a step compared with the single-threaded type.
+pub(crate) type Ipc = ipc_threadsafe::Service;
+
+/// Environment variable that overrides the root directory of the default [`Namespace`].
 pub const ROOT_VARIABLE: &str = "ENDLESS_GYM_ROOT";
 
-/// Longest name of an engine.
+/// Maximum length of an engine name in bytes.
 const MAX_SERVICE_NAME: usize = 64;
 
-/// Longest root: a socket under it must keep within the 107 bytes of a Unix socket's path, with the prefix before its name
-/// (at most [`MAX_PREFIX`] bytes) and 49 bytes of its own.
+/// Maximum length of the root in bytes. The path of a Unix socket has at most 107 bytes: the root, a separator, the prefix (at
+/// most [`MAX_PREFIX`] bytes) and 49 bytes of the socket's own name.
 const MAX_ROOT: usize = 107 - 1 - MAX_PREFIX - 49;
 const MAX_PREFIX: usize = 16;
 
-/// A place in which engines and trainers meet: a directory for sockets and small files, and a prefix for segments in shared
-/// memory. Processes see each other only within the same namespace.
+/// A root directory for sockets and small files, and a prefix for shared memory segments. Engines, trainers and observers find
+/// each other only within the same namespace.
 ///
-/// The default is `/tmp/endless-gym-<uid>`, or the directory that `ENDLESS_GYM_ROOT` names: one for each user, with access for
-/// nobody else. It does not depend on the session, since engines outlive logins.
+/// The default root is `/tmp/endless-gym-<uid>`, or the directory in the environment variable `ENDLESS_GYM_ROOT`. It belongs to
+/// one user and is not accessible to others. It does not depend on the login session, because engines outlive logins.
+///
+/// ```
+/// use endless_gym_service::Namespace;
+///
+/// let namespace = Namespace::at("/tmp/my-experiment");
+/// assert_eq!(namespace, Namespace::at("/tmp/my-experiment"));
+/// assert_ne!(namespace.prefix(), Namespace::at("/tmp/another").prefix());
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Namespace {
     root: PathBuf,
@@ -42,44 +54,45 @@ impl Default for Namespace {
 }
 
 impl Namespace {
-    /// The namespace at that directory, which is made when it is needed. The prefix follows from the path.
+    /// The namespace with the root directory `root`, an absolute path of at most 41 bytes. The directory is created when it is
+    /// first used. The prefix is derived from the path.
     pub fn at(root: impl Into<PathBuf>) -> Self {
         let root = root.into();
         let prefix = format!("endless{:08x}_", crc32fast::hash(root.as_os_str().as_bytes()));
         Namespace { root, prefix }
     }
 
-    /// The same directory with another prefix: 1 to 16 letters, digits, `_` or `-`.
+    /// The same root directory with another prefix: 1 to 16 letters, digits, `_` or `-`.
     pub fn with_prefix(self, prefix: impl Into<String>) -> Self {
         Namespace { prefix: prefix.into(), ..self }
     }
 
-    /// The directory of sockets and small files.
+    /// The root directory.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// What the names of all segments in `/dev/shm` start with.
+    /// The prefix of the names of all shared memory segments in `/dev/shm`.
     pub fn prefix(&self) -> &str {
         &self.prefix
     }
 
-    /// Makes the directory where it is missing, refuses one that others may write to, and describes both to the middleware.
-    pub(super) fn prepare(&self) -> Result<Config, ServiceError> {
+    /// Creates the root directory if it is missing, fails if other users can write to it, and returns iceoryx2's configuration.
+    pub(crate) fn prepare(&self) -> Result<Config, ServiceError> {
         let unusable = |reason: String| ServiceError::Root { path: self.root.clone(), reason };
         if !self.root.is_absolute() {
-            return Err(unusable("it is not an absolute path".to_owned()));
+            return Err(unusable("it must be an absolute path".to_owned()));
         }
         if self.root.as_os_str().len() > MAX_ROOT {
             let length = self.root.as_os_str().len();
             return Err(unusable(format!(
-                "its {length} bytes leave no room for a socket's name, which takes the rest of 107; give a path of at most {MAX_ROOT}"
+                "it must have at most {MAX_ROOT} bytes, so that the paths of Unix sockets fit into 107 bytes, got {length}"
             )));
         }
         let fits = |c: u8| c.is_ascii_alphanumeric() || c == b'_' || c == b'-';
         if !(1..=MAX_PREFIX).contains(&self.prefix.len()) || !self.prefix.bytes().all(fits) {
             return Err(unusable(format!(
-                "the prefix `{}` is not 1 to {MAX_PREFIX} letters, digits, `_` or `-`",
+                "the prefix must be 1 to {MAX_PREFIX} letters, digits, `_` or `-`, got `{}`",
                 self.prefix
             )));
         }
@@ -87,22 +100,22 @@ impl Namespace {
         let metadata = fs::symlink_metadata(&self.root).map_err(|e| unusable(e.to_string()))?;
         let (owner, user) = (metadata.uid(), rustix::process::getuid().as_raw());
         if !metadata.is_dir() {
-            return Err(unusable("it is not a directory".to_owned()));
+            return Err(unusable("it must be a directory".to_owned()));
         }
         if owner != user {
-            return Err(unusable(format!("it belongs to user {owner}, and this process to user {user}")));
+            return Err(unusable(format!(
+                "it must belong to user {user}, who runs this process, and belongs to user {owner}"
+            )));
         }
         if metadata.permissions().mode() & 0o022 != 0 {
-            return Err(unusable(
-                "other users may write to it; take their permission away with `chmod 700`".to_owned(),
-            ));
+            return Err(unusable("other users must not have write permission; remove it with `chmod 700`".to_owned()));
         }
         let mut config = Config::default();
         let root = IceoryxPath::new(self.root.as_os_str().as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;
         config.global.set_root_path(&root);
         config.global.prefix = FileName::new(self.prefix.as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;
         config.global.creation_timeout = Duration::from_millis(500);
-        // We clean up ourselves, and more carefully.
+        // `NamespaceNode` cleans up, under the namespace's lock.
         config.global.node.cleanup_dead_nodes_on_creation = false;
         config.global.node.cleanup_dead_nodes_on_destruction = false;
         config.global.service.cleanup_dead_nodes_on_open = false;
@@ -110,13 +123,13 @@ impl Namespace {
     }
 }
 
-/// Checks the name of an engine: 1 to 64 letters, digits, `.`, `_` or `-`.
-pub(super) fn check_name(service: &str) -> Result<(), ServiceError> {
+/// Checks an engine name: 1 to 64 letters, digits, `.`, `_` or `-`.
+pub(crate) fn check_name(service: &str) -> Result<(), ServiceError> {
     let fits = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'.' | b'_' | b'-');
     if (1..=MAX_SERVICE_NAME).contains(&service.len()) && service.bytes().all(fits) {
         Ok(())
     } else {
-        Err(ServiceError::InvalidName { given: service.to_owned(), longest: MAX_SERVICE_NAME })
+        Err(ServiceError::InvalidName { given: service.to_owned(), max_length: MAX_SERVICE_NAME })
     }
 }
 
@@ -129,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn the_prefix_follows_from_the_root() {
+    fn the_prefix_is_derived_from_the_root() {
         assert_eq!(Namespace::at("/tmp/a"), Namespace::at("/tmp/a"));
         assert_ne!(Namespace::at("/tmp/a").prefix(), Namespace::at("/tmp/b").prefix());
         assert!(Namespace::at("/tmp/a").prefix().len() <= MAX_PREFIX);
@@ -145,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_engines_are_checked() {
+    fn engine_names_are_checked() {
         check_name("mortar_mayhem-1.0").unwrap();
         for name in ["", "a/b", "a b", &"a".repeat(65)] {
             assert!(matches!(check_name(name), Err(ServiceError::InvalidName { .. })), "{name}");

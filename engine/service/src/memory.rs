@@ -1,43 +1,44 @@
-//! Making sure that there is as much shared memory as the batches need.
+//! Prefaulting of shared memory: making sure that it is available before it is written to.
 //!
-//! A segment in `/dev/shm` may be larger than what is left there; the process then dies of SIGBUS on the first touch of a page
-//! too many, often hours into a run. So memory is asked for before it is written to.
+//! A segment in `/dev/shm` may be larger than the space that is left there. The process is then killed by SIGBUS when it first
+//! writes to a page for which there is no memory, possibly hours after its start. Each chunk is therefore prefaulted before its
+//! first use, and missing memory is an error.
 
 use std::mem::MaybeUninit;
 
 use rustix::io::Errno;
 use rustix::mm::Advice;
 
-use super::error::ServiceError;
-use super::message::PayloadBlock;
+use crate::error::ServiceError;
+use crate::message::PayloadBlock;
 use endless_gym_core::batch::BLOCK_BYTES;
 
 const PATH: &str = "/dev/shm";
 
-/// Bytes to spare for the middleware's own segments and for headers.
+/// Bytes reserved for iceoryx2's own segments and for headers.
 const MARGIN: u64 = 1 << 20;
 
-/// The chunks that are known to be in memory, by address.
+/// The addresses of the chunks that have been prefaulted.
 #[derive(Debug, Default)]
-pub(super) struct Resident(Vec<usize>);
+pub(crate) struct PrefaultedChunks(Vec<usize>);
 
-impl Resident {
-    /// Whether `/dev/shm` has room for `chunks` batches of `blocks` blocks.
-    pub(super) fn check_available(blocks: usize, chunks: usize) -> Result<(), ServiceError> {
+impl PrefaultedChunks {
+    /// Fails if `/dev/shm` has no room for `chunks` chunks of `blocks` blocks.
+    pub(crate) fn check_available(blocks: usize, chunks: usize) -> Result<(), ServiceError> {
         match available() {
             Some(available) => check(needed(blocks, chunks), available),
             None => Ok(()),
         }
     }
 
-    /// Brings a chunk into memory if it is not known to be there.
-    pub(super) fn admit(&mut self, chunk: &mut [MaybeUninit<PayloadBlock>]) -> Result<(), ServiceError> {
+    /// Prefaults a chunk unless it has been prefaulted before.
+    pub(crate) fn prefault(&mut self, chunk: &mut [MaybeUninit<PayloadBlock>]) -> Result<(), ServiceError> {
         let address = chunk.as_ptr().addr();
         if self.0.contains(&address) {
             return Ok(());
         }
         match populate(chunk) {
-            // A kernel before 5.14 knows no such advice; the check above has to do.
+            // Linux before 5.14 does not support the advice; `check_available` must suffice.
             Ok(()) | Err(Errno::INVAL) => {
                 self.0.push(address);
                 Ok(())
@@ -59,25 +60,25 @@ fn check(needed: u64, available: u64) -> Result<(), ServiceError> {
     if needed <= available { Ok(()) } else { Err(ServiceError::SharedMemoryTooSmall { needed, available, path: PATH }) }
 }
 
-/// Bytes that are left; `None` where the file system does not say, or has no limit.
+/// Free bytes; `None` if the file system does not report them or has no limit.
 fn available() -> Option<u64> {
     let file_system = rustix::fs::statvfs(PATH).ok()?;
     (file_system.f_blocks > 0).then(|| file_system.f_bavail.saturating_mul(file_system.f_frsize))
 }
 
-/// Sizes that the pages of the operating system may have.
-const PAGES: [usize; 3] = [4 << 10, 16 << 10, 64 << 10];
+/// Possible page sizes of the operating system.
+const PAGE_SIZES: [usize; 3] = [4 << 10, 16 << 10, 64 << 10];
 
-/// Allocates the pages under `chunk` without changing what is in them.
+/// Allocates the pages of `chunk` without changing their content.
 fn populate(chunk: &mut [MaybeUninit<PayloadBlock>]) -> rustix::io::Result<()> {
     let start = chunk.as_mut_ptr();
-    let mut pages = PAGES.into_iter();
+    let mut pages = PAGE_SIZES.into_iter();
     let mut page = pages.next().unwrap_or(1);
     loop {
         let above = start.addr() % page;
         let (first, length) = (start.wrapping_byte_sub(above), above + size_of_val(chunk));
-        // SAFETY: the range covers whole pages that hold a part of `chunk`, which is mapped for writing; if it is not one of
-        // whole pages, the call does nothing. The advice allocates pages and changes neither their content nor the mapping.
+        // SAFETY: the range covers the pages of `chunk`, which is mapped for writing. If `page` is not the page size, the call
+        // fails without an effect. The advice allocates pages and changes neither their content nor the mapping.
         match unsafe { rustix::mm::madvise(first.cast(), length, Advice::LinuxPopulateWrite) } {
             Err(Errno::INTR | Errno::AGAIN) => {}
             Err(Errno::INVAL) => match pages.next() {
@@ -106,23 +107,23 @@ mod tests {
     }
 
     #[test]
-    fn pages_that_cannot_be_had_are_an_error_and_not_a_signal() {
-        // The second page of the mapping lies behind the end of the file: touching it raises SIGBUS, as a full /dev/shm does.
-        let page = PAGES[2];
-        let path = std::env::temp_dir().join(format!("endless-preflight-{}", std::process::id()));
+    fn missing_pages_are_an_error_and_not_a_signal() {
+        // The second page of the mapping is beyond the end of the file: writing to it raises SIGBUS, as in a full /dev/shm.
+        let page = PAGE_SIZES[2];
+        let path = std::env::temp_dir().join(format!("endless-prefault-{}", std::process::id()));
         let file = File::options().read(true).write(true).create(true).truncate(true).open(&path).unwrap();
         std::fs::remove_file(&path).unwrap();
         file.set_len(page as u64).unwrap();
-        // SAFETY: a new mapping at an address of the system's choice, which stays for as long as the process.
+        // SAFETY: a new mapping at an address that the system chooses, which lasts until the process ends.
         let start = unsafe {
             mmap(std::ptr::null_mut(), 2 * page, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0)
         };
         let start = start.unwrap().cast::<MaybeUninit<PayloadBlock>>();
         let blocks = page / BLOCK_BYTES;
-        // SAFETY: both pages are mapped for writing, nothing else uses them, and nobody touches the second.
-        let (there, missing) = unsafe { std::slice::from_raw_parts_mut(start, 2 * blocks) }.split_at_mut(blocks);
-        let mut resident = Resident::default();
-        resident.admit(&mut there[1..]).unwrap();
-        assert!(matches!(resident.admit(missing), Err(ServiceError::SharedMemoryTooSmall { .. })));
+        // SAFETY: both pages are mapped for writing and not used elsewhere; the second is never accessed.
+        let (present, missing) = unsafe { std::slice::from_raw_parts_mut(start, 2 * blocks) }.split_at_mut(blocks);
+        let mut chunks = PrefaultedChunks::default();
+        chunks.prefault(&mut present[1..]).unwrap();
+        assert!(matches!(chunks.prefault(missing), Err(ServiceError::SharedMemoryTooSmall { .. })));
     }
 }

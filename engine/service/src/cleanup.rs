@@ -1,13 +1,14 @@
-//! Removing what the middleware cannot: the remains of processes that died while they were joining or leaving a namespace.
+//! Removes resources that iceoryx2 cannot remove: those of processes that died while they joined or left a namespace.
 //!
-//! The middleware removes what dead processes leave by the records that they keep of themselves. A process that is killed
-//! between two steps of that leaves remains which are skipped for ever, or worse:
+//! iceoryx2 removes the resources of a dead process by the records that the process kept. A process that is killed between two
+//! steps of its start or end leaves resources that iceoryx2 ignores or waits for forever:
 //!
-//! - a **segment without a size**, made and not sized yet. The middleware waits for its size without end, so these go first;
-//! - a **stub**: a member without its description, or a service whose description was begun. Every look at the members passes it;
-//! - **strays**: segments and sockets that no record names. They are known as such once a namespace has no members.
+//! - **unsized segments**: created, but not resized yet. iceoryx2 waits without a timeout for the size, so they are removed
+//!   first;
+//! - **incomplete nodes and services**: a node without details, or a service whose static configuration is not finished;
+//! - **orphans**: segments and sockets that no record names. They are recognised once a namespace has no nodes.
 //!
-//! Also, the counter that numbers members stays in shared memory even if all goes well.
+//! In addition, the shared counter that numbers the nodes remains after a regular end.
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
@@ -20,53 +21,57 @@ use std::time::Duration;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, SemanticString};
 
-use super::node::Ipc;
+use crate::lock::NamespaceLock;
+use crate::namespace::Ipc;
 
 const SEGMENTS: &str = "/dev/shm";
 
-/// After this time a segment that has no size yet will not get one. It takes microseconds.
-const UNSIZED: Duration = Duration::from_millis(500);
+/// Age from which an unsized segment counts as abandoned. Creating and resizing one takes microseconds.
+const UNSIZED_SEGMENT_AGE: Duration = Duration::from_millis(500);
 
-/// After this time a service whose description was begun will not be finished. It takes milliseconds.
-const BEGUN: Duration = Duration::from_secs(1);
+/// Age from which an incomplete service counts as abandoned. Creating one takes milliseconds.
+const INCOMPLETE_SERVICE_AGE: Duration = Duration::from_secs(1);
 
-/// After this time a process that has not finished joining is taken for dead. It takes milliseconds.
-const UNFINISHED: Duration = Duration::from_secs(10);
+/// Age from which an incomplete node or an orphan counts as abandoned. Creating a node takes milliseconds.
+const INCOMPLETE_NODE_AGE: Duration = Duration::from_secs(10);
 
-/// Removes segments without a size. Waits for those that are too young to tell, so that afterwards no segment of a process
-/// that was dead before is without a size.
-pub(super) fn unsized_segments(config: &Config) {
+/// Removes unsized segments. Waits until the younger ones reach [`UNSIZED_SEGMENT_AGE`]: on return, no process that was dead
+/// before the call has an unsized segment.
+pub(crate) fn remove_unsized_segments(config: &Config) {
     let prefix = config.global.prefix.as_bytes();
     for segment in entries(Path::new(SEGMENTS)).into_iter().filter(|path| is_named(path, prefix)) {
         let is_unsized = || metadata(&segment).filter(|data| data.len() == 0);
         let Some(data) = is_unsized() else { continue };
-        std::thread::sleep(UNSIZED.saturating_sub(age(&data)));
+        std::thread::sleep(UNSIZED_SEGMENT_AGE.saturating_sub(age(&data)));
         if is_unsized().is_some() {
             remove(&segment);
         }
     }
 }
 
-/// Removes stubs of services. They keep their name taken.
-pub(super) fn services(config: &Config) {
+/// Removes incomplete services, which block their names. The lock keeps an engine from creating a service of the same
+/// name between the check and the removal.
+pub(crate) fn remove_incomplete_services(config: &Config, _lock: &NamespaceLock) {
     for path in entries(&directory(&config.global.service_dir())) {
-        // A description becomes read-only when it is finished.
-        if metadata(&path).is_some_and(|data| data.permissions().mode() & 0o200 != 0 && age(&data) >= BEGUN) {
+        // iceoryx2 makes a static configuration read-only when it is finished.
+        if metadata(&path)
+            .is_some_and(|data| data.permissions().mode() & 0o200 != 0 && age(&data) >= INCOMPLETE_SERVICE_AGE)
+        {
             remove(&path);
         }
     }
 }
 
-/// Removes stubs of members.
-pub(super) fn members(config: &Config) {
+/// Removes incomplete nodes.
+pub(crate) fn remove_incomplete_nodes(config: &Config) {
     let mut dead = HashSet::new();
-    let mut whole = HashSet::new();
+    let mut complete = HashSet::new();
     let listed = Node::<Ipc>::list(config, |state| {
         let number = state.node_id().value().to_string();
         match &state {
             NodeState::Dead(view) if view.details().is_none() => dead.insert(number),
             NodeState::Undefined(_) => false,
-            NodeState::Alive(_) | NodeState::Dead(_) | NodeState::Inaccessible(_) => whole.insert(number),
+            NodeState::Alive(_) | NodeState::Dead(_) | NodeState::Inaccessible(_) => complete.insert(number),
         };
         CallbackProgression::Continue
     });
@@ -74,38 +79,38 @@ pub(super) fn members(config: &Config) {
         return;
     }
     for path in entries(&directory(&config.global.node_dir())) {
-        let Some(number) = member_number(&path, config.global.prefix.as_bytes()) else { continue };
-        if dead.contains(&number) || (!whole.contains(&number) && is_old(&path)) {
+        let Some(number) = node_number(&path, config.global.prefix.as_bytes()) else { continue };
+        if dead.contains(&number) || (!complete.contains(&number) && is_old(&path)) {
             remove(&path);
         }
     }
 }
 
-/// Removes the counter and strays if the namespace has no members, dead ones included.
+/// Removes the node counter and all orphans if the namespace has no nodes, neither running nor dead.
 ///
-/// Nothing is confused when the counter starts over, since the number is one part of a member's identity beside process and
-/// time. A stray is recognised by its age: what a member owns that has joined in the meantime is young.
-pub(super) fn deserted(config: &Config) {
-    let mut is_deserted = true;
+/// The counter may restart at zero: a node's id also contains its process id and its start time. Orphans are recognised by their
+/// age, so that the resources of a node that joins in the meantime are kept.
+pub(crate) fn remove_orphans(config: &Config) {
+    let mut is_empty = true;
     let listed = Node::<Ipc>::list(config, |_| {
-        is_deserted = false;
+        is_empty = false;
         CallbackProgression::Stop
     });
-    if listed.is_err() || !is_deserted {
+    if listed.is_err() || !is_empty {
         return;
     }
     let prefix = config.global.prefix.as_bytes();
-    let places =
+    let directories =
         [PathBuf::from(SEGMENTS), directory(config.global.root_path()), directory(&config.global.service_dir())];
-    for path in places.iter().flat_map(|place| entries(place)).filter(|path| is_named(path, prefix)) {
+    for path in directories.iter().flat_map(|directory| entries(directory)).filter(|path| is_named(path, prefix)) {
         if path.as_os_str().as_bytes().ends_with(b".global_mgmt") || is_old(&path) {
             remove(&path);
         }
     }
 }
 
-/// The member that a file or directory belongs to: `NUMBER`, or `PREFIX NUMBER .node_monitor...`.
-fn member_number(path: &Path, prefix: &[u8]) -> Option<String> {
+/// The number of the node that a file or directory belongs to: `NUMBER`, or `PREFIX NUMBER .node_monitor...`.
+fn node_number(path: &Path, prefix: &[u8]) -> Option<String> {
     let name = path.file_name()?.as_bytes();
     let name = std::str::from_utf8(name.strip_prefix(prefix).unwrap_or(name)).ok()?;
     let number = name.split('.').next()?;
@@ -128,18 +133,18 @@ fn metadata(path: &Path) -> Option<Metadata> {
     fs::symlink_metadata(path).ok()
 }
 
-/// Time since the last change; zero if the clock was set back since.
+/// Time since the last modification; zero if the clock was set back since then.
 fn age(data: &Metadata) -> Duration {
     data.modified().ok().and_then(|at| at.elapsed().ok()).unwrap_or_default()
 }
 
 fn is_old(path: &Path) -> bool {
-    metadata(path).is_some_and(|data| age(&data) >= UNFINISHED)
+    metadata(path).is_some_and(|data| age(&data) >= INCOMPLETE_NODE_AGE)
 }
 
 fn remove(path: &Path) {
-    tracing::debug!(path = %path.display(), "removing the remains of a dead process");
-    // Whoever else is at it does the same.
+    tracing::debug!(path = %path.display(), "removing a resource of a dead process");
+    // An error means that another process has removed it.
     let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
 }
 
@@ -152,8 +157,8 @@ mod tests {
 
     use super::*;
 
-    /// A namespace in a directory of its own, without members.
-    fn place(name: &str) -> (PathBuf, Config) {
+    /// A namespace in a directory of its own, without nodes.
+    fn empty_namespace(name: &str) -> (PathBuf, Config) {
         let root = PathBuf::from(format!("/tmp/endless-sweep-{name}-{}", std::process::id()));
         let mut config = Config::default();
         config.global.set_root_path(&iceoryx2::prelude::Path::new(root.as_os_str().as_bytes()).unwrap());
@@ -172,8 +177,8 @@ mod tests {
     }
 
     #[test]
-    fn files_of_members_are_recognised() {
-        let number = |name: &str| member_number(&Path::new("/tmp").join(name), b"e1_");
+    fn files_of_nodes_are_recognised() {
+        let number = |name: &str| node_number(&Path::new("/tmp").join(name), b"e1_");
         assert_eq!(number("123").as_deref(), Some("123"));
         assert_eq!(number("e1_123.node_monitor_owner_lock").as_deref(), Some("123"));
         assert_eq!(number("e2_123.node_monitor"), None);
@@ -182,33 +187,33 @@ mod tests {
     }
 
     #[test]
-    fn stubs_go_when_they_are_old() {
-        let (root, config) = place("stub");
+    fn incomplete_resources_are_removed_when_they_are_old() {
+        let (root, config) = empty_namespace("stub");
         let services = root.join("services");
         let [finished, begun, stuck] =
             [("a", 0o400, 60), ("b", 0o600, 0), ("c", 0o600, 60)].map(|(n, m, s)| file(&services, &config, n, m, s));
         let nodes = root.join("nodes");
         let [young, old] = [("1", 1), ("2", 60)].map(|(n, s)| file(&nodes, &config, n, 0o600, s));
-        super::services(&config);
-        members(&config);
+        remove_incomplete_services(&config, &NamespaceLock::acquire(&root).unwrap());
+        remove_incomplete_nodes(&config);
         assert!(finished.exists() && begun.exists() && !stuck.exists());
         assert!(young.exists() && !old.exists());
-        deserted(&config);
-        assert!(!finished.exists() && begun.exists(), "nobody uses what lies in a deserted place");
+        remove_orphans(&config);
+        assert!(!finished.exists() && begun.exists(), "old resources of an empty namespace are orphans");
         fs::remove_dir_all(&root).unwrap();
     }
 
     #[test]
-    fn segments_without_a_size_go_when_it_is_certain() {
-        let (root, config) = place("size");
+    fn unsized_segments_are_removed_when_they_are_old() {
+        let (root, config) = empty_namespace("size");
         let segments = Path::new(SEGMENTS);
         let [old, young, sized] = ["old", "young", "sized"].map(|name| file(segments, &config, name, 0o600, 0));
         File::options().write(true).open(&old).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
         fs::write(&sized, "x").unwrap();
         let start = Instant::now();
-        unsized_segments(&config);
+        remove_unsized_segments(&config);
         assert!(!old.exists() && !young.exists() && sized.exists());
-        assert!(start.elapsed() >= UNSIZED / 2);
+        assert!(start.elapsed() >= UNSIZED_SEGMENT_AGE / 2);
         fs::remove_file(sized).unwrap();
         fs::remove_dir_all(&root).unwrap();
     }

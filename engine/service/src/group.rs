@@ -1,0 +1,247 @@
+//! One group of an engine: its pool, its ports, and how it executes requests.
+
+use endless_gym_core::batch::{Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for};
+use endless_gym_core::pool::{Pool, ResetRequest};
+use iceoryx2::port::ReceiveError;
+use iceoryx2::sample::Sample;
+use serde_json::{Map, Value as Json};
+
+use crate::error::{Rejection, ServiceError};
+use crate::memory::PrefaultedChunks;
+use crate::message::{PayloadBlock, RequestHeader, RequestKind};
+use crate::namespace::Ipc;
+use crate::ports::{self, EngineServices, LeaseLimits, PortError, RequestSubscriber, ResponsePublisher};
+
+/// Chunks of a group that are prefaulted at the start: the engine writes one while the trainer reads the other. More are used
+/// when a trainer or an observer holds more batches; [`Engine::new`](crate::Engine::new) checks that there is room for them.
+const CHUNKS_AT_START: usize = 2;
+
+/// A request in shared memory.
+pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
+
+/// Why a request is rejected, and an explanation.
+pub(crate) type Rejected = (Rejection, String);
+
+/// What the response to a request holds.
+pub(crate) enum Outcome {
+    Batch { env_steps: usize },
+    Snapshot { bytes: usize },
+}
+
+/// One group of an engine.
+pub(crate) struct Group {
+    pool: Pool,
+    requests: RequestSubscriber,
+    pub responses: ResponsePublisher,
+    pub memory: PrefaultedChunks,
+    request: RequestData,
+    /// The trainer that last reset all environments.
+    trainer: Option<u64>,
+    /// Batches returned so far.
+    pub step: u64,
+}
+
+impl Group {
+    pub(crate) fn new(
+        services: &EngineServices<'_>,
+        number: usize,
+        pool: Pool,
+        limits: LeaseLimits,
+    ) -> Result<Self, ServiceError> {
+        let requests = services
+            .requests(number)?
+            .subscriber_builder()
+            .create()
+            .map_err(|e| ServiceError::middleware("cannot create a subscriber")(e.to_string()))?;
+        let service = services.responses(number, limits)?;
+        let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), CHUNKS_AT_START);
+        let (responses, memory) = publisher.map_err(|e| match e {
+            PortError::Other(e) => e,
+            PortError::LimitReached => {
+                ServiceError::middleware("cannot create a publisher")("it exists already".to_owned())
+            }
+        })?;
+        Ok(Group { pool, requests, responses, memory, request: RequestData::default(), trainer: None, step: 0 })
+    }
+
+    /// The next request, if there is one.
+    pub(crate) fn poll(&self) -> Result<Option<RequestSample>, ServiceError> {
+        match self.requests.receive() {
+            // The trainer died while it connected.
+            Err(ReceiveError::ConnectionFailure(e)) => {
+                tracing::warn!(error = %e, "cannot receive from a trainer");
+                Ok(None)
+            }
+            received => received.map_err(|e| ServiceError::middleware("cannot receive a request")(e.to_string())),
+        }
+    }
+
+    /// Checks a request and copies its payload. `header` is a copy as well.
+    pub(crate) fn read(
+        &mut self,
+        layout: &Layout,
+        header: &RequestHeader,
+        payload: &[Block],
+    ) -> Result<RequestKind, Rejected> {
+        let kind = self.request.read(layout, header, payload)?;
+        let resets_all = match kind {
+            RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore => false,
+            RequestKind::ResetEach => !self.request.reset.contains(&0),
+            RequestKind::ResetAll | RequestKind::ResetSeed => true,
+        };
+        if !resets_all && self.trainer != Some(header.trainer) {
+            let text = "this trainer must reset all environments of the group first";
+            return Err((Rejection::NotReset, text.to_owned()));
+        }
+        Ok(kind)
+    }
+
+    /// Executes the request that was read last and writes the response into `payload`.
+    pub(crate) fn execute(
+        &mut self,
+        kind: RequestKind,
+        header: &RequestHeader,
+        payload: &mut [Block],
+    ) -> Result<Outcome, Rejected> {
+        let RequestData { action, reset, seed, snapshot, options, .. } = &self.request;
+        let (options, env) = (options.as_ref(), usize::try_from(header.env).unwrap_or(usize::MAX));
+        let batch_blocks = self.pool.layout().blocks();
+        let batch = &mut payload[..batch_blocks];
+        let done = match kind {
+            RequestKind::Step => self.pool.step(action, batch),
+            RequestKind::Snapshot => return self.write_snapshot(env, payload),
+            RequestKind::Restore => {
+                let done = self.pool.restore(env, snapshot).map(|()| Outcome::Snapshot { bytes: 0 });
+                return done.map_err(|e| (Rejection::Snapshot, e.to_string()));
+            }
+            RequestKind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
+            RequestKind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
+            RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each { reset, seed }, options, batch),
+        };
+        done.map_err(|e| (Rejection::Pool, e.to_string()))?;
+        self.trainer = Some(header.trainer);
+        Ok(Outcome::Batch { env_steps: if kind == RequestKind::Step { self.pool.layout().num_envs() } else { 0 } })
+    }
+
+    /// Writes a snapshot of an environment over the batch in `payload`.
+    fn write_snapshot(&self, env: usize, payload: &mut [Block]) -> Result<Outcome, Rejected> {
+        let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
+        if snapshot.len() > SNAPSHOT_BYTES {
+            let text = format!(
+                "snapshot must have at most {SNAPSHOT_BYTES} bytes, got {}; use reset parameters with shorter lists",
+                snapshot.len()
+            );
+            return Err((Rejection::Snapshot, text));
+        }
+        self.pool.layout().forget_frames(payload);
+        bytemuck::cast_slice_mut(payload)[..snapshot.len()].copy_from_slice(&snapshot);
+        Ok(Outcome::Snapshot { bytes: snapshot.len() })
+    }
+}
+
+/// The payload of the current request, copied out of shared memory: the trainer cannot change it after the check. The buffers are
+/// reused, so that a step does not allocate.
+#[derive(Debug, Default)]
+struct RequestData {
+    action: Vec<i32>,
+    reset: Vec<u8>,
+    seed: Vec<u64>,
+    snapshot: Vec<u8>,
+    options_text: Vec<u8>,
+    options: Option<Map<String, Json>>,
+}
+
+impl RequestData {
+    fn read(&mut self, layout: &Layout, header: &RequestHeader, payload: &[Block]) -> Result<RequestKind, Rejected> {
+        if header.layout_version != LAYOUT_VERSION {
+            let text = format!("layout version must be {LAYOUT_VERSION}, got {}", header.layout_version);
+            return Err((Rejection::Version, text));
+        }
+        let Some(kind) = RequestKind::from_code(header.kind) else {
+            return Err((Rejection::Kind, format!("request kind must be 1 to 6, got {}", header.kind)));
+        };
+        if payload.len() < layout.blocks() {
+            let text = format!("payload must have {} blocks of 64 bytes, got {}", layout.blocks(), payload.len());
+            return Err((Rejection::Payload, text));
+        }
+        match kind {
+            RequestKind::Step => copy(&mut self.action, layout.read(payload, "action")),
+            RequestKind::ResetEach => {
+                copy(&mut self.reset, layout.read(payload, "reset"));
+                copy(&mut self.seed, layout.read(payload, "seed"));
+            }
+            RequestKind::Restore => copy(&mut self.snapshot, prefix(layout.read(payload, "snapshot"), header.bytes)),
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot => {}
+        }
+        self.options = match kind {
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::ResetEach if header.bytes > 0 => {
+                copy(&mut self.options_text, prefix(layout.read(payload, "options"), header.bytes));
+                let options = serde_json::from_slice(&self.options_text);
+                Some(
+                    options
+                        .map_err(|e| (Rejection::Options, format!("reset parameters must be a JSON object: {e}")))?,
+                )
+            }
+            _ => None,
+        };
+        Ok(kind)
+    }
+}
+
+/// Blocks of a chunk that can hold a batch or a snapshot.
+pub(crate) fn chunk_blocks(batch: &Layout) -> usize {
+    batch.blocks().max(blocks_for(SNAPSHOT_BYTES))
+}
+
+/// The first `length` elements, or an empty slice if there are fewer.
+fn prefix<T>(elements: &[T], length: u64) -> &[T] {
+    usize::try_from(length).ok().and_then(|length| elements.get(..length)).unwrap_or_default()
+}
+
+fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {
+    to.clear();
+    to.extend_from_slice(from);
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::batch::{action_layout, zeroed};
+    use endless_gym_core::envs;
+
+    use super::*;
+
+    #[test]
+    fn a_request_that_changes_after_it_was_read_has_no_effect() {
+        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1);
+        let mut payload = zeroed(layout.blocks());
+        let mut data = RequestData::default();
+        let header = |kind: RequestKind, bytes| RequestHeader {
+            layout_version: LAYOUT_VERSION,
+            kind: kind.code(),
+            bytes,
+            ..RequestHeader::default()
+        };
+
+        let text = br#"{"arena_size": 3}"#;
+        layout.write::<u8>(&mut payload, "options")[..text.len()].copy_from_slice(text);
+        data.read(&layout, &header(RequestKind::ResetAll, text.len() as u64), &payload).unwrap();
+        layout.write::<u8>(&mut payload, "options").fill(b'x');
+        assert_eq!(data.options.as_ref().unwrap()["arena_size"], 3);
+        assert_eq!(data.options_text, text);
+
+        layout.write::<u8>(&mut payload, "snapshot").fill(1);
+        data.read(&layout, &header(RequestKind::Restore, 9), &payload).unwrap();
+        layout.write::<u8>(&mut payload, "snapshot").fill(2);
+        assert_eq!((&data.snapshot[..], &data.options), (&[1; 9][..], &None));
+    }
+
+    #[test]
+    fn a_length_beyond_the_payload_reads_nothing() {
+        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1);
+        let payload = zeroed(layout.blocks());
+        let header =
+            RequestHeader { layout_version: LAYOUT_VERSION, kind: 2, bytes: u64::MAX, ..RequestHeader::default() };
+        let (reason, _) = RequestData::default().read(&layout, &header, &payload).unwrap_err();
+        assert_eq!(reason, Rejection::Options);
+    }
+}

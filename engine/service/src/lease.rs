@@ -1,0 +1,176 @@
+//! Leases on batches in shared memory, and the port that receives them.
+
+use std::sync::Arc;
+
+use endless_gym_core::batch::{Batch, Block, LAYOUT_VERSION};
+use iceoryx2::identifiers::UniqueNodeId;
+use iceoryx2::port::ReceiveError;
+use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::sample::Sample;
+
+use crate::error::ServiceError;
+use crate::fork_guard::ForkGuard;
+use crate::message::{PayloadBlock, ResponseContent, ResponseHeader, copied};
+use crate::namespace::Ipc;
+use crate::node::NamespaceNode;
+use crate::ports::{self, EngineServices, ResponseSubscriber};
+use crate::specification::ServiceSpecification;
+
+/// A lease on a group's batch in shared memory.
+///
+/// The batch is read where the engine wrote it, without a copy. The engine does not write to its memory until the lease is
+/// dropped. [`batches_held`](ServiceSpecification::batches_held) leases of a group may be held at a time.
+pub struct BatchLease {
+    // Dropped before the port through which it was received.
+    sample: ForkGuard<Sample<Ipc, [PayloadBlock], ResponseHeader>>,
+    group: usize,
+    step: u64,
+    specification: Arc<ServiceSpecification>,
+    // The engine reclaims the chunks of a port that is closed, so the port must live as long as the lease.
+    _port: Arc<ResponsePort>,
+}
+
+// SAFETY: a shared reference only reads the payload and the length in iceoryx2's header, which are not written to while the
+// sample is held. The mutable parts of the sample are used when it is dropped, which requires ownership.
+unsafe impl Sync for BatchLease {}
+
+impl BatchLease {
+    /// The arrays of the batch.
+    pub fn batch(&self) -> Batch<'_> {
+        Batch::new(&self.specification.batch, self.blocks())
+    }
+
+    /// The memory of the batch, laid out as [`ServiceSpecification::batch`] says.
+    pub fn blocks(&self) -> &[Block] {
+        bytemuck::cast_slice(self.sample.payload())
+    }
+
+    /// The number of the batch's group.
+    pub fn group(&self) -> usize {
+        self.group
+    }
+
+    /// Batches that the group has returned since the engine started, including this one.
+    pub fn step(&self) -> u64 {
+        self.step
+    }
+
+    /// The engine's specification.
+    pub fn specification(&self) -> &ServiceSpecification {
+        &self.specification
+    }
+}
+
+impl std::fmt::Debug for BatchLease {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("BatchLease").field("group", &self.group).field("step", &self.step).finish_non_exhaustive()
+    }
+}
+
+/// A message from the engine: a batch, a snapshot or a rejection.
+pub(crate) struct Response {
+    lease: BatchLease,
+    /// The trainer and the number of the request that it answers.
+    trainer: u64,
+    request: u64,
+    content: ResponseContent,
+}
+
+impl Response {
+    /// Whether it answers that request.
+    pub(crate) fn answers(&self, trainer: u64, request: u64) -> bool {
+        (self.trainer, self.request) == (trainer, request)
+    }
+
+    /// The batch; `None` if the message is something else.
+    pub(crate) fn into_batch(self) -> Option<BatchLease> {
+        (self.content == ResponseContent::Batch).then_some(self.lease)
+    }
+
+    /// A copy of the snapshot; `None` if the message is something else.
+    pub(crate) fn to_snapshot(&self) -> Option<Vec<u8>> {
+        let ResponseContent::Snapshot { bytes } = self.content else { return None };
+        let payload: &[u8] = bytemuck::cast_slice(self.lease.sample.payload());
+        payload.get(..bytes).map(<[u8]>::to_vec)
+    }
+
+    /// Turns a rejection into an error.
+    pub(crate) fn check_accepted(self) -> Result<Self, ServiceError> {
+        match self.content {
+            ResponseContent::Rejection { reason, message } => {
+                let (service, group) = (self.lease.specification.service.clone(), self.lease.group);
+                Err(ServiceError::Rejected { service, group, reason, message })
+            }
+            _ => Ok(self),
+        }
+    }
+}
+
+/// The port that receives one group's responses.
+pub(crate) struct ResponsePort {
+    subscriber: ForkGuard<ResponseSubscriber>,
+    group: usize,
+    engine: UniqueNodeId,
+    _node: Arc<NamespaceNode>,
+}
+
+impl ResponsePort {
+    pub(crate) fn open(
+        services: &EngineServices<'_>,
+        node: &Arc<NamespaceNode>,
+        group: usize,
+        specification: &ServiceSpecification,
+    ) -> Result<Self, ServiceError> {
+        let service = services.responses(group, specification.lease_limits())?;
+        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+        let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
+        let subscriber = service.subscriber_builder().create().map_err(|e| match e {
+            SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
+                service: specification.service.clone(),
+                limit: specification.observers,
+            },
+            e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
+        })?;
+        Ok(ResponsePort { subscriber: ForkGuard::new(subscriber), group, engine, _node: Arc::clone(node) })
+    }
+
+    /// The engine's node.
+    pub(crate) fn engine(&self) -> UniqueNodeId {
+        self.engine
+    }
+
+    /// The next message; `None` if there is none.
+    pub(crate) fn receive(
+        self: &Arc<Self>,
+        specification: &Arc<ServiceSpecification>,
+    ) -> Result<Option<Response>, ServiceError> {
+        let sample = match self.subscriber.receive() {
+            Ok(None) => return Ok(None),
+            Ok(Some(sample)) => sample,
+            Err(ReceiveError::ExceedsMaxBorrows) => {
+                return Err(ServiceError::TooManyBatchesHeld { group: self.group, limit: specification.batches_held });
+            }
+            // The engine is dead. The liveness check of the trainer or observer reports it.
+            Err(ReceiveError::ConnectionFailure(e)) => {
+                tracing::debug!(error = %e, "cannot receive from the engine");
+                return Ok(None);
+            }
+        };
+        let header = copied(sample.user_header());
+        if header.layout_version != LAYOUT_VERSION
+            || header.group as usize != self.group
+            || header.incarnation != specification.incarnation
+            || sample.payload().len() < specification.batch.blocks()
+        {
+            return Err(ServiceError::IncompatibleTypes { service: specification.service.clone() });
+        }
+        let lease = BatchLease {
+            sample: ForkGuard::new(sample),
+            group: self.group,
+            step: header.step,
+            specification: Arc::clone(specification),
+            _port: Arc::clone(self),
+        };
+        Ok(Some(Response { lease, trainer: header.trainer, request: header.request, content: header.content() }))
+    }
+}

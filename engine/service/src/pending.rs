@@ -1,0 +1,71 @@
+//! The requests of a trainer that have not been answered yet.
+
+use crate::message::RequestKind;
+
+/// What is requested.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Request {
+    pub kind: RequestKind,
+    /// First seed of a [`RequestKind::ResetSeed`].
+    pub seed: u64,
+    /// Environment of a [`RequestKind::Snapshot`] or a [`RequestKind::Restore`].
+    pub env: usize,
+    /// Checksum of the snapshot of a [`RequestKind::Restore`].
+    pub checksum: u32,
+}
+
+impl Request {
+    pub(crate) fn new(kind: RequestKind) -> Self {
+        Request { kind, seed: 0, env: 0, checksum: 0 }
+    }
+}
+
+/// By group, the number and the content of the request that has not been answered yet.
+#[derive(Clone, Debug)]
+pub(crate) struct PendingRequests(Vec<Option<(u64, Request)>>);
+
+impl PendingRequests {
+    pub(crate) fn new(groups: usize) -> Self {
+        PendingRequests(vec![None; groups])
+    }
+
+    /// Number of groups.
+    pub(crate) fn groups(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Replaces the pending request of a group.
+    pub(crate) fn insert(&mut self, group: usize, number: u64, request: Request) {
+        self.0[group] = Some((number, request));
+    }
+
+    /// Removes the pending request of a group.
+    pub(crate) fn remove(&mut self, group: usize) {
+        self.0[group] = None;
+    }
+
+    /// Removes all pending requests.
+    pub(crate) fn clear(&mut self) {
+        self.0.fill(None);
+    }
+
+    /// Whether that request is pending in a group.
+    pub(crate) fn has(&self, group: usize, request: Request) -> bool {
+        self.0[group].is_some_and(|(_, pending)| pending == request)
+    }
+
+    /// The number of the request that is pending in a group, if it returns a batch (`batch`) or does not (`!batch`).
+    pub(crate) fn number(&self, group: usize, batch: bool) -> Option<u64> {
+        self.0[group].filter(|(_, pending)| pending.kind.returns_batch() == batch).map(|(number, _)| number)
+    }
+
+    /// Whether a group has a pending request that returns a batch.
+    pub(crate) fn has_batch(&self, group: usize) -> bool {
+        self.number(group, true).is_some()
+    }
+
+    /// Whether any group has a pending request that returns a batch.
+    pub(crate) fn has_any_batch(&self) -> bool {
+        (0..self.groups()).any(|group| self.has_batch(group))
+    }
+}
