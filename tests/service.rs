@@ -8,6 +8,8 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use endless_gym::batch::ActionSection;
+use endless_gym::envs::ActionError;
 use endless_gym::pool::ResetRequest;
 use endless_gym::service::{ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, Trainer, engines};
 use rustix::process::{Pid, Signal, kill_process};
@@ -94,7 +96,10 @@ fn mistakes_of_a_trainer_are_typed_errors() {
             trainer.reset(0, ResetRequest::Each { reset: &[1, 1], seed: &[1] }),
             Err(ServiceError::ResetCount { given: 1, num_envs: 2 })
         ));
-        assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::ActionCount { given: 1, num_envs: 2, .. })));
+        assert!(matches!(
+            trainer.send(0, &[0]),
+            Err(ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }))
+        ));
 
         // Nothing can be stepped before the first reset.
         trainer.send(0, &vec![0; 2 * width]).unwrap();
@@ -108,7 +113,10 @@ fn mistakes_of_a_trainer_are_typed_errors() {
         let mut actions = vec![0; 2 * width];
         actions[width] = 99;
         let error = trainer.send(0, &actions).unwrap_err();
-        assert!(matches!(&error, ServiceError::ActionRange { env: 1, given, .. } if given[0] == 99), "{error}");
+        assert!(
+            matches!(&error, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given[0] == 99),
+            "{error}"
+        );
 
         let mut held = Vec::new();
         for _ in 0..trainer.specification().batches_held {
@@ -349,7 +357,7 @@ fn bad_messages_are_answered_with_rejections() {
     let (status, text) = foreign.ask(step, 1, |_| {}).unwrap();
     assert!(status != 0 && text.contains("1 blocks"), "{text}");
     let out_of_range = |blocks: &mut [endless_gym::batch::Block]| {
-        specification.action.write::<i32>(blocks, "action").fill(-1);
+        specification.action.write::<i32>(blocks, ActionSection::Action).fill(-1);
     };
     let (status, text) = foreign.ask(step, foreign.blocks(), out_of_range).unwrap();
     assert!(status != 0 && text.contains("-1"), "{text}");
@@ -358,7 +366,7 @@ fn bad_messages_are_answered_with_rejections() {
 
     // Nothing of that has harmed the engine.
     let fine = |blocks: &mut [endless_gym::batch::Block]| {
-        specification.action.write::<i32>(blocks, "action").fill(0);
+        specification.action.write::<i32>(blocks, ActionSection::Action).fill(0);
     };
     assert_eq!(foreign.ask(step, foreign.blocks(), fine).unwrap().0, 0);
     drop(foreign);

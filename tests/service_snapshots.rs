@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use endless_gym::batch::{Block, SNAPSHOT_BYTES, zeroed};
-use endless_gym::pool::{Options, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::foreign::{ActionHeader, Foreign};
@@ -163,7 +163,7 @@ fn one_that_is_late_is_waited_for_by_the_same_call() {
 fn a_thousand_spotlights_fit() {
     let place = Place::new();
     let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
-    let options = Options::Shared(options.as_object().unwrap().clone());
+    let options = ResetOptions::Shared(options.as_object().unwrap().clone());
     let pool = PoolConfig { options, features: true, frames: None, ..PoolConfig::new("SearingSpotlights-v0", 1) };
     let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
     let mut engine = Engine::new(&EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();

@@ -16,6 +16,9 @@ from endless_gym import _native
 
 SCREEN = 84
 
+#: The environment id that programs use by default.
+DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
+
 
 @dataclass(frozen=True)
 class Frames:

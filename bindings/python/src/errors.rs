@@ -51,8 +51,7 @@ pub fn service(error: ServiceError) -> PyErr {
         E::TimedOut { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
         | E::NoSuchGroup { .. }
-        | E::ActionCount { .. }
-        | E::ActionRange { .. }
+        | E::Action(_)
         | E::ResetCount { .. }
         | E::OptionsTooLong { .. }
         | E::SnapshotTooLong { .. }

@@ -1,22 +1,17 @@
 //! Options that several commands share.
 
-use clap::ValueEnum;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use endless_gym_core::batch::Frames;
-use endless_gym_core::pool::{Autoreset, Options, PoolConfig, Seeding};
+use endless_gym_core::pool::{Autoreset, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::raster::PixelFormat;
 use serde_json::{Map, Value as Json};
 
 use super::Failure;
 
-/// Auto-reset modes by Gymnasium's names.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-pub enum AutoresetMode {
-    /// Start the next episode in the step after one ended.
-    NextStep,
-    /// Start it in the same step.
-    SameStep,
-    /// Wait for the trainer to reset.
-    Disabled,
+/// The parser of an autoreset mode, with the modes' help.
+pub fn autoreset_parser() -> impl TypedValueParser<Value = Autoreset> {
+    let values = Autoreset::ALL.map(|mode| PossibleValue::new(mode.name()).help(mode.summary()));
+    PossibleValuesParser::new(values).try_map(|name| name.parse::<Autoreset>())
 }
 
 /// What the frames are like.
@@ -105,22 +100,12 @@ impl EnvironmentArgs {
                 .map_err(|error| format!("--env-options {options}: expected a JSON object: {error}"))
         });
         let each = each.collect::<Result<Vec<_>, _>>()?;
-        let options = if each.is_empty() { Options::Shared(options) } else { Options::Each(each) };
+        let options = if each.is_empty() { ResetOptions::Shared(options) } else { ResetOptions::Each(each) };
         let seeding = match (self.seed_range, &self.seed_list[..]) {
             (Some((start, end)), _) => Seeding::Range { start, end, seed: self.seed },
             (None, []) => Seeding::Continue { seed: self.seed },
             (None, list) => Seeding::List(list.to_vec()),
         };
         Ok(PoolConfig { options, seeding, ..PoolConfig::new(id, num_envs) })
-    }
-}
-
-impl From<AutoresetMode> for Autoreset {
-    fn from(mode: AutoresetMode) -> Self {
-        match mode {
-            AutoresetMode::NextStep => Autoreset::NextStep,
-            AutoresetMode::SameStep => Autoreset::SameStep,
-            AutoresetMode::Disabled => Autoreset::Disabled,
-        }
     }
 }

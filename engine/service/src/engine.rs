@@ -17,8 +17,10 @@ use super::ports::{self, ActionSubscriber, Limits, Names, ObservationPublisher, 
 use super::preflight::Resident;
 use super::specification::{self, Published, Specification};
 use super::wait::wait;
-use endless_gym_core::batch::{Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, action_layout, blocks_for};
-use endless_gym_core::pool::{Options, Pool, PoolConfig, PoolError, ResetRequest, Threads};
+use endless_gym_core::batch::{
+    ActionLayout, ActionSection, Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, action_layout, blocks_for,
+};
+use endless_gym_core::pool::{Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Threads};
 
 /// Most groups that an engine serves.
 pub const MAX_GROUPS: usize = 64;
@@ -90,11 +92,11 @@ impl EngineConfig {
             .map(|group| {
                 let first_env = group * num_envs;
                 let options = match &self.pool.options {
-                    Options::Shared(options) => Options::Shared(options.clone()),
-                    Options::Each(each) if each.len() == total_envs => {
-                        Options::Each(each[first_env..first_env + num_envs].to_vec())
+                    ResetOptions::Shared(options) => ResetOptions::Shared(options.clone()),
+                    ResetOptions::Each(each) if each.len() == total_envs => {
+                        ResetOptions::Each(each[first_env..first_env + num_envs].to_vec())
                     }
-                    Options::Each(each) => {
+                    ResetOptions::Each(each) => {
                         return Err(PoolError::OptionsCount { given: each.len(), num_envs: total_envs });
                     }
                 };
@@ -165,7 +167,7 @@ impl Engine {
         specification::refuse_second_engine(&node, &config.service)?;
         let pools: Vec<Pool> =
             config.pools()?.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<_, _>>()?;
-        let specification = specify(config, &pools[0]);
+        let specification = specify(config, &pools[0])?;
         let limits = specification.limits();
         let blocks = chunk_blocks(&specification.batch);
         Resident::check_available(blocks, limits.resident() * config.groups)?;
@@ -311,7 +313,12 @@ impl Group {
     }
 
     /// Checks a message and copies what it holds.
-    fn take(&mut self, layout: &Layout, header: &ActionHeader, payload: &[Block]) -> Result<Kind, (Rejection, String)> {
+    fn take(
+        &mut self,
+        layout: &ActionLayout,
+        header: &ActionHeader,
+        payload: &[Block],
+    ) -> Result<Kind, (Rejection, String)> {
         if header.layout_version != LAYOUT_VERSION {
             let text = format!("it is of layout version {}, the engine's is {LAYOUT_VERSION}", header.layout_version);
             return Err((Rejection::Version, text));
@@ -324,17 +331,19 @@ impl Group {
             return Err((Rejection::Payload, text));
         }
         match kind {
-            Kind::Step => copy(&mut self.action, layout.read(payload, "action")),
+            Kind::Step => copy(&mut self.action, layout.read(payload, ActionSection::Action)),
             Kind::ResetEach => {
-                copy(&mut self.reset, layout.read(payload, "reset"));
-                copy(&mut self.seed, layout.read(payload, "seed"));
+                copy(&mut self.reset, layout.read(payload, ActionSection::Reset));
+                copy(&mut self.seed, layout.read(payload, ActionSection::Seed));
             }
-            Kind::Restore => copy(&mut self.snapshot, start(layout.read(payload, "snapshot"), header.bytes)),
+            Kind::Restore => {
+                copy(&mut self.snapshot, start(layout.read(payload, ActionSection::Snapshot), header.bytes))
+            }
             Kind::ResetAll | Kind::ResetSeed | Kind::Snapshot => {}
         }
         self.options = match kind {
             Kind::ResetAll | Kind::ResetSeed | Kind::ResetEach if header.bytes > 0 => {
-                let options = serde_json::from_slice(start(layout.read(payload, "options"), header.bytes));
+                let options = serde_json::from_slice(start(layout.read(payload, ActionSection::Options), header.bytes));
                 Some(options.map_err(|e| (Rejection::Options, format!("its reset parameters cannot be read: {e}")))?)
             }
             _ => None,
@@ -411,10 +420,10 @@ fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {
     to.extend_from_slice(from);
 }
 
-fn specify(config: &EngineConfig, pool: &Pool) -> Specification {
+fn specify(config: &EngineConfig, pool: &Pool) -> Result<Specification, PoolError> {
     let spec = pool.spec();
     let features: &[_] = if config.pool.features { spec.features } else { &[] };
-    Specification {
+    Ok(Specification {
         service: config.service.clone(),
         layout_version: LAYOUT_VERSION,
         engine_version: PACKAGE_VERSION.to_owned(),
@@ -424,18 +433,18 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Specification {
         groups: config.groups,
         num_envs: config.pool.num_envs,
         batch: pool.layout().clone(),
-        action: action_layout(spec, config.pool.num_envs),
+        action: action_layout(spec, config.pool.num_envs)?,
         frames: config.pool.frames,
-        action_space: spec.action_space.into(),
+        action_space: spec.action_space.clone(),
         info: spec.info.iter().map(|column| column.name.to_owned()).collect(),
         features: features.iter().map(|column| column.name.to_owned()).collect(),
         options: match &config.pool.options {
-            Options::Shared(options) => vec![options.clone()],
-            Options::Each(each) => each.clone(),
+            ResetOptions::Shared(options) => vec![options.clone()],
+            ResetOptions::Each(each) => each.clone(),
         },
         autoreset: config.pool.autoreset,
         render_fps: spec.render_fps,
         batches_held: config.batches_held,
         observers: config.observers,
-    }
+    })
 }

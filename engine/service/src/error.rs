@@ -6,6 +6,7 @@ use std::time::Duration;
 use thiserror::Error;
 
 use endless_gym_core::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::PoolError;
 
 /// Version of this package, as a message names it.
@@ -58,10 +59,8 @@ pub enum ServiceError {
     SharedMemoryTooSmall { needed: u64, available: u64, path: &'static str },
     #[error("there is no group {given}; engine `{service}` has groups 0 to {}", groups.saturating_sub(1))]
     NoSuchGroup { service: String, given: usize, groups: usize },
-    #[error("{given} action numbers for {num_envs} environments of {branches} branches; give {}", num_envs * branches)]
-    ActionCount { given: usize, num_envs: usize, branches: usize },
-    #[error("action {given:?} of environment {env} is not in {space}")]
-    ActionRange { env: usize, given: Vec<i32>, space: String },
+    #[error(transparent)]
+    Action(#[from] ActionError),
     #[error("a reset with {given} flags or seeds asked of {num_envs} environments; give one of both for each")]
     ResetCount { given: usize, num_envs: usize },
     #[error(

@@ -59,5 +59,5 @@ pub use engine::{Engine, EngineConfig, MAX_GROUPS, Summary};
 pub use error::{Rejection, ServiceError};
 pub use observer::Observer;
 pub use received::Received;
-pub use specification::{Actions, Specification, engines};
+pub use specification::{Specification, engines};
 pub use trainer::{ConnectConfig, Trainer};

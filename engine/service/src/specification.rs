@@ -22,7 +22,7 @@ use super::error::{PACKAGE_VERSION, ServiceError};
 use super::node::{Ipc, Member};
 use super::ports::{self, CLEANUP_TIMEOUT, Limits, Names, SPECIFICATION_PREFIX};
 use super::sweep;
-use endless_gym_core::batch::{Frames, LAYOUT_VERSION, Layout};
+use endless_gym_core::batch::{ActionLayout, Frames, LAYOUT_VERSION, Layout};
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::pool::Autoreset;
 
@@ -46,17 +46,16 @@ pub struct Specification {
     /// The layout of a group's batch.
     pub batch: Layout,
     /// The layout of the message that steps or resets a group.
-    pub action: Layout,
+    pub action: ActionLayout,
     /// What the frames in a batch look like, if it has any.
     pub frames: Option<Frames>,
-    pub action_space: Actions,
+    pub action_space: ActionSpace,
     /// Names of the columns of `info`.
     pub info: Vec<String>,
     /// Names of the columns of `features`.
     pub features: Vec<String>,
     /// Reset parameters that were given: one set for all environments, or one for each of all groups.
     pub options: Vec<Map<String, Json>>,
-    #[serde(with = "AutoresetName")]
     pub autoreset: Autoreset,
     /// Frames a second at which a person would watch.
     pub render_fps: u32,
@@ -85,51 +84,6 @@ impl Specification {
         ];
         same.into_iter().find(|(_, same)| !same).map(|(what, _)| what)
     }
-}
-
-/// The action space of an environment: [`ActionSpace`], as a specification carries it.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Actions {
-    /// One number in `0..n`.
-    Discrete(i32),
-    /// Several numbers, each in `0..n` for its own `n`.
-    MultiDiscrete(Vec<i32>),
-}
-
-impl Actions {
-    /// Number of choices of each branch.
-    pub fn branches(&self) -> &[i32] {
-        match self {
-            Actions::Discrete(n) => std::slice::from_ref(n),
-            Actions::MultiDiscrete(branches) => branches,
-        }
-    }
-}
-
-impl From<ActionSpace> for Actions {
-    fn from(space: ActionSpace) -> Self {
-        match space {
-            ActionSpace::Discrete(n) => Actions::Discrete(n),
-            ActionSpace::MultiDiscrete(branches) => Actions::MultiDiscrete(branches.to_vec()),
-        }
-    }
-}
-
-impl std::fmt::Display for Actions {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Actions::Discrete(n) => write!(f, "Discrete({n})"),
-            Actions::MultiDiscrete(branches) => write!(f, "MultiDiscrete({branches:?})"),
-        }
-    }
-}
-
-#[derive(Serialize, Deserialize)]
-#[serde(remote = "Autoreset", rename_all = "snake_case")]
-enum AutoresetName {
-    NextStep,
-    SameStep,
-    Disabled,
 }
 
 /// Says how to read the rest. Its form never changes.

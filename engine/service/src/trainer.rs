@@ -17,7 +17,7 @@ use super::ports::{self, ActionPublisher, CLEANUP_TIMEOUT, Names, Open, PortErro
 use super::received::{ObservationPort, Received};
 use super::specification::{self, Specification};
 use super::wait::wait;
-use endless_gym_core::batch::{Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::batch::{ActionSection, Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use endless_gym_core::pool::ResetRequest;
 
 /// How long a trainer hears nothing before it looks whether the engine still lives.
@@ -151,7 +151,7 @@ impl Trainer {
             return Err(ServiceError::OptionsTooLong { given: options.len() });
         }
         let write_options = |message: &mut [Block]| {
-            let text = specification.action.write::<u8>(message, "options");
+            let text = specification.action.write::<u8>(message, ActionSection::Options);
             text[..options.len()].copy_from_slice(options.as_bytes());
             Ok(options.len())
         };
@@ -163,8 +163,8 @@ impl Trainer {
                 Err(ServiceError::ResetCount { given, num_envs })
             }
             ResetRequest::Each { reset, seed } => self.post(group, Asked::of(Kind::ResetEach), |message| {
-                specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
-                specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
+                specification.action.write::<u8>(message, ActionSection::Reset).copy_from_slice(reset);
+                specification.action.write::<u64>(message, ActionSection::Seed).copy_from_slice(seed);
                 write_options(message)
             }),
         }
@@ -173,15 +173,12 @@ impl Trainer {
     /// Steps a group; [`receive`](Trainer::receive) returns what came of it. `actions` holds a row for each environment, one
     /// number for each branch of the action space.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
-        let expected = self.specification.num_envs * self.specification.action_space.branches().len();
-        if actions.len() != expected {
-            return Err(ServiceError::ActionCount {
-                given: actions.len(),
-                num_envs: self.specification.num_envs,
-                branches: self.specification.action_space.branches().len(),
-            });
-        }
-        self.send_with(group, |message| message.copy_from_slice(actions))
+        let specification = Arc::clone(&self.specification);
+        specification.action_space.check(specification.num_envs, actions)?;
+        self.post(group, Asked::of(Kind::Step), |message| {
+            specification.action.write::<i32>(message, ActionSection::Action).copy_from_slice(actions);
+            Ok(0)
+        })
     }
 
     /// As [`Trainer::send`], for actions that `fill` writes where the engine reads them. Until then the slice holds an earlier
@@ -189,9 +186,10 @@ impl Trainer {
     pub fn send_with(&mut self, group: usize, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
         self.post(group, Asked::of(Kind::Step), |message| {
-            let actions = specification.action.write::<i32>(message, "action");
+            let actions = specification.action.write::<i32>(message, ActionSection::Action);
             fill(actions);
-            check_actions(&specification, actions).map(|()| 0)
+            specification.action_space.check(specification.num_envs, actions)?;
+            Ok(0)
         })
     }
 
@@ -239,7 +237,7 @@ impl Trainer {
         }
         let specification = Arc::clone(&self.specification);
         let write = |message: &mut [Block]| {
-            specification.action.write::<u8>(message, "snapshot")[..given].copy_from_slice(snapshot);
+            specification.action.write::<u8>(message, ActionSection::Snapshot)[..given].copy_from_slice(snapshot);
             Ok(given)
         };
         let asked = Asked { env, snapshot: crc32fast::hash(snapshot), ..Asked::of(Kind::Restore) };
@@ -447,18 +445,5 @@ fn action_publisher(
         }
         services.node.clean();
         std::thread::sleep(RETRY);
-    }
-}
-
-fn check_actions(specification: &Specification, actions: &[i32]) -> Result<(), ServiceError> {
-    let branches = specification.action_space.branches();
-    let fits = |action: &[i32]| action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a));
-    match actions.chunks_exact(branches.len().max(1)).enumerate().find(|(_, action)| !fits(action)) {
-        None => Ok(()),
-        Some((env, action)) => Err(ServiceError::ActionRange {
-            env,
-            given: action.to_vec(),
-            space: specification.action_space.to_string(),
-        }),
     }
 }

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from endless_gym.agents.metrics import is_finite
-from endless_gym.specs import spec
+from endless_gym.specs import DEFAULT_ENV_ID, spec
 
 AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
 PresetName = Literal["paper", "old", "throughput", "quick"]
@@ -147,7 +147,7 @@ class PPO:
 class Settings:
     """Train an agent with PPO on one of the Memory Gym environments."""
 
-    env: str = "Endless-MortarMayhem-v0"
+    env: str = DEFAULT_ENV_ID
     """environment id; `endless list` shows them"""
     agent: AgentName = "gru"
     """the memory: gru, lstm, trxl (Transformer-XL), gtrxl (with gates); or one of the naive baselines: none, stack (grey frames),

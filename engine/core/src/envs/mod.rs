@@ -1,5 +1,6 @@
 //! The environments: the trait that each fills, the registry of ids, and their reset parameters.
 
+mod action_space;
 pub mod character;
 pub mod mortar_mayhem;
 pub mod mystery_path;
@@ -18,8 +19,9 @@ use thiserror::Error;
 
 use crate::random::Generator;
 use crate::raster::Canvas;
+pub use action_space::{ActionError, ActionSpace, InvalidActionSpace};
 pub use parameters::{Kind, Parameter, ParameterError, ResetParameters};
-pub use spec::{ActionSpace, Column, FRAME_BYTES, InfoColumn, SCREEN, Spec};
+pub use spec::{Column, FRAME_BYTES, InfoColumn, SCREEN, Spec};
 
 /// Rules and pictures of one family of environments.
 ///
@@ -122,6 +124,9 @@ pub enum Family {
     MysteryPath(mystery_path::Variant),
     SearingSpotlights(searing_spotlights::Variant),
 }
+
+/// The environment id that commands and training programs use by default.
+pub const DEFAULT_ENV_ID: &str = "Endless-MortarMayhem-v0";
 
 /// Every environment id, in the order in which `endless list` shows them.
 pub fn specs() -> impl Iterator<Item = &'static Spec> {

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::Family;
+use super::action_space::ActionSpace;
 use super::parameters::Parameter;
 
 /// Width and height of an observation in pixels.
@@ -10,34 +11,6 @@ pub const SCREEN: usize = 84;
 
 /// Bytes of one observation: 84x84 RGB.
 pub const FRAME_BYTES: usize = SCREEN * SCREEN * 3;
-
-/// Actions of an environment, as the original's Gymnasium space.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub enum ActionSpace {
-    /// One number in `0..n`.
-    Discrete(i32),
-    /// Several numbers, each in `0..n` for its own `n`.
-    MultiDiscrete(&'static [i32]),
-}
-
-impl ActionSpace {
-    /// Number of choices of each branch.
-    pub fn branches(&self) -> &[i32] {
-        match self {
-            ActionSpace::Discrete(n) => std::slice::from_ref(n),
-            ActionSpace::MultiDiscrete(branches) => branches,
-        }
-    }
-}
-
-impl std::fmt::Display for ActionSpace {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            ActionSpace::Discrete(n) => write!(f, "Discrete({n})"),
-            ActionSpace::MultiDiscrete(branches) => write!(f, "MultiDiscrete({branches:?})"),
-        }
-    }
-}
 
 /// A number with a name and a meaning: a column of the info or of the feature observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -1,6 +1,6 @@
 //! Painting one surface onto another: copied, with a colour key, and translucent.
 
-use super::canvas::clip;
+use super::runs::clip;
 use super::{Canvas, Rgb, Surface};
 
 /// Mixes a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26

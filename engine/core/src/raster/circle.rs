@@ -5,10 +5,10 @@
 
 use std::ops::Range;
 
-use super::canvas::{clip, fill_run};
+use super::runs::{clip, fill_run};
 use super::{Canvas, Rgb};
 
-/// Larger radii are drawn with this one, to bound the work.
+/// Maximum radius; larger ones are drawn with it, to bound the time.
 const MAX_RADIUS: i64 = 1 << 16;
 
 /// Whether the midpoint that follows the point `(x, y)` of an outline lies outside of the circle,

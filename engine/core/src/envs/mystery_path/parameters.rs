@@ -196,7 +196,7 @@ pub const SPECS: &[Spec] = &[
         id: "MysteryPath-v0",
         summary: "Find an invisible path to the goal; whoever falls off starts over and has to remember where",
         family: Family::MysteryPath(Variant::Free),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: 0,
         ground_truth: 0,
         info: FINITE_INFO,
