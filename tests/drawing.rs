@@ -125,7 +125,7 @@ fn a_pixel_that_somebody_changed_is_found() {
     let PoolError::WrongFrame(WrongFrame { expected, found, .. }) = &error else { panic!("{error}") };
     assert_eq!(expected ^ 1, *found);
     assert!(matches!(error, PoolError::WrongFrame(WrongFrame { env: 1, pixel: (83, 2), .. })), "{error}");
-    assert!(error.to_string().contains("environment 1 is wrong at (83, 2)"), "{error}");
+    assert!(error.to_string().contains("environment 1 is wrong at pixel (83, 2)"), "{error}");
 
     // What is half written is not trusted, and what is announced is no mistake.
     pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();

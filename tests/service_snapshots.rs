@@ -118,7 +118,7 @@ fn mistakes_are_typed_errors() {
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
     for bytes in [u64::MAX, 1 << 40] {
         let (status, text) = foreign.ask(ActionHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
-        assert!(status != 0 && text.contains("no snapshot"), "{text}");
+        assert!(status != 0 && text.contains("not a snapshot"), "{text}");
     }
 }
 

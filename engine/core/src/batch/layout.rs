@@ -1,15 +1,12 @@
 //! Where each section of a batch lies in memory.
 
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 use super::block::{BLOCK_BYTES, Block, blocks_for};
 use super::dtype::{Dtype, Element};
+use super::layout_error::{LayoutError, MAX_ENVS};
 use super::sections::{ActionSection, BatchSection, Contents, RowShape, SectionTable};
 use crate::envs::Spec;
-
-/// Maximum number of environments in a batch.
-pub const MAX_ENVS: usize = 1 << 20;
 
 /// Maximum number of dimensions of a section's array, the environment's index included.
 pub const MAX_DIMENSIONS: usize = 8;
@@ -283,119 +280,8 @@ impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
     }
 }
 
-/// A description of a layout that is not valid.
-#[derive(Clone, Debug, Error, PartialEq, Eq)]
-pub enum LayoutError {
-    /// No environment, or too many.
-    #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]
-    NumEnvs {
-        /// The number that was given.
-        given: usize,
-    },
-    /// A section that the table lacks.
-    #[error("unknown section `{given}`")]
-    UnknownSection {
-        /// The name that was given.
-        given: String,
-    },
-    /// A section that is given twice.
-    #[error("section `{section}` is given twice")]
-    Duplicate {
-        /// The section's name.
-        section: &'static str,
-    },
-    /// A section is missing that every layout has.
-    #[error("section `{section}` is missing")]
-    Missing {
-        /// The section's name.
-        section: &'static str,
-    },
-    /// A section has another number type than the table says.
-    #[error("section `{section}` must have dtype {expected}, got {given}")]
-    Dtype {
-        /// The section's name.
-        section: &'static str,
-        /// The number type that was given.
-        given: Dtype,
-        /// The table's number type.
-        expected: Dtype,
-    },
-    /// A section's row has another number of dimensions than the table says.
-    #[error("the row shape of section `{section}` must be {expected}, got {given:?}")]
-    Shape {
-        /// The section's name.
-        section: &'static str,
-        /// The shape that was given.
-        given: Vec<usize>,
-        /// The shapes that are allowed, in words.
-        expected: String,
-    },
-    /// A section does not start at a multiple of [`BLOCK_BYTES`].
-    #[error("the offset of section `{section}` must be a multiple of {BLOCK_BYTES}, got {given}")]
-    Alignment {
-        /// The section's name.
-        section: &'static str,
-        /// The offset that was given, in bytes.
-        given: usize,
-    },
-    /// Sections are not in the order of their offsets.
-    #[error("sections must be in the order of their offsets; section `{section}` at byte {given} follows a later one")]
-    Order {
-        /// The section's name.
-        section: &'static str,
-        /// The offset that was given, in bytes.
-        given: usize,
-    },
-    /// A section starts before the end of the one before it.
-    #[error("section `{section}` overlaps the one before it: it must start at byte {end} or later, got {given}")]
-    Overlap {
-        /// The section's name.
-        section: &'static str,
-        /// The offset that was given, in bytes.
-        given: usize,
-        /// End of the section before it, in bytes.
-        end: usize,
-    },
-    /// A section's end does not fit the address space.
-    #[error("section `{section}` is too large for the address space")]
-    TooLarge {
-        /// The section's name.
-        section: &'static str,
-    },
-    /// A section of bytes is too short for the longest message.
-    #[error("section `{section}` must have at least {needed} bytes, got {given}")]
-    TooShort {
-        /// The section's name.
-        section: &'static str,
-        /// Bytes of all rows.
-        given: usize,
-        /// Bytes of the longest message.
-        needed: usize,
-    },
-    /// A section reaches beyond the declared size.
-    #[error("section `{section}` ends at byte {end}, beyond the declared {blocks} blocks of {BLOCK_BYTES} bytes")]
-    PastEnd {
-        /// The section's name.
-        section: &'static str,
-        /// End of the section, in bytes.
-        end: usize,
-        /// The declared size in blocks.
-        blocks: usize,
-    },
-    /// The declared size is not that of the sections.
-    #[error("blocks must be {expected}, the size of all sections, got {given}")]
-    Blocks {
-        /// The declared size.
-        given: usize,
-        /// The sections' size.
-        expected: usize,
-    },
-}
-
 #[cfg(test)]
 mod tests {
-    use serde_json::{Value as Json, json};
-
     use super::super::block::zeroed;
     use super::super::frames::Frames;
     use super::*;
@@ -474,82 +360,6 @@ mod tests {
         assert_eq!(error, Err(LayoutError::TooLarge { section: "observation" }));
     }
 
-    /// What deserialising says of a layout of which a part is replaced.
-    fn refused(pointer: &str, value: Json) -> String {
-        let mut json = serde_json::to_value(layout(4)).unwrap();
-        *json.pointer_mut(pointer).expect(pointer) = value;
-        serde_json::from_value::<Layout>(json).unwrap_err().to_string()
-    }
-
-    #[test]
-    fn forged_layouts_are_refused() {
-        let mut valid = serde_json::to_value(layout(4)).unwrap();
-        let blocks = layout(4).blocks();
-        // observation, features, ground_truth, reward, terminated, truncated, ...
-        assert_eq!(valid["sections"][3]["name"], "reward");
-        for (pointer, value, message) in [
-            ("/num_envs", json!(0), "num_envs must be 1 to 1048576, got 0".to_owned()),
-            ("/num_envs", json!(1_u64 << 40), "num_envs must be 1 to 1048576, got 1099511627776".to_owned()),
-            ("/sections/3/name", json!("rewards"), "unknown section `rewards`".to_owned()),
-            ("/sections/3/name", json!("action"), "unknown section `action`".to_owned()),
-            ("/sections/4/name", json!("truncated"), "section `truncated` is given twice".to_owned()),
-            ("/sections/3/dtype", json!("float32"), "section `reward` must have dtype float64, got float32".to_owned()),
-            ("/sections/3/shape", json!([1]), "the row shape of section `reward` must be (), got [1]".to_owned()),
-            (
-                "/sections/0/shape",
-                json!([1, 1, 1, 1, 1, 1, 1, 1, 1]),
-                "the row shape of section `observation` must be a frame's shape of 2 to 4 dimensions, got \
-                 [1, 1, 1, 1, 1, 1, 1, 1, 1]"
-                    .to_owned(),
-            ),
-            (
-                "/sections/3/offset",
-                json!(90_001),
-                "the offset of section `reward` must be a multiple of 64, got 90001".to_owned(),
-            ),
-            (
-                "/sections/3/offset",
-                json!(64),
-                "sections must be in the order of their offsets; section `reward` at byte 64 follows a later one"
-                    .to_owned(),
-            ),
-            (
-                "/blocks",
-                json!(0),
-                format!("section `observation` ends at byte {}, beyond the declared 0 blocks of 64 bytes", 4 * 21168),
-            ),
-            (
-                "/blocks",
-                json!(blocks + 1),
-                format!("blocks must be {blocks}, the size of all sections, got {}", blocks + 1),
-            ),
-            (
-                "/blocks",
-                json!(blocks - 1),
-                format!("blocks must be {blocks}, the size of all sections, got {}", blocks - 1),
-            ),
-        ] {
-            let found = refused(pointer, value.clone());
-            assert_eq!(found, message, "{pointer} {value}");
-        }
-        let last = valid["sections"].as_array().unwrap().len() - 1;
-        let overlapping = &valid["sections"][1]["offset"].as_u64().unwrap() - 64;
-        assert!(refused("/sections/1/offset", json!(overlapping)).contains("overlaps the one before it"));
-        let beyond = (layout(4).blocks() * BLOCK_BYTES) as u64;
-        assert!(refused(&format!("/sections/{last}/offset"), json!(beyond)).contains("beyond the declared"));
-        for shape in
-            [json!([u64::MAX, 2]), json!([u64::MAX, 0]), json!([1_u64 << 62, 1_u64 << 62]), json!([1_u64 << 61, 1])]
-        {
-            assert_eq!(refused("/sections/0/shape", shape), "section `observation` is too large for the address space");
-        }
-        let edge = json!(u64::MAX - 63);
-        assert!(refused(&format!("/sections/{last}/offset"), edge).contains("too large for the address space"));
-        assert!(refused("/num_envs", json!(5)).contains("overlaps the one before it"));
-        valid["sections"].as_array_mut().unwrap().remove(3);
-        let error = serde_json::from_value::<Layout>(valid).unwrap_err();
-        assert_eq!(error.to_string(), "section `reward` is missing");
-    }
-
     #[test]
     fn a_message_takes_the_longest_options_and_snapshots() {
         let spec = envs::specs().next().unwrap();
@@ -562,9 +372,5 @@ mod tests {
                 assert!(layout.section(section).unwrap().bytes() >= bytes);
             }
         }
-        let mut json = serde_json::to_value(action_layout(spec, 4).unwrap()).unwrap();
-        json["sections"][3]["shape"] = json!([1000]);
-        let error = serde_json::from_value::<ActionLayout>(json).unwrap_err();
-        assert_eq!(error.to_string(), "section `options` must have at least 16384 bytes, got 4000");
     }
 }

@@ -13,8 +13,11 @@
 
 mod block;
 mod dtype;
+#[cfg(test)]
+mod forged_tests;
 mod frames;
 mod layout;
+mod layout_error;
 mod sections;
 mod stamp;
 mod view;
@@ -22,7 +25,8 @@ mod view;
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use dtype::{Dtype, Element};
 pub use frames::{Frames, MAX_STACK};
-pub use layout::{ActionLayout, Layout, LayoutError, MAX_DIMENSIONS, MAX_ENVS, Section, action_layout, batch_layout};
+pub use layout::{ActionLayout, Layout, MAX_DIMENSIONS, Section, action_layout, batch_layout};
+pub use layout_error::{LayoutError, MAX_ENVS};
 pub use sections::{ActionSection, BatchSection, Contents, OPTIONS_BYTES, RowShape, SNAPSHOT_BYTES, SectionTable};
 pub(crate) use stamp::Stamp;
 pub use view::Batch;

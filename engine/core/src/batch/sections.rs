@@ -181,7 +181,7 @@ macro_rules! section_table {
     };
 }
 
-/// Hands the table of a batch's sections to another macro, with whatever is given before it.
+/// Calls another macro with the tokens that are given, followed by the table of a batch's sections.
 macro_rules! batch_sections {
     ($macro:ident! $($before:tt)*) => {
         $macro! {

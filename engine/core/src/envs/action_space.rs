@@ -109,7 +109,7 @@ pub struct InvalidActionSpace {
 pub enum ActionError {
     /// Too few or too many numbers.
     #[error(
-        "actions must be {num_envs} rows of {branches} numbers, {} in all, got {given}",
+        "actions must be a row of length {branches} for each of {num_envs} environments, {} numbers in all, got {given}",
         num_envs.saturating_mul(*branches)
     )]
     Count {
@@ -169,7 +169,7 @@ mod tests {
         assert_eq!(space.check(2, &[0, 3, 1]), Err(ActionError::Count { given: 3, num_envs: 2, branches: 1 }));
         assert_eq!(
             space.check(2, &[]).unwrap_err().to_string(),
-            "actions must be 2 rows of 1 numbers, 2 in all, got 0"
+            "actions must be a row of length 1 for each of 2 environments, 2 numbers in all, got 0"
         );
         for (env, wrong) in [(0, [-1, 0]), (1, [0, 4]), (1, [3, i32::MIN])] {
             let error = space.check(2, &wrong).unwrap_err();

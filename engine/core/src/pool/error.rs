@@ -100,8 +100,8 @@ pub enum PoolError {
     },
     /// With [`check_drawing`](super::PoolConfig::check_drawing) only: a frame differs from one that is drawn in full.
     ///
-    /// All or some environments have advanced by the time that this is noticed, and the batch is incomplete. The pool must not be
-    /// used further.
+    /// All or some of the environments have advanced then, and the batch is incomplete. Its generation stamp is removed, so the
+    /// next write into it draws in full.
     #[error(transparent)]
     WrongFrame(#[from] WrongFrame),
     /// The memory for a batch is too small.

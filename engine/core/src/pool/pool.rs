@@ -196,7 +196,7 @@ impl Pool {
     /// pool.step(&[1, 0, 2, 2], &mut blocks)?;
     /// let expected = Batch::new(pool.layout(), &blocks).observation()[..84 * 84 * 3].to_vec();
     ///
-    /// // Environment 1 goes on as environment 0 did.
+    /// // Environment 1 continues as environment 0 did.
     /// pool.restore(1, &snapshot)?;
     /// pool.step(&[0, 0, 1, 0], &mut blocks)?;
     /// assert_eq!(Batch::new(pool.layout(), &blocks).observation()[84 * 84 * 3..], expected);
@@ -208,7 +208,7 @@ impl Pool {
     }
 
     /// Puts an environment into the state of a snapshot of the same environment id, which may come from another pool with other
-    /// reset parameters. It goes on identically. [`observe`](Pool::observe) writes its observation.
+    /// reset parameters. The episode continues identically. [`observe`](Pool::observe) writes its observation.
     ///
     /// The seeds of later episodes are the snapshot's too if both pools have the same kind of [`Seeding`](super::Seeding). An
     /// observation of several frames repeats the snapshot's frame, as at the start of an episode.

@@ -1,19 +1,30 @@
-//! Which seed each episode of each environment gets.
+//! The seeds of episodes.
 
 use serde::{Deserialize, Serialize};
 
 use crate::random::{Generator, SeedSequence};
 
-/// How episodes are seeded. Environments are counted over all groups of an engine, so that results depend neither on the
-/// number of threads nor on how the environments are divided.
+/// The source of the episodes' seeds. Environments are numbered over all groups of an engine, so that results depend neither on
+/// the number of threads nor on the division into groups.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Seeding {
     /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as the original's does
-    /// when it is reset without a seed. Without a seed, from the operating system's entropy.
-    Continue { seed: Option<u64> },
-    /// Each episode draws its seed uniformly from `start..end`. `seed` fixes the draws. The paper trains on `0..100000`.
-    Range { start: u64, end: u64, seed: Option<u64> },
-    /// Episode `e` of environment `i` of `n` gets the seed number `e * n + i` of the list, which starts over at its end.
+    /// when it is reset without a seed.
+    Continue {
+        /// The seed of environment 0; `None` seeds each environment from the operating system's entropy.
+        seed: Option<u64>,
+    },
+    /// Each episode draws its seed uniformly from `start..end`. The paper trains on `0..100000`.
+    Range {
+        /// The lowest seed.
+        start: u64,
+        /// The end of the range, excluded: more than `start`, and at most 2^63 - 1.
+        end: u64,
+        /// Seed of the draws: environment `i` draws with `SeedSequence(seed, spawn_key=(i,))`. `None` takes the operating system's
+        /// entropy.
+        seed: Option<u64>,
+    },
+    /// Episode `e` of environment `i` of `n` has the seed at index `(e * n + i) % length` of the list, which must not be empty.
     List(Vec<u64>),
 }
 
@@ -57,7 +68,7 @@ impl Seeds {
         }
     }
 
-    /// What a snapshot keeps of the seeds to come.
+    /// The part of a snapshot that determines the seeds of later episodes.
     pub(super) fn save(&self) -> SavedSeeds {
         match self {
             Seeds::Continue { first } => SavedSeeds::Continue { first: *first },
@@ -66,7 +77,7 @@ impl Seeds {
         }
     }
 
-    /// Goes on where a snapshot was taken. Under another policy than the snapshot's, this one's seeds stay.
+    /// Continues the snapshot's seeds. Nothing changes if the snapshot's kind of [`Seeding`] is another.
     pub(super) fn restore(&mut self, saved: SavedSeeds) {
         match (self, saved) {
             (Seeds::Continue { first }, SavedSeeds::Continue { first: saved }) => *first = saved,
@@ -77,7 +88,7 @@ impl Seeds {
     }
 }
 
-/// Where an environment is in its sequence of seeds.
+/// The position of an environment in its sequence of seeds.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) enum SavedSeeds {
     Continue { first: Option<u64> },

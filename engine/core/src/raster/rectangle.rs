@@ -3,7 +3,7 @@
 use super::circle::{Octant, falls};
 use super::{Canvas, CornerRadii, Rect, Rgb};
 
-/// Farther out, coordinates of rounded rectangles are drawn as this one, to bound the work.
+/// Maximum coordinate of a rounded rectangle; larger ones are drawn as this, to bound the time.
 const MAX_COORDINATE: i64 = 1 << 16;
 
 /// The outermost columns and rows of a rectangle, all within it.
@@ -57,7 +57,7 @@ impl Corners {
         if needs.iter().all(|&(length, needed)| needed <= length) {
             return corners;
         }
-        // Single precision, as in pygame: it decides how the scaled radii are cut off.
+        // Single precision, as in pygame: it determines the truncation of the scaled radii.
         let factor = needs.iter().map(|&(length, needed)| length as f32 / needed as f32).fold(f32::INFINITY, f32::min);
         let scaled = |radius: i64| (radius as f32 * factor) as i64;
         Self {
@@ -156,7 +156,7 @@ impl Canvas<'_> {
         }
     }
 
-    /// Fills a rectangle whose corners are cut off straight: what the round corners are added to.
+    /// Fills a rectangle whose corners are cut off straight; the round corners are added to it.
     fn fill_octagon(&mut self, color: Rgb, edges: &Edges, corners: &Corners) {
         let &Edges { left, top, right, bottom } = edges;
         let points = [
