@@ -184,6 +184,7 @@ fn use_all(layout: &Layout) -> Result<(), TestCaseError> {
     prop_assert_eq!(batch.episode_length().last(), Some(&3));
     prop_assert_eq!(batch.bytes().len(), (layout.blocks() - 1) * 64);
     for section in layout.sections() {
+        prop_assert!(section.name().row().admits(section.shape()) && section.shape().len() < MAX_DIMENSIONS);
         let short = &blocks[..layout.blocks() / 2];
         prop_assert!(layout.read::<u8>(short, section.name()).len() <= section.bytes());
         prop_assert!(layout.write::<f64>(&mut zeroed(1), section.name()).len() <= 8);
@@ -200,7 +201,7 @@ proptest! {
         id in 0..9_usize,
         num_envs in 1..5_usize,
         options in 0..8_u8,
-        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), values()), 1..5),
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), values()), 1..3),
     ) {
         let spec = envs::specs().nth(id).unwrap();
         let contents = Contents {

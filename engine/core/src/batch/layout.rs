@@ -262,7 +262,7 @@ impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
     fn try_from(fields: LayoutFields) -> Result<Self, LayoutError> {
         let mut builder = Builder::<S>::new(fields.num_envs)?;
         for SectionFields { name, dtype, shape, offset } in fields.sections {
-            let section = S::from_name(&name).ok_or_else(|| LayoutError::UnknownSection { given: name })?;
+            let section = S::from_name(&name).ok_or(LayoutError::UnknownSection { given: name })?;
             if dtype != section.dtype() {
                 return Err(LayoutError::Dtype { section: section.name(), given: dtype, expected: section.dtype() });
             }
