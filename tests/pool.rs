@@ -254,7 +254,11 @@ fn wrong_configurations_are_refused() {
     let with =
         |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
-    assert!(matches!(refused(config(0)), PoolError::NumEnvs { given: 0 }));
+    assert_eq!(refused(config(0)).to_string(), "num_envs must be 1 to 1048576, got 0");
+    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2)] {
+        let outside = PoolConfig { first_env, total_envs, ..config(3) };
+        assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
+    }
     assert!(matches!(refused(PoolConfig { seeding: Seeding::List(vec![]), ..config(1) }), PoolError::NoSeeds));
     let empty = Seeding::Range { start: 5, end: 5, seed: None };
     assert!(matches!(refused(PoolConfig { seeding: empty, ..config(1) }), PoolError::SeedRange { .. }));

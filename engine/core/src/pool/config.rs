@@ -50,7 +50,7 @@ pub struct PoolConfig {
     /// Number of this pool's first environment among all environments, for [`seeding`](Self::seeding): an engine that serves
     /// several groups numbers its environments through.
     pub first_env: usize,
-    /// Number of environments in all pools together, for [`seeding`](Self::seeding).
+    /// Number of environments in all pools together, for [`seeding`](Self::seeding): at least `first_env + num_envs`.
     pub total_envs: usize,
 }
 
@@ -82,6 +82,11 @@ impl PoolConfig {
             && !(1..=MAX_STACK).contains(&given)
         {
             return Err(PoolError::Stack { given });
+        }
+        let end = self.first_env.checked_add(self.num_envs);
+        if end.is_none_or(|end| end > self.total_envs) {
+            let PoolConfig { first_env, num_envs, total_envs, .. } = *self;
+            return Err(PoolError::EnvNumbers { first_env, num_envs, total_envs });
         }
         match &self.seeding {
             Seeding::List(seeds) if seeds.is_empty() => Err(PoolError::NoSeeds),

@@ -40,6 +40,16 @@ pub enum PoolError {
         /// The number that was given.
         given: usize,
     },
+    /// The pool's environments are not among all environments.
+    #[error("first_env + num_envs must be at most total_envs, got {first_env} + {num_envs} and {total_envs}")]
+    EnvNumbers {
+        /// Number of the pool's first environment.
+        first_env: usize,
+        /// Number of environments in the pool.
+        num_envs: usize,
+        /// Number of environments in all pools together.
+        total_envs: usize,
+    },
     /// No frame in an observation, or too many.
     #[error("frame stack must be 1 to {MAX_STACK}, got {given}")]
     Stack {

@@ -31,9 +31,20 @@ pub enum Seeding {
 /// The seeds of one environment's episodes.
 #[derive(Debug)]
 pub(super) enum Seeds {
-    Continue { first: Option<u64> },
-    Range { start: i64, end: i64, draws: Generator },
-    List { seeds: std::sync::Arc<[u64]>, next: usize, stride: usize },
+    Continue {
+        first: Option<u64>,
+    },
+    Range {
+        start: i64,
+        end: i64,
+        draws: Generator,
+    },
+    /// Both indices are below the length of the list.
+    List {
+        seeds: std::sync::Arc<[u64]>,
+        next: usize,
+        stride: usize,
+    },
 }
 
 impl Seeds {
@@ -51,7 +62,7 @@ impl Seeds {
                     None => Generator::from_entropy(),
                 },
             },
-            Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env, stride: total },
+            Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env % list.len(), stride: total % list.len() },
         }
     }
 
@@ -61,7 +72,7 @@ impl Seeds {
             Seeds::Continue { first } => first.take(),
             Seeds::Range { start, end, draws } => Some(draws.integers(*start, *end) as u64),
             Seeds::List { seeds, next, stride } => {
-                let seed = seeds[*next % seeds.len()];
+                let seed = seeds[*next];
                 *next = (*next + *stride) % seeds.len();
                 Some(seed)
             }
