@@ -94,10 +94,14 @@ fn mistakes_are_typed_errors() {
     rejected(trainer.snapshot(0, 0, SECONDS).unwrap_err(), "reset", Rejection::NotReset);
     reset(&mut trainer, 1);
     let snapshot = trainer.snapshot(0, 0, SECONDS).unwrap();
-    rejected(trainer.snapshot(0, NUM_ENVS, SECONDS).unwrap_err(), "environment", Rejection::Snapshot);
-    rejected(trainer.restore(0, NUM_ENVS, &snapshot, SECONDS).unwrap_err(), "environment", Rejection::Snapshot);
-    rejected(trainer.restore(0, 0, &snapshot[1..], SECONDS).unwrap_err(), "no snapshot", Rejection::Snapshot);
-    rejected(trainer.restore(0, 0, &[], SECONDS).unwrap_err(), "no snapshot", Rejection::Snapshot);
+    rejected(trainer.snapshot(0, NUM_ENVS, SECONDS).unwrap_err(), "env must be 0 to 2, got 3", Rejection::Snapshot);
+    rejected(
+        trainer.restore(0, NUM_ENVS, &snapshot, SECONDS).unwrap_err(),
+        "env must be 0 to 2, got 3",
+        Rejection::Snapshot,
+    );
+    rejected(trainer.restore(0, 0, &snapshot[1..], SECONDS).unwrap_err(), "not a snapshot", Rejection::Snapshot);
+    rejected(trainer.restore(0, 0, &[], SECONDS).unwrap_err(), "not a snapshot", Rejection::Snapshot);
     assert!(matches!(trainer.snapshot(1, 0, SECONDS), Err(ServiceError::NoSuchGroup { given: 1, .. })));
     let long = vec![0; SNAPSHOT_BYTES + 1];
     assert!(matches!(trainer.restore(0, 0, &long, SECONDS), Err(ServiceError::SnapshotTooLong { .. })));

@@ -109,3 +109,23 @@ impl EnvironmentArgs {
         Ok(PoolConfig { options, seeding, ..PoolConfig::new(id, num_envs) })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::{Arg, Command};
+
+    use super::*;
+
+    #[test]
+    fn autoreset_modes_are_given_by_their_names() {
+        let parse = |given: &str| {
+            let command = Command::new("endless").arg(Arg::new("mode").value_parser(autoreset_parser()));
+            command.try_get_matches_from(["endless", given]).map(|found| found.get_one::<Autoreset>("mode").copied())
+        };
+        for mode in Autoreset::ALL {
+            assert_eq!(parse(mode.name()).unwrap(), Some(mode));
+        }
+        let message = parse("never").unwrap_err().to_string();
+        assert!(Autoreset::ALL.iter().all(|mode| message.contains(mode.name())), "{message}");
+    }
+}
