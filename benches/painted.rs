@@ -9,7 +9,7 @@ use endless_gym::envs::mystery_path::MysteryPath;
 use endless_gym::envs::searing_spotlights::SearingSpotlights;
 use endless_gym::envs::{self, EnvSpec, Environment, Family, ResetParameters, SCREEN};
 use endless_gym::random::Generator;
-use endless_gym::raster::Sketch;
+use endless_gym::raster::DirtySurface;
 use serde_json::Map;
 
 use actions::Actions;
@@ -22,7 +22,7 @@ fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
     let assets = Arc::new(E::assets(variant, &parameters));
     let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1));
     env.reset(&assets, &mut random);
-    let (mut actions, mut sketch, mut shown) = (Actions::new(spec, 1), Sketch::new(SCREEN, SCREEN), env.scene());
+    let (mut actions, mut surface, mut shown) = (Actions::new(spec, 1), DirtySurface::new(SCREEN, SCREEN), env.scene());
     let (mut bytes, mut lines) = (0, 0);
     for _ in 0..STEPS {
         if env.step(actions.next(), &mut random).terminated {
@@ -30,8 +30,8 @@ fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
         }
         let scene = env.scene();
         if shown != scene {
-            E::repaint(&assets, &shown, &scene, &mut sketch.canvas());
-            sketch.for_each_run(|x, rows, _| {
+            E::repaint(&assets, &shown, &scene, &mut surface.canvas());
+            surface.for_each_run(|x, rows, _| {
                 let (start, end) = ((x * SCREEN + rows.start) * 3, (x * SCREEN + rows.end) * 3);
                 bytes += end - start;
                 lines += (end - 1) / LINE - start / LINE + 1;

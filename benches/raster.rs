@@ -2,7 +2,7 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use endless_gym::envs::{FRAME_BYTES, SCREEN};
-use endless_gym::raster::{Canvas, Disc, PixelFormat, Rect, Sketch, Sprite, Surface};
+use endless_gym::raster::{Canvas, DirtySurface, Disc, PixelFormat, Rect, Sprite, Surface};
 
 fn round_surface(side: usize) -> Surface {
     let mut surface = Surface::new(side, side);
@@ -38,8 +38,8 @@ fn paint(criterion: &mut Criterion) {
 
 fn store(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("raster/store");
-    let mut sketch = Sketch::new(SCREEN, SCREEN);
-    sketch.canvas().fill([10, 20, 30]);
+    let mut surface = DirtySurface::new(SCREEN, SCREEN);
+    surface.canvas().fill([10, 20, 30]);
     let mut picture = vec![0; FRAME_BYTES];
     let plain = PixelFormat::default();
     for (name, format) in [
@@ -47,7 +47,7 @@ fn store(criterion: &mut Criterion) {
         ("channels_first", PixelFormat { channels_first: true, ..plain }),
         ("row_major", PixelFormat { row_major: true, ..plain }),
     ] {
-        group.bench_function(name, |bencher| bencher.iter(|| format.store(&sketch, &mut picture)));
+        group.bench_function(name, |bencher| bencher.iter(|| format.store(&surface, &mut picture)));
     }
     group.finish();
 }

@@ -5,9 +5,11 @@
 
 mod common;
 
-use endless_gym::batch::{Batch, Block, Frames, zeroed};
+use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
 use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, SCREEN};
-use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads, WrongFrame};
+use endless_gym::pool::{
+    Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads, WrongFrame,
+};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -41,7 +43,7 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
             1 => buffers[used] = buffers[(used + 1) % 4].clone(),
             2 => {
                 let frames = pool.layout().clone();
-                frames.write::<u8>(&mut buffers[used], "observation").fill(77);
+                frames.write::<u8>(&mut buffers[used], BatchSection::Observation).fill(77);
                 frames.forget_frames(&mut buffers[used]);
             }
             3 => other.observe(&mut buffers[used])?,
@@ -92,7 +94,7 @@ proptest! {
     ) {
         let autoreset = if same_step { Autoreset::SameStep } else { Autoreset::NextStep };
         let with = |given| PoolConfig {
-            options: Options::Shared(given),
+            options: ResetOptions::Shared(given),
             autoreset,
             final_observation: true,
             frames: Some(Frames { format, stack }),
@@ -115,15 +117,15 @@ fn a_pixel_that_somebody_changed_is_found() {
     pool.reset(ResetRequest::All, &mut buffer).unwrap();
     let (env, x, y) = (1, 83, 2);
     let corrupt = |buffer: &mut [Block]| {
-        layout.write::<u8>(buffer, "observation")[env * FRAME_BYTES + (x * SCREEN + y) * 3 + 1] ^= 1;
+        layout.write::<u8>(buffer, BatchSection::Observation)[env * FRAME_BYTES + (x * SCREEN + y) * 3 + 1] ^= 1;
     };
 
     corrupt(&mut buffer);
     let error = pool.step(&[0; NUM_ENVS], &mut buffer).unwrap_err();
     let PoolError::WrongFrame(WrongFrame { expected, found, .. }) = &error else { panic!("{error}") };
     assert_eq!(expected ^ 1, *found);
-    assert!(matches!(error, PoolError::WrongFrame(WrongFrame { env: 1, place: (83, 2), .. })), "{error}");
-    assert!(error.to_string().contains("environment 1 is wrong at (83, 2)"), "{error}");
+    assert!(matches!(error, PoolError::WrongFrame(WrongFrame { env: 1, pixel: (83, 2), .. })), "{error}");
+    assert!(error.to_string().contains("environment 1 is wrong at pixel (83, 2)"), "{error}");
 
     // What is half written is not trusted, and what is announced is no mistake.
     pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();

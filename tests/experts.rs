@@ -19,7 +19,7 @@ fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
     let mut actions = vec![0; num_envs * branches];
     for _ in 0..steps {
         let batch = Batch::new(pool.layout(), &blocks);
-        let (features, vectors) = (batch.section("features"), batch.section("vector_observation"));
+        let (features, vectors) = (batch.features(), batch.vector_observation());
         for (env, (expert, action)) in experts.iter_mut().zip(actions.chunks_exact_mut(branches)).enumerate() {
             let features = &features[env * spec.features.len()..][..spec.features.len()];
             let vector = &vectors[env * spec.vector_observation..][..spec.vector_observation];
@@ -28,7 +28,7 @@ fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
         pool.step(&actions, &mut blocks).unwrap();
         let batch = Batch::new(pool.layout(), &blocks);
         for (env, ended) in ended.iter_mut().enumerate().filter(|(env, _)| batch.terminated()[*env] == 1) {
-            let info = &batch.section::<f64>("info")[env * spec.info.len()..][..spec.info.len()];
+            let info = &batch.info()[env * spec.info.len()..][..spec.info.len()];
             ended.get_or_insert_with(|| info.to_vec());
         }
         if ended.iter().all(Option::is_some) {

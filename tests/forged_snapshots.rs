@@ -5,7 +5,7 @@ use ciborium::Value;
 use endless_gym::batch::{Block, zeroed};
 use endless_gym::envs::view::VIEW_BYTES;
 use endless_gym::envs::{self, EnvSpec, Family, ParameterKind, mortar_mayhem, mystery_path, searing_spotlights};
-use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Seeding, SnapshotError, Threads};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -84,7 +84,7 @@ impl Game {
     fn new(spec: &'static EnvSpec, seeding: Seeding, options: Map<String, Json>) -> Self {
         let config = PoolConfig {
             seeding,
-            options: Options::Shared(options),
+            options: ResetOptions::Shared(options),
             autoreset: Autoreset::SameStep,
             final_observation: true,
             features: true,

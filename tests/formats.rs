@@ -4,9 +4,9 @@ mod common;
 
 use std::collections::VecDeque;
 
-use endless_gym::batch::{Batch, Block, Frames, zeroed};
+use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
 use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, Parameter, SCREEN};
-use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym::raster::PixelFormat;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -50,7 +50,7 @@ impl Player {
         let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
         let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
         let config = PoolConfig {
-            options: Options::Shared(options.into_iter().collect()),
+            options: ResetOptions::Shared(options.into_iter().collect()),
             frames: Some(frames),
             seeding: Seeding::Continue { seed: Some(5) },
             autoreset: Autoreset::SameStep,
@@ -63,7 +63,7 @@ impl Player {
         Player { pool, batch }
     }
 
-    fn row(&self, section: &str, env: usize) -> &[u8] {
+    fn row(&self, section: BatchSection, env: usize) -> &[u8] {
         let rows = Batch::new(self.pool.layout(), &self.batch).section::<u8>(section);
         let width = rows.len() / NUM_ENVS;
         &rows[env * width..(env + 1) * width]
@@ -75,18 +75,18 @@ fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
     let mut standard = Player::new(spec, Frames::default());
     let mut other = Player::new(spec, frames);
     let what = format!("{}: {frames:?}", spec.id);
-    let section = other.pool.layout().section("observation").unwrap();
-    assert_eq!(section.shape, frames.shape(), "{what}");
+    let section = other.pool.layout().section(BatchSection::Observation).unwrap();
+    assert_eq!(section.shape(), frames.shape(), "{what}");
     let mut past: Vec<VecDeque<Vec<u8>>> = Vec::new();
     for env in 0..NUM_ENVS {
-        past.push(vec![convert(standard.row("observation", env), frames.format); frames.stack].into());
+        past.push(vec![convert(standard.row(BatchSection::Observation, env), frames.format); frames.stack].into());
     }
     let mut random = SmallRng::seed_from_u64(2);
     let mut episodes = 0;
     for step in 0..steps {
         for (env, past) in past.iter().enumerate() {
             let expected: Vec<u8> = past.iter().flatten().copied().collect();
-            assert!(other.row("observation", env) == expected, "{what} step {step} environment {env}");
+            assert!(other.row(BatchSection::Observation, env) == expected, "{what} step {step} environment {env}");
         }
         let actions: Vec<i32> = (0..NUM_ENVS)
             .flat_map(|_| spec.action_space.branches())
@@ -99,13 +99,16 @@ fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
             if terminated[env] == 1 {
                 episodes += 1;
                 past.pop_front();
-                past.push_back(convert(standard.row("final_observation", env), frames.format));
+                past.push_back(convert(standard.row(BatchSection::FinalObservation, env), frames.format));
                 let expected: Vec<u8> = past.iter().flatten().copied().collect();
-                assert!(other.row("final_observation", env) == expected, "{what} step {step} environment {env}");
-                *past = vec![convert(standard.row("observation", env), frames.format); frames.stack].into();
+                assert!(
+                    other.row(BatchSection::FinalObservation, env) == expected,
+                    "{what} step {step} environment {env}"
+                );
+                *past = vec![convert(standard.row(BatchSection::Observation, env), frames.format); frames.stack].into();
             } else {
                 past.pop_front();
-                past.push_back(convert(standard.row("observation", env), frames.format));
+                past.push_back(convert(standard.row(BatchSection::Observation, env), frames.format));
             }
         }
     }
@@ -131,7 +134,7 @@ fn every_format_is_a_plain_conversion() {
 fn one_format_is_the_originals() {
     assert_eq!(Frames::default().shape(), [SCREEN, SCREEN, 3]);
     let player = Player::new(envs::specs().next().unwrap(), Frames::default());
-    assert_eq!(player.row("observation", 0).len(), FRAME_BYTES);
+    assert_eq!(player.row(BatchSection::Observation, 0).len(), FRAME_BYTES);
 }
 
 #[test]
@@ -155,6 +158,6 @@ fn a_restored_stack_starts_anew() {
     }
     player.pool.restore(1, &snapshot).unwrap();
     player.pool.observe(&mut player.batch).unwrap();
-    let (first, second) = player.row("observation", 1).split_at(FRAME_BYTES);
+    let (first, second) = player.row(BatchSection::Observation, 1).split_at(FRAME_BYTES);
     assert!(first == second);
 }

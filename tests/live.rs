@@ -12,7 +12,7 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::{self, EnvSpec};
-use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use endless_gym::trace::{Trace, replay};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
@@ -94,7 +94,7 @@ fn case(spec: &'static EnvSpec) -> impl Strategy<Value = Case> {
 /// Plays a case in the engine: the request that makes the original play the same.
 fn play(spec: &'static EnvSpec, case: &Case) -> Json {
     let config = PoolConfig {
-        options: Options::Shared(case.options.clone()),
+        options: ResetOptions::Shared(case.options.clone()),
         autoreset: Autoreset::Disabled,
         features: true,
         ..PoolConfig::new(spec.id, 1)
@@ -114,7 +114,7 @@ fn play(spec: &'static EnvSpec, case: &Case) -> Json {
         for _ in 0..MAX_STEPS {
             let batch = Batch::new(pool.layout(), &blocks);
             let mut action = vec![0; branches.len()];
-            expert.act(batch.section("features"), batch.section("vector_observation"), &mut action);
+            expert.act(batch.features(), batch.vector_observation(), &mut action);
             if random.random::<f64>() < case.error_rate {
                 action.iter_mut().zip(branches).for_each(|(number, n)| *number = random.random_range(0..*n));
             }

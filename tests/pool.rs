@@ -3,8 +3,8 @@
 mod common;
 
 use endless_gym::batch::{Batch, Block, zeroed};
-use endless_gym::envs;
-use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads};
+use endless_gym::envs::{self, ActionError};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -105,7 +105,7 @@ fn next_step_autoreset_starts_an_episode_in_the_step_after_its_end() {
                 assert_eq!((batch.reward()[env], batch.terminated()[env]), (0.0, 0));
                 assert_eq!((batch.episode_return()[env], batch.episode_length()[env]), (0.0, 0));
             }
-            let longest = batch.section::<f64>("info")[env * 2 + 1];
+            let longest = batch.info()[env * 2 + 1];
             assert!(longest == 0.0 || batch.terminated()[env] == 1);
             *ended = batch.terminated()[env] == 1;
         }
@@ -125,19 +125,19 @@ fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
         assert_eq!(next.batch().reward(), same.batch().reward());
         assert_eq!(next.batch().terminated(), same.batch().terminated());
         assert_eq!(next.batch().episode_length(), same.batch().episode_length());
-        assert_eq!(next.batch().section::<f64>("info"), same.batch().section::<f64>("info"));
+        assert_eq!(next.batch().info(), same.batch().info());
         if next.batch().terminated()[0] == 0 {
             assert_eq!(next.frame(0), same.frame(0));
             continue;
         }
         ends += 1;
-        let kept = same.batch().section::<f64>("final_ground_truth");
-        assert_eq!(next.batch().section::<f64>("ground_truth"), kept);
-        assert_eq!(next.batch().section::<f32>("features"), same.batch().section::<f32>("final_features"));
-        assert_eq!(next.batch().observation(), same.batch().section::<u8>("final_observation"));
+        let kept = same.batch().final_ground_truth();
+        assert_eq!(next.batch().ground_truth(), kept);
+        assert_eq!(next.batch().features(), same.batch().final_features());
+        assert_eq!(next.batch().observation(), same.batch().final_observation());
         next.step(&[0, 0]);
         assert_eq!(next.frame(0), same.frame(0), "the new episode's first observation");
-        assert_eq!(next.batch().section::<f64>("ground_truth"), same.batch().section::<f64>("ground_truth"));
+        assert_eq!(next.batch().ground_truth(), same.batch().ground_truth());
     }
     assert!(ends > 5, "{ends} episodes");
 }
@@ -150,12 +150,12 @@ fn the_vector_observation_is_kept_too() {
         ..PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new("MortarMayhemB-Grid-v0", 1) }
     };
     let mut player = Player::new(&config, 1);
-    let commands = player.batch().section::<f32>("vector_observation").to_vec();
+    let commands = player.batch().vector_observation().to_vec();
     while player.batch().terminated()[0] == 0 {
         player.step(&[1]);
     }
-    assert_eq!(player.batch().section::<f32>("final_vector_observation"), commands);
-    assert_ne!(player.batch().section::<f32>("vector_observation"), commands);
+    assert_eq!(player.batch().final_vector_observation(), commands);
+    assert_ne!(player.batch().vector_observation(), commands);
 }
 
 #[test]
@@ -206,7 +206,7 @@ fn each_environment_may_have_options_of_its_own() {
     let each = vec![options(json!({})), options(json!({"agent_scale": 0.4})), options(json!({}))];
     let seeding = Seeding::List(vec![8]);
     let player = Player::new(
-        &PoolConfig { options: Options::Each(each), seeding: seeding.clone(), ..PoolConfig::new(ID, 3) },
+        &PoolConfig { options: ResetOptions::Each(each), seeding: seeding.clone(), ..PoolConfig::new(ID, 3) },
         1,
     );
     assert_eq!(player.frame(0), first_frame(8));
@@ -217,7 +217,7 @@ fn each_environment_may_have_options_of_its_own() {
 #[test]
 fn a_reset_may_bring_other_options() {
     let other = options(json!({"initial_command_count": 4, "agent_scale": 0.5}));
-    let mut fresh = Player::new(&PoolConfig { options: Options::Shared(other.clone()), ..config(2) }, 1);
+    let mut fresh = Player::new(&PoolConfig { options: ResetOptions::Shared(other.clone()), ..config(2) }, 1);
     let mut player = Player::new(&config(2), 1);
     let before = player.frame(1);
     let request = ResetRequest::Each { reset: &[2, 0], seed: &[3, 0] };
@@ -244,26 +244,31 @@ fn without_frames_nothing_else_changes() {
         without.step_at_random();
         assert!(without.batch().observation().is_empty());
         assert_eq!(with.batch().reward(), without.batch().reward());
-        assert_eq!(with.batch().section::<f32>("features"), without.batch().section::<f32>("features"));
+        assert_eq!(with.batch().features(), without.batch().features());
     }
 }
 
 #[test]
 fn wrong_configurations_are_refused() {
     let refused = |config: PoolConfig| Pool::new(&config, &Threads::new(1).unwrap()).err().unwrap();
-    let with = |given: Json| refused(PoolConfig { options: Options::Shared(options(given)), ..config(2) }).to_string();
+    let with =
+        |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
-    assert!(matches!(refused(config(0)), PoolError::NumEnvs { given: 0 }));
+    assert_eq!(refused(config(0)).to_string(), "num_envs must be 1 to 1048576, got 0");
+    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2)] {
+        let outside = PoolConfig { first_env, total_envs, ..config(3) };
+        assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
+    }
     assert!(matches!(refused(PoolConfig { seeding: Seeding::List(vec![]), ..config(1) }), PoolError::NoSeeds));
     let empty = Seeding::Range { start: 5, end: 5, seed: None };
     assert!(matches!(refused(PoolConfig { seeding: empty, ..config(1) }), PoolError::SeedRange { .. }));
-    let two = Options::Each(vec![Map::new(); 2]);
+    let two = ResetOptions::Each(vec![Map::new(); 2]);
     assert!(matches!(refused(PoolConfig { options: two, ..config(3) }), PoolError::OptionsCount { .. }));
     assert!(with(json!({"arena_sise": 5})).contains("`arena_sise`; it has max_steps, agent_scale"));
-    assert!(with(json!({"allowed_commands": 3})).contains("`allowed_commands` must be an integer, 4 to 9, got 3"));
+    assert!(with(json!({"allowed_commands": 3})).contains("`allowed_commands` is 3, which is out of range"));
     assert!(with(json!({"allowed_commands": 3})).contains("4 to 9"));
-    assert!(with(json!({"visual_feedback": 1})).contains("`visual_feedback` must be true or false, got 1"));
-    let one_of_two = Options::Each(vec![Map::new(), options(json!({"agent_speed": "fast"}))]);
+    assert!(with(json!({"visual_feedback": 1})).contains("`visual_feedback` is 1, but has to be: true or false"));
+    let one_of_two = ResetOptions::Each(vec![Map::new(), options(json!({"agent_speed": "fast"}))]);
     let text = refused(PoolConfig { options: one_of_two, ..config(2) }).to_string();
     assert!(text.contains("environment 1") && text.contains("agent_speed"), "{text}");
 }
@@ -275,9 +280,12 @@ fn wrong_calls_are_refused_and_move_nothing() {
     assert!(matches!(pool.step(&[0; 4], &mut blocks), Err(PoolError::NotReset)));
     pool.reset(ResetRequest::All, &mut blocks).unwrap();
     let before = blocks.clone();
-    assert!(matches!(pool.step(&[0; 3], &mut blocks), Err(PoolError::ActionCount { given: 3, .. })));
-    assert!(matches!(pool.step(&[0, 0, 0, 3], &mut blocks), Err(PoolError::ActionRange { env: 1, .. })));
-    assert!(matches!(pool.step(&[-1, 0, 0, 0], &mut blocks), Err(PoolError::ActionRange { env: 0, .. })));
+    assert!(matches!(pool.step(&[0; 3], &mut blocks), Err(PoolError::Action(ActionError::Count { given: 3, .. }))));
+    assert!(matches!(pool.step(&[0, 0, 0, 3], &mut blocks), Err(PoolError::Action(ActionError::Range { env: 1, .. }))));
+    assert!(matches!(
+        pool.step(&[-1, 0, 0, 0], &mut blocks),
+        Err(PoolError::Action(ActionError::Range { env: 0, .. }))
+    ));
     assert!(matches!(pool.step(&[0; 4], &mut blocks[1..]), Err(PoolError::BatchTooShort { .. })));
     let request = ResetRequest::Each { reset: &[1], seed: &[1] };
     assert!(matches!(pool.reset(request, &mut blocks), Err(PoolError::ResetCount { .. })));
@@ -295,7 +303,7 @@ proptest! {
         seed: u64,
     ) {
         let config = PoolConfig {
-            options: Options::Shared(given),
+            options: ResetOptions::Shared(given),
             seeding: Seeding::Continue { seed: Some(seed) },
             features: true,
             ..PoolConfig::new(spec.id, 3)

@@ -8,8 +8,8 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym::batch::{Batch, action_layout, zeroed};
-use endless_gym::envs::spec;
+use endless_gym::batch::{ActionSection, Batch, Contents, action_layout, batch_layout, zeroed};
+use endless_gym::envs::{ActionError, spec};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{
     ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
@@ -107,7 +107,10 @@ fn mistakes_of_a_trainer_are_typed_errors() {
             trainer.reset(0, ResetRequest::Each { reset: &[1, 1], seed: &[1] }),
             Err(ServiceError::ResetCount { given: 1, num_envs: 2 })
         ));
-        assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::ActionCount { given: 1, num_envs: 2, .. })));
+        assert!(matches!(
+            trainer.send(0, &[0]),
+            Err(ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }))
+        ));
 
         // The environments must be reset before the first step.
         trainer.send(0, &vec![0; 2 * width]).unwrap();
@@ -121,7 +124,10 @@ fn mistakes_of_a_trainer_are_typed_errors() {
         let mut actions = vec![0; 2 * width];
         actions[width] = 99;
         let error = trainer.send(0, &actions).unwrap_err();
-        assert!(matches!(&error, ServiceError::ActionRange { env: 1, given, .. } if given[0] == 99), "{error}");
+        assert!(
+            matches!(&error, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given[0] == 99),
+            "{error}"
+        );
 
         let mut held = Vec::new();
         for _ in 0..trainer.specification().batches_held {
@@ -362,7 +368,7 @@ fn bad_messages_are_answered_with_rejections() {
     let (status, text) = foreign.ask(step, 1, |_| {}).unwrap();
     assert!(status != 0 && text.contains("got 1"), "{text}");
     let out_of_range = |blocks: &mut [endless_gym::batch::Block]| {
-        specification.action.write::<i32>(blocks, "action").fill(-1);
+        specification.action.write::<i32>(blocks, ActionSection::Action).fill(-1);
     };
     let (status, text) = foreign.ask(step, foreign.blocks(), out_of_range).unwrap();
     assert!(status != 0 && text.contains("-1"), "{text}");
@@ -371,7 +377,7 @@ fn bad_messages_are_answered_with_rejections() {
 
     // The engine still answers.
     let fine = |blocks: &mut [endless_gym::batch::Block]| {
-        specification.action.write::<i32>(blocks, "action").fill(0);
+        specification.action.write::<i32>(blocks, ActionSection::Action).fill(0);
     };
     assert_eq!(foreign.ask(step, foreign.blocks(), fine).unwrap().0, 0);
     drop(foreign);
@@ -387,6 +393,8 @@ fn another_version_is_refused_with_both_numbers() {
     assert!(error.to_string().contains("install the same version"), "{error}");
 }
 
+const CONTENTS: Contents = Contents { frames: None, features: false, final_observation: false };
+
 #[test]
 fn a_malformed_specification_is_an_error_and_not_a_panic() {
     let place = Place::new();
@@ -397,8 +405,11 @@ fn a_malformed_specification_is_an_error_and_not_a_panic() {
         ("num_envs", ServiceSpecification { num_envs: 0, ..valid.clone() }),
         ("batches_held", ServiceSpecification { batches_held: 0, ..valid.clone() }),
         ("Chess-v0", ServiceSpecification { id: "Chess-v0".to_owned(), ..valid.clone() }),
-        ("action", ServiceSpecification { action: valid.batch.clone(), ..valid.clone() }),
-        ("batch", ServiceSpecification { batch: action_layout(spec(ID).unwrap(), 2), ..valid.clone() }),
+        ("action", ServiceSpecification { action: action_layout(spec(ID).unwrap(), 2).unwrap(), ..valid.clone() }),
+        (
+            "batch",
+            ServiceSpecification { batch: batch_layout(spec(ID).unwrap(), 2, CONTENTS).unwrap(), ..valid.clone() },
+        ),
     ];
     for (part, specification) in malformed {
         let _published = service_support::foreign::specification(place.namespace(), "malformed", &specification);

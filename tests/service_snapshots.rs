@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use endless_gym::batch::{Block, SNAPSHOT_BYTES, zeroed};
-use endless_gym::pool::{Options, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::foreign::{Foreign, RequestHeader};
@@ -95,10 +95,14 @@ fn mistakes_are_typed_errors() {
     rejected(trainer.snapshot(0, 0, SECONDS).unwrap_err(), "reset", Rejection::NotReset);
     reset(&mut trainer, 1);
     let snapshot = trainer.snapshot(0, 0, SECONDS).unwrap();
-    rejected(trainer.snapshot(0, NUM_ENVS, SECONDS).unwrap_err(), "environment", Rejection::Snapshot);
-    rejected(trainer.restore(0, NUM_ENVS, &snapshot, SECONDS).unwrap_err(), "environment", Rejection::Snapshot);
-    rejected(trainer.restore(0, 0, &snapshot[1..], SECONDS).unwrap_err(), "no snapshot", Rejection::Snapshot);
-    rejected(trainer.restore(0, 0, &[], SECONDS).unwrap_err(), "no snapshot", Rejection::Snapshot);
+    rejected(trainer.snapshot(0, NUM_ENVS, SECONDS).unwrap_err(), "env must be 0 to 2, got 3", Rejection::Snapshot);
+    rejected(
+        trainer.restore(0, NUM_ENVS, &snapshot, SECONDS).unwrap_err(),
+        "env must be 0 to 2, got 3",
+        Rejection::Snapshot,
+    );
+    rejected(trainer.restore(0, 0, &snapshot[1..], SECONDS).unwrap_err(), "not a snapshot", Rejection::Snapshot);
+    rejected(trainer.restore(0, 0, &[], SECONDS).unwrap_err(), "not a snapshot", Rejection::Snapshot);
     assert!(matches!(trainer.snapshot(1, 0, SECONDS), Err(ServiceError::NoSuchGroup { given: 1, .. })));
     let long = vec![0; SNAPSHOT_BYTES + 1];
     assert!(matches!(trainer.restore(0, 0, &long, SECONDS), Err(ServiceError::SnapshotTooLong { .. })));
@@ -119,7 +123,7 @@ fn mistakes_are_typed_errors() {
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
     for bytes in [u64::MAX, 1 << 40] {
         let (status, text) = foreign.ask(RequestHeader { kind: 6, bytes, ..good }, foreign.blocks(), |_| {}).unwrap();
-        assert!(status != 0 && text.contains("no snapshot"), "{text}");
+        assert!(status != 0 && text.contains("not a snapshot"), "{text}");
     }
 }
 
@@ -164,7 +168,7 @@ fn a_late_snapshot_is_returned_by_the_same_call() {
 fn a_thousand_spotlights_fit() {
     let place = Place::new();
     let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
-    let options = Options::Shared(options.as_object().unwrap().clone());
+    let options = ResetOptions::Shared(options.as_object().unwrap().clone());
     let pool = PoolConfig { options, features: true, frames: None, ..PoolConfig::new("SearingSpotlights-v0", 1) };
     let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
     let mut engine = Engine::new(&EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();

@@ -2,7 +2,9 @@
 
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs;
-use endless_gym::pool::{Options, Pool, PoolConfig, ResetRequest, SNAPSHOT_VERSION, Seeding, SnapshotError, Threads};
+use endless_gym::pool::{
+    Pool, PoolConfig, ResetOptions, ResetRequest, SNAPSHOT_VERSION, Seeding, SnapshotError, Threads,
+};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -59,7 +61,7 @@ fn a_restored_environment_goes_on_identically() {
 fn the_snapshots_options_come_along() {
     let id = "MortarMayhem-v0";
     let options = json!({"arena_size": 3, "agent_scale": 0.4}).as_object().unwrap().clone();
-    let (original, blocks) = pool(&PoolConfig { options: Options::Shared(options), ..config(id, 1) });
+    let (original, blocks) = pool(&PoolConfig { options: ResetOptions::Shared(options), ..config(id, 1) });
     let (mut restored, mut other_blocks) = pool(&config(id, 2));
     restored.restore(0, &original.snapshot(0).unwrap()).unwrap();
     restored.observe(&mut other_blocks).unwrap();

@@ -53,7 +53,7 @@ fn new_pool(num_envs: usize) -> Result<Pool, Box<dyn Error>> {
     let mut config = PoolConfig::new(ID, num_envs);
     // Rewards are all that the search looks at, so nothing is drawn.
     config.frames = None;
-    config.options = serde_json::from_value(options).map(endless_gym::pool::Options::Shared)?;
+    config.options = serde_json::from_value(options).map(endless_gym::pool::ResetOptions::Shared)?;
     Ok(Pool::new(&config, &Threads::new(1)?)?)
 }
 

@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 __version__: str
+# Names of the autoreset modes: those of Gymnasium's `AutoresetMode` in lower case.
+AUTORESET_MODES: tuple[str, ...]
+DEFAULT_ENV_ID: str
 
 class EngineLost(ConnectionError):
     """The engine process has ended, or was replaced by another one."""

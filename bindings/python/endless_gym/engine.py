@@ -119,7 +119,7 @@ def serve(
         "--threads": num_threads or 0,
         "--groups": groups,
         "--batches-held": batches_held,
-        "--autoreset": {"NextStep": "next-step", "SameStep": "same-step", "Disabled": "disabled"}[mode.value],
+        "--autoreset": mode.name.lower(),
     }
     if seed is not None:
         arguments["--seed"] = seed

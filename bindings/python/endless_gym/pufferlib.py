@@ -24,6 +24,7 @@ except ImportError as error:
         "pip install --no-deps pufferlib==3.0.0 gym==0.26.2 pettingzoo shimmy; see examples/pufferlib_rollout.py"
     ) from error
 
+from endless_gym.specs import DEFAULT_ENV_ID
 from endless_gym.vector import make_vec
 
 __all__ = ["EndlessPufferEnv"]
@@ -43,7 +44,7 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
 
     def __init__(
         self,
-        env_id: str = "Endless-MortarMayhem-v0",
+        env_id: str = DEFAULT_ENV_ID,
         num_envs: int = 64,
         buf: dict[str, np.ndarray] | None = None,
         seed: int | None = None,

@@ -17,6 +17,9 @@ from endless_gym import _native
 #: Side of a frame in pixels.
 SCREEN = 84
 
+#: The environment id that programs use by default.
+DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
+
 
 @dataclass(frozen=True)
 class Frames:

@@ -30,11 +30,7 @@ Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dic
 #: Values of `observation`, and whether the batch contains frames and the feature observation.
 OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
 
-_MODES = {
-    "next_step": AutoresetMode.NEXT_STEP,
-    "same_step": AutoresetMode.SAME_STEP,
-    "disabled": AutoresetMode.DISABLED,
-}
+_MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
 
 
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):

@@ -1,7 +1,7 @@
 //! What Python hands over: actions, options, seeds.
 
 use endless_gym::batch::Frames;
-use endless_gym::pool::{Autoreset, Options, ResetRequest, Seeding};
+use endless_gym::pool::{Autoreset, ResetOptions, ResetRequest, Seeding, UnknownAutoreset};
 use endless_gym::raster::PixelFormat;
 use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -56,25 +56,18 @@ pub fn options(text: &str) -> PyResult<Map<String, Json>> {
 }
 
 /// The reset parameters of a pool: the JSON text of an object for all environments, or of a list of them.
-pub fn pool_options(text: &str) -> PyResult<Options> {
+pub fn pool_options(text: &str) -> PyResult<ResetOptions> {
     if text.starts_with('[') {
         let each = serde_json::from_str(text);
-        each.map(Options::Each).map_err(|error| PyValueError::new_err(format!("options cannot be read: {error}")))
+        each.map(ResetOptions::Each).map_err(|error| PyValueError::new_err(format!("options cannot be read: {error}")))
     } else {
-        options(text).map(Options::Shared)
+        options(text).map(ResetOptions::Shared)
     }
 }
 
 /// An auto-reset mode by its name.
 pub fn autoreset(name: &str) -> PyResult<Autoreset> {
-    match name {
-        "next_step" => Ok(Autoreset::NextStep),
-        "same_step" => Ok(Autoreset::SameStep),
-        "disabled" => Ok(Autoreset::Disabled),
-        _ => Err(PyValueError::new_err(format!(
-            "no auto-reset mode `{name}`; there are `next_step`, `same_step` and `disabled`"
-        ))),
-    }
+    name.parse().map_err(|error: UnknownAutoreset| PyValueError::new_err(error.to_string()))
 }
 
 /// Where the seeds of episodes come from.

@@ -2,7 +2,7 @@
 
 use std::ffi::c_void;
 
-use endless_gym::batch::{Block, Dtype, Layout};
+use endless_gym::batch::{Block, Dtype, Layout, MAX_DIMENSIONS, RowShape, Section, SectionTable};
 use numpy::npyffi::{NPY_ARRAY_ALIGNED, NPY_ARRAY_C_CONTIGUOUS, NpyTypes, PY_ARRAY_API, PyArrayObject, npy_intp};
 use numpy::{PyArrayDescr, PyArrayDescrMethods, dtype, npyffi};
 use pyo3::PyClass;
@@ -28,25 +28,25 @@ pub fn sections<'py, T: PyClass<Frozen = True> + Owner + Sync>(
         .sections()
         .iter()
         .map(|section| {
-            let mut shape = [0; 8];
+            let mut shape = [0; MAX_DIMENSIONS];
             shape[0] = layout.num_envs() as npy_intp;
-            for (to, from) in shape[1..].iter_mut().zip(&section.shape) {
+            for (to, from) in shape[1..].iter_mut().zip(section.shape()) {
                 *to = *from as npy_intp;
             }
-            let shape = &mut shape[..=section.shape.len()];
-            let data = blocks.as_ptr().wrapping_byte_add(section.offset);
+            let shape = &mut shape[..=section.shape().len()];
+            let data = blocks.as_ptr().wrapping_byte_add(section.offset());
             // SAFETY: the section's numbers lie within the blocks, as asserted, at a multiple of 64 bytes. The blocks stay where
             // they are and as they are while the owner lives, which the array keeps alive and does not write to.
-            unsafe { array(py, descriptor(py, section.dtype, &section.name), shape, data, owner.as_any()) }
+            unsafe { array(py, descriptor(py, section), shape, data, owner.as_any()) }
         })
         .collect::<PyResult<Vec<_>>>()?;
     PyTuple::new(py, arrays)
 }
 
-fn descriptor<'py>(py: Python<'py>, number: Dtype, name: &str) -> Bound<'py, PyArrayDescr> {
-    match (number, name) {
+fn descriptor<'py>(py: Python<'py>, section: &Section) -> Bound<'py, PyArrayDescr> {
+    match (section.dtype(), section.name().row()) {
         // Zeros and ones.
-        (Dtype::Uint8, "terminated" | "truncated") => dtype::<bool>(py),
+        (Dtype::Uint8, RowShape::Flag) => dtype::<bool>(py),
         (Dtype::Uint8, _) => dtype::<u8>(py),
         (Dtype::Int32, _) => dtype::<i32>(py),
         (Dtype::Uint64, _) => dtype::<u64>(py),

@@ -52,8 +52,7 @@ pub fn service(error: ServiceError) -> PyErr {
         E::InvalidName { .. }
         | E::InvalidTimeout { .. }
         | E::NoSuchGroup { .. }
-        | E::ActionCount { .. }
-        | E::ActionRange { .. }
+        | E::Action(_)
         | E::ResetCount { .. }
         | E::OptionsTooLong { .. }
         | E::SnapshotTooLong { .. }

@@ -15,8 +15,10 @@ use std::ffi::OsString;
 use std::process::ExitCode;
 
 use endless_gym::envs;
+use endless_gym::pool::Autoreset;
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
+use pyo3::types::PyTuple;
 
 /// All environments' specifications, as JSON text.
 #[pyfunction]
@@ -35,6 +37,8 @@ fn endless(py: Python<'_>, arguments: Vec<OsString>, itself: Vec<OsString>) -> u
 fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("AUTORESET_MODES", PyTuple::new(py, Autoreset::ALL.map(Autoreset::name))?)?;
+    module.add("DEFAULT_ENV_ID", envs::DEFAULT_ENV_ID)?;
     module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
     module.add_class::<pool::Pool>()?;

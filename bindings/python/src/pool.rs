@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use endless_gym::batch::{Block, zeroed};
+use endless_gym::batch::{Block, SectionTable, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
 use endless_gym::pool::{self as engine, PoolConfig};
 use numpy::{PyArray1, PyArrayMethods};
@@ -83,8 +83,8 @@ impl Pool {
     }
 
     /// Names of the arrays that `reset` and `step` return.
-    fn sections(&self) -> Vec<String> {
-        self.pool.layout().sections().iter().map(|section| section.name.clone()).collect()
+    fn sections(&self) -> Vec<&'static str> {
+        self.pool.layout().sections().iter().map(|section| section.name().name()).collect()
     }
 
     #[pyo3(signature = (request=None, options=None))]

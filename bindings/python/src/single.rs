@@ -3,7 +3,7 @@
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
 use endless_gym::envs::{FRAME_BYTES, SCREEN};
-use endless_gym::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -26,7 +26,7 @@ impl Single {
     #[new]
     fn new(id: &str, options: &str) -> PyResult<Self> {
         let config = PoolConfig {
-            options: Options::Shared(arguments::options(options)?),
+            options: ResetOptions::Shared(arguments::options(options)?),
             autoreset: Autoreset::Disabled,
             ..PoolConfig::new(id, 1)
         };
@@ -59,8 +59,7 @@ impl Single {
         self.pool.step(&self.action, &mut self.blocks).map_err(errors::pool)?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);
         let ended = batch.terminated()[0] != 0;
-        let end = ended
-            .then(|| (batch.episode_return()[0], batch.episode_length()[0], batch.section::<f64>("info").to_vec()));
+        let end = ended.then(|| (batch.episode_return()[0], batch.episode_length()[0], batch.info().to_vec()));
         Ok((self.arrays(py)?, batch.reward()[0], ended, end))
     }
 
@@ -93,8 +92,8 @@ impl Single {
     fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Arrays<'py>> {
         let batch = Batch::new(self.pool.layout(), &self.blocks);
         let frame = PyArray1::from_slice(py, batch.observation()).reshape([SCREEN, SCREEN, 3])?.into_any();
-        let vector = batch.section::<f32>("vector_observation");
-        let truth = batch.section::<f64>("ground_truth");
+        let vector = batch.vector_observation();
+        let truth = batch.ground_truth();
         let vector = (!vector.is_empty()).then(|| PyArray1::from_slice(py, vector).into_any());
         let truth = (!truth.is_empty()).then(|| PyArray1::from_slice(py, truth).into_any());
         Ok((frame, vector, truth))

@@ -66,7 +66,7 @@ def test_snapshots_go_on_identically_here_and_elsewhere(where, elsewhere) -> Non
             one, other = envs.recv(1), others.recv(1)
             np.testing.assert_array_equal(one[0], other[0][::-1])
             np.testing.assert_array_equal(one[1], other[1][::-1])
-        with pytest.raises(ValueError, match="no snapshot"):
+        with pytest.raises(ValueError, match="not a snapshot"):
             others.restore({0: b"whatever"})
         for env in (3, -1):
             with pytest.raises(ValueError, match=f"no environment {env}"):
@@ -211,7 +211,7 @@ def test_environments_may_have_options_of_their_own(where) -> None:
                 number = 2 * group + env
                 alone = endless_gym.Env("MortarMayhem-v0", options=each[number])
                 np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
-    with pytest.raises((ValueError, RuntimeError), match=r"3 .* 2 environments"):
+    with pytest.raises((ValueError, RuntimeError), match=r"3 .* 2 environments|2 sets, one for each, got 3"):
         where("MortarMayhem-v0", 2, options=each[:3])
 
 
@@ -320,5 +320,5 @@ def test_frames_are_as_gymnasiums_wrappers_make_them(where, mode: AutoresetMode,
 def test_frames_that_cannot_be_are_refused(where) -> None:
     with pytest.raises(ValueError, match="has no frames"):
         where(ID, 2, observation="features", frames=endless_gym.Frames(stack=2))
-    with pytest.raises((ValueError, RuntimeError), match="a stack of 65 frames"):
+    with pytest.raises((ValueError, RuntimeError), match="frame stack must be 1 to 64, got 65"):
         where(ID, 2, frames=endless_gym.Frames(stack=65))

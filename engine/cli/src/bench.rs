@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{Batch, zeroed};
-use endless_gym_core::envs::{self, EnvSpec};
+use endless_gym_core::envs::{self, DEFAULT_ENV_ID, EnvSpec};
 use endless_gym_core::pool::{Pool, ResetRequest, Threads};
 use endless_gym_service::timeout_from_seconds;
 use serde::Serialize;
@@ -29,7 +29,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id, or `all`.
-    #[arg(long = "env", value_name = "ID", default_value = super::DEFAULT_ENVIRONMENT)]
+    #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
     id: String,
     /// Environments.
     #[arg(long, default_value_t = 1024)]

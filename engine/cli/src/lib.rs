@@ -40,9 +40,6 @@ enum Command {
     Verify(verify::Args),
 }
 
-/// The environment that commands take where none is named.
-const DEFAULT_ENVIRONMENT: &str = "Endless-MortarMayhem-v0";
-
 /// What any command may fail with: it is shown as one line.
 type Failure = Box<dyn std::error::Error>;
 

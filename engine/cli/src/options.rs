@@ -1,22 +1,17 @@
 //! Options that several commands share.
 
-use clap::ValueEnum;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use endless_gym_core::batch::Frames;
-use endless_gym_core::pool::{Autoreset, Options, PoolConfig, Seeding};
+use endless_gym_core::pool::{Autoreset, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::raster::PixelFormat;
 use serde_json::{Map, Value as Json};
 
 use super::Failure;
 
-/// Auto-reset modes by Gymnasium's names.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-pub enum AutoresetMode {
-    /// Start the next episode in the step after one ended.
-    NextStep,
-    /// Start it in the same step.
-    SameStep,
-    /// Wait for the trainer to reset.
-    Disabled,
+/// The parser of an autoreset mode, with the modes' help.
+pub fn autoreset_parser() -> impl TypedValueParser<Value = Autoreset> {
+    let values = Autoreset::ALL.map(|mode| PossibleValue::new(mode.name()).help(mode.summary()));
+    PossibleValuesParser::new(values).try_map(|name| name.parse::<Autoreset>())
 }
 
 /// What the frames are like.
@@ -105,7 +100,7 @@ impl EnvironmentArgs {
                 .map_err(|error| format!("--env-options {options}: expected a JSON object: {error}"))
         });
         let each = each.collect::<Result<Vec<_>, _>>()?;
-        let options = if each.is_empty() { Options::Shared(options) } else { Options::Each(each) };
+        let options = if each.is_empty() { ResetOptions::Shared(options) } else { ResetOptions::Each(each) };
         let seeding = match (self.seed_range, &self.seed_list[..]) {
             (Some((start, end)), _) => Seeding::Range { start, end, seed: self.seed },
             (None, []) => Seeding::Continue { seed: self.seed },
@@ -115,12 +110,22 @@ impl EnvironmentArgs {
     }
 }
 
-impl From<AutoresetMode> for Autoreset {
-    fn from(mode: AutoresetMode) -> Self {
-        match mode {
-            AutoresetMode::NextStep => Autoreset::NextStep,
-            AutoresetMode::SameStep => Autoreset::SameStep,
-            AutoresetMode::Disabled => Autoreset::Disabled,
+#[cfg(test)]
+mod tests {
+    use clap::{Arg, Command};
+
+    use super::*;
+
+    #[test]
+    fn autoreset_modes_are_given_by_their_names() {
+        let parse = |given: &str| {
+            let command = Command::new("endless").arg(Arg::new("mode").value_parser(autoreset_parser()));
+            command.try_get_matches_from(["endless", given]).map(|found| found.get_one::<Autoreset>("mode").copied())
+        };
+        for mode in Autoreset::ALL {
+            assert_eq!(parse(mode.name()).unwrap(), Some(mode));
         }
+        let message = parse("never").unwrap_err().to_string();
+        assert!(Autoreset::ALL.iter().all(|mode| message.contains(mode.name())), "{message}");
     }
 }

@@ -57,7 +57,7 @@ impl ExpertPlayer {
     }
 
     pub fn act(&mut self, batch: &Batch<'_>, actions: &mut [i32]) {
-        let (features, vectors) = (batch.section("features"), batch.section("vector_observation"));
+        let (features, vectors) = (batch.features(), batch.vector_observation());
         let terminated = batch.terminated();
         let rows = self.experts.iter_mut().zip(&mut self.ended).zip(actions.chunks_exact_mut(self.branches));
         for (env, ((expert, ended), action)) in rows.enumerate() {
@@ -98,7 +98,7 @@ impl Tally {
         let terminated = batch.terminated();
         self.steps += terminated.len() as u64;
         self.running_return = batch.episode_return().iter().sum::<f64>() / terminated.len() as f64;
-        let info = batch.section::<f64>("info");
+        let info = batch.info();
         for env in (0..terminated.len()).filter(|env| terminated[*env] == 1) {
             self.episodes += 1;
             self.returns += batch.episode_return()[env];

@@ -2,17 +2,18 @@
 
 use std::process::ExitCode;
 
-use endless_gym_core::pool::{PoolConfig, Threads};
+use endless_gym_core::envs::DEFAULT_ENV_ID;
+use endless_gym_core::pool::{Autoreset, PoolConfig, Threads};
 use endless_gym_service::{Engine, EngineConfig};
 
-use super::options::{AutoresetMode, EnvironmentArgs, FrameArgs};
+use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser};
 use super::output::{grouped, print};
 use super::{Failure, stop};
 
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id; `endless list` shows them.
-    #[arg(long = "env", value_name = "ID", default_value = super::DEFAULT_ENVIRONMENT)]
+    #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
     id: String,
     /// Environments in each group.
     #[arg(long, default_value_t = 1024)]
@@ -29,8 +30,8 @@ pub struct Args {
     #[command(flatten)]
     environment: EnvironmentArgs,
     /// When an episode that ended gives way to the next.
-    #[arg(long, value_enum, default_value = "next-step")]
-    autoreset: AutoresetMode,
+    #[arg(long, value_name = "MODE", value_parser = autoreset_parser(), default_value_t = Autoreset::default())]
+    autoreset: Autoreset,
     /// Keep the last observation of episodes that same-step auto-reset ends.
     #[arg(long)]
     final_observation: bool,
@@ -53,7 +54,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
         stop::on_closed_input(&stop);
     }
     let pool = PoolConfig {
-        autoreset: args.autoreset.into(),
+        autoreset: args.autoreset,
         final_observation: args.final_observation,
         frames: args.frames.frames(),
         features: args.features,

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{LAYOUT_VERSION, action_layout};
-use endless_gym_core::pool::{Options, Pool};
+use endless_gym_core::pool::{Pool, PoolError, ResetOptions};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
@@ -107,7 +107,7 @@ impl Engine {
         blackboard::refuse_second_engine(&node, &config.service, &NamespaceLock::acquire(node.root())?)?;
         let pools: Vec<Pool> =
             config.pools()?.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<_, _>>()?;
-        let specification = specify(config, &pools[0]);
+        let specification = specify(config, &pools[0])?;
         let limits = specification.lease_limits();
         let blocks = chunk_blocks(&specification.batch);
         PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
@@ -219,10 +219,10 @@ impl Engine {
     }
 }
 
-fn specify(config: &EngineConfig, pool: &Pool) -> ServiceSpecification {
+fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, PoolError> {
     let spec = pool.spec();
     let features: &[_] = if config.pool.features { spec.features } else { &[] };
-    ServiceSpecification {
+    Ok(ServiceSpecification {
         service: config.service.clone(),
         layout_version: LAYOUT_VERSION,
         engine_version: PACKAGE_VERSION.to_owned(),
@@ -232,18 +232,18 @@ fn specify(config: &EngineConfig, pool: &Pool) -> ServiceSpecification {
         groups: config.groups,
         num_envs: config.pool.num_envs,
         batch: pool.layout().clone(),
-        action: action_layout(spec, config.pool.num_envs),
+        action: action_layout(spec, config.pool.num_envs)?,
         frames: config.pool.frames,
-        action_space: spec.action_space.into(),
+        action_space: spec.action_space.clone(),
         info: spec.info.iter().map(|column| column.name.to_owned()).collect(),
         features: features.iter().map(|column| column.name.to_owned()).collect(),
         options: match &config.pool.options {
-            Options::Shared(options) => vec![options.clone()],
-            Options::Each(each) => each.clone(),
+            ResetOptions::Shared(options) => vec![options.clone()],
+            ResetOptions::Each(each) => each.clone(),
         },
         autoreset: config.pool.autoreset,
         render_fps: spec.render_fps,
         batches_held: config.batches_held,
         observers: config.observers,
-    }
+    })
 }

@@ -1,6 +1,6 @@
 //! What an engine serves.
 
-use endless_gym_core::pool::{MAX_ENVS, Options, PoolConfig, PoolError, Threads};
+use endless_gym_core::pool::{MAX_ENVS, PoolConfig, PoolError, ResetOptions, Threads};
 
 use crate::error::ServiceError;
 use crate::namespace::{Namespace, check_name};
@@ -22,7 +22,7 @@ pub struct EngineConfig {
     /// The namespace in which trainers find the engine.
     pub namespace: Namespace,
     /// The environments of one group. The engine overrides `first_env` and `total_envs`, which count the environments of all
-    /// groups. [`Options::Each`] holds the reset parameters of all groups, one group after the other.
+    /// groups. [`ResetOptions::Each`] holds the reset parameters of all groups, one group after the other.
     pub pool: PoolConfig,
     /// Number of groups, 1 to [`MAX_GROUPS`]. Each is stepped when its actions arrive, so that a trainer can work on one group
     /// while the engine steps another.
@@ -76,11 +76,11 @@ impl EngineConfig {
             .map(|group| {
                 let first_env = group * num_envs;
                 let options = match &self.pool.options {
-                    Options::Shared(options) => Options::Shared(options.clone()),
-                    Options::Each(each) if each.len() == total_envs => {
-                        Options::Each(each[first_env..first_env + num_envs].to_vec())
+                    ResetOptions::Shared(options) => ResetOptions::Shared(options.clone()),
+                    ResetOptions::Each(each) if each.len() == total_envs => {
+                        ResetOptions::Each(each[first_env..first_env + num_envs].to_vec())
                     }
-                    Options::Each(each) => {
+                    ResetOptions::Each(each) => {
                         return Err(PoolError::OptionsCount { given: each.len(), num_envs: total_envs });
                     }
                 };

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use endless_gym_core::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::PoolError;
 use thiserror::Error;
 
@@ -155,29 +156,9 @@ pub enum ServiceError {
         /// Number of groups of the engine.
         groups: usize,
     },
-    /// There are too few or too many actions.
-    #[error(
-        "actions must be {} numbers for {num_envs} environments with {branches} branches each, got {given}",
-        num_envs * branches
-    )]
-    ActionCount {
-        /// Number of integers that were given.
-        given: usize,
-        /// Environments in the group.
-        num_envs: usize,
-        /// Branches of the action space.
-        branches: usize,
-    },
-    /// An action is not in the action space. No environment has been stepped.
-    #[error("action of environment {env} must be in {space}, got {given:?}")]
-    ActionRange {
-        /// The first environment whose action is invalid.
-        env: usize,
-        /// Its action.
-        given: Vec<i32>,
-        /// The action space.
-        space: String,
-    },
+    /// Actions of a wrong number or out of range. No environment has been stepped.
+    #[error(transparent)]
+    Action(#[from] ActionError),
     /// A reset has too few or too many flags or seeds.
     #[error("reset must have {num_envs} flags and {num_envs} seeds, one for each environment, got {given}")]
     ResetCount {

@@ -1,6 +1,6 @@
 //! One group of an engine: its pool, its ports, and how it executes requests.
 
-use endless_gym_core::batch::{Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for};
+use endless_gym_core::batch::{ActionLayout, ActionSection, Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for};
 use endless_gym_core::pool::{Pool, ResetRequest};
 use iceoryx2::port::ReceiveError;
 use iceoryx2::sample::Sample;
@@ -79,7 +79,7 @@ impl Group {
     /// Checks a request and copies its payload. `header` is a copy as well.
     pub(crate) fn read(
         &mut self,
-        layout: &Layout,
+        layout: &ActionLayout,
         header: &RequestHeader,
         payload: &[Block],
     ) -> Result<RequestKind, Rejected> {
@@ -152,7 +152,12 @@ struct RequestData {
 }
 
 impl RequestData {
-    fn read(&mut self, layout: &Layout, header: &RequestHeader, payload: &[Block]) -> Result<RequestKind, Rejected> {
+    fn read(
+        &mut self,
+        layout: &ActionLayout,
+        header: &RequestHeader,
+        payload: &[Block],
+    ) -> Result<RequestKind, Rejected> {
         if header.layout_version != LAYOUT_VERSION {
             let text = format!("layout version must be {LAYOUT_VERSION}, got {}", header.layout_version);
             return Err((Rejection::Version, text));
@@ -165,17 +170,19 @@ impl RequestData {
             return Err((Rejection::Payload, text));
         }
         match kind {
-            RequestKind::Step => copy(&mut self.action, layout.read(payload, "action")),
+            RequestKind::Step => copy(&mut self.action, layout.read(payload, ActionSection::Action)),
             RequestKind::ResetEach => {
-                copy(&mut self.reset, layout.read(payload, "reset"));
-                copy(&mut self.seed, layout.read(payload, "seed"));
+                copy(&mut self.reset, layout.read(payload, ActionSection::Reset));
+                copy(&mut self.seed, layout.read(payload, ActionSection::Seed));
             }
-            RequestKind::Restore => copy(&mut self.snapshot, prefix(layout.read(payload, "snapshot"), header.bytes)),
+            RequestKind::Restore => {
+                copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes))
+            }
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot => {}
         }
         self.options = match kind {
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::ResetEach if header.bytes > 0 => {
-                copy(&mut self.options_text, prefix(layout.read(payload, "options"), header.bytes));
+                copy(&mut self.options_text, prefix(layout.read(payload, ActionSection::Options), header.bytes));
                 let options = serde_json::from_slice(&self.options_text);
                 Some(
                     options
@@ -212,7 +219,7 @@ mod tests {
 
     #[test]
     fn a_request_that_changes_after_it_was_read_has_no_effect() {
-        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1);
+        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1).unwrap();
         let mut payload = zeroed(layout.blocks());
         let mut data = RequestData::default();
         let header = |kind: RequestKind, bytes| RequestHeader {
@@ -223,21 +230,21 @@ mod tests {
         };
 
         let text = br#"{"arena_size": 3}"#;
-        layout.write::<u8>(&mut payload, "options")[..text.len()].copy_from_slice(text);
+        layout.write::<u8>(&mut payload, ActionSection::Options)[..text.len()].copy_from_slice(text);
         data.read(&layout, &header(RequestKind::ResetAll, text.len() as u64), &payload).unwrap();
-        layout.write::<u8>(&mut payload, "options").fill(b'x');
+        layout.write::<u8>(&mut payload, ActionSection::Options).fill(b'x');
         assert_eq!(data.options.as_ref().unwrap()["arena_size"], 3);
         assert_eq!(data.options_text, text);
 
-        layout.write::<u8>(&mut payload, "snapshot").fill(1);
+        layout.write::<u8>(&mut payload, ActionSection::Snapshot).fill(1);
         data.read(&layout, &header(RequestKind::Restore, 9), &payload).unwrap();
-        layout.write::<u8>(&mut payload, "snapshot").fill(2);
+        layout.write::<u8>(&mut payload, ActionSection::Snapshot).fill(2);
         assert_eq!((&data.snapshot[..], &data.options), (&[1; 9][..], &None));
     }
 
     #[test]
     fn a_length_beyond_the_payload_reads_nothing() {
-        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1);
+        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1).unwrap();
         let payload = zeroed(layout.blocks());
         let header =
             RequestHeader { layout_version: LAYOUT_VERSION, kind: 2, bytes: u64::MAX, ..RequestHeader::default() };

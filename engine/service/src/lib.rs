@@ -73,5 +73,5 @@ pub use error::{Rejection, ServiceError};
 pub use lease::BatchLease;
 pub use namespace::{Namespace, ROOT_VARIABLE};
 pub use observer::Observer;
-pub use specification::{Actions, ServiceSpecification};
+pub use specification::ServiceSpecification;
 pub use trainer::Trainer;

@@ -1,6 +1,6 @@
 //! The specification of an engine: what trainers and observers must know before they connect.
 
-use endless_gym_core::batch::{Frames, Layout, action_layout};
+use endless_gym_core::batch::{ActionLayout, Frames, Layout, action_layout};
 use endless_gym_core::envs::{self, ActionSpace};
 use endless_gym_core::pool::{Autoreset, MAX_ENVS};
 use serde::{Deserialize, Serialize};
@@ -31,11 +31,11 @@ pub struct ServiceSpecification {
     /// Layout of a group's batch.
     pub batch: Layout,
     /// Layout of a request to step or reset a group.
-    pub action: Layout,
+    pub action: ActionLayout,
     /// Format of the frames in a batch; `None` if batches have no frames.
     pub frames: Option<Frames>,
     /// The action space of one environment.
-    pub action_space: Actions,
+    pub action_space: ActionSpace,
     /// Names of the columns of the batch's section `info`.
     pub info: Vec<String>,
     /// Names of the columns of the batch's section `features`.
@@ -43,7 +43,6 @@ pub struct ServiceSpecification {
     /// The reset parameters that were given: one map for all environments, or one for each environment of all groups.
     pub options: Vec<Map<String, Json>>,
     /// When a new episode starts after the end of one.
-    #[serde(with = "AutoresetName")]
     pub autoreset: Autoreset,
     /// Frames per second at which a person would watch.
     pub render_fps: u32,
@@ -72,7 +71,8 @@ impl ServiceSpecification {
             }
         }
         let spec = envs::spec(&self.id).map_err(|e| e.to_string())?;
-        if self.action != action_layout(spec, self.num_envs) || self.action_space != spec.action_space.into() {
+        let action = action_layout(spec, self.num_envs).map_err(|e| e.to_string())?;
+        if self.action != action || self.action_space != spec.action_space {
             return Err(format!("action layout or action space is not that of {}", self.id));
         }
         if self.batch.num_envs() != self.num_envs {
@@ -95,49 +95,4 @@ impl ServiceSpecification {
         ];
         same.into_iter().find(|(_, same)| !same).map(|(what, _)| what)
     }
-}
-
-/// The action space of an environment: [`ActionSpace`] in a form that can be deserialised.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Actions {
-    /// One integer in `0..n`.
-    Discrete(i32),
-    /// Several integers, each in `0..n` for its own `n`.
-    MultiDiscrete(Vec<i32>),
-}
-
-impl Actions {
-    /// Number of choices of each branch.
-    pub fn branches(&self) -> &[i32] {
-        match self {
-            Actions::Discrete(n) => std::slice::from_ref(n),
-            Actions::MultiDiscrete(branches) => branches,
-        }
-    }
-}
-
-impl From<ActionSpace> for Actions {
-    fn from(space: ActionSpace) -> Self {
-        match space {
-            ActionSpace::Discrete(n) => Actions::Discrete(n),
-            ActionSpace::MultiDiscrete(branches) => Actions::MultiDiscrete(branches.to_vec()),
-        }
-    }
-}
-
-impl std::fmt::Display for Actions {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Actions::Discrete(n) => write!(f, "Discrete({n})"),
-            Actions::MultiDiscrete(branches) => write!(f, "MultiDiscrete({branches:?})"),
-        }
-    }
-}
-
-#[derive(Serialize, Deserialize)]
-#[serde(remote = "Autoreset", rename_all = "snake_case")]
-enum AutoresetName {
-    NextStep,
-    SameStep,
-    Disabled,
 }

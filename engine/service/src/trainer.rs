@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::batch::{ActionSection, Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use endless_gym_core::pool::ResetRequest;
 use serde_json::{Map, Value as Json};
 
@@ -141,7 +141,7 @@ impl Trainer {
             return Err(ServiceError::OptionsTooLong { given: options.len() });
         }
         let write_options = |message: &mut [Block]| {
-            let text = specification.action.write::<u8>(message, "options");
+            let text = specification.action.write::<u8>(message, ActionSection::Options);
             text[..options.len()].copy_from_slice(options.as_bytes());
             Ok(options.len())
         };
@@ -155,8 +155,8 @@ impl Trainer {
                 Err(ServiceError::ResetCount { given, num_envs })
             }
             ResetRequest::Each { reset, seed } => self.post(group, Request::new(RequestKind::ResetEach), |message| {
-                specification.action.write::<u8>(message, "reset").copy_from_slice(reset);
-                specification.action.write::<u64>(message, "seed").copy_from_slice(seed);
+                specification.action.write::<u8>(message, ActionSection::Reset).copy_from_slice(reset);
+                specification.action.write::<u64>(message, ActionSection::Seed).copy_from_slice(seed);
                 write_options(message)
             }),
         }
@@ -166,19 +166,16 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::ActionCount`], [`ServiceError::ActionRange`], [`ServiceError::NoSuchGroup`],
+    /// [`ServiceError::Action`], [`ServiceError::NoSuchGroup`],
     /// [`ServiceError::AnswerPending`], and [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has
     /// ended.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
-        let expected = self.specification.num_envs * self.specification.action_space.branches().len();
-        if actions.len() != expected {
-            return Err(ServiceError::ActionCount {
-                given: actions.len(),
-                num_envs: self.specification.num_envs,
-                branches: self.specification.action_space.branches().len(),
-            });
-        }
-        self.send_with(group, |message| message.copy_from_slice(actions))
+        let specification = Arc::clone(&self.specification);
+        specification.action_space.check(specification.num_envs, actions)?;
+        self.post(group, Request::new(RequestKind::Step), |message| {
+            specification.action.write::<i32>(message, ActionSection::Action).copy_from_slice(actions);
+            Ok(0)
+        })
     }
 
     /// Like [`send`](Trainer::send), but `fill` writes the actions directly into shared memory. The slice has shape
@@ -190,9 +187,10 @@ impl Trainer {
     pub fn send_with(&mut self, group: usize, fill: impl FnOnce(&mut [i32])) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
         self.post(group, Request::new(RequestKind::Step), |message| {
-            let actions = specification.action.write::<i32>(message, "action");
+            let actions = specification.action.write::<i32>(message, ActionSection::Action);
             fill(actions);
-            check_actions(&specification, actions).map(|()| 0)
+            specification.action_space.check(specification.num_envs, actions)?;
+            Ok(0)
         })
     }
 
@@ -276,7 +274,7 @@ impl Trainer {
         }
         let specification = Arc::clone(&self.specification);
         let write = |message: &mut [Block]| {
-            specification.action.write::<u8>(message, "snapshot")[..given].copy_from_slice(snapshot);
+            specification.action.write::<u8>(message, ActionSection::Snapshot)[..given].copy_from_slice(snapshot);
             Ok(given)
         };
         let request = Request { env, checksum: crc32fast::hash(snapshot), ..Request::new(RequestKind::Restore) };
@@ -403,18 +401,5 @@ impl Trainer {
 
     fn incompatible(&self) -> ServiceError {
         ServiceError::IncompatibleTypes { service: self.config.service.clone() }
-    }
-}
-
-fn check_actions(specification: &ServiceSpecification, actions: &[i32]) -> Result<(), ServiceError> {
-    let branches = specification.action_space.branches();
-    let fits = |action: &[i32]| action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a));
-    match actions.chunks_exact(branches.len().max(1)).enumerate().find(|(_, action)| !fits(action)) {
-        None => Ok(()),
-        Some((env, action)) => Err(ServiceError::ActionRange {
-            env,
-            given: action.to_vec(),
-            space: specification.action_space.to_string(),
-        }),
     }
 }

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from endless_gym.agents.metrics import is_finite
-from endless_gym.specs import spec
+from endless_gym.specs import DEFAULT_ENV_ID, spec
 
 AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
 PresetName = Literal["paper", "old", "throughput", "quick"]
@@ -148,7 +148,7 @@ class PPO:
 class Settings:
     """Train an agent with PPO on one of the Memory Gym environments."""
 
-    env: str = "Endless-MortarMayhem-v0"
+    env: str = DEFAULT_ENV_ID
     """environment id; `endless list` lists them"""
     agent: AgentName = "gru"
     """gru, lstm, trxl (Transformer-XL) or gtrxl (gated Transformer-XL); or a baseline without memory: none, stack (stacked grey

@@ -1,20 +1,22 @@
-//! What the frames of an observation look like.
+//! The format of the frames of an observation.
 
 use serde::{Deserialize, Serialize};
 
 use crate::envs::SCREEN;
 use crate::raster::PixelFormat;
 
-/// Most frames in an observation.
+/// Maximum number of frames in an observation.
 pub const MAX_STACK: usize = 64;
 
-/// The frames of an observation. The default is the original's: one, uint8 (84, 84, 3), indexed \[x\]\[y\]\[channel\].
+/// Format of an observation's frames. The default is the original's: one frame, uint8 (84, 84, 3), indexed
+/// \[x\]\[y\]\[channel\].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Frames {
-    /// How the pixels of each frame lie.
+    /// Order of the numbers within a frame.
     pub format: PixelFormat,
-    /// The last frames of the episode that are in an observation, oldest first, 1 to [`MAX_STACK`]; an episode's first frame
-    /// stands for those before it. With more than 1 they are the first index, as in Gymnasium's `FrameStackObservation`.
+    /// Number of frames in an observation, 1 to [`MAX_STACK`]: the last frames of the episode, oldest first. At the start of an
+    /// episode its first frame is repeated. With more than 1 the frame is the first index, as in Gymnasium's
+    /// `FrameStackObservation`.
     pub stack: usize,
 }
 
@@ -26,6 +28,13 @@ impl Default for Frames {
 
 impl Frames {
     /// Shape of one environment's observation.
+    ///
+    /// ```
+    /// use endless_gym_core::batch::Frames;
+    ///
+    /// assert_eq!(Frames::default().shape(), [84, 84, 3]);
+    /// assert_eq!(Frames { stack: 4, ..Frames::default() }.shape(), [4, 84, 84, 3]);
+    /// ```
     pub fn shape(self) -> Vec<usize> {
         let frame = self.format.shape(SCREEN, SCREEN);
         if self.stack == 1 { frame } else { [vec![self.stack], frame].concat() }

@@ -1,221 +1,376 @@
-//! Where each array of a batch lies: the one description that every reader and writer uses.
+//! Where each section of a batch lies in memory.
 
-use bytemuck::Pod;
 use serde::{Deserialize, Serialize};
 
 use super::block::{BLOCK_BYTES, Block, blocks_for};
-use super::stamp::Stamp;
+use super::dtype::{Dtype, Element};
+use super::layout_error::{LayoutError, MAX_ENVS};
+use super::sections::{ActionSection, BatchSection, Contents, RowShape, SectionTable};
+use crate::envs::EnvSpec;
 
-/// Number type of a section.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Dtype {
-    Uint8,
-    Int32,
-    Uint64,
-    Float32,
-    Float64,
+/// Maximum number of dimensions of a section's array, the environment's index included.
+pub const MAX_DIMENSIONS: usize = 8;
+
+/// One array of a batch: `num_envs` rows of [`shape`](Section::shape) numbers in C order.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Section<S: SectionTable = BatchSection> {
+    name: S,
+    shape: Vec<usize>,
+    offset: usize,
+    width: usize,
+    bytes: usize,
 }
 
-impl Dtype {
-    /// Bytes of one number.
-    pub const fn size(self) -> usize {
-        match self {
-            Dtype::Uint8 => 1,
-            Dtype::Int32 | Dtype::Float32 => 4,
-            Dtype::Uint64 | Dtype::Float64 => 8,
-        }
+impl<S: SectionTable> Section<S> {
+    /// Which section it is.
+    pub fn name(&self) -> S {
+        self.name
     }
 
-    /// numpy's name of the type.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Dtype::Uint8 => "uint8",
-            Dtype::Int32 => "int32",
-            Dtype::Uint64 => "uint64",
-            Dtype::Float32 => "float32",
-            Dtype::Float64 => "float64",
-        }
+    /// Number type.
+    pub fn dtype(&self) -> Dtype {
+        self.name.dtype()
     }
-}
 
-/// Ties a Rust number type to its [`Dtype`].
-pub trait Element: Pod + Send + Sync {
-    /// The type's description in a layout.
-    const DTYPE: Dtype;
-}
+    /// Shape of one environment's row; empty for a single number. It has fewer than [`MAX_DIMENSIONS`] dimensions.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
 
-macro_rules! element {
-    ($($rust:ty => $dtype:ident),*) => { $(impl Element for $rust { const DTYPE: Dtype = Dtype::$dtype; })* };
-}
-element!(u8 => Uint8, i32 => Int32, u64 => Uint64, f32 => Float32, f64 => Float64);
+    /// Bytes from the start of the batch; a multiple of [`BLOCK_BYTES`].
+    pub fn offset(&self) -> usize {
+        self.offset
+    }
 
-/// One array of a batch: `num_envs` rows of `shape` numbers, C order, at `offset` bytes from the batch's start.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Section {
-    pub name: String,
-    pub dtype: Dtype,
-    /// Shape of one environment's row; empty for a single number.
-    pub shape: Vec<usize>,
-    /// Bytes from the start of the batch; a multiple of 64.
-    pub offset: usize,
-}
-
-impl Section {
     /// Numbers in one environment's row.
     pub fn width(&self) -> usize {
-        self.shape.iter().product()
+        self.width
+    }
+
+    /// Bytes of all rows, without the padding behind them.
+    pub fn bytes(&self) -> usize {
+        self.bytes
     }
 }
 
-/// The sections of a batch of `num_envs` environments, in the order of their offsets.
+/// Where the sections of a batch of `num_envs` environments lie in memory.
+///
+/// A layout that exists is valid: its sections are those of the table `S` with their number types and numbers of dimensions, each
+/// starts at a multiple of [`BLOCK_BYTES`], they do not overlap, and all of them lie within the declared size. Deserialising
+/// refuses anything else with a [`LayoutError`].
+///
+/// ```
+/// use endless_gym_core::batch::{BatchSection, Contents, Frames, Layout, batch_layout, zeroed};
+/// use endless_gym_core::envs;
+///
+/// let contents = Contents { frames: Some(Frames::default()), features: false, final_observation: false };
+/// let layout = batch_layout(envs::spec("MysteryPath-v0")?, 16, contents)?;
+/// let observation = layout.section(BatchSection::Observation).unwrap();
+/// assert_eq!(observation.shape(), [84, 84, 3]);
+///
+/// let mut batch = zeroed(layout.blocks());
+/// layout.write::<f64>(&mut batch, BatchSection::Reward)[3] = 0.1;
+/// assert_eq!(layout.read::<f64>(&batch, BatchSection::Reward)[3], 0.1);
+///
+/// let mut json = serde_json::to_value(&layout)?;
+/// assert_eq!(serde_json::from_value::<Layout>(json.clone())?, layout);
+/// json["num_envs"] = 0.into();
+/// let error = serde_json::from_value::<Layout>(json).unwrap_err();
+/// assert_eq!(error.to_string(), "num_envs must be 1 to 1048576, got 0");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Layout {
+#[serde(try_from = "LayoutFields", into = "LayoutFields", bound = "S: SectionTable")]
+pub struct Layout<S: SectionTable = BatchSection> {
     num_envs: usize,
-    sections: Vec<Section>,
-    /// A block behind the sections belongs to the pool that writes them.
-    stamped: bool,
+    /// By their offsets.
+    sections: Vec<Section<S>>,
+    blocks: usize,
 }
 
-impl Layout {
-    /// Lays `(name, dtype, row shape)` out one after the other, each aligned to 64 bytes.
-    pub fn new<'a>(num_envs: usize, arrays: impl IntoIterator<Item = (&'a str, Dtype, Vec<usize>)>) -> Self {
-        let mut layout = Layout { num_envs, sections: Vec::new(), stamped: false };
-        for (name, dtype, shape) in arrays {
-            let offset = layout.blocks() * BLOCK_BYTES;
-            layout.sections.push(Section { name: name.to_owned(), dtype, shape, offset });
+/// The layout of the message that a trainer sends to an engine.
+pub type ActionLayout = Layout<ActionSection>;
+
+/// The layout of a batch of `num_envs` environments, 1 to [`MAX_ENVS`].
+pub fn batch_layout(spec: &EnvSpec, num_envs: usize, contents: Contents) -> Result<Layout, LayoutError> {
+    let sections = BatchSection::ALL.iter();
+    Layout::new(num_envs, sections.filter_map(|section| Some((*section, section.row_shape(spec, contents)?))))
+}
+
+/// The layout of the message that a trainer sends to an engine, for `num_envs` environments, 1 to [`MAX_ENVS`].
+pub fn action_layout(spec: &EnvSpec, num_envs: usize) -> Result<ActionLayout, LayoutError> {
+    check_num_envs(num_envs)?;
+    Layout::new(num_envs, ActionSection::ALL.iter().map(|section| (*section, section.row_shape(spec, num_envs))))
+}
+
+impl<S: SectionTable> Layout<S> {
+    /// Lays sections of these row shapes out one after the other.
+    fn new(num_envs: usize, sections: impl IntoIterator<Item = (S, Vec<usize>)>) -> Result<Self, LayoutError> {
+        let mut builder = Builder::new(num_envs)?;
+        for (name, shape) in sections {
+            let offset = blocks_for(builder.end) * BLOCK_BYTES;
+            builder.add(name, shape, offset)?;
         }
-        layout
+        builder.finish()
     }
 
-    /// The same sections with room for a pool's stamp behind them.
-    pub(super) fn with_stamp(self) -> Self {
-        Layout { stamped: true, ..self }
-    }
-
-    /// The place of the pool's stamp.
-    pub(super) fn stamp_block(&self) -> Option<usize> {
-        self.stamped.then(|| self.section_blocks())
-    }
-
-    /// Makes the pool that next writes into `batch` draw every frame in full. Whoever has changed frames in a batch, and gives
-    /// it to a pool again, has to call this in between.
-    pub fn forget_frames(&self, batch: &mut [Block]) {
-        Stamp::default().write(self, batch);
-    }
-
-    /// Environments in the batch.
+    /// Number of environments in the batch, 1 to [`MAX_ENVS`].
     pub fn num_envs(&self) -> usize {
         self.num_envs
     }
 
     /// All sections, in the order of their offsets.
-    pub fn sections(&self) -> &[Section] {
+    pub fn sections(&self) -> &[Section<S>] {
         &self.sections
     }
 
-    /// The section of that name, if this batch has it.
-    pub fn section(&self, name: &str) -> Option<&Section> {
+    /// A section, if the batch has it.
+    pub fn section(&self, name: S) -> Option<&Section<S>> {
         self.sections.iter().find(|section| section.name == name)
     }
 
-    /// Bytes that the section's rows take, without the padding behind them.
-    pub fn section_bytes(&self, section: &Section) -> usize {
-        self.num_envs * section.width() * section.dtype.size()
-    }
-
-    /// Blocks that the whole batch takes.
+    /// Size of the whole batch in blocks.
     pub fn blocks(&self) -> usize {
-        self.section_blocks() + usize::from(self.stamped)
+        self.blocks
     }
 
-    /// Blocks that the sections take.
+    /// Size of the sections in blocks, without the writer's stamp.
     pub(super) fn section_blocks(&self) -> usize {
-        self.sections.last().map_or(0, |last| blocks_for(last.offset + self.section_bytes(last)))
+        self.blocks - S::STAMP_BLOCKS
     }
 
-    /// The section's numbers in `batch`: `num_envs` rows after each other. Empty if the layout has no such section, if `T` is
-    /// not its type, or if `batch` is too short.
-    pub fn read<'a, T: Element>(&self, batch: &'a [Block], name: &str) -> &'a [T] {
+    /// The section's numbers in `batch`: `num_envs` rows after each other. Empty if the layout lacks the section, if `T` is not
+    /// its type, or if `batch` is too short.
+    pub fn read<'a, T: Element>(&self, batch: &'a [Block], name: S) -> &'a [T] {
         self.section(name)
-            .filter(|section| section.dtype == T::DTYPE)
+            .filter(|_| name.dtype() == T::DTYPE)
             .and_then(|section| {
                 let bytes: &[u8] = bytemuck::cast_slice(batch);
-                bytes.get(section.offset..section.offset + self.section_bytes(section))
+                bytes.get(section.offset..section.offset + section.bytes)
             })
             .map_or(&[], bytemuck::cast_slice)
     }
 
     /// As [`Layout::read`], for writing.
-    pub fn write<'a, T: Element>(&self, batch: &'a mut [Block], name: &str) -> &'a mut [T] {
-        match self.section(name).filter(|section| section.dtype == T::DTYPE) {
-            Some(section) => {
-                let range = section.offset..section.offset + self.section_bytes(section);
+    pub fn write<'a, T: Element>(&self, batch: &'a mut [Block], name: S) -> &'a mut [T] {
+        self.section(name)
+            .filter(|_| name.dtype() == T::DTYPE)
+            .and_then(|section| {
                 let bytes: &mut [u8] = bytemuck::cast_slice_mut(batch);
-                bytes.get_mut(range).map_or(&mut [], bytemuck::cast_slice_mut)
-            }
-            None => &mut [],
+                bytes.get_mut(section.offset..section.offset + section.bytes)
+            })
+            .map_or(&mut [], bytemuck::cast_slice_mut)
+    }
+}
+
+fn check_num_envs(given: usize) -> Result<(), LayoutError> {
+    if (1..=MAX_ENVS).contains(&given) { Ok(()) } else { Err(LayoutError::NumEnvs { given }) }
+}
+
+/// Checks sections one by one, in the order of their offsets.
+struct Builder<S: SectionTable> {
+    num_envs: usize,
+    sections: Vec<Section<S>>,
+    /// Bytes from the start of the batch to the end of the last section.
+    end: usize,
+}
+
+impl<S: SectionTable> Builder<S> {
+    fn new(num_envs: usize) -> Result<Self, LayoutError> {
+        check_num_envs(num_envs)?;
+        Ok(Builder { num_envs, sections: Vec::new(), end: 0 })
+    }
+
+    fn add(&mut self, name: S, shape: Vec<usize>, offset: usize) -> Result<(), LayoutError> {
+        let text = name.name();
+        if shape.len() >= MAX_DIMENSIONS || !name.row().admits(&shape) {
+            return Err(LayoutError::Shape { section: text, expected: name.row().to_string(), given: shape });
         }
+        if self.sections.iter().any(|other| other.name == name) {
+            return Err(LayoutError::Duplicate { section: text });
+        }
+        if !offset.is_multiple_of(BLOCK_BYTES) {
+            return Err(LayoutError::Alignment { section: text, given: offset });
+        }
+        if offset < self.sections.last().map_or(0, |last| last.offset) {
+            return Err(LayoutError::Order { section: text, given: offset });
+        }
+        if offset < self.end {
+            return Err(LayoutError::Overlap { section: text, given: offset, end: self.end });
+        }
+        let too_large = || LayoutError::TooLarge { section: text };
+        // As if no dimension were 0, so that each of them alone fits too.
+        let count = shape.iter().try_fold(self.num_envs, |count, length| count.checked_mul((*length).max(1)));
+        let largest =
+            count.and_then(|count| count.checked_mul(name.dtype().size())).and_then(|n| n.checked_add(offset));
+        // A slice has at most isize::MAX bytes; the last block and the stamp have to fit too.
+        largest.filter(|end| *end <= isize::MAX as usize - 2 * BLOCK_BYTES).ok_or_else(too_large)?;
+        let width: usize = shape.iter().product();
+        let bytes = self.num_envs * width * name.dtype().size();
+        if let RowShape::Bytes(needed) = name.row()
+            && bytes < needed
+        {
+            return Err(LayoutError::TooShort { section: text, given: bytes, needed });
+        }
+        self.end = offset + bytes;
+        self.sections.push(Section { name, shape, offset, width, bytes });
+        Ok(())
+    }
+
+    fn finish(self) -> Result<Layout<S>, LayoutError> {
+        let has = |name: &S| self.sections.iter().any(|section| section.name == *name);
+        if let Some(missing) = S::ALL.iter().find(|name| name.is_required() && !has(name)) {
+            return Err(LayoutError::Missing { section: missing.name() });
+        }
+        let blocks = blocks_for(self.end) + S::STAMP_BLOCKS;
+        Ok(Layout { num_envs: self.num_envs, sections: self.sections, blocks })
+    }
+}
+
+/// A layout as it is in JSON.
+#[derive(Clone, Serialize, Deserialize)]
+struct LayoutFields {
+    num_envs: usize,
+    blocks: usize,
+    sections: Vec<SectionFields>,
+}
+
+#[derive(Clone, Serialize, Deserialize)]
+struct SectionFields {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    offset: usize,
+}
+
+impl<S: SectionTable> From<Layout<S>> for LayoutFields {
+    fn from(layout: Layout<S>) -> Self {
+        let fields = |section: Section<S>| SectionFields {
+            name: section.name.name().to_owned(),
+            dtype: section.dtype(),
+            shape: section.shape,
+            offset: section.offset,
+        };
+        let sections = layout.sections.into_iter().map(fields).collect();
+        LayoutFields { num_envs: layout.num_envs, blocks: layout.blocks, sections }
+    }
+}
+
+impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
+    type Error = LayoutError;
+
+    fn try_from(fields: LayoutFields) -> Result<Self, LayoutError> {
+        let mut builder = Builder::<S>::new(fields.num_envs)?;
+        for SectionFields { name, dtype, shape, offset } in fields.sections {
+            let section = S::from_name(&name).ok_or(LayoutError::UnknownSection { given: name })?;
+            if dtype != section.dtype() {
+                return Err(LayoutError::Dtype { section: section.name(), given: dtype, expected: section.dtype() });
+            }
+            builder.add(section, shape, offset)?;
+            if blocks_for(builder.end) > fields.blocks {
+                let (end, blocks) = (builder.end, fields.blocks);
+                return Err(LayoutError::PastEnd { section: section.name(), end, blocks });
+            }
+        }
+        let layout = builder.finish()?;
+        if layout.blocks != fields.blocks {
+            return Err(LayoutError::Blocks { given: fields.blocks, expected: layout.blocks });
+        }
+        Ok(layout)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::block::zeroed;
+    use super::super::frames::Frames;
     use super::*;
+    use crate::envs;
+
+    fn everything() -> Contents {
+        Contents { frames: Some(Frames::default()), features: true, final_observation: true }
+    }
+
+    fn layout(num_envs: usize) -> Layout {
+        batch_layout(envs::spec("Endless-MortarMayhem-v0").unwrap(), num_envs, everything()).unwrap()
+    }
 
     #[test]
     fn sections_are_aligned_and_do_not_overlap() {
-        let layout = Layout::new(
-            3,
-            [("a", Dtype::Uint8, vec![5, 7]), ("b", Dtype::Float64, vec![]), ("c", Dtype::Float32, vec![2])],
-        );
-        let mut end = 0;
-        for section in layout.sections() {
-            assert_eq!(section.offset % BLOCK_BYTES, 0);
-            assert!(section.offset >= end);
-            end = section.offset + layout.section_bytes(section);
+        for (spec, num_envs) in envs::specs().zip([1, 3, 64, 1000].into_iter().cycle()) {
+            let layout = batch_layout(spec, num_envs, everything()).unwrap();
+            let mut end = 0;
+            for section in layout.sections() {
+                assert_eq!(section.offset() % BLOCK_BYTES, 0);
+                assert!(section.offset() >= end);
+                assert_eq!(section.bytes(), num_envs * section.width() * section.dtype().size());
+                end = section.offset() + section.bytes();
+            }
+            assert_eq!(layout.section_blocks() * BLOCK_BYTES, end.next_multiple_of(BLOCK_BYTES));
+            assert_eq!(layout.blocks(), layout.section_blocks() + 1);
         }
-        assert_eq!(layout.blocks() * BLOCK_BYTES, end.next_multiple_of(BLOCK_BYTES));
     }
 
     #[test]
     fn reading_returns_what_was_written() {
-        let layout = Layout::new(4, [("a", Dtype::Uint8, vec![3]), ("b", Dtype::Float64, vec![])]);
+        let layout = layout(4);
         let mut batch = zeroed(layout.blocks());
-        layout.write::<f64>(&mut batch, "b").copy_from_slice(&[1.0, 2.0, 3.0, 4.0]);
-        layout.write::<u8>(&mut batch, "a").fill(9);
-        assert_eq!(layout.read::<f64>(&batch, "b"), [1.0, 2.0, 3.0, 4.0]);
-        assert_eq!(layout.read::<u8>(&batch, "a"), [9; 12]);
+        layout.write::<f64>(&mut batch, BatchSection::Reward).copy_from_slice(&[1.0, 2.0, 3.0, 4.0]);
+        layout.write::<u8>(&mut batch, BatchSection::Terminated).fill(9);
+        assert_eq!(layout.read::<f64>(&batch, BatchSection::Reward), [1.0, 2.0, 3.0, 4.0]);
+        assert_eq!(layout.read::<u8>(&batch, BatchSection::Terminated), [9; 4]);
+        assert_eq!(layout.read::<u8>(&batch, BatchSection::Truncated), [0; 4]);
     }
 
     #[test]
-    fn a_wrong_name_type_or_length_reads_as_empty() {
-        let layout = Layout::new(4, [("a", Dtype::Float64, vec![9])]);
+    fn a_missing_section_wrong_type_or_short_batch_reads_as_empty() {
+        let layout = batch_layout(
+            envs::spec("MysteryPath-v0").unwrap(),
+            4,
+            Contents { frames: None, features: false, final_observation: false },
+        );
+        let layout = layout.unwrap();
         let batch = zeroed(layout.blocks());
-        assert!(layout.read::<f64>(&batch, "b").is_empty());
-        assert!(layout.read::<f32>(&batch, "a").is_empty());
-        assert!(layout.read::<f64>(&batch[1..], "a").is_empty());
+        assert_eq!(layout.read::<f64>(&batch, BatchSection::Reward).len(), 4);
+        assert!(layout.read::<u8>(&batch, BatchSection::Observation).is_empty());
+        assert!(layout.read::<f32>(&batch, BatchSection::Reward).is_empty());
+        assert!(layout.read::<f64>(&[], BatchSection::Reward).is_empty());
     }
 
     #[test]
-    fn the_stamp_lies_behind_the_sections() {
-        let layout = Layout::new(3, [("a", Dtype::Uint8, vec![30])]).with_stamp();
-        let mut batch = zeroed(layout.blocks());
-        assert_eq!(batch.len(), 3);
-        let stamp = Stamp { pool: 7, slot: 1, write: 2 };
-        stamp.write(&layout, &mut batch);
-        assert_eq!(Stamp::read(&layout, &batch), stamp);
-        assert_eq!(layout.read::<u8>(&batch, "a"), [0; 90]);
-        layout.forget_frames(&mut batch);
-        assert_eq!(Stamp::read(&layout, &batch), Stamp::default());
-        assert_eq!(Stamp::read(&layout, &batch[..2]), Stamp::default());
-    }
-
-    #[test]
-    fn a_layout_survives_json() {
-        let layout = Layout::new(4, [("a", Dtype::Uint8, vec![84, 84, 3]), ("b", Dtype::Uint64, vec![])]);
+    fn layouts_survive_json() {
+        let layout = layout(5);
         let text = serde_json::to_string(&layout).unwrap();
         assert_eq!(serde_json::from_str::<Layout>(&text).unwrap(), layout);
+        let actions = action_layout(envs::specs().next().unwrap(), 5).unwrap();
+        let text = serde_json::to_string(&actions).unwrap();
+        assert_eq!(serde_json::from_str::<ActionLayout>(&text).unwrap(), actions);
+        assert!(serde_json::from_str::<Layout>(&text).is_err(), "the tables differ");
+    }
+
+    #[test]
+    fn too_many_and_too_few_environments_are_refused() {
+        let spec = envs::specs().next().unwrap();
+        for given in [0, MAX_ENVS + 1, usize::MAX] {
+            assert_eq!(batch_layout(spec, given, everything()), Err(LayoutError::NumEnvs { given }));
+            assert_eq!(action_layout(spec, given), Err(LayoutError::NumEnvs { given }));
+        }
+        let frames = Some(Frames { stack: usize::MAX, ..Frames::default() });
+        let error = batch_layout(spec, 3, Contents { frames, ..everything() });
+        assert_eq!(error, Err(LayoutError::TooLarge { section: "observation" }));
+    }
+
+    #[test]
+    fn a_message_takes_the_longest_options_and_snapshots() {
+        let spec = envs::specs().next().unwrap();
+        for num_envs in [1, 7, 1024, MAX_ENVS] {
+            let layout = action_layout(spec, num_envs).unwrap();
+            for (section, bytes) in ActionSection::ALL.iter().filter_map(|section| match section.row() {
+                RowShape::Bytes(bytes) => Some((*section, bytes)),
+                _ => None,
+            }) {
+                assert!(layout.section(section).unwrap().bytes() >= bytes);
+            }
+        }
     }
 }

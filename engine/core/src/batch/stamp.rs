@@ -1,38 +1,71 @@
-//! The pool's own note in a batch: which of its writes the frames are from.
+//! The generation stamp of a batch: by which write of which pool its frames were drawn.
 
 use bytemuck::{Pod, Zeroable};
 
 use super::block::Block;
 use super::layout::Layout;
 
-/// Says which pool wrote the frames of a batch, and in which of its writes.
+/// Identifies the last write into a batch.
 ///
-/// A pool that finds its own last stamp in a batch knows what each frame shows, and changes only what differs. Any other stamp,
-/// such as that of a batch which was copied or overwritten, makes it draw everything. All zeros are no stamp.
+/// A pool that finds the stamp of its own last write into a buffer knows the scene that each frame shows, and repaints only the
+/// differences. With any other stamp, such as that of a batch that was copied or overwritten, it draws every frame in full. Zeros
+/// are no stamp.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct Stamp {
-    /// A random number, one for each pool.
+    /// The pool's random identity.
     pub pool: u64,
-    /// Where the pool has noted what the frames show.
-    pub slot: u64,
-    /// Number of the write, counted from 1.
-    pub write: u64,
+    /// Index of the pool's record of the buffer.
+    pub buffer: u64,
+    /// Generation counter: number of the write among all of the pool's, from 1.
+    pub generation: u64,
 }
 
 impl Stamp {
-    /// The stamp of a batch; none where there is no room for one.
+    /// The stamp of a batch; none where the batch is too short to have one.
     pub fn read(layout: &Layout, batch: &[Block]) -> Stamp {
-        let block = layout.stamp_block().and_then(|at| batch.get(at));
-        block.map_or_else(Stamp::default, |block| {
+        batch.get(layout.section_blocks()).map_or_else(Stamp::default, |block| {
             *bytemuck::from_bytes(&bytemuck::bytes_of(block)[..size_of::<Stamp>()])
         })
     }
 
     /// Stamps a batch.
     pub fn write(self, layout: &Layout, batch: &mut [Block]) {
-        if let Some(block) = layout.stamp_block().and_then(|at| batch.get_mut(at)) {
+        if let Some(block) = batch.get_mut(layout.section_blocks()) {
             bytemuck::bytes_of_mut(block)[..size_of::<Stamp>()].copy_from_slice(bytemuck::bytes_of(&self));
         }
+    }
+}
+
+impl Layout {
+    /// Removes the stamp of `batch`, such that the pool that next writes into it draws every frame in full. Required between a
+    /// change to the frames and the pool's next write into the same memory.
+    pub fn forget_frames(&self, batch: &mut [Block]) {
+        Stamp::default().write(self, batch);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::block::zeroed;
+    use super::super::layout::batch_layout;
+    use super::super::sections::{BatchSection, Contents};
+    use super::*;
+    use crate::envs;
+
+    #[test]
+    fn the_stamp_lies_behind_the_sections() {
+        let contents = Contents { frames: None, features: true, final_observation: false };
+        let layout = batch_layout(envs::specs().next().unwrap(), 3, contents).unwrap();
+        let mut batch = zeroed(layout.blocks());
+        let stamp = Stamp { pool: 7, buffer: 1, generation: 2 };
+        stamp.write(&layout, &mut batch);
+        assert_eq!(Stamp::read(&layout, &batch), stamp);
+        let last = layout.sections().last().unwrap();
+        assert_eq!(last.name(), BatchSection::Info);
+        assert!(layout.read::<f64>(&batch, last.name()).iter().all(|number| *number == 0.0));
+        layout.forget_frames(&mut batch);
+        assert_eq!(Stamp::read(&layout, &batch), Stamp::default());
+        assert_eq!(Stamp::read(&layout, &batch[..layout.blocks() - 1]), Stamp::default());
     }
 }

@@ -1,5 +1,6 @@
 //! The environments: the trait that each family implements, the registry of ids, and the reset parameters.
 
+mod action_space;
 pub mod character;
 pub mod character_sprites;
 mod environment;
@@ -16,10 +17,11 @@ mod steering;
 mod vector;
 pub mod view;
 
+pub use action_space::{ActionError, ActionSpace, InvalidActionSpace};
 pub use environment::{Environment, InvalidState, Transition};
 pub use expert::Expert;
 pub use family::{Family, Locomotion, MortarMayhemVariant, MysteryPathVariant, SearingSpotlightsVariant};
 pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
-pub use registry::{UnknownEnvironment, expert, spec, specs};
+pub use registry::{DEFAULT_ENV_ID, UnknownEnvironment, expert, spec, specs};
 pub use screen::{FRAME_BYTES, Frame, SCREEN};
-pub use spec::{ActionSpace, Column, EnvSpec, InfoColumn};
+pub use spec::{Column, EnvSpec, InfoColumn};

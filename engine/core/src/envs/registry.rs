@@ -7,6 +7,9 @@ use super::family::Family;
 use super::spec::EnvSpec;
 use super::{mortar_mayhem, mystery_path, searing_spotlights};
 
+/// The environment id that commands and training programs use by default.
+pub const DEFAULT_ENV_ID: &str = "Endless-MortarMayhem-v0";
+
 /// Every environment id, in the order in which `endless list` shows them.
 pub fn specs() -> impl Iterator<Item = &'static EnvSpec> {
     mortar_mayhem::SPECS.iter().chain(mystery_path::SPECS).chain(searing_spotlights::SPECS)

@@ -2,36 +2,9 @@
 
 use serde::Serialize;
 
+use super::action_space::ActionSpace;
 use super::family::Family;
 use super::parameters::Parameter;
-
-/// Actions of an environment, as the original's Gymnasium space.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub enum ActionSpace {
-    /// One number in `0..n`.
-    Discrete(i32),
-    /// Several numbers, each in `0..n` for its own `n`.
-    MultiDiscrete(&'static [i32]),
-}
-
-impl ActionSpace {
-    /// Number of choices of each branch.
-    pub fn branches(&self) -> &[i32] {
-        match self {
-            ActionSpace::Discrete(n) => std::slice::from_ref(n),
-            ActionSpace::MultiDiscrete(branches) => branches,
-        }
-    }
-}
-
-impl std::fmt::Display for ActionSpace {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            ActionSpace::Discrete(n) => write!(f, "Discrete({n})"),
-            ActionSpace::MultiDiscrete(branches) => write!(f, "MultiDiscrete({branches:?})"),
-        }
-    }
-}
 
 /// A column of the feature observation (float32).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -1,69 +1,72 @@
-//! Which buffers the pool has written into, and when: so that it knows what is in them without looking at their addresses.
+//! The buffers that a pool has written into, with a generation counter: which of them still hold the pool's last write.
 //!
-//! A buffer is known by the stamp in it. Memory that was recycled, copied, mapped anew, or written to by another pool has another
-//! stamp than the one that was noted for it, or none, and is drawn in full.
+//! A buffer is recognised by the generation stamp in its memory and not by its address. Memory that was recycled, copied, mapped
+//! again or written to by another pool has another stamp than the pool's record says, or none, and is drawn in full. As with buffer
+//! age (`EGL_EXT_buffer_age`), a buffer that is several writes old is updated from its own last content.
 
 use std::sync::atomic::{Ordering, fence};
 
 use crate::batch::{Block, Layout, Stamp};
 
-/// Most buffers that are known at a time. A trainer and its observers hold fewer.
-const MOST: usize = 32;
+/// Maximum number of buffers that are recorded at a time. A trainer and its observers hold fewer.
+const MAX_BUFFERS: usize = 32;
 
-/// The buffers of a pool.
+/// The records of a pool's buffers.
 #[derive(Debug)]
 pub(super) struct Buffers {
-    /// Tells the pool's stamps from all others'.
+    /// The pool's random identity, in its stamps.
     pool: u64,
-    /// By slot, the number of the last write.
+    /// For each buffer, the generation of the last write into it.
     writes: Vec<u64>,
+    /// The generation counter.
     last_write: u64,
 }
 
-/// A buffer that is to be written into.
+/// A buffer during a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Buffer {
-    /// Where is noted what its frames show.
-    pub slot: usize,
-    /// What is noted there is still so.
-    pub known: bool,
+    /// Index of its record, and of its drawn scenes.
+    pub index: usize,
+    /// Whether its content is the pool's last write into that record.
+    pub current: bool,
 }
 
 impl Buffers {
-    /// No buffer is known. `identity` tells this pool's stamps from all others'.
+    /// No records. `identity` distinguishes this pool's stamps from those of other pools.
     pub fn new(identity: u64) -> Self {
         // All zeros are no stamp.
         Buffers { pool: identity | 1, writes: Vec::new(), last_write: 0 }
     }
 
-    /// Takes the stamp off a buffer that is about to be written into: until [`finish`](Buffers::finish), nobody knows it.
+    /// Finds the record of a buffer that is to be written into, or makes one, and removes the buffer's stamp: until
+    /// [`finish`](Buffers::finish) its content counts as unknown.
     pub fn begin(&mut self, layout: &Layout, batch: &mut [Block]) -> Buffer {
         let stamp = Stamp::read(layout, batch);
-        let noted = usize::try_from(stamp.slot).ok().filter(|_| stamp.pool == self.pool);
-        let known = noted.filter(|slot| self.writes.get(*slot) == Some(&stamp.write));
-        let buffer = known.map_or_else(|| self.take_slot(), |slot| Buffer { slot, known: true });
+        let index = usize::try_from(stamp.buffer).ok().filter(|_| stamp.pool == self.pool);
+        let current = index.filter(|index| self.writes.get(*index) == Some(&stamp.generation));
+        let buffer = current.map_or_else(|| self.take_record(), |index| Buffer { index, current: true });
         layout.forget_frames(batch);
-        // Whatever ends this process from here on, the stamp is off before the first pixel changes.
+        // If this process ends during the write, the stamp must be gone before the first pixel has changed.
         fence(Ordering::SeqCst);
         buffer
     }
 
-    /// Stamps a buffer that has been written.
+    /// Stamps a buffer after a write.
     pub fn finish(&mut self, buffer: Buffer, layout: &Layout, batch: &mut [Block]) {
         fence(Ordering::SeqCst);
         self.last_write += 1;
-        self.writes[buffer.slot] = self.last_write;
-        Stamp { pool: self.pool, slot: buffer.slot as u64, write: self.last_write }.write(layout, batch);
+        self.writes[buffer.index] = self.last_write;
+        Stamp { pool: self.pool, buffer: buffer.index as u64, generation: self.last_write }.write(layout, batch);
     }
 
-    /// A new slot, or the one that was used least recently.
-    fn take_slot(&mut self) -> Buffer {
-        let oldest = (0..self.writes.len()).min_by_key(|slot| self.writes[*slot]);
-        let slot = oldest.filter(|_| self.writes.len() == MOST).unwrap_or_else(|| {
+    /// A new record, or the least recently used one.
+    fn take_record(&mut self) -> Buffer {
+        let oldest = (0..self.writes.len()).min_by_key(|index| self.writes[*index]);
+        let index = oldest.filter(|_| self.writes.len() == MAX_BUFFERS).unwrap_or_else(|| {
             self.writes.push(0);
             self.writes.len() - 1
         });
-        Buffer { slot, known: false }
+        Buffer { index, current: false }
     }
 }
 
@@ -81,51 +84,51 @@ mod tests {
 
     fn layout() -> Layout {
         let contents = Contents { frames: Some(Frames::default()), features: false, final_observation: false };
-        batch_layout(envs::specs().next().unwrap(), 1, contents)
+        batch_layout(envs::specs().next().unwrap(), 1, contents).unwrap()
     }
 
     #[test]
-    fn a_buffer_is_known_from_its_second_write_on() {
+    fn a_buffer_is_current_from_its_second_write_on() {
         let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batches = [zeroed(layout.blocks()), zeroed(layout.blocks())];
-        for known in [false, true, true] {
-            for (slot, batch) in batches.iter_mut().enumerate() {
-                assert_eq!(write(&mut buffers, &layout, batch), Buffer { slot, known });
+        for current in [false, true, true] {
+            for (index, batch) in batches.iter_mut().enumerate() {
+                assert_eq!(write(&mut buffers, &layout, batch), Buffer { index, current });
             }
         }
     }
 
     #[test]
-    fn copies_and_other_pools_buffers_are_not_known() {
+    fn copies_and_other_pools_buffers_are_not_current() {
         let (mut buffers, mut others, layout) = (Buffers::new(1), Buffers::new(3), layout());
         let mut batch = zeroed(layout.blocks());
         write(&mut buffers, &layout, &mut batch);
-        assert!(!write(&mut others, &layout, &mut batch).known);
-        assert!(!write(&mut buffers, &layout, &mut batch).known);
+        assert!(!write(&mut others, &layout, &mut batch).current);
+        assert!(!write(&mut buffers, &layout, &mut batch).current);
         let mut copy = batch.clone();
-        assert!(write(&mut buffers, &layout, &mut batch).known);
-        assert!(!write(&mut buffers, &layout, &mut copy).known, "the note is of the original's second write");
+        assert!(write(&mut buffers, &layout, &mut batch).current);
+        assert!(!write(&mut buffers, &layout, &mut copy).current, "the record is of the original's second write");
         let mut later = batch.clone();
-        assert!(write(&mut buffers, &layout, &mut later).known, "a copy of the last write is as good");
-        assert!(!write(&mut buffers, &layout, &mut batch).known, "but only one of the two");
+        assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is as good");
+        assert!(!write(&mut buffers, &layout, &mut batch).current, "but only one of the two");
     }
 
     #[test]
-    fn a_buffer_whose_write_was_not_finished_is_not_known() {
+    fn a_buffer_whose_write_was_not_finished_is_not_current() {
         let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batch = zeroed(layout.blocks());
         write(&mut buffers, &layout, &mut batch);
-        assert!(buffers.begin(&layout, &mut batch).known);
-        assert!(!write(&mut buffers, &layout, &mut batch).known);
+        assert!(buffers.begin(&layout, &mut batch).current);
+        assert!(!write(&mut buffers, &layout, &mut batch).current);
     }
 
     #[test]
-    fn the_least_recently_written_buffer_is_forgotten() {
+    fn the_least_recently_written_record_is_replaced() {
         let (mut buffers, layout) = (Buffers::new(1), layout());
-        let mut batches = vec![zeroed(layout.blocks()); MOST + 1];
-        batches.iter_mut().for_each(|batch| assert!(!write(&mut buffers, &layout, batch).known));
-        assert!(write(&mut buffers, &layout, &mut batches[1]).known);
-        assert_eq!(write(&mut buffers, &layout, &mut batches[0]), Buffer { slot: 2, known: false });
-        assert_eq!(buffers.writes.len(), MOST);
+        let mut batches = vec![zeroed(layout.blocks()); MAX_BUFFERS + 1];
+        batches.iter_mut().for_each(|batch| assert!(!write(&mut buffers, &layout, batch).current));
+        assert!(write(&mut buffers, &layout, &mut batches[1]).current);
+        assert_eq!(write(&mut buffers, &layout, &mut batches[0]), Buffer { index: 2, current: false });
+        assert_eq!(buffers.writes.len(), MAX_BUFFERS);
     }
 }

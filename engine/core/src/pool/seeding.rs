@@ -1,4 +1,4 @@
-//! Which seed each episode of each environment gets.
+//! The seeds of episodes.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -6,16 +6,27 @@ use serde::{Deserialize, Serialize};
 
 use crate::random::{EntropyError, Generator, SeedSequence, entropy};
 
-/// How episodes are seeded. Environments are counted over all groups of an engine, so that results depend neither on the
-/// number of threads nor on how the environments are divided.
+/// The source of the episodes' seeds. Environments are numbered over all groups of an engine, so that results depend neither on
+/// the number of threads nor on the division into groups.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Seeding {
     /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as the original's does
-    /// when it is reset without a seed. Without a seed, from the operating system's entropy.
-    Continue { seed: Option<u64> },
-    /// Each episode draws its seed uniformly from `start..end`. `seed` fixes the draws. The paper trains on `0..100000`.
-    Range { start: u64, end: u64, seed: Option<u64> },
-    /// Episode `e` of environment `i` of `n` gets the seed number `e * n + i` of the list, which starts over at its end.
+    /// when it is reset without a seed.
+    Continue {
+        /// The seed of environment 0; `None` seeds each environment from the operating system's entropy.
+        seed: Option<u64>,
+    },
+    /// Each episode draws its seed uniformly from `start..end`. The paper trains on `0..100000`.
+    Range {
+        /// The lowest seed.
+        start: u64,
+        /// The end of the range, excluded: more than `start`, and at most 2^63 - 1.
+        end: u64,
+        /// Seed of the draws: environment `i` draws with `SeedSequence(seed, spawn_key=(i,))`. `None` takes the operating system's
+        /// entropy.
+        seed: Option<u64>,
+    },
+    /// Episode `e` of environment `i` of `n` has the seed at index `(e * n + i) % length` of the list, which must not be empty.
     List(Vec<u64>),
 }
 
@@ -63,9 +74,20 @@ impl Unseeded {
 /// The seeds of one environment's episodes.
 #[derive(Debug)]
 pub(super) enum Seeds {
-    Continue { first: Option<u64> },
-    Range { start: i64, end: i64, draws: Generator },
-    List { seeds: std::sync::Arc<[u64]>, next: usize, stride: usize },
+    Continue {
+        first: Option<u64>,
+    },
+    Range {
+        start: i64,
+        end: i64,
+        draws: Generator,
+    },
+    /// Both indices are below the length of the list.
+    List {
+        seeds: std::sync::Arc<[u64]>,
+        next: usize,
+        stride: usize,
+    },
 }
 
 impl Seeds {
@@ -89,7 +111,7 @@ impl Seeds {
                     None => unseeded.seeds(env),
                 },
             },
-            Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env, stride: total },
+            Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env % list.len(), stride: total % list.len() },
         }
     }
 
@@ -99,14 +121,14 @@ impl Seeds {
             Seeds::Continue { first } => first.take(),
             Seeds::Range { start, end, draws } => Some(draws.integers(*start, *end) as u64),
             Seeds::List { seeds, next, stride } => {
-                let seed = seeds[*next % seeds.len()];
+                let seed = seeds[*next];
                 *next = (*next + *stride) % seeds.len();
                 Some(seed)
             }
         }
     }
 
-    /// What a snapshot keeps of the seeds to come.
+    /// The part of a snapshot that determines the seeds of later episodes.
     pub(super) fn save(&self) -> SavedSeeds {
         match self {
             Seeds::Continue { first } => SavedSeeds::Continue { first: *first },
@@ -115,7 +137,7 @@ impl Seeds {
         }
     }
 
-    /// Goes on where a snapshot was taken. Under another policy than the snapshot's, this one's seeds stay.
+    /// Continues the snapshot's seeds. Nothing changes if the snapshot's kind of [`Seeding`] is another.
     pub(super) fn restore(&mut self, saved: SavedSeeds) {
         match (self, saved) {
             (Seeds::Continue { first }, SavedSeeds::Continue { first: saved }) => *first = saved,
@@ -126,7 +148,7 @@ impl Seeds {
     }
 }
 
-/// Where an environment is in its sequence of seeds.
+/// The position of an environment in its sequence of seeds.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) enum SavedSeeds {
     Continue { first: Option<u64> },

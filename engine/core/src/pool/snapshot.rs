@@ -15,10 +15,10 @@ use crate::random::Generator;
 const MAGIC: [u8; 4] = *b"EGYM";
 const HEAD: usize = 12;
 
-/// Version of the format. It changes with every change to what a snapshot holds.
+/// Version of the snapshot format. It changes with every change to the content.
 pub const SNAPSHOT_VERSION: u32 = 1;
 
-/// What a snapshot holds.
+/// The content of a snapshot.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Saved<S> {
     pub id: String,
@@ -65,25 +65,47 @@ impl<S: DeserializeOwned> Saved<S> {
     }
 }
 
-/// A snapshot that cannot be taken or gone on from. The environment is as it was.
+/// A snapshot that cannot be taken or restored. The environment has not changed.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    #[error("there is no environment {given}; the pool has 0 to {}", num_envs - 1)]
-    NoSuchEnvironment { given: usize, num_envs: usize },
-    #[error("the environment was never reset, so that it has no state yet; reset it first")]
+    /// The pool has no environment of that number.
+    #[error("env must be 0 to {}, got {given}", num_envs - 1)]
+    NoSuchEnvironment {
+        /// The number that was given.
+        given: usize,
+        /// Number of environments in the pool.
+        num_envs: usize,
+    },
+    /// The environments have no state before their first reset.
+    #[error("the environments must be reset once before a snapshot is taken")]
     NotReset,
-    #[error("the bytes are no snapshot")]
+    /// The bytes are too few, or do not start with `EGYM`.
+    #[error("the bytes are not a snapshot")]
     NoSnapshot,
-    #[error("the snapshot is of version {given}, and this endless-gym reads version {SNAPSHOT_VERSION}; take it anew")]
-    Version { given: u32 },
-    #[error("the snapshot is damaged: its checksum does not fit")]
+    /// The snapshot was taken by a version of this crate with another format.
+    #[error("the snapshot must be of version {SNAPSHOT_VERSION}, got version {given}; take it again")]
+    Version {
+        /// The snapshot's version.
+        given: u32,
+    },
+    /// The checksum differs.
+    #[error("the snapshot is damaged: its checksum differs")]
     Damaged,
+    /// The content cannot be encoded or decoded.
     #[error("the snapshot's content cannot be read: {0}")]
     Content(String),
-    #[error("the snapshot is of {given}, and the pool has {expected}")]
-    OtherEnvironment { given: String, expected: &'static str },
+    /// The snapshot is of another environment id.
+    #[error("the snapshot must be of {expected}, got {given}")]
+    OtherEnvironment {
+        /// The snapshot's environment id.
+        given: String,
+        /// The pool's environment id.
+        expected: &'static str,
+    },
+    /// The snapshot's reset parameters are not valid.
     #[error("the snapshot's reset parameters: {0}")]
     Parameters(#[from] ParameterError),
+    /// The snapshot's state is not a possible one of its environment.
     #[error("the snapshot's content is not valid: {0}")]
     State(#[from] InvalidState),
 }

@@ -6,7 +6,7 @@ mod workers;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use super::PoolError;
+use super::error::PoolError;
 
 /// Threads that step environments: the calling thread and workers. Several pools may share them; they then take turns.
 ///

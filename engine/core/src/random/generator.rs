@@ -1,4 +1,4 @@
-//! The draws of numpy's `Generator` that the environments use.
+//! numpy's `Generator`: the methods that the environments use.
 
 use std::fmt;
 
@@ -11,6 +11,17 @@ use super::seed_sequence::SeedSequence;
 
 /// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
 ///
+/// ```
+/// use endless_gym_core::random::Generator;
+///
+/// // numpy.random.default_rng(42).integers(0, 10, 5) and .random()
+/// let mut rng = Generator::from_seed(42);
+/// let mut values = [0; 5];
+/// rng.fill_integers(0, 10, &mut values);
+/// assert_eq!(values, [0, 7, 6, 4, 4]);
+/// assert_eq!(Generator::from_seed(42).random(), 0.7739560485559633);
+/// ```
+///
 /// Sources: `numpy/random/_generator.pyx`, `src/distributions/distributions.c` and
 /// `src/pcg64/pcg64.h` (numpy 1.26 and 2.x).
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,13 +29,13 @@ use super::seed_sequence::SeedSequence;
 pub struct Generator {
     /// The bit generator, 64 bits a step.
     bits: Pcg64,
-    /// The high half of a step whose low half went into a 32-bit draw; the next 32-bit draw takes
-    /// it, whatever 64-bit draws come in between. numpy's `has_uint32` and `uinteger`.
+    /// The high half of a step whose low half was used by a 32-bit draw. The next 32-bit draw uses
+    /// it, regardless of 64-bit draws in between. numpy's `has_uint32` and `uinteger`.
     kept: Option<u32>,
 }
 
 impl Generator {
-    /// The generator that Gymnasium's `np_random(seed)` gives; every value is a valid seed.
+    /// The generator that Gymnasium's `np_random(seed)` returns; every value is a valid seed.
     pub fn from_seed(seed: u64) -> Self {
         Self::from_seed_sequence(&SeedSequence::new(seed))
     }
@@ -47,10 +58,10 @@ impl Generator {
     }
 
     /// `integers(low, high)`: a uniform whole number of `low..high`, by numpy's `int64` path.
-    /// numpy counts float arguments as whole numbers cut towards zero.
+    /// numpy truncates float arguments towards zero.
     ///
-    /// A range of one number is that number and draws nothing. Callers guarantee `low < high`,
-    /// which numpy insists on; an empty range gives `low` and draws nothing too.
+    /// A range of one number returns that number and draws nothing. An empty range, for which numpy
+    /// raises an error, returns `low` and draws nothing.
     #[inline]
     pub fn integers(&mut self, low: i64, high: i64) -> i64 {
         if low.saturating_add(1) >= high {
@@ -61,18 +72,18 @@ impl Generator {
         low.wrapping_add_unsigned(self.below(count))
     }
 
-    /// `integers(low, high, size)`: fills `values` with what as many calls of
-    /// [`integers`](Self::integers) would give, which is what numpy does for a size.
+    /// `integers(low, high, size)`: fills `values`. The draws are those of as many calls of
+    /// [`integers`](Self::integers), as in numpy.
     #[inline]
     pub fn fill_integers(&mut self, low: i64, high: i64, values: &mut [i64]) {
         values.fill_with(|| self.integers(low, high));
     }
 
-    /// `choice(items)`: one of the items, each as likely as another. A single item draws nothing.
+    /// `choice(items)`: one of the items, with equal probabilities. A single item draws nothing.
     ///
     /// # Panics
     ///
-    /// If there are no items, where numpy raises an error.
+    /// If `items` is empty, for which numpy raises an error.
     #[inline]
     pub fn choice<'a, T>(&mut self, items: &'a [T]) -> &'a T {
         // A slice of items that have a size holds at most i64::MAX of them.
@@ -86,15 +97,15 @@ impl Generator {
         (self.bits.next_u64() >> 11) as f64 * STEP
     }
 
-    /// `uniform(low, high)`: `low + (high - low) * random()`, rounded after each step as numpy does,
-    /// so in `[low, high)` but for rounding. Callers guarantee what numpy insists on: `high - low`
-    /// is finite and not negative.
+    /// `uniform(low, high)`: `low + (high - low) * random()`, rounded after each operation as in
+    /// numpy, so in `[low, high)` up to rounding. `high - low` must be finite and not negative, or
+    /// the result is meaningless; numpy raises an error.
     #[inline]
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.random()
     }
 
-    /// A uniform number of `0..count`, for a count of 2 or more, from as few bits as numpy takes.
+    /// A uniform number of `0..count`, for a count of 2 or more, from as many bits as numpy uses.
     #[inline]
     fn below(&mut self, count: u64) -> u64 {
         const WORDS: u64 = 1 << 32;
@@ -108,7 +119,7 @@ impl Generator {
     }
 
     /// Lemire's method on 32-bit draws: the high half of `count * draw` is the result, and the low
-    /// half tells the few draws that would favour some results and are repeated.
+    /// half identifies the few draws that would bias the result and are repeated.
     ///
     /// Daniel Lemire, "Fast Random Integer Generation in an Interval",
     /// ACM Transactions on Modeling and Computer Simulation 29 (1), 2019.

@@ -1,9 +1,8 @@
 //! numpy's random numbers, bit for bit: [`SeedSequence`] and [`Generator`] over PCG64.
 //!
-//! The environments were written against `numpy.random.Generator(PCG64(SeedSequence(seed)))`, which
-//! is what Gymnasium's `np_random(seed)` hands out. The same seed has to give the same episodes
-//! here, so the draws follow numpy 1.26 and 2.x (which agree) exactly, down to how many bits each
-//! of them consumes.
+//! The original environments use `numpy.random.Generator(PCG64(SeedSequence(seed)))`, the generator
+//! of Gymnasium's `np_random(seed)`. The same seed must give the same episodes here, so the draws
+//! equal those of numpy 1.26 and 2.x, which agree, including the number of bits that each consumes.
 
 mod entropy;
 mod generator;
@@ -20,7 +19,7 @@ mod tests {
 
     use super::{Generator, SeedSequence};
 
-    /// What numpy gave, recorded by `tests/random/record_random.py`.
+    /// numpy's results, recorded by `tests/random/record_random.py`.
     #[derive(Deserialize)]
     struct Cases {
         seedings: Vec<Seeding>,

@@ -1,21 +1,31 @@
-//! numpy's seeding: mixes entropy of any size into a small pool and derives start states from it.
+//! numpy's seeding: entropy of any size is mixed into a small pool, from which initial states are derived.
 
 use std::array;
 
 /// Number of 32-bit words in the pool, numpy's default.
 const POOL_SIZE: usize = 4;
 
-/// The hash that takes words into the pool.
+/// The hash of words that are mixed into the pool.
 const ABSORB: Hash = Hash { constant: 0x43b0_d7e5, step: 0x931e_8875 };
-/// The hash that takes words out of the pool.
+/// The hash of words that are generated from the pool.
 const GENERATE: Hash = Hash { constant: 0x8b51_f9dd, step: 0x58f3_8ded };
 /// Weights of the two words that are mixed into one.
 const MIX_LEFT: u32 = 0xca01_f9dd;
 const MIX_RIGHT: u32 = 0x4973_f715;
 
-/// `numpy.random.SeedSequence`: turns a seed into well-mixed words to start a bit generator from.
+/// `numpy.random.SeedSequence`: turns a seed into well-mixed words for the initial state of a bit generator.
 ///
-/// The pool holds everything that was mixed in so far, so the value is small and cheap to copy.
+/// The pool of 4 words is the whole state, so the value is small and cheap to copy.
+///
+/// ```
+/// use endless_gym_core::random::{Generator, SeedSequence};
+///
+/// // numpy.random.SeedSequence(42).generate_state(2)
+/// assert_eq!(SeedSequence::new(42).generate_state_u32(), [3444837047, 2669555309]);
+/// // numpy.random.default_rng(numpy.random.SeedSequence(42, spawn_key=(1,)))
+/// let rng = Generator::from_seed_sequence(&SeedSequence::new(42).with_spawn_key(&[1]));
+/// assert_ne!(rng, Generator::from_seed(42));
+/// ```
 ///
 /// Source: `numpy/random/bit_generator.pyx` (numpy 1.26 and 2.x), after Melissa O'Neill's
 /// `seed_seq_fe`.
@@ -55,16 +65,16 @@ impl SeedSequence {
 
     /// `SeedSequence(entropy, spawn_key=key)`: an independent sequence for each key of the same
     /// entropy. On a sequence that has a key already the new one is appended, as numpy's `spawn`
-    /// does. (A key above 2³² - 1 is two words to numpy, least significant first.)
+    /// does. numpy splits a key above 2³² - 1 into two words, least significant first.
     #[must_use]
     pub fn with_spawn_key(self, key: &[u32]) -> Self {
-        // numpy pads short entropy to the pool's size before it appends the key, so that a key
-        // always is what comes after the pool was filled.
+        // numpy pads short entropy to the pool's size before it appends the key, so a key is always
+        // absorbed after the pool was filled.
         self.absorb(key)
     }
 
-    /// `generate_state(N, numpy.uint32)`. The sequence stays as it is: it gives the same words
-    /// each time, and more of them go on where fewer end.
+    /// `generate_state(N, numpy.uint32)`. The sequence does not change: every call returns the same
+    /// words, and those of a smaller `N` are a prefix of those of a larger.
     pub fn generate_state_u32<const N: usize>(&self) -> [u32; N] {
         let mut hash = GENERATE;
         array::from_fn(|index| hash.next(self.pool[index % POOL_SIZE]))
@@ -90,7 +100,7 @@ impl SeedSequence {
     }
 }
 
-/// A hash of words whose constant moves on with each word.
+/// A hash of words whose constant changes with each word.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Hash {
     constant: u32,
@@ -110,7 +120,7 @@ fn mix(left: u32, right: u32) -> u32 {
     fold(left.wrapping_sub(right.wrapping_mul(MIX_RIGHT)))
 }
 
-/// Lets the high half, where multiplication mixes best, bear on the low half.
+/// Mixes the high half, where multiplication mixes best, into the low half.
 fn fold(word: u32) -> u32 {
     word ^ word >> 16
 }

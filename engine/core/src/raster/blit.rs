@@ -1,10 +1,10 @@
 //! Painting one surface onto another: copied, with a colour key, and translucent.
 
-use super::canvas::clip;
+use super::runs::clip;
 use super::{Canvas, Rgb, Surface};
 
-/// Mixes a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26
-/// does: the change is `1/255` of the difference per unit of `alpha`, cut off towards zero.
+/// Blends a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26
+/// does: the change is `1/255` of the difference per unit of `alpha`, truncated towards zero.
 #[inline]
 pub const fn blend_keyed(source: u8, below: u8, alpha: u8) -> u8 {
     let weighted = source.abs_diff(below) as u16 * alpha as u16;
@@ -13,40 +13,40 @@ pub const fn blend_keyed(source: u8, below: u8, alpha: u8) -> u8 {
     if source >= below { below + change } else { below - change }
 }
 
-/// Mixes a channel of a translucent surface without a colour key into the channel below it, as SDL
+/// Blends a channel of a translucent surface without a colour key into the channel below it, as SDL
 /// 2.26 does: the change is `1/256` of the difference per unit of `alpha`, rounded down, but an
-/// `alpha` of 255 covers fully.
+/// `alpha` of 255 is opaque.
 #[inline]
-pub const fn blend_plain(source: u8, below: u8, alpha: u8) -> u8 {
+const fn blend_plain(source: u8, below: u8, alpha: u8) -> u8 {
     if alpha == 255 {
         return source;
     }
     ((source as u16 * alpha as u16 + below as u16 * (256 - alpha as u16)) >> 8) as u8
 }
 
-/// How the channels of a surface meet those below them.
+/// The blending rule of a surface.
 #[derive(Clone, Copy)]
-enum Mixing {
-    Copied,
+enum Blending {
+    Opaque,
     Keyed,
     Plain,
 }
 
-impl Mixing {
+impl Blending {
     fn of(source: &Surface) -> Self {
         if source.alpha() == 255 {
-            Self::Copied
+            Self::Opaque
         } else if source.color_key().is_some() && !source.run_length_encoded {
             Self::Keyed
         } else {
-            // SDL blends run-length encoded surfaces by the rule of those without a key.
+            // SDL blends run-length encoded surfaces like those without a key.
             Self::Plain
         }
     }
 
     fn paint(self, source: &[u8], below: &mut [u8], alpha: u8) {
         match self {
-            Self::Copied => below.copy_from_slice(source),
+            Self::Opaque => below.copy_from_slice(source),
             Self::Keyed => {
                 for (source, below) in source.iter().zip(below) {
                     *below = blend_keyed(*source, *below, alpha);
@@ -63,7 +63,7 @@ impl Mixing {
 
 impl Canvas<'_> {
     /// Paints `source` with its top left corner at `(x, y)`, as `pygame.Surface.blit` does: without
-    /// the pixels of its colour key, and as translucent as its alpha says.
+    /// the pixels of its colour key, and blended by its alpha.
     pub fn blit(&mut self, source: &Surface, x: i32, y: i32) {
         let (x, y) = (i64::from(x), i64::from(y));
         let columns = clip(x, x + source.width() as i64 - 1, &self.columns());
@@ -71,14 +71,14 @@ impl Canvas<'_> {
         if columns.is_empty() || rows.is_empty() || source.alpha() == 0 {
             return;
         }
-        let mixing = Mixing::of(source);
+        let blending = Blending::of(source);
         for column in columns {
             let first = (column as i64 - x) as usize * source.height() + (rows.start as i64 - y) as usize;
             let run = &source.pixels().as_chunks::<3>().0[first..][..rows.len()];
             for (first, opaque) in opaque_runs(run, source.color_key()) {
                 let row = rows.start + first;
                 let below = self.run_mut(column, row..row + opaque.len());
-                mixing.paint(opaque.as_flattened(), below, source.alpha());
+                blending.paint(opaque.as_flattened(), below, source.alpha());
             }
         }
     }

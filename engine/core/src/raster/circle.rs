@@ -5,14 +5,14 @@
 
 use std::ops::Range;
 
-use super::canvas::{clip, fill_run};
+use super::runs::{clip, fill_run};
 use super::{Canvas, Rgb};
 
-/// Larger radii are drawn with this one, to bound the work.
+/// Maximum radius; larger ones are drawn with it, to bound the time.
 const MAX_RADIUS: i64 = 1 << 16;
 
 /// Whether the midpoint that follows the point `(x, y)` of an outline lies outside of the circle,
-/// so that the outline has to come one pixel nearer.
+/// in which case the outline moves one pixel towards the centre.
 pub(super) fn falls(radius: i64, x: i64, y: i64) -> bool {
     (x + 1) * (x + 1) + y * (y - 1) >= radius * radius
 }
@@ -45,10 +45,10 @@ impl Iterator for Octant {
     }
 }
 
-/// A filled circle, made ready to be painted at any place, as one run per column.
+/// A filled circle, compiled to one run per column, for painting at any place.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Disc {
-    /// Per distance of a column from the centre, from 1: how far its run reaches up and down.
+    /// For each distance of a column from the centre, from 1, the half height of its run.
     half_heights: Vec<i32>,
 }
 
@@ -100,22 +100,22 @@ impl Disc {
         })
     }
 
-    /// How far the column at a place from the centre reaches up and down; 0 where there is none.
+    /// Half height of the column at distance `x` from the centre; 0 beyond the disc.
     #[inline]
     pub fn half_height(&self, x: i64) -> i32 {
-        // Both sides of the centre are alike: the column -1 is as far away as 0.
+        // The disc is symmetric: the column -1 is as far from the centre as the column 0.
         self.half_heights.get((x ^ (x >> 63)) as usize).copied().unwrap_or(0)
     }
 
-    /// Whether the disc covers the pixel at a place from its centre.
+    /// Whether the disc covers the pixel at `(x, y)` from its centre.
     #[inline]
     pub fn contains(&self, (x, y): (i32, i32)) -> bool {
-        // Both sides of the centre are alike: the column -1 is as far away as 0.
+        // The disc is symmetric: the column -1 is as far from the centre as the column 0.
         let distance = |from_centre: i32| from_centre ^ (from_centre >> 31);
         self.half_heights.get(distance(x) as usize).is_some_and(|half| distance(y) < *half)
     }
 
-    /// Those of some rows of the column `x` that the disc about `center` covers.
+    /// The part of `rows` in the column `x` that the disc about `center` covers.
     #[inline]
     pub fn rows(&self, center: (i32, i32), x: usize, rows: &Range<usize>) -> Range<usize> {
         let right = x as i64 - i64::from(center.0);
@@ -208,7 +208,7 @@ impl Canvas<'_> {
         }
     }
 
-    /// Fills a circle with a ready [`Disc`]: the same pixels as [`Canvas::draw_circle`]'s.
+    /// Fills a circle with a compiled [`Disc`]: the same pixels as those of [`Canvas::draw_circle`].
     pub fn fill_disc(&mut self, color: Rgb, center: (i32, i32), disc: &Disc) {
         for DiscColumn { x, rows } in disc.columns(center, &self.columns(), self.rows()) {
             fill_run(self.run_mut(x, rows), color);

@@ -1,15 +1,15 @@
-//! Which parts of a picture have to be painted anew.
+//! Dirty rectangles: the parts of a picture that need repainting.
 
 use super::{Canvas, Rect};
 
-/// Most rectangles that are kept apart.
-const MOST: usize = 8;
+/// Maximum number of rectangles; beyond it they are merged.
+const MAX_RECTS: usize = 8;
 
-/// A few rectangles of a canvas, none of which overlap: the old and the new places of what has changed.
+/// Dirty rectangles of a canvas, which do not overlap: the old and the new places of what has changed.
 #[derive(Clone, Copy, Debug)]
 pub struct Damage {
     canvas: Rect,
-    rects: [Rect; MOST],
+    rects: [Rect; MAX_RECTS],
     count: usize,
 }
 
@@ -17,10 +17,10 @@ impl Damage {
     /// No damage to a canvas of that size.
     pub fn new(width: usize, height: usize) -> Self {
         let canvas = Rect::new(0, 0, width as i32, height as i32);
-        Damage { canvas, rects: [Rect::default(); MOST], count: 0 }
+        Damage { canvas, rects: [Rect::default(); MAX_RECTS], count: 0 }
     }
 
-    /// Everything that changes within `rect` has to be painted.
+    /// Adds a rectangle, clipped to the canvas. Rectangles that overlap are merged into their bounding rectangle.
     #[inline]
     pub fn add(&mut self, rect: Rect) {
         let mut rect = self.canvas.intersection(&rect);
@@ -29,9 +29,9 @@ impl Damage {
         }
         let mut at = 0;
         while at < self.count {
-            // One that has grown may overlap those that it was compared with before.
-            if meets(&self.rects[at], &rect) || self.count == MOST {
-                rect = about(&self.rects[at], &rect);
+            // A rectangle that has grown may overlap those that it was compared with before.
+            if overlap(&self.rects[at], &rect) || self.count == MAX_RECTS {
+                rect = bounding(&self.rects[at], &rect);
                 self.count -= 1;
                 self.rects[at] = self.rects[self.count];
                 at = 0;
@@ -43,27 +43,27 @@ impl Damage {
         self.count += 1;
     }
 
-    /// Whether anything within `rect` is to be painted.
+    /// Whether a pixel of `rect` is dirty.
     #[inline]
     pub fn overlaps(&self, rect: &Rect) -> bool {
         self.rects().iter().any(|damaged| damaged.overlaps(rect))
     }
 
-    /// The rectangles.
+    /// The dirty rectangles.
     pub fn rects(&self) -> &[Rect] {
         &self.rects[..self.count]
     }
 
-    /// Has all of it painted: `paint` gets the canvas with each of the rectangles as its clip.
+    /// Calls `paint` for each rectangle, with the canvas clipped to it.
     #[inline]
     pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
         self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
     }
 }
 
-/// [`Rect::overlaps`] for rectangles that lie on the canvas and have pixels, whose numbers are small.
+/// [`Rect::overlaps`] for rectangles on the canvas that have pixels, whose sums cannot overflow.
 #[inline]
-fn meets(one: &Rect, other: &Rect) -> bool {
+fn overlap(one: &Rect, other: &Rect) -> bool {
     one.x < other.x + other.width
         && other.x < one.x + one.width
         && one.y < other.y + other.height
@@ -72,7 +72,7 @@ fn meets(one: &Rect, other: &Rect) -> bool {
 
 /// [`Rect::union`] for the same.
 #[inline]
-fn about(one: &Rect, other: &Rect) -> Rect {
+fn bounding(one: &Rect, other: &Rect) -> Rect {
     let (x, y) = (one.x.min(other.x), one.y.min(other.y));
     let right = (one.x + one.width).max(other.x + other.width);
     let bottom = (one.y + one.height).max(other.y + other.height);
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn far_away_is_no_damage() {
+    fn rectangles_beyond_the_canvas_are_ignored() {
         let mut damage = Damage::new(84, 84);
         damage.add(Rect::new(i32::MAX, 3, i32::MAX, 4));
         damage.add(Rect::new(i32::MIN, i32::MIN, 5, 5));

@@ -1,23 +1,30 @@
-//! How the pixels of a finished picture may lie in memory.
+//! The order of a frame's numbers in memory.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Rgb, Sketch};
+use super::{DirtySurface, Rgb};
 
-/// Order and kind of the numbers in a picture. The default is a canvas' own: \[x\]\[y\]\[channel\], as the original's
-/// observations are.
+/// Order and kind of the numbers in a frame. The default is the order of a [`Canvas`](super::Canvas) and of the original's
+/// observations: \[x\]\[y\]\[channel\].
+///
+/// ```
+/// use endless_gym_core::raster::PixelFormat;
+///
+/// let format = PixelFormat { channels_first: true, row_major: true, ..PixelFormat::default() };
+/// assert_eq!(format.shape(84, 84), [3, 84, 84]);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PixelFormat {
-    /// One number a pixel, without an index for the channel: its brightness, as Gymnasium's `GrayscaleObservation` has it.
+    /// One number for each pixel, without an index for the channel: its luma, as Gymnasium's `GrayscaleObservation` computes it.
     pub grayscale: bool,
-    /// The channel is the first index, as PyTorch's convolutions want it.
+    /// The channel is the first index, as PyTorch's convolutions expect. Without effect in grayscale.
     pub channels_first: bool,
-    /// \[row\]\[column\] instead of \[x\]\[y\].
+    /// Indexed \[row\]\[column\] instead of \[x\]\[y\].
     pub row_major: bool,
 }
 
 impl PixelFormat {
-    /// Shape of a picture's array.
+    /// Shape of a frame's array.
     pub fn shape(self, width: usize, height: usize) -> Vec<usize> {
         let (first, second) = if self.row_major { (height, width) } else { (width, height) };
         match self {
@@ -27,13 +34,13 @@ impl PixelFormat {
         }
     }
 
-    /// Whether a canvas can be painted on the picture itself.
+    /// Whether a [`Canvas`](super::Canvas) can be laid over a frame in this format.
     pub fn is_canvas(self) -> bool {
         !self.row_major && !self.grayscale && !self.channels_first
     }
 
-    /// The pixel (x, y) that a byte of a picture belongs to.
-    pub fn place(self, byte: usize, width: usize, height: usize) -> (usize, usize) {
+    /// The pixel (x, y) that a byte of a frame belongs to.
+    pub fn pixel_of(self, byte: usize, width: usize, height: usize) -> (usize, usize) {
         let pixel = match self {
             PixelFormat { grayscale: true, .. } => byte,
             PixelFormat { channels_first: true, .. } => byte % (width * height),
@@ -42,25 +49,29 @@ impl PixelFormat {
         if self.row_major { (pixel % width, pixel / width) } else { (pixel / height, pixel % height) }
     }
 
-    /// Writes the pixels that were painted on a sketch to their places in `picture`.
-    pub fn store(self, sketch: &Sketch, picture: &mut [u8]) {
-        let (width, height) = (sketch.width(), sketch.height());
+    /// Copies the dirty pixels of `surface` into `frame`, which has the surface's size in this format.
+    ///
+    /// # Panics
+    ///
+    /// If `frame` is too short.
+    pub fn store(self, surface: &DirtySurface, frame: &mut [u8]) {
+        let (width, height) = (surface.width(), surface.height());
         let (across, down) = if self.row_major { (1, width) } else { (height, 1) };
-        sketch.for_each_run(|x, rows, run| {
+        surface.for_each_run(|x, rows, run| {
             let places = rows.map(|y| x * across + y * down);
             match self {
                 PixelFormat { grayscale: true, .. } => {
-                    places.zip(run).for_each(|(at, color)| picture[at] = brightness(*color));
+                    places.zip(run).for_each(|(at, color)| frame[at] = luma(*color));
                 }
                 PixelFormat { channels_first: true, .. } => {
-                    let (red, rest) = picture.split_at_mut(width * height);
+                    let (red, rest) = frame.split_at_mut(width * height);
                     let (green, blue) = rest.split_at_mut(width * height);
                     for (at, color) in places.zip(run) {
                         [red[at], green[at], blue[at]] = *color;
                     }
                 }
                 _ => {
-                    let pixels = picture.as_chunks_mut().0;
+                    let pixels = frame.as_chunks_mut().0;
                     places.zip(run).for_each(|(at, color)| pixels[at] = *color);
                 }
             }
@@ -68,8 +79,8 @@ impl PixelFormat {
     }
 }
 
-/// A colour's brightness, cut off as Gymnasium does.
-fn brightness([red, green, blue]: Rgb) -> u8 {
+/// A colour's luma, truncated, as `GrayscaleObservation` of Gymnasium 1.x computes it.
+fn luma([red, green, blue]: Rgb) -> u8 {
     (f64::from(red) * 0.2125 + f64::from(green) * 0.7154 + f64::from(blue) * 0.0721) as u8
 }
 
@@ -78,11 +89,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_format_has_every_pixel_in_its_place() {
+    fn every_format_stores_every_pixel_at_its_index() {
         let (width, height) = (3, 2);
-        let mut sketch = Sketch::new(width, height);
+        let mut surface = DirtySurface::new(width, height);
         let color = |x: usize, y: usize| [10 * x as u8, 10 * y as u8 + 1, 7];
-        let mut canvas = sketch.canvas();
+        let mut canvas = surface.canvas();
         for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
             *canvas.pixel_mut(x, y) = color(x, y);
         }
@@ -90,12 +101,12 @@ mod tests {
             let [grayscale, channels_first, row_major] = [1, 2, 4].map(|bit| bits & bit != 0);
             let format = PixelFormat { grayscale, channels_first, row_major };
             let shape = format.shape(width, height);
-            let mut picture = vec![255; shape.iter().product()];
-            format.store(&sketch, &mut picture);
+            let mut frame = vec![255; shape.iter().product()];
+            format.store(&surface, &mut frame);
             for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
                 let (first, second) = if row_major { (y, x) } else { (x, y) };
                 for (channel, value) in color(x, y).into_iter().enumerate() {
-                    let expected = if grayscale { brightness(color(x, y)) } else { value };
+                    let expected = if grayscale { luma(color(x, y)) } else { value };
                     let place = match shape[..] {
                         [_, seconds] => first * seconds + second,
                         [channels, seconds, 3] if channels == if row_major { height } else { width } => {
@@ -104,15 +115,15 @@ mod tests {
                         [_, firsts, seconds] => (channel * firsts + first) * seconds + second,
                         _ => unreachable!("{shape:?}"),
                     };
-                    assert_eq!(picture[place], expected, "{format:?} ({x}, {y})");
-                    assert_eq!(format.place(place, width, height), (x, y), "{format:?}");
+                    assert_eq!(frame[place], expected, "{format:?} ({x}, {y})");
+                    assert_eq!(format.pixel_of(place, width, height), (x, y), "{format:?}");
                 }
             }
         }
     }
 
     #[test]
-    fn brightness_is_cut_off() {
-        assert_eq!([[255; 3], [255, 0, 0], [0, 255, 0], [0, 0, 255]].map(brightness), [255, 54, 182, 18]);
+    fn luma_is_truncated() {
+        assert_eq!([[255; 3], [255, 0, 0], [0, 255, 0], [0, 0, 255]].map(luma), [255, 54, 182, 18]);
     }
 }

@@ -74,10 +74,10 @@ fn clip_line(start: Point, end: Point, width: i64, height: i64) -> Option<(Point
 
 impl Canvas<'_> {
     /// Draws a line of `width` pixels between two points, both included, as `pygame.draw.line`
-    /// does: the ends of a wide line are flat, and it is measured along the axis that it is the
-    /// steeper to. Nothing is drawn for a `width` below 1.
+    /// does: the ends of a wide line are flat, and its width is measured along the axis to which the
+    /// line is steeper. Nothing is drawn for a `width` below 1.
     ///
-    /// pygame cuts off the fractions of the points, towards zero, before it does anything else.
+    /// pygame truncates the points towards zero first.
     pub fn draw_line(&mut self, color: Rgb, start: (i32, i32), end: (i32, i32), width: i32) {
         let start = (start.0.into(), start.1.into());
         let end = (end.0.into(), end.1.into());
@@ -122,7 +122,7 @@ impl Canvas<'_> {
         let mut walk = Walk::new(turned(start), end);
         let (mut along, mut across) = turned(clipped.0);
         loop {
-            // Off the canvas and moving away, nothing is left to paint.
+            // Beyond the canvas and moving away from it: nothing is left to paint.
             if if walk.step.0 > 0 { along >= size.0 } else { along < 0 } {
                 return;
             }

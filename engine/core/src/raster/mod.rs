@@ -1,46 +1,51 @@
-//! Software drawing that paints exactly the pixels that pygame 2.4 paints.
+//! A software rasteriser that paints exactly the pixels that pygame 2.4 paints.
 //!
-//! The environments were drawn with pygame, and what they drew is the observation. So every rule
-//! here is pygame's own, with its quirks: how it rounds a circle, which way a wide line grows, how
-//! SDL mixes a translucent surface into another one.
+//! The original environments draw with pygame, and their frames are the observations. So every rule here is pygame's own, with its
+//! quirks: the rounding of a circle, the direction in which a wide line grows, the blending of a translucent surface by SDL.
 //!
-//! A picture is built on a [`Surface`]; a [`Canvas`] draws into pixels that lie elsewhere, such as
-//! an observation; a [`Sprite`] and a [`Disc`] are pictures made ready to be painted quickly. A
-//! [`Sketch`] remembers what was painted on it, and a [`PixelFormat`] carries that to where the
-//! pixels are to lie in another order, or as grey.
+//! A [`Surface`] owns a picture; a [`Canvas`] draws into pixels that lie elsewhere, such as an observation; a [`Sprite`] and a
+//! [`Disc`] are pictures compiled for fast painting. [`Damage`] collects dirty rectangles. A [`DirtySurface`] tracks its dirty
+//! pixels, which a [`PixelFormat`] copies into a frame of another format.
 //!
-//! Pixels are RGB, column by column: the byte of channel `c` of the pixel `(x, y)` is
-//! `(x * height + y) * 3 + c`. A whole surface is thus byte for byte the array `[x][y][c]` that
-//! `pygame.surfarray.array3d` gives.
+//! Pixels are RGB, column by column: the byte of channel `c` of the pixel `(x, y)` is `(x * height + y) * 3 + c`. A whole surface
+//! is thus byte for byte the array `[x][y][c]` that `pygame.surfarray.array3d` returns.
 //!
-//! pygame takes floats for positions and sizes and cuts off their fractions, towards zero. Here
-//! they are whole numbers: the caller truncates (`value as i32`).
+//! pygame takes floats for positions and sizes and truncates them towards zero. Here they are whole numbers: the caller truncates
+//! (`value as i32`).
+//!
+//! # Stability
+//!
+//! [`PixelFormat`] is part of the crate's interface. All else is public for the benchmarks and for
+//! [`Environment`](crate::envs::Environment), and may change in any version.
 
 mod blit;
 mod canvas;
 mod circle;
+mod color;
 mod damage;
+mod dirty_surface;
 mod format;
 mod line;
+mod rect;
 mod rectangle;
 mod rotate;
+mod runs;
 mod scale;
-mod sketch;
 mod sprite;
 mod surface;
 
 #[cfg(test)]
 mod tests;
 
-pub use blit::{blend_keyed, blend_plain};
+pub(crate) use blit::blend_keyed;
 pub use canvas::Canvas;
-pub use circle::{Disc, DiscColumn, circle_outline};
+pub(crate) use circle::circle_outline;
+pub use circle::{Disc, DiscColumn};
+pub use color::Rgb;
 pub use damage::Damage;
+pub use dirty_surface::DirtySurface;
 pub use format::PixelFormat;
-pub use rectangle::{CornerRadii, Rect};
-pub use sketch::Sketch;
-pub use sprite::{Sprite, copy_run};
+pub use rect::{CornerRadii, Rect};
+pub(crate) use runs::copy_run;
+pub use sprite::Sprite;
 pub use surface::Surface;
-
-/// A colour: red, green, blue.
-pub type Rgb = [u8; 3];

@@ -1,73 +1,9 @@
-//! Rectangles: filled or with a border, with square or rounded corners.
+//! Drawing rectangles: filled or with a border, with square or rounded corners.
 
 use super::circle::{Octant, falls};
-use super::{Canvas, Rgb};
+use super::{Canvas, CornerRadii, Rect, Rgb};
 
-/// A rectangle in pixels: its top left corner and its size.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Rect {
-    /// The leftmost column.
-    pub x: i32,
-    /// The topmost row.
-    pub y: i32,
-    /// Number of columns.
-    pub width: i32,
-    /// Number of rows.
-    pub height: i32,
-}
-
-impl Rect {
-    /// A rectangle with its top left corner at `(x, y)`.
-    pub const fn new(x: i32, y: i32, width: i32, height: i32) -> Self {
-        Self { x, y, width, height }
-    }
-
-    /// The column right of the rectangle and the row below it.
-    #[inline]
-    fn end(&self) -> (i32, i32) {
-        (self.x.saturating_add(self.width), self.y.saturating_add(self.height))
-    }
-
-    /// Whether a pixel lies in both rectangles.
-    #[inline]
-    pub fn overlaps(&self, other: &Rect) -> bool {
-        self.x < other.x.saturating_add(other.width)
-            && other.x < self.x.saturating_add(self.width)
-            && self.y < other.y.saturating_add(other.height)
-            && other.y < self.y.saturating_add(self.height)
-            && [self.width, self.height, other.width, other.height].iter().all(|length| *length > 0)
-    }
-
-    /// The pixels that lie in both; of a size of 0 or less if there is none.
-    #[inline]
-    pub fn intersection(&self, other: &Rect) -> Rect {
-        let (x, y) = (self.x.max(other.x), self.y.max(other.y));
-        let (own, others) = (self.end(), other.end());
-        let (right, bottom) = (own.0.min(others.0), own.1.min(others.1));
-        Rect { x, y, width: right.saturating_sub(x), height: bottom.saturating_sub(y) }
-    }
-
-    /// The smallest rectangle about both.
-    #[inline]
-    pub fn union(&self, other: &Rect) -> Rect {
-        let (x, y) = (self.x.min(other.x), self.y.min(other.y));
-        let (own, others) = (self.end(), other.end());
-        let (right, bottom) = (own.0.max(others.0), own.1.max(others.1));
-        Rect { x, y, width: right.saturating_sub(x), height: bottom.saturating_sub(y) }
-    }
-}
-
-/// The radii of a rectangle's corners in pixels; 0 is a square corner.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct CornerRadii {
-    /// As pygame's `border_top_left_radius`; the others likewise.
-    pub top_left: u32,
-    pub top_right: u32,
-    pub bottom_left: u32,
-    pub bottom_right: u32,
-}
-
-/// Farther out, coordinates of rounded rectangles are drawn as this one, to bound the work.
+/// Maximum coordinate of a rounded rectangle; larger ones are drawn as this, to bound the time.
 const MAX_COORDINATE: i64 = 1 << 16;
 
 /// The outermost columns and rows of a rectangle, all within it.
@@ -121,7 +57,7 @@ impl Corners {
         if needs.iter().all(|&(length, needed)| needed <= length) {
             return corners;
         }
-        // Single precision, as in pygame: it decides how the scaled radii are cut off.
+        // Single precision, as in pygame: it determines the truncation of the scaled radii.
         let factor = needs.iter().map(|&(length, needed)| length as f32 / needed as f32).fold(f32::INFINITY, f32::min);
         let scaled = |radius: i64| (radius as f32 * factor) as i64;
         Self {
@@ -220,7 +156,7 @@ impl Canvas<'_> {
         }
     }
 
-    /// Fills a rectangle whose corners are cut off straight: what the round corners are added to.
+    /// Fills a rectangle whose corners are cut off straight; the round corners are added to it.
     fn fill_octagon(&mut self, color: Rgb, edges: &Edges, corners: &Corners) {
         let &Edges { left, top, right, bottom } = edges;
         let points = [

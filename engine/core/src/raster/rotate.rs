@@ -1,12 +1,12 @@
-//! Turning a picture about its centre.
+//! Rotation of a picture.
 
 use super::Surface;
 
 impl Surface {
-    /// The surface turned counterclockwise by `degrees`, as `pygame.transform.rotate` does.
+    /// The surface rotated counterclockwise by `degrees`, as `pygame.transform.rotate` does.
     ///
     /// Multiples of 90 degrees move the pixels exactly. Other angles give a surface that is large
-    /// enough for the turned picture, sample the nearest pixel in 16.16 fixed point, and fill the
+    /// enough for the rotated picture, sample the nearest pixel in 16.16 fixed point, and fill the
     /// rest with the colour key or, without one, with the colour of the top left pixel. The colour
     /// key and the alpha carry over.
     pub fn rotate(&self, degrees: i32) -> Surface {

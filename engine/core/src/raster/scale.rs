@@ -1,4 +1,4 @@
-//! Stretching and shrinking a picture.
+//! Scaling of a picture.
 
 use super::Surface;
 

@@ -1,9 +1,9 @@
-//! Pictures that are painted often: compiled to the runs of their opaque pixels.
+//! Pictures that are painted often, compiled to the runs of their opaque pixels.
 
 use std::ops::Range;
 
 use super::blit::opaque_runs;
-use super::canvas::clip;
+use super::runs::{clip, copy_run};
 use super::{Canvas, Disc, Rect, Surface, blend_keyed};
 
 /// A picture whose opaque pixels are stored as vertical runs, which are contiguous on a canvas.
@@ -30,8 +30,8 @@ struct Run {
 }
 
 impl Sprite {
-    /// Compiles a surface: all pixels but those of its colour key. The surface's alpha does not
-    /// count; a sprite is opaque.
+    /// Compiles a surface: all pixels but those of its colour key. The surface's alpha has no
+    /// effect; a sprite is opaque.
     pub fn new(surface: &Surface) -> Self {
         let mut runs = Vec::new();
         let mut pixels = Vec::new();
@@ -52,7 +52,7 @@ impl Sprite {
         Self { runs, pixels, bounds, blocks }
     }
 
-    /// The smallest rectangle about the opaque pixels, from the sprite's top left corner: what
+    /// The bounding rectangle of the opaque pixels, from the sprite's top left corner: what
     /// [`Sprite::blit`] at `(0, 0)` can change. Without opaque pixels its size is 0.
     pub fn bounds(&self) -> Rect {
         self.bounds
@@ -69,7 +69,7 @@ impl Sprite {
         let (columns, rows) = (canvas.columns(), canvas.rows());
         let (first, end) = (columns.start as i64, columns.end as i64);
         let (highest, lowest) = (rows.start as i64, rows.end as i64);
-        if left >= first && top >= highest && right <= end && bottom <= lowest && !canvas.is_noting() {
+        if left >= first && top >= highest && right <= end && bottom <= lowest && !canvas.tracks_dirty() {
             // Negative where the sprite's empty margin reaches beyond the canvas; the blocks do not.
             let corner = i64::from(x) * canvas.height() as i64 + i64::from(y);
             self.blocks.copy(corner, canvas);
@@ -78,7 +78,7 @@ impl Sprite {
         }
     }
 
-    /// The smallest rectangle about the opaque pixels of the sprite with its top left corner at `(x, y)`.
+    /// The bounding rectangle of the opaque pixels of the sprite with its top left corner at `(x, y)`.
     #[inline]
     pub fn bounds_at(&self, (x, y): (i32, i32)) -> Rect {
         Rect { x: x.saturating_add(self.bounds.x), y: y.saturating_add(self.bounds.y), ..self.bounds }
@@ -178,7 +178,7 @@ impl Blocks {
         blocks
     }
 
-    /// Paints them all, from the pixel of that number on, counted column by column.
+    /// Paints all blocks. `corner` is the index of the pixel at the sprite's top left corner, column by column.
     #[inline]
     fn copy(&self, corner: i64, canvas: &mut Canvas<'_>) {
         self.one.copy(corner, canvas);
@@ -225,37 +225,11 @@ impl<const N: usize> BlocksOf<N> {
     }
 }
 
-/// The smallest rectangle about some runs.
+/// The bounding rectangle of some runs.
 fn bounds(runs: &[Run]) -> Rect {
     let left = runs.iter().map(|run| run.x).min().unwrap_or(0);
     let right = runs.iter().map(|run| run.x + 1).max().unwrap_or(0);
     let top = runs.iter().map(|run| run.y).min().unwrap_or(0);
     let bottom = runs.iter().map(|run| run.y + run.length).max().unwrap_or(0);
     Rect::new(left as i32, top as i32, (right - left) as i32, (bottom - top) as i32)
-}
-
-/// Copies a run between slices of the same length: as two blocks of a fixed size that may overlap, which are moved in
-/// registers. A copy of any length would be a call, which only pays for long ones.
-#[inline]
-pub fn copy_run(source: &[u8], target: &mut [u8]) {
-    match source.len() {
-        3 => copy_ends::<3>(source, target),
-        4..8 => copy_ends::<4>(source, target),
-        8..16 => copy_ends::<8>(source, target),
-        16..32 => copy_ends::<16>(source, target),
-        32..64 => copy_ends::<32>(source, target),
-        64..128 => copy_ends::<64>(source, target),
-        _ => target.copy_from_slice(source),
-    }
-}
-
-/// Copies the first `N` bytes and the last.
-#[inline]
-fn copy_ends<const N: usize>(source: &[u8], target: &mut [u8]) {
-    if let (Some(source), Some(target)) = (source.first_chunk::<N>(), target.first_chunk_mut()) {
-        *target = *source;
-    }
-    if let (Some(source), Some(target)) = (source.last_chunk::<N>(), target.last_chunk_mut()) {
-        *target = *source;
-    }
 }

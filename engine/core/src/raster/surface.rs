@@ -1,4 +1,4 @@
-//! A picture of its own, with the colour key and the alpha that pygame's surfaces have.
+//! A picture with the colour key and the alpha of a pygame surface.
 
 use super::{Canvas, CornerRadii, Rect, Rgb};
 
@@ -10,7 +10,7 @@ pub struct Surface {
     pixels: Vec<u8>,
     color_key: Option<Rgb>,
     alpha: u8,
-    /// Whether SDL holds the picture run-length encoded, because that changes how it blends it.
+    /// Whether SDL would hold the picture run-length encoded, which changes how it is blended.
     pub(super) run_length_encoded: bool,
 }
 
@@ -19,7 +19,7 @@ impl Surface {
     ///
     /// # Panics
     ///
-    /// When the pixels are too many for the memory.
+    /// If the size in bytes overflows `usize`.
     pub fn new(width: usize, height: usize) -> Self {
         let size = width.checked_mul(height).and_then(|pixels| pixels.checked_mul(3));
         Self {
@@ -58,12 +58,12 @@ impl Surface {
         &self.pixels
     }
 
-    /// The bytes, to be changed.
+    /// The bytes, for changing them.
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         &mut self.pixels
     }
 
-    /// Gives the bytes away.
+    /// Returns the bytes.
     pub fn into_pixels(self) -> Vec<u8> {
         self.pixels
     }
@@ -88,12 +88,12 @@ impl Surface {
         self.run_length_encoded &= color_key.is_none();
     }
 
-    /// How much the surface covers when it is blitted: 0 not at all, 255 fully.
+    /// The opacity when the surface is blitted, from 0 (transparent) to 255 (opaque).
     pub fn alpha(&self) -> u8 {
         self.alpha
     }
 
-    /// Sets the alpha; values beyond 0 to 255 become the nearest of them.
+    /// Sets the alpha, clamped to 0 to 255.
     pub fn set_alpha(&mut self, alpha: i32) {
         self.alpha = alpha.clamp(0, 255) as u8;
         self.run_length_encoded = false;

@@ -1,24 +1,26 @@
-//! Plays a trace's actions again and compares everything that the original returned.
+//! The replay of a trace, with a comparison of everything that the original returned.
 
 use std::fmt;
 
 use serde_json::{Map, Value as Json};
 
-use super::{Trace, TraceError};
+use super::format::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
 use crate::envs::view::VIEW_BYTES;
-use crate::pool::{Autoreset, Options, Pool, PoolConfig, ResetRequest, Threads};
+use crate::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 
-/// How a replay went.
+/// The outcome of a replay.
 #[derive(Debug, Default)]
 pub struct Replay {
+    /// Number of episodes that were compared.
     pub episodes: usize,
+    /// Number of steps that were compared.
     pub steps: usize,
-    /// Values that differ.
+    /// Number of values that differ.
     pub differences: usize,
-    /// The first of them.
+    /// The first value that differs.
     pub first: Option<Difference>,
-    /// Ground-truth views compared.
+    /// Number of ground-truth views that were compared.
     pub views: usize,
 }
 
@@ -29,8 +31,11 @@ pub struct Difference {
     pub episode: usize,
     /// Step of the episode, from 1; 0 is the reset.
     pub step: usize,
+    /// Which value differs.
     pub what: String,
+    /// The original's value.
     pub expected: String,
+    /// This engine's value.
     pub found: String,
 }
 
@@ -58,9 +63,27 @@ impl Replay {
 }
 
 /// Replays `trace` and counts the values that differ.
+///
+/// # Errors
+///
+/// [`TraceError::Pool`] if the trace's environment, reset parameters or actions are not valid.
+///
+/// ```
+/// use endless_gym_core::trace::{Trace, replay};
+///
+/// let text = r#"{"env": "MysteryPath-Grid-v0", "options": {}, "episodes": [
+///     {"seed": 1, "reset_crc": 0, "reset_info": {}, "steps": [[0, 0.0, false, 0, {}]]}]}"#;
+/// let trace: Trace = serde_json::from_str(text)?;
+/// let outcome = replay(&trace)?;
+/// assert_eq!((outcome.episodes, outcome.steps), (1, 1));
+/// // The two checksums of observations are wrong.
+/// assert_eq!(outcome.differences, 2);
+/// assert_eq!(outcome.first.unwrap().what, "observation checksum");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
     let config = PoolConfig {
-        options: Options::Shared(trace.options.clone()),
+        options: ResetOptions::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
         check_drawing: true,
         ..PoolConfig::new(&trace.env, 1)
@@ -76,7 +99,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
         }
         let batch = Batch::new(pool.layout(), &blocks);
         replay.compare(0, "observation checksum", episode.reset_crc, crc32fast::hash(batch.observation()));
-        replay.compare(0, "vector observation", &*episode.reset_vector, batch.section("vector_observation"));
+        replay.compare(0, "vector observation", &*episode.reset_vector, batch.vector_observation());
         compare_info(&mut replay, 0, &episode.reset_info, &info(&pool, &blocks, false));
         for (step, expected) in (1..).zip(&episode.steps) {
             pool.step(&expected.action, &mut blocks)?;
@@ -101,14 +124,14 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
 fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static str, Vec<f64>)> {
     let batch = Batch::new(pool.layout(), blocks);
     let mut info = Vec::new();
-    let ground_truth = batch.section::<f64>("ground_truth");
+    let ground_truth = batch.ground_truth();
     if !ground_truth.is_empty() {
         info.push(("ground_truth", ground_truth.to_vec()));
     }
     if done {
         info.push(("reward", batch.episode_return().to_vec()));
         info.push(("length", vec![f64::from(batch.episode_length()[0])]));
-        let columns = pool.spec().info.iter().zip(batch.section::<f64>("info"));
+        let columns = pool.spec().info.iter().zip(batch.info());
         info.extend(columns.map(|(column, value)| (column.name, vec![*value])));
     }
     info
@@ -118,7 +141,7 @@ fn compare_info(replay: &mut Replay, step: usize, expected: &Map<String, Json>, 
     for (name, value) in expected {
         let value: Option<Vec<f64>> = match value {
             Json::Array(values) => values.iter().map(Json::as_f64).collect(),
-            // JSON knows no other way to write what is not a number.
+            // JSON has no NaN.
             Json::Null => Some(vec![f64::NAN]),
             value => value.as_f64().map(|value| vec![value]),
         };

@@ -6,9 +6,10 @@
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
+use crate::envs::action_space::ActionSpace;
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
-use crate::envs::spec::{ActionSpace, EnvSpec, InfoColumn};
+use crate::envs::spec::{EnvSpec, InfoColumn};
 
 const AGENT_SCALE: Parameter = Parameter::float(
     "agent_scale",
@@ -159,7 +160,7 @@ pub const SPECS: &[EnvSpec] = &[
             endless: false,
             start_offset: false,
         }),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: 0,
         ground_truth: 0,
         info: FINITE_INFO,
@@ -193,7 +194,7 @@ pub const SPECS: &[EnvSpec] = &[
             endless: false,
             start_offset: true,
         }),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
         ground_truth: 0,
         info: FINITE_INFO,
@@ -227,7 +228,7 @@ pub const SPECS: &[EnvSpec] = &[
             endless: true,
             start_offset: true,
         }),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: 0,
         ground_truth: 2,
         info: ENDLESS_INFO,

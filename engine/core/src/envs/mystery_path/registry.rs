@@ -5,10 +5,11 @@
 
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
+use crate::envs::action_space::ActionSpace;
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
 use crate::envs::screen::SCREEN;
-use crate::envs::spec::{ActionSpace, EnvSpec, InfoColumn};
+use crate::envs::spec::{EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
     Parameter::int(
@@ -132,7 +133,7 @@ pub const SPECS: &[EnvSpec] = &[
         id: "MysteryPath-v0",
         summary: "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
         family: Family::MysteryPath(Variant::Free),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: 0,
         ground_truth: 0,
         info: FINITE_INFO,

@@ -88,7 +88,7 @@ impl<'a> LightChange<'a> {
         if self.changes.is_empty() {
             return;
         }
-        if canvas.is_noting() {
+        if canvas.tracks_dirty() {
             self.note(canvas);
         }
         let frame: &mut Frame = canvas.pixels_mut().try_into().expect("the canvas is a frame");
@@ -134,12 +134,12 @@ impl LightChange<'_> {
         for change in &self.changes {
             match change {
                 CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => {
-                    for_each_run(circle, |x, rows| canvas.note(x..x + 1, &rows))
+                    for_each_run(circle, |x, rows| canvas.mark_dirty(x..x + 1, &rows))
                 }
                 CircleChange::Moved(from, to) => {
                     for (crescent, circle) in [(crescent(from, to), from), (crescent(to, from), to)] {
                         for (x, y) in crescent.pixels.iter().filter_map(|pixel| on_screen(pixel, circle)) {
-                            canvas.note(x..x + 1, &(y..y + 1));
+                            canvas.mark_dirty(x..x + 1, &(y..y + 1));
                         }
                     }
                 }

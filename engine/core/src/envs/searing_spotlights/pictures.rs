@@ -68,7 +68,7 @@ impl Chessboard {
             canvas.runs_mut().for_each(|(x, run)| copy_run(self.column(x)[rows.clone()].as_flattened(), run));
             return;
         }
-        canvas.note(columns, &rows);
+        canvas.mark_dirty(columns, &rows);
         // Paints the first two columns of tiles, then copies what is painted, doubling it each time.
         let mut painted = 2 * TILE;
         let first = canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0.iter_mut().take(painted);

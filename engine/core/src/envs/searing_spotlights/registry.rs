@@ -5,9 +5,10 @@
 
 use super::features::FEATURES;
 use super::parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
+use crate::envs::action_space::ActionSpace;
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
-use crate::envs::spec::{ActionSpace, EnvSpec, InfoColumn};
+use crate::envs::spec::{EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
     const ANY: (i64, i64) = (i64::MIN, i64::MAX);
@@ -217,7 +218,7 @@ pub const SPECS: &[EnvSpec] = &[
         id: "SearingSpotlights-v0",
         summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
         family: Family::SearingSpotlights(Variant { endless: false }),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: 0,
         ground_truth: 0,
         info: FINITE_INFO,
@@ -229,7 +230,7 @@ pub const SPECS: &[EnvSpec] = &[
         id: "Endless-SearingSpotlights-v0",
         summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
         family: Family::SearingSpotlights(Variant { endless: true }),
-        action_space: ActionSpace::MultiDiscrete(&[3, 3]),
+        action_space: ActionSpace::multi_discrete(&[3, 3]),
         vector_observation: 0,
         ground_truth: 4,
         info: ENDLESS_INFO,

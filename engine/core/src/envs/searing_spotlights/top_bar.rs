@@ -114,7 +114,7 @@ fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: Rgb) {
     if columns.start >= columns.end {
         return;
     }
-    canvas.note(columns.clone(), &rows);
+    canvas.mark_dirty(columns.clone(), &rows);
     let columns = &mut canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0[columns];
     if rows.len() == BAR_HEIGHT {
         // A block of constant size compiles to one or two stores for each column.

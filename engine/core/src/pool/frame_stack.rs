@@ -1,18 +1,18 @@
-//! The last frames of an episode, for observations that have several.
+//! The last frames of an episode, for observations of several frames.
 
 use std::collections::VecDeque;
 
-/// What the last frames of an episode show, oldest first, for observations of several frames; empty for those of one.
+/// The scenes of the last frames of an episode, oldest first. Nothing is kept for observations of one frame.
 #[derive(Clone, Debug)]
-pub(super) struct History<S> {
+pub(super) struct FrameStack<S> {
     scenes: VecDeque<S>,
     length: usize,
 }
 
-impl<S: Clone> History<S> {
-    /// For observations of `length` frames.
+impl<S: Clone> FrameStack<S> {
+    /// A stack for observations of `length` frames.
     pub fn new(length: usize) -> Self {
-        History { scenes: VecDeque::with_capacity(length), length }
+        FrameStack { scenes: VecDeque::with_capacity(length), length }
     }
 
     /// Frames in an observation.
@@ -20,7 +20,7 @@ impl<S: Clone> History<S> {
         self.length
     }
 
-    /// An episode starts: its first frame stands for those before it.
+    /// Fills the stack with the first scene of an episode.
     pub fn restart(&mut self, scene: impl FnOnce() -> S) {
         self.scenes.clear();
         if self.length > 1 {
@@ -28,7 +28,7 @@ impl<S: Clone> History<S> {
         }
     }
 
-    /// The episode goes on.
+    /// Replaces the oldest scene by a new one.
     pub fn push(&mut self, scene: impl FnOnce() -> S) {
         if self.length > 1 {
             self.scenes.pop_front();
@@ -36,7 +36,8 @@ impl<S: Clone> History<S> {
         }
     }
 
-    /// The scenes of the observation's frames, of which `last` is the last.
+    /// The scenes of the observation's frames, oldest first. `last` returns the newest one, which an observation of one frame
+    /// has.
     pub fn scenes(&self, last: impl FnOnce() -> S) -> impl Iterator<Item = S> {
         let last = (self.length == 1).then(last);
         self.scenes.iter().cloned().chain(last)

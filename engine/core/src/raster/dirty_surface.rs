@@ -1,28 +1,30 @@
-//! A picture that remembers which of its pixels were painted, for those who then carry only these elsewhere.
+//! A surface with dirty tracking.
 
 use std::ops::Range;
 
 use super::{Canvas, Rgb};
 
-/// A picture that is painted in parts. What was not painted since the last [`canvas`](Sketch::canvas) means nothing.
+/// Pixels with a dirty mask, of which only the painted ones are copied elsewhere.
+///
+/// The colours of pixels that were not painted since the last call of [`canvas`](DirtySurface::canvas) are unspecified.
 #[derive(Clone, Debug)]
-pub struct Sketch {
+pub struct DirtySurface {
     pixels: Vec<u8>,
     width: usize,
     height: usize,
-    /// By column, a bit for each row.
-    painted: Vec<u128>,
+    /// For each column a bit for each row.
+    dirty: Vec<u128>,
 }
 
-impl Sketch {
-    /// An unpainted sketch of at most 128 rows.
+impl DirtySurface {
+    /// A surface of at most 128 rows without a dirty pixel.
     ///
     /// # Panics
     ///
-    /// With more rows.
+    /// If `height` is more than 128.
     pub fn new(width: usize, height: usize) -> Self {
-        assert!(height <= u128::BITS as usize, "a sketch of {height} rows");
-        Sketch { pixels: vec![0; width * height * 3], width, height, painted: vec![0; width] }
+        assert!(height <= u128::BITS as usize, "height must be 0 to 128, got {height}");
+        DirtySurface { pixels: vec![0; width * height * 3], width, height, dirty: vec![0; width] }
     }
 
     /// Width in pixels.
@@ -35,16 +37,16 @@ impl Sketch {
         self.height
     }
 
-    /// Forgets everything; what is painted on the canvas is remembered.
+    /// Clears the dirty mask, and returns a canvas that marks the pixels painted on it.
     pub fn canvas(&mut self) -> Canvas<'_> {
-        self.painted.fill(0);
-        Canvas::new(&mut self.pixels, self.width, self.height).noting(&mut self.painted)
+        self.dirty.fill(0);
+        Canvas::new(&mut self.pixels, self.width, self.height).tracking_dirty(&mut self.dirty)
     }
 
-    /// Hands out what was painted: column, rows, pixels.
+    /// Calls `run` for each run of dirty pixels with its column, its rows, and its pixels.
     pub fn for_each_run(&self, mut run: impl FnMut(usize, Range<usize>, &[Rgb])) {
         let columns = self.pixels.as_chunks::<3>().0.chunks_exact(self.height.max(1));
-        for (x, (bits, column)) in self.painted.iter().zip(columns).enumerate() {
+        for (x, (bits, column)) in self.dirty.iter().zip(columns).enumerate() {
             let mut rest = *bits;
             while rest != 0 {
                 let start = rest.trailing_zeros() as usize;
@@ -62,37 +64,37 @@ mod tests {
     use crate::raster::{Rect, Sprite, Surface};
 
     /// The pixels that were painted.
-    fn painted(sketch: &Sketch) -> Vec<(usize, usize)> {
+    fn painted(surface: &DirtySurface) -> Vec<(usize, usize)> {
         let mut painted = Vec::new();
-        sketch.for_each_run(|x, rows, _| painted.extend(rows.map(|y| (x, y))));
+        surface.for_each_run(|x, rows, _| painted.extend(rows.map(|y| (x, y))));
         painted
     }
 
     #[test]
-    fn only_what_is_painted_is_handed_out() {
-        let mut sketch = Sketch::new(5, 128);
-        let mut canvas = sketch.canvas();
+    fn only_painted_pixels_are_dirty() {
+        let mut surface = DirtySurface::new(5, 128);
+        let mut canvas = surface.canvas();
         *canvas.pixel_mut(1, 127) = [1, 2, 3];
         canvas.draw_rect([9; 3], Rect::new(3, 0, 9, 2), 0);
         canvas.clipped(Rect::new(0, 126, 1, 9)).fill([7; 3]);
-        assert_eq!(painted(&sketch), [(0, 126), (0, 127), (1, 127), (3, 0), (3, 1), (4, 0), (4, 1)]);
+        assert_eq!(painted(&surface), [(0, 126), (0, 127), (1, 127), (3, 0), (3, 1), (4, 0), (4, 1)]);
         let mut colors = Vec::new();
-        sketch.for_each_run(|_, _, run| colors.extend_from_slice(run));
+        surface.for_each_run(|_, _, run| colors.extend_from_slice(run));
         assert_eq!(colors, [[7; 3], [7; 3], [1, 2, 3], [9; 3], [9; 3], [9; 3], [9; 3]]);
-        sketch.canvas().fill([0; 3]);
-        assert_eq!(painted(&sketch).len(), 5 * 128);
-        sketch.canvas();
-        assert_eq!(painted(&sketch), []);
+        surface.canvas().fill([0; 3]);
+        assert_eq!(painted(&surface).len(), 5 * 128);
+        surface.canvas();
+        assert_eq!(painted(&surface), []);
     }
 
-    /// Whatever paints: each pixel that changes is handed out, and with what it has become.
+    /// Every drawing operation marks each pixel that it changes.
     #[test]
-    fn everything_that_paints_is_noticed() {
-        let mut surface = Surface::new(7, 9);
-        surface.fill([0, 0, 255]);
-        surface.draw_circle([200, 100, 0], (4, 4), 3, 0);
-        surface.set_color_key(Some([0, 0, 255]));
-        let sprite = Sprite::new(&surface);
+    fn every_drawing_operation_marks_its_pixels() {
+        let mut source = Surface::new(7, 9);
+        source.fill([0, 0, 255]);
+        source.draw_circle([200, 100, 0], (4, 4), 3, 0);
+        source.set_color_key(Some([0, 0, 255]));
+        let sprite = Sprite::new(&source);
         let disc = crate::raster::Disc::new(4);
         let picture = vec![55; 20 * 30 * 3];
         type Paint<'a> = &'a dyn Fn(&mut Canvas<'_>);
@@ -101,7 +103,7 @@ mod tests {
             &|canvas| canvas.clipped(Rect::new(3, 4, 5, 6)).fill([1, 2, 3]),
             &|canvas| canvas.paste(&picture),
             &|canvas| canvas.clipped(Rect::new(3, 4, 5, 6)).paste(&picture),
-            &|canvas| canvas.blit(&surface, 3, 25),
+            &|canvas| canvas.blit(&source, 3, 25),
             &|canvas| sprite.blit(canvas, 5, 6),
             &|canvas| sprite.blit(canvas, -3, 26),
             &|canvas| sprite.blit_within(canvas, 5, 6, &disc, (8, 9)),
@@ -111,12 +113,12 @@ mod tests {
             &|canvas| canvas.draw_line([4, 5, 6], (-2, 3), (30, 20), 3),
         ];
         for (number, paint) in ways.iter().enumerate() {
-            let mut expected = Sketch::new(20, 30);
+            let mut expected = DirtySurface::new(20, 30);
             paint(&mut Canvas::new(&mut expected.pixels, 20, 30));
-            let mut sketch = Sketch::new(20, 30);
-            paint(&mut sketch.canvas());
-            let mut found = vec![0; sketch.pixels.len()];
-            sketch.for_each_run(|x, rows, run| {
+            let mut surface = DirtySurface::new(20, 30);
+            paint(&mut surface.canvas());
+            let mut found = vec![0; surface.pixels.len()];
+            surface.for_each_run(|x, rows, run| {
                 found[(x * 30 + rows.start) * 3..][..run.len() * 3].copy_from_slice(run.as_flattened());
             });
             assert!(found.iter().any(|byte| *byte != 0), "way {number} paints nothing");

@@ -1,0 +1,346 @@
+//! The tables of sections: the one list from which layouts, their checks, the views of a batch and this documentation are made.
+
+use std::fmt;
+
+use super::dtype::{Dtype, Element};
+use super::frames::Frames;
+use crate::envs::EnvSpec;
+
+/// Maximum length of a message's reset parameters, in bytes of JSON text.
+pub const OPTIONS_BYTES: usize = 16 * 1024;
+
+/// Maximum length of a snapshot in a message, in bytes. Most snapshots have less than a kilobyte beside their reset parameters;
+/// one with 1,000 spotlights has about 80 kilobytes, and reset parameters allow twice as many.
+pub const SNAPSHOT_BYTES: usize = 256 * 1024;
+
+/// The sections that a kind of memory may have: [`BatchSection`] or [`ActionSection`].
+///
+/// A [`Layout`](super::Layout) says where each of them lies. The trait is not meant for other types.
+pub trait SectionTable: Copy + Eq + fmt::Debug + fmt::Display + 'static {
+    /// All sections, in the order in which they lie in memory.
+    const ALL: &'static [Self];
+
+    /// Blocks behind the last section that belong to the writer.
+    const STAMP_BLOCKS: usize;
+
+    /// The section's name in JSON and in Python.
+    fn name(self) -> &'static str;
+
+    /// The section's number type.
+    fn dtype(self) -> Dtype;
+
+    /// The shapes that one environment's row may have.
+    fn row(self) -> RowShape;
+
+    /// Whether every layout has the section.
+    fn is_required(self) -> bool;
+
+    /// The section of that name, if there is one.
+    fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.iter().copied().find(|section| section.name() == name)
+    }
+}
+
+/// The shapes that one environment's row of a section may have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RowShape {
+    /// One number: `()`.
+    Scalar,
+    /// One number that is 0 or 1: `()`. Python shows it as `bool`.
+    Flag,
+    /// Several numbers: `(k,)`.
+    Vector,
+    /// Frames as [`Frames`] describes them: 2 to 4 dimensions.
+    Frames,
+    /// Bytes that run on over all rows: `(k,)`, such that all rows together have at least this many.
+    Bytes(usize),
+}
+
+impl RowShape {
+    /// Whether a row may have that shape. How many bytes a section of [`RowShape::Bytes`] has in all is not checked here.
+    pub(super) fn admits(self, shape: &[usize]) -> bool {
+        match self {
+            RowShape::Scalar | RowShape::Flag => shape.is_empty(),
+            RowShape::Vector | RowShape::Bytes(_) => shape.len() == 1,
+            RowShape::Frames => (2..=4).contains(&shape.len()),
+        }
+    }
+}
+
+impl fmt::Display for RowShape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            RowShape::Scalar | RowShape::Flag => "()",
+            RowShape::Vector | RowShape::Bytes(_) => "(k,)",
+            RowShape::Frames => "a frame's shape of 2 to 4 dimensions",
+        })
+    }
+}
+
+/// numpy's name of a Rust number type, for the documentation.
+macro_rules! dtype_name {
+    (u8) => {
+        "uint8"
+    };
+    (i32) => {
+        "int32"
+    };
+    (u64) => {
+        "uint64"
+    };
+    (f32) => {
+        "float32"
+    };
+    (f64) => {
+        "float64"
+    };
+}
+
+/// A row's shape, for the documentation.
+macro_rules! row_name {
+    (Scalar) => {
+        "()"
+    };
+    (Flag) => {
+        "()"
+    };
+    (Vector) => {
+        "(k,)"
+    };
+    (Frames) => {
+        "(84, 84, 3), or as [`Frames`] describes"
+    };
+    (Bytes) => {
+        "(k,)"
+    };
+}
+
+macro_rules! presence {
+    (required) => {
+        true
+    };
+    (optional) => {
+        false
+    };
+}
+
+/// Makes the enum of a table, with the table as its documentation.
+macro_rules! section_table {
+    (
+        $(#[$meta:meta])*
+        $table:ident, $stamp_blocks:literal;
+        $($variant:ident $name:ident: $element:ident, $row:ident $(($bytes:ident))?, $presence:ident, $meaning:literal;)*
+    ) => {
+        $(#[$meta])*
+        ///
+        /// | section | dtype | row shape | contents |
+        /// | --- | --- | --- | --- |
+        $(#[doc = concat!("| `", stringify!($name), "` | ", dtype_name!($element), " | ", row_name!($row), " | ", $meaning, " |")])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+        pub enum $table {
+            $(
+                #[doc = concat!("`", stringify!($name), "`, ", dtype_name!($element), " ", row_name!($row), ": ", $meaning, ".")]
+                $variant,
+            )*
+        }
+
+        impl SectionTable for $table {
+            const ALL: &'static [Self] = &[$($table::$variant),*];
+            const STAMP_BLOCKS: usize = $stamp_blocks;
+
+            fn name(self) -> &'static str {
+                match self {
+                    $($table::$variant => stringify!($name),)*
+                }
+            }
+
+            fn dtype(self) -> Dtype {
+                match self {
+                    $($table::$variant => <$element as Element>::DTYPE,)*
+                }
+            }
+
+            fn row(self) -> RowShape {
+                match self {
+                    $($table::$variant => RowShape::$row $(($bytes))?,)*
+                }
+            }
+
+            fn is_required(self) -> bool {
+                match self {
+                    $($table::$variant => presence!($presence),)*
+                }
+            }
+        }
+
+        impl fmt::Display for $table {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(self.name())
+            }
+        }
+    };
+}
+
+/// Calls another macro with the tokens that are given, followed by the table of a batch's sections.
+macro_rules! batch_sections {
+    ($macro:ident! $($before:tt)*) => {
+        $macro! {
+            $($before)*
+            Observation observation: u8, Frames, optional,
+                "the frames; absent where frames are turned off";
+            VectorObservation vector_observation: f32, Vector, optional,
+                "the commands, one-hot; ids with `MortarMayhemB` only";
+            Features features: f32, Vector, optional,
+                "the content of the frame in numbers, in the order of the environment's specification; on request";
+            GroundTruth ground_truth: f64, Vector, optional,
+                "the original's info `ground_truth`; ids that have it only";
+            Reward reward: f64, Scalar, required,
+                "reward of this step";
+            Terminated terminated: u8, Flag, required,
+                "1 where this step ended the episode";
+            Truncated truncated: u8, Flag, required,
+                "always 0: the original reports its step limit as `terminated`";
+            EpisodeReturn episode_return: f64, Scalar, required,
+                "sum of the running episode's rewards, this step included";
+            EpisodeLength episode_length: i32, Scalar, required,
+                "number of steps of the running episode, this step included";
+            Info info: f64, Vector, required,
+                "the original's further final infos, in the order of the environment's specification; 0 in steps that end no episode";
+            FinalObservation final_observation: u8, Frames, optional,
+                "`observation` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
+            FinalVectorObservation final_vector_observation: f32, Vector, optional,
+                "`vector_observation` likewise";
+            FinalFeatures final_features: f32, Vector, optional,
+                "`features` likewise";
+            FinalGroundTruth final_ground_truth: f64, Vector, optional,
+                "`ground_truth` likewise";
+        }
+    };
+}
+pub(super) use batch_sections;
+
+batch_sections! { section_table!
+    /// A section of a batch, the memory that a step of a group of environments writes.
+    ///
+    /// In same-step autoreset, `observation`, `vector_observation`, `features` and `ground_truth` belong to the new episode in a
+    /// step that ends one, while reward, flags, `episode_*` and `info` belong to the episode that ended.
+    BatchSection, 1;
+}
+
+section_table! {
+    /// A section of the message that a trainer sends to an engine. All are present; a message's header says which are in use.
+    ActionSection, 0;
+    Action action: i32, Vector, required,
+        "for a step, one number for each branch of the action space";
+    Reset reset: u8, Scalar, required,
+        "for a reset of some environments: 0 leaves the environment alone, 1 starts its next episode, 2 starts an episode with `seed`";
+    Seed seed: u64, Scalar, required,
+        "for a reset of some environments: the seed where `reset` is 2";
+    Options options: u8, Bytes(OPTIONS_BYTES), required,
+        "for a reset with other reset parameters: JSON text that runs on over the rows, at least [`OPTIONS_BYTES`] in all";
+    Snapshot snapshot: u8, Bytes(SNAPSHOT_BYTES), required,
+        "for restoring an environment: its snapshot, which runs on over the rows, at least [`SNAPSHOT_BYTES`] in all";
+}
+
+/// Which optional sections a batch has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Contents {
+    /// Format of the frames; `None` leaves them out, and nothing is drawn.
+    pub frames: Option<Frames>,
+    /// Whether there is the feature observation.
+    pub features: bool,
+    /// Whether there are the `final_*` sections, for same-step autoreset.
+    pub final_observation: bool,
+}
+
+impl BatchSection {
+    /// Shape of the section's row in a batch of that environment; `None` where the batch lacks the section.
+    pub(super) fn row_shape(self, spec: &EnvSpec, contents: Contents) -> Option<Vec<usize>> {
+        let columns = |count: usize| (count > 0).then(|| vec![count]);
+        let final_of = |section: BatchSection| section.row_shape(spec, contents).filter(|_| contents.final_observation);
+        match self {
+            BatchSection::Observation => contents.frames.map(Frames::shape),
+            BatchSection::VectorObservation => columns(spec.vector_observation),
+            BatchSection::Features => columns(spec.features.len()).filter(|_| contents.features),
+            BatchSection::GroundTruth => columns(spec.ground_truth),
+            BatchSection::Reward
+            | BatchSection::Terminated
+            | BatchSection::Truncated
+            | BatchSection::EpisodeReturn
+            | BatchSection::EpisodeLength => Some(vec![]),
+            BatchSection::Info => Some(vec![spec.info.len()]),
+            BatchSection::FinalObservation => final_of(BatchSection::Observation),
+            BatchSection::FinalVectorObservation => final_of(BatchSection::VectorObservation),
+            BatchSection::FinalFeatures => final_of(BatchSection::Features),
+            BatchSection::FinalGroundTruth => final_of(BatchSection::GroundTruth),
+        }
+    }
+}
+
+impl ActionSection {
+    /// Shape of the section's row in a message for `num_envs` environments, which is not 0.
+    pub(super) fn row_shape(self, spec: &EnvSpec, num_envs: usize) -> Vec<usize> {
+        match (self, self.row()) {
+            (_, RowShape::Bytes(bytes)) => vec![bytes.div_ceil(num_envs)],
+            (ActionSection::Action, _) => vec![spec.action_space.branches().len()],
+            _ => vec![],
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::envs;
+
+    #[test]
+    fn names_are_unique_and_found_again() {
+        fn check<S: SectionTable>() {
+            for section in S::ALL {
+                assert_eq!(S::from_name(section.name()), Some(*section));
+            }
+            assert_eq!(S::from_name("rewards"), None);
+            assert_eq!(S::from_name(""), None);
+        }
+        check::<BatchSection>();
+        check::<ActionSection>();
+    }
+
+    /// Each `final_*` section has the number type and the shape of the section that it is named after.
+    #[test]
+    fn final_sections_equal_their_originals() {
+        for spec in envs::specs() {
+            let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
+            for section in BatchSection::ALL {
+                let Some(original) = section.name().strip_prefix("final_") else { continue };
+                let original = BatchSection::from_name(original).unwrap();
+                assert_eq!(section.dtype(), original.dtype());
+                assert_eq!(section.row(), original.row());
+                assert_eq!(section.row_shape(spec, contents), original.row_shape(spec, contents));
+                assert_eq!(section.row_shape(spec, Contents { final_observation: false, ..contents }), None);
+            }
+        }
+    }
+
+    #[test]
+    fn shapes_fit_the_table() {
+        for spec in envs::specs() {
+            for stack in [1, 4] {
+                let frames = Some(Frames { stack, ..Frames::default() });
+                let contents = Contents { frames, features: true, final_observation: true };
+                for section in BatchSection::ALL {
+                    let shape = section.row_shape(spec, contents);
+                    assert!(shape.iter().all(|shape| section.row().admits(shape)), "{section} {shape:?}");
+                    assert!(shape.is_some() || !section.is_required());
+                }
+                let none = Contents { frames: None, features: false, final_observation: false };
+                for section in BatchSection::ALL {
+                    assert!(section.row_shape(spec, none).is_some() || !section.is_required(), "{section}");
+                }
+            }
+            for section in ActionSection::ALL {
+                assert!(section.row().admits(&section.row_shape(spec, 3)), "{section}");
+            }
+        }
+    }
+}

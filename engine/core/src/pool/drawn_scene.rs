@@ -1,0 +1,131 @@
+//! The scene that was last drawn into each frame of a buffer, and the update of the frame to another scene.
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use thiserror::Error;
+
+use crate::envs::{Environment, SCREEN};
+use crate::raster::{Canvas, DirtySurface, PixelFormat};
+
+/// Settings for drawing frames.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct DrawSettings {
+    /// Whether the buffer is as the pool last wrote it, so that its drawn scenes are what its frames show.
+    pub current: bool,
+    pub format: PixelFormat,
+    /// Whether every frame is compared with one that is drawn in full.
+    pub check: bool,
+}
+
+/// The scene that was last drawn into a frame, with its assets; `None` before the first.
+#[derive(Debug)]
+pub(super) struct DrawnScene<E: Environment>(Option<(Arc<E::Assets>, E::Scene)>);
+
+impl<E: Environment> DrawnScene<E> {
+    /// Nothing was drawn yet.
+    pub fn unknown() -> Self {
+        DrawnScene(None)
+    }
+
+    /// Updates `frame` to `scene`: repaints the differences to the drawn scene, or draws in full where the frame's content is not
+    /// known or was drawn with other assets.
+    pub fn update(
+        &mut self,
+        assets: &Arc<E::Assets>,
+        scene: E::Scene,
+        settings: DrawSettings,
+        frame: &mut [u8],
+    ) -> Result<(), WrongFrame> {
+        match &mut self.0 {
+            Some((drawn_with, drawn)) if settings.current && Arc::ptr_eq(drawn_with, assets) => {
+                if *drawn != scene {
+                    paint_on(frame, settings.format, |canvas| E::repaint(assets, drawn, &scene, canvas));
+                }
+                if settings.check {
+                    compare::<E>(assets, Some(drawn), &scene, settings.format, frame)?;
+                }
+                *drawn = scene;
+            }
+            drawn => {
+                draw_in_full::<E>(assets, &scene, settings.format, frame);
+                if settings.check {
+                    compare::<E>(assets, None, &scene, settings.format, frame)?;
+                }
+                *drawn = Some((Arc::clone(assets), scene));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Draws a frame in full.
+pub(super) fn draw_in_full<E: Environment>(
+    assets: &E::Assets,
+    scene: &E::Scene,
+    format: PixelFormat,
+    frame: &mut [u8],
+) {
+    paint_on(frame, format, |canvas| E::paint(assets, scene, canvas));
+}
+
+thread_local! {
+    /// The surface for frames in a format that a canvas cannot be laid over.
+    static SURFACE: RefCell<DirtySurface> = RefCell::new(DirtySurface::new(SCREEN, SCREEN));
+}
+
+/// Calls `paint` for a frame in that format. Only painted pixels change.
+fn paint_on(frame: &mut [u8], format: PixelFormat, paint: impl FnOnce(&mut Canvas<'_>)) {
+    if format.is_canvas() {
+        return paint(&mut Canvas::new(frame, SCREEN, SCREEN));
+    }
+    SURFACE.with_borrow_mut(|surface| {
+        paint(&mut surface.canvas());
+        format.store(surface, frame);
+    });
+}
+
+/// Compares a frame with one that is drawn in full.
+fn compare<E: Environment>(
+    assets: &E::Assets,
+    drawn: Option<&E::Scene>,
+    scene: &E::Scene,
+    format: PixelFormat,
+    frame: &[u8],
+) -> Result<(), WrongFrame> {
+    let mut expected = vec![0; frame.len()];
+    draw_in_full::<E>(assets, scene, format, &mut expected);
+    match expected.iter().zip(frame).position(|(expected, found)| expected != found) {
+        None => Ok(()),
+        Some(byte) => Err(WrongFrame {
+            env: 0,
+            pixel: format.pixel_of(byte, SCREEN, SCREEN),
+            expected: expected[byte],
+            found: frame[byte],
+            before: drawn.map_or_else(|| "unknown".to_owned(), |drawn| format!("{drawn:?}")),
+            scene: format!("{scene:?}"),
+        }),
+    }
+}
+
+/// A frame that was updated differs from the same frame drawn in full: a mistake in this crate, or the frame was changed without
+/// a call of [`Layout::forget_frames`](crate::batch::Layout::forget_frames).
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error(
+    "the frame of environment {env} is wrong at pixel {pixel:?}: expected {expected}, found {found}; its scene was {before}, and \
+     is {scene}"
+)]
+pub struct WrongFrame {
+    /// Number of the environment.
+    pub env: usize,
+    /// (x, y) of the first pixel that differs.
+    pub pixel: (usize, usize),
+    /// The byte of a frame that is drawn in full.
+    pub expected: u8,
+    /// The byte of the updated frame.
+    pub found: u8,
+    /// The scene that the frame showed before, or `unknown`, in the notation of `Debug`.
+    pub before: String,
+    /// The scene that the frame is to show, likewise.
+    pub scene: String,
+}

@@ -1,0 +1,150 @@
+//! One environment of a pool, and how it writes its row of a batch.
+
+use std::sync::Arc;
+
+use super::autoreset::Autoreset;
+use super::config::OptionMap;
+use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame, draw_in_full};
+use super::frame_stack::FrameStack;
+use super::seeding::Seeds;
+use crate::batch::BatchMut;
+use crate::envs::Environment;
+use crate::random::Generator;
+
+/// An environment with its generator, its seeds, and what is counted of its episode.
+pub(super) struct EnvSlot<E: Environment> {
+    pub env: E,
+    /// The assets for the next episode.
+    pub assets: Arc<E::Assets>,
+    pub random: Generator,
+    pub seeds: Seeds,
+    pub episode_return: f64,
+    pub episode_length: i32,
+    pub frame_stack: FrameStack<E::Scene>,
+    /// Whether the last step ended the episode, so that in next-step autoreset the next one starts another.
+    pub ended: bool,
+    /// The reset parameters as they were given, which `assets` were made from.
+    pub options: Arc<OptionMap>,
+}
+
+impl<E: Environment> EnvSlot<E> {
+    /// An environment that has not been reset yet, for observations of `stack` frames. `random` is its generator until an episode
+    /// is seeded.
+    pub fn new(assets: Arc<E::Assets>, options: Arc<OptionMap>, seeds: Seeds, random: Generator, stack: usize) -> Self {
+        EnvSlot {
+            env: E::new(&assets),
+            assets,
+            random,
+            seeds,
+            episode_return: 0.0,
+            episode_length: 0,
+            frame_stack: FrameStack::new(stack),
+            ended: false,
+            options,
+        }
+    }
+
+    /// Starts an episode with that seed, or with the next one of the environment's own.
+    pub fn start_episode(&mut self, seed: Option<u64>) {
+        if let Some(seed) = seed.or_else(|| self.seeds.next()) {
+            self.random = Generator::from_seed(seed);
+        }
+        self.env.reset(&self.assets, &mut self.random);
+        self.frame_stack.restart(|| self.env.scene());
+        self.episode_return = 0.0;
+        self.episode_length = 0;
+        self.ended = false;
+    }
+
+    /// The scenes of the observation's frames.
+    fn scenes(&self) -> impl Iterator<Item = E::Scene> {
+        self.frame_stack.scenes(|| self.env.scene())
+    }
+
+    /// Plays a step, or in next-step autoreset starts the next episode, and writes the environment's row without its frames.
+    pub fn step(
+        &mut self,
+        autoreset: Autoreset,
+        draw: DrawSettings,
+        action: &[i32],
+        out: &mut BatchMut<'_>,
+        row: usize,
+    ) {
+        if self.ended && autoreset == Autoreset::NextStep {
+            self.start_episode(None);
+            return self.write_start(out, row);
+        }
+        let transition = self.env.step(action, &mut self.random);
+        self.frame_stack.push(|| self.env.scene());
+        self.episode_return += transition.reward;
+        self.episode_length = self.episode_length.saturating_add(1);
+        self.ended = transition.terminated;
+        self.write_transition(out, row, transition.reward, transition.terminated);
+        if transition.terminated {
+            self.env.info(out.info.row(row));
+            if autoreset == Autoreset::SameStep {
+                self.write_final_observation(draw, out, row);
+                self.start_episode(None);
+            }
+        } else {
+            out.info.row(row).fill(0.0);
+        }
+        self.write_numbers(out, row);
+    }
+
+    /// Writes the row of an environment that did not step, without its frames: the current observation, a reward of 0, no flag.
+    pub fn write_start(&self, out: &mut BatchMut<'_>, row: usize) {
+        self.write_transition(out, row, 0.0, false);
+        out.info.row(row).fill(0.0);
+        self.write_numbers(out, row);
+    }
+
+    fn write_transition(&self, out: &mut BatchMut<'_>, row: usize, reward: f64, terminated: bool) {
+        out.reward.row(row)[0] = reward;
+        out.terminated.row(row)[0] = u8::from(terminated);
+        out.truncated.row(row)[0] = 0;
+        out.episode_return.row(row)[0] = self.episode_return;
+        out.episode_length.row(row)[0] = self.episode_length;
+    }
+
+    /// Writes the observations other than the frames.
+    fn write_numbers(&self, out: &mut BatchMut<'_>, row: usize) {
+        write_if_present(out.vector_observation.row(row), |r| self.env.vector_observation(r));
+        write_if_present(out.features.row(row), |r| self.env.features(r));
+        write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
+    }
+
+    /// Updates the frames of the observation. `drawn` has the scene that was last drawn into each of them.
+    #[inline]
+    pub fn draw(
+        &self,
+        drawn: &mut [DrawnScene<E>],
+        settings: DrawSettings,
+        frames: &mut [u8],
+    ) -> Result<(), WrongFrame> {
+        let assets = self.env.shared();
+        if let [drawn] = drawn {
+            return drawn.update(assets, self.env.scene(), settings, frames);
+        }
+        let frames = frames.chunks_exact_mut(frames.len() / drawn.len());
+        let mut stacked = self.scenes().zip(drawn).zip(frames);
+        stacked.try_for_each(|((scene, drawn), frame)| drawn.update(assets, scene, settings, frame))
+    }
+
+    fn write_final_observation(&self, draw: DrawSettings, out: &mut BatchMut<'_>, row: usize) {
+        write_if_present(out.final_observation.row(row), |r| {
+            for (scene, frame) in self.scenes().zip(r.chunks_exact_mut(r.len() / self.frame_stack.length())) {
+                draw_in_full::<E>(self.env.shared(), &scene, draw.format, frame);
+            }
+        });
+        write_if_present(out.final_vector_observation.row(row), |r| self.env.vector_observation(r));
+        write_if_present(out.final_features.row(row), |r| self.env.features(r));
+        write_if_present(out.final_ground_truth.row(row), |r| self.env.ground_truth(r));
+    }
+}
+
+fn write_if_present<T>(row: &mut [T], write: impl FnOnce(&mut [T])) {
+    if !row.is_empty() {
+        write(row);
+    }
+}

@@ -1,0 +1,129 @@
+//! The errors of a pool.
+
+use thiserror::Error;
+
+use super::drawn_scene::WrongFrame;
+use crate::batch::{BLOCK_BYTES, LayoutError, MAX_ENVS, MAX_STACK};
+use crate::envs::view::VIEW_BYTES;
+use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
+use crate::random::EntropyError;
+
+/// A pool that cannot be made, or a call that it cannot carry out.
+///
+/// The call has changed no environment and no batch, except for [`PoolError::WrongFrame`].
+#[derive(Debug, Error)]
+pub enum PoolError {
+    /// No environment has that id.
+    #[error(transparent)]
+    UnknownEnvironment(#[from] UnknownEnvironment),
+    /// Reset parameters for all environments are not valid.
+    #[error(transparent)]
+    Parameters(#[from] ParameterError),
+    /// An episode without a seed needs entropy, and there is none.
+    #[error(transparent)]
+    Entropy(#[from] EntropyError),
+    /// Reset parameters of one environment are not valid.
+    #[error("options of environment {env}: {source}")]
+    ParametersOf {
+        /// Number of the environment.
+        env: usize,
+        /// What is wrong with its parameters.
+        source: ParameterError,
+    },
+    /// The number of sets of reset parameters differs from the number of environments.
+    #[error("options must be one set for all environments or {num_envs} sets, one for each, got {given} sets")]
+    OptionsCount {
+        /// Number of sets that were given.
+        given: usize,
+        /// Number of environments in the pool.
+        num_envs: usize,
+    },
+    /// No environment, or too many.
+    #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]
+    NumEnvs {
+        /// The number that was given.
+        given: usize,
+    },
+    /// The pool's environments are not among all environments.
+    #[error("first_env + num_envs must be at most total_envs, got {first_env} + {num_envs} and {total_envs}")]
+    EnvNumbers {
+        /// Number of the pool's first environment.
+        first_env: usize,
+        /// Number of environments in the pool.
+        num_envs: usize,
+        /// Number of environments in all pools together.
+        total_envs: usize,
+    },
+    /// No frame in an observation, or too many.
+    #[error("frame stack must be 1 to {MAX_STACK}, got {given}")]
+    Stack {
+        /// The number of frames that was given.
+        given: usize,
+    },
+    /// The batch of such a pool would not fit the address space.
+    #[error(transparent)]
+    Layout(#[from] LayoutError),
+    /// The list of seeds is empty.
+    #[error("the list of seeds must have at least one seed, got none")]
+    NoSeeds,
+    /// The range of seeds is empty or too large.
+    #[error("the range of seeds must not be empty and must end at 2^63 - 1 or lower, got {start}..{end}")]
+    SeedRange {
+        /// The first seed.
+        start: u64,
+        /// The end of the range, excluded.
+        end: u64,
+    },
+    /// The operating system refuses to start a thread.
+    #[error("cannot start {count} threads: {source}")]
+    Threads {
+        /// Number of threads, the calling one included.
+        count: usize,
+        /// The operating system's error.
+        source: std::io::Error,
+    },
+    /// A call that needs running episodes came before the first reset of all environments.
+    #[error("the environments must be reset once before the first step")]
+    NotReset,
+    /// Actions of a wrong number or out of range.
+    #[error(transparent)]
+    Action(#[from] ActionError),
+    /// A reset request has a wrong number of flags or seeds.
+    #[error("a reset request must have {num_envs} flags and {num_envs} seeds, got {flags} and {seeds}")]
+    ResetCount {
+        /// Number of flags that were given.
+        flags: usize,
+        /// Number of seeds that were given.
+        seeds: usize,
+        /// Number of environments in the pool.
+        num_envs: usize,
+    },
+    /// The pool has no environment of that number.
+    #[error("env must be 0 to {}, got {given}", num_envs - 1)]
+    NoSuchEnv {
+        /// The number that was given.
+        given: usize,
+        /// Number of environments in the pool.
+        num_envs: usize,
+    },
+    /// Memory for a ground-truth view has a wrong size.
+    #[error("a ground-truth view must have {VIEW_BYTES} bytes, got {given}")]
+    ViewSize {
+        /// The number of bytes that was given.
+        given: usize,
+    },
+    /// With [`check_drawing`](super::PoolConfig::check_drawing) only: a frame differs from one that is drawn in full.
+    ///
+    /// All or some of the environments have advanced then, and the batch is incomplete. Its generation stamp is removed, so the
+    /// next write into it draws in full.
+    #[error(transparent)]
+    WrongFrame(#[from] WrongFrame),
+    /// The memory for a batch is too small.
+    #[error("a batch must have at least {needed} blocks of {BLOCK_BYTES} bytes, got {given}")]
+    BatchTooShort {
+        /// Number of blocks that were given.
+        given: usize,
+        /// Number of blocks that the layout needs.
+        needed: usize,
+    },
+}

@@ -1,0 +1,239 @@
+//! The environments of a pool, which are all of one family.
+
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
+use std::sync::Arc;
+
+use serde_json::Value as Json;
+
+use super::autoreset::Autoreset;
+use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
+use super::division::EnvRange;
+use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame};
+use super::env_slot::EnvSlot;
+use super::error::PoolError;
+use super::seeding::{Seeding, Seeds, Unseeded};
+use super::snapshot::{Saved, SnapshotError};
+use super::threads::Threads;
+use crate::batch::BatchMut;
+use crate::envs::{EnvSpec, Environment, ParameterError, ResetParameters, view};
+
+/// The means for writing a batch.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct WriteContext<'a> {
+    pub threads: &'a Threads,
+    /// Index of the buffer's drawn scenes.
+    pub buffer: usize,
+    pub draw: DrawSettings,
+}
+
+/// The environments of a pool, of any family: one virtual call for a whole batch.
+pub(super) trait EnvSlots: Send + Sync {
+    /// Steps all environments.
+    fn step(
+        &mut self,
+        context: WriteContext<'_>,
+        autoreset: Autoreset,
+        actions: &[i32],
+        out: BatchMut<'_>,
+    ) -> Result<(), WrongFrame>;
+
+    /// Resets environments as `request` says and writes every environment's row.
+    fn reset(
+        &mut self,
+        context: WriteContext<'_>,
+        request: ResetRequest<'_>,
+        out: BatchMut<'_>,
+    ) -> Result<(), WrongFrame>;
+
+    /// Sets other reset parameters for the environments that `request` resets, from their next episode on.
+    fn set_options(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError>;
+
+    /// The whole state of one environment.
+    fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError>;
+
+    /// Replaces one environment's state by a snapshot's.
+    fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError>;
+
+    /// Draws one environment's ground-truth view.
+    fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
+}
+
+/// The environments of a pool, all of one family.
+pub(super) struct FamilySlots<E: Environment> {
+    slots: Vec<EnvSlot<E>>,
+    /// For each buffer, the scenes that were last drawn into its frames.
+    drawn: Vec<Vec<DrawnScene<E>>>,
+    /// Frames in an observation.
+    stack: usize,
+    spec: &'static EnvSpec,
+    variant: E::Variant,
+}
+
+/// Makes the environments of one family; those with the same options share their assets.
+pub(super) fn family_slots<E: Environment>(
+    spec: &'static EnvSpec,
+    variant: E::Variant,
+    config: &PoolConfig,
+    unseeded: Unseeded,
+) -> Result<FamilySlots<E>, PoolError> {
+    // The options of an environment, and what is made from them.
+    let make = |given: &OptionMap| -> Result<(Arc<OptionMap>, Arc<E::Assets>), ParameterError> {
+        let parameters = ResetParameters::new(spec.id, spec.parameters, given)?;
+        Ok((Arc::new(given.clone()), Arc::new(E::assets(variant, &parameters))))
+    };
+    let made: Vec<_> = match &config.options {
+        ResetOptions::Shared(given) => vec![make(given)?; config.num_envs],
+        ResetOptions::Each(each) if each.len() == config.num_envs => {
+            let mut known = HashMap::new();
+            each.iter()
+                .enumerate()
+                .map(|(env, given)| match known.entry(Json::from(given.clone()).to_string()) {
+                    Entry::Occupied(entry) => Ok(Clone::clone(entry.get())),
+                    Entry::Vacant(entry) => make(given)
+                        .map(|made| Clone::clone(entry.insert(made)))
+                        .map_err(|source| PoolError::ParametersOf { env, source }),
+                })
+                .collect::<Result<_, _>>()?
+        }
+        ResetOptions::Each(each) => {
+            return Err(PoolError::OptionsCount { given: each.len(), num_envs: config.num_envs });
+        }
+    };
+    let list: Arc<[u64]> = match &config.seeding {
+        Seeding::List(seeds) => seeds.as_slice().into(),
+        _ => [].into(),
+    };
+    let stack = config.frames.unwrap_or_default().stack;
+    let slots = made.into_iter().enumerate().map(|(env, (options, assets))| {
+        let number = config.first_env + env;
+        let seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack)
+    });
+    Ok(FamilySlots { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
+}
+
+impl<E: Environment> FamilySlots<E> {
+    /// Writes all rows. `play` gets an environment's number, the environment, and the rows that its own is number `row` of, and
+    /// writes everything but the frames.
+    fn write(
+        &mut self,
+        context: WriteContext<'_>,
+        out: BatchMut<'_>,
+        play: impl Fn(usize, &mut EnvSlot<E>, &mut BatchMut<'_>, usize) + Sync,
+    ) -> Result<(), WrongFrame> {
+        while self.drawn.len() <= context.buffer {
+            self.drawn.push((0..self.slots.len() * self.stack).map(|_| DrawnScene::unknown()).collect());
+        }
+        let (stack, drawn) = (self.stack, &mut self.drawn[context.buffer]);
+        let all = EnvRange { first: 0, slots: &mut self.slots, drawn, stack, out };
+        all.for_each_piece(context.threads, |piece| {
+            let EnvRange { first, slots, drawn, mut out, .. } = piece;
+            for (row, (slot, drawn)) in slots.iter_mut().zip(drawn.chunks_exact_mut(stack)).enumerate() {
+                play(first + row, slot, &mut out, row);
+                let frames = out.observation.row(row);
+                if !frames.is_empty() {
+                    let outcome = slot.draw(drawn, context.draw, frames);
+                    outcome.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// The assets for these options: those of an environment that has the same, or new ones.
+    fn with_options(&self, options: &OptionMap) -> Result<(Arc<E::Assets>, Arc<OptionMap>), ParameterError> {
+        if let Some(slot) = self.slots.iter().find(|slot| *slot.options == *options) {
+            return Ok((Arc::clone(&slot.assets), Arc::clone(&slot.options)));
+        }
+        let parameters = ResetParameters::new(self.spec.id, self.spec.parameters, options)?;
+        Ok((Arc::new(E::assets(self.variant, &parameters)), Arc::new(options.clone())))
+    }
+}
+
+impl<E: Environment> EnvSlots for FamilySlots<E> {
+    fn step(
+        &mut self,
+        context: WriteContext<'_>,
+        autoreset: Autoreset,
+        actions: &[i32],
+        out: BatchMut<'_>,
+    ) -> Result<(), WrongFrame> {
+        let branches = self.spec.action_space.branches().len();
+        self.write(context, out, |env, slot, out, row| {
+            slot.step(autoreset, context.draw, &actions[env * branches..][..branches], out, row);
+        })
+    }
+
+    fn reset(
+        &mut self,
+        context: WriteContext<'_>,
+        request: ResetRequest<'_>,
+        out: BatchMut<'_>,
+    ) -> Result<(), WrongFrame> {
+        self.write(context, out, |env, slot, out, row| {
+            match request {
+                ResetRequest::All => slot.start_episode(None),
+                ResetRequest::Seed(seed) => slot.start_episode(Some(seed.wrapping_add(env as u64))),
+                ResetRequest::Each { reset, seed } => match reset[env] {
+                    0 => {}
+                    1 => slot.start_episode(None),
+                    _ => slot.start_episode(Some(seed[env])),
+                },
+            }
+            slot.write_start(out, row);
+        })
+    }
+
+    fn set_options(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError> {
+        let (assets, options) = self.with_options(options)?;
+        for (env, slot) in self.slots.iter_mut().enumerate() {
+            if request.resets(env) {
+                slot.assets = Arc::clone(&assets);
+                slot.options = Arc::clone(&options);
+            }
+        }
+        Ok(())
+    }
+
+    fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
+        let slot = &self.slots[env];
+        // The state is borrowed when it is saved and owned when it is restored; its encoding is the same.
+        Saved {
+            id: self.spec.id.to_owned(),
+            options: Json::from(OptionMap::clone(&slot.options)).to_string(),
+            random: slot.random.clone(),
+            seeds: slot.seeds.save(),
+            episode_return: slot.episode_return,
+            episode_length: slot.episode_length,
+            ended: slot.ended,
+            state: slot.env.state(),
+        }
+        .to_bytes()
+    }
+
+    fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
+        let saved = Saved::<E::State>::from_bytes(snapshot)?;
+        if saved.id != self.spec.id {
+            return Err(SnapshotError::OtherEnvironment { given: saved.id, expected: self.spec.id });
+        }
+        let options: OptionMap =
+            serde_json::from_str(&saved.options).map_err(|error| SnapshotError::Content(error.to_string()))?;
+        let (assets, options) = self.with_options(&options)?;
+        let slot = &mut self.slots[env];
+        slot.env.restore(&assets, saved.state)?;
+        slot.frame_stack.restart(|| slot.env.scene());
+        slot.assets = assets;
+        slot.options = options;
+        slot.random = saved.random;
+        slot.seeds.restore(saved.seeds);
+        slot.episode_return = saved.episode_return;
+        slot.episode_length = saved.episode_length;
+        slot.ended = saved.ended;
+        Ok(())
+    }
+
+    fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
+        view::ground_truth_view(&mut self.slots[env].env, out);
+    }
+}

@@ -1,0 +1,256 @@
+//! The pool: environments, threads, and the buffers that they write into.
+
+use super::autoreset::Autoreset;
+use super::buffers::Buffers;
+use super::config::{OptionMap, PoolConfig, ResetRequest};
+use super::drawn_scene::{DrawSettings, WrongFrame};
+use super::error::PoolError;
+use super::family_slots::{EnvSlots, WriteContext, family_slots};
+use super::seeding::Unseeded;
+use super::snapshot::SnapshotError;
+use super::threads::Threads;
+use crate::batch::{BatchMut, Block, Layout, batch_layout};
+use crate::envs::mortar_mayhem::MortarMayhem;
+use crate::envs::mystery_path::MysteryPath;
+use crate::envs::searing_spotlights::SearingSpotlights;
+use crate::envs::view::VIEW_BYTES;
+use crate::envs::{self, EnvSpec, Family};
+use crate::raster::PixelFormat;
+
+/// Environments of one id in lockstep.
+///
+/// Every call that advances the environments writes a batch, whose memory the caller gives: [`Layout::blocks`] blocks. The same
+/// memory may be given again, also after others, in which case only changed pixels are written.
+///
+/// ```
+/// use endless_gym_core::batch::{Batch, zeroed};
+/// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+///
+/// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 8), &Threads::new(1)?)?;
+/// let mut blocks = zeroed(pool.layout().blocks());
+/// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
+///
+/// let actions = vec![0; 8 * pool.spec().action_space.branches().len()];
+/// for _ in 0..10 {
+///     pool.step(&actions, &mut blocks)?;
+/// }
+/// let batch = Batch::new(pool.layout(), &blocks);
+/// assert_eq!(batch.episode_length(), [10; 8]);
+/// assert_eq!(batch.observation().len(), 8 * 84 * 84 * 3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Pool {
+    spec: &'static EnvSpec,
+    layout: Layout,
+    slots: Box<dyn EnvSlots>,
+    buffers: Buffers,
+    format: PixelFormat,
+    check_drawing: bool,
+    autoreset: Autoreset,
+    threads: Threads,
+    first_env: usize,
+    was_reset: bool,
+}
+
+impl Pool {
+    /// Makes the environments. [`reset`](Pool::reset) starts their first episodes.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError`] if the id is unknown, or a reset parameter or a number of `config` is out of its range.
+    pub fn new(config: &PoolConfig, threads: &Threads) -> Result<Self, PoolError> {
+        let spec = envs::spec(&config.id)?;
+        config.check()?;
+        let layout = batch_layout(spec, config.num_envs, config.contents())?;
+        let unseeded = Unseeded::draw(&config.seeding)?;
+        let slots: Box<dyn EnvSlots> = match spec.family {
+            Family::MortarMayhem(variant) => Box::new(family_slots::<MortarMayhem>(spec, variant, config, unseeded)?),
+            Family::MysteryPath(variant) => Box::new(family_slots::<MysteryPath>(spec, variant, config, unseeded)?),
+            Family::SearingSpotlights(variant) => {
+                Box::new(family_slots::<SearingSpotlights>(spec, variant, config, unseeded)?)
+            }
+        };
+        Ok(Pool {
+            spec,
+            layout,
+            slots,
+            buffers: Buffers::new(unseeded.identity()),
+            format: config.frames.unwrap_or_default().format,
+            check_drawing: config.check_drawing,
+            autoreset: config.autoreset,
+            threads: threads.clone(),
+            first_env: config.first_env,
+            was_reset: false,
+        })
+    }
+
+    /// The specification of the environment id.
+    pub fn spec(&self) -> &'static EnvSpec {
+        self.spec
+    }
+
+    /// The layout of this pool's batches.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Starts episodes and writes every environment's row: the current observation, a reward of 0, no flag.
+    ///
+    /// # Errors
+    ///
+    /// As [`reset_with`](Pool::reset_with).
+    pub fn reset(&mut self, request: ResetRequest<'_>, batch: &mut [Block]) -> Result<(), PoolError> {
+        self.reset_with(request, None, batch)
+    }
+
+    /// As [`reset`](Pool::reset), with other reset parameters: the environments that start an episode play it and all later ones
+    /// with `options`, by the original's names, and the defaults for the rest. `None` keeps each environment's own.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError`] if `request` has a wrong number of flags or seeds, if the first reset leaves environments out, if an option
+    /// is not valid, or if `batch` is too short. No environment has changed then. [`PoolError::WrongFrame`] is an exception, see
+    /// there.
+    pub fn reset_with(
+        &mut self,
+        request: ResetRequest<'_>,
+        options: Option<&OptionMap>,
+        batch: &mut [Block],
+    ) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        let request = match request {
+            ResetRequest::Seed(seed) => ResetRequest::Seed(seed.wrapping_add(self.first_env as u64)),
+            other => other,
+        };
+        match request {
+            ResetRequest::Each { reset, seed } if reset.len() != num_envs || seed.len() != num_envs => {
+                return Err(PoolError::ResetCount { flags: reset.len(), seeds: seed.len(), num_envs });
+            }
+            ResetRequest::Each { reset, .. } if !self.was_reset && reset.contains(&0) => {
+                return Err(PoolError::NotReset);
+            }
+            _ => {}
+        }
+        self.check_batch(batch)?;
+        if let Some(options) = options {
+            // After all other checks, so that an error changes no environment.
+            self.slots.set_options(request, options)?;
+        }
+        self.write(batch, |slots, context, out| slots.reset(context, request, out))?;
+        self.was_reset = true;
+        Ok(())
+    }
+
+    /// Plays one step of every environment. `actions` has `num_envs` rows of one number for each branch of the action space.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError`] if the environments were not reset yet, if `actions` has a wrong length or a number out of range, or if
+    /// `batch` is too short. No environment has advanced then. [`PoolError::WrongFrame`] is an exception, see there.
+    pub fn step(&mut self, actions: &[i32], batch: &mut [Block]) -> Result<(), PoolError> {
+        if !self.was_reset {
+            return Err(PoolError::NotReset);
+        }
+        self.spec.action_space.check(self.layout.num_envs(), actions)?;
+        let autoreset = self.autoreset;
+        self.write(batch, |slots, context, out| slots.step(context, autoreset, actions, out))
+    }
+
+    /// The error of a batch that is too short.
+    fn check_batch(&self, batch: &[Block]) -> Result<(), PoolError> {
+        let (given, needed) = (batch.len(), self.layout.blocks());
+        if given < needed { Err(PoolError::BatchTooShort { given, needed }) } else { Ok(()) }
+    }
+
+    /// Calls `write` with the batch's rows, between removing the buffer's generation stamp and setting the new one.
+    fn write(
+        &mut self,
+        batch: &mut [Block],
+        write: impl FnOnce(&mut dyn EnvSlots, WriteContext<'_>, BatchMut<'_>) -> Result<(), WrongFrame>,
+    ) -> Result<(), PoolError> {
+        self.check_batch(batch)?;
+        let buffer = self.buffers.begin(&self.layout, batch);
+        let draw = DrawSettings { current: buffer.current, format: self.format, check: self.check_drawing };
+        let context = WriteContext { threads: &self.threads, buffer: buffer.index, draw };
+        let (given, needed) = (batch.len(), self.layout.blocks());
+        let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
+        write(&mut *self.slots, context, out)?;
+        self.buffers.finish(buffer, &self.layout, batch);
+        Ok(())
+    }
+
+    /// Writes every environment's row without starting an episode: the current observation, a reward of 0, no flag.
+    ///
+    /// # Errors
+    ///
+    /// As [`reset`](Pool::reset).
+    pub fn observe(&mut self, batch: &mut [Block]) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        self.reset(ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] }, batch)
+    }
+
+    /// The whole state of one environment, its generator included, for [`restore`](Pool::restore).
+    ///
+    /// # Errors
+    ///
+    /// [`SnapshotError::NoSuchEnvironment`] or [`SnapshotError::NotReset`].
+    ///
+    /// ```
+    /// # use endless_gym_core::batch::{Batch, zeroed};
+    /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    /// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-v0", 2), &Threads::new(1)?)?;
+    /// let mut blocks = zeroed(pool.layout().blocks());
+    /// pool.reset(ResetRequest::Seed(3), &mut blocks)?;
+    /// let snapshot = pool.snapshot(0)?;
+    ///
+    /// pool.step(&[1, 0, 2, 2], &mut blocks)?;
+    /// let expected = Batch::new(pool.layout(), &blocks).observation()[..84 * 84 * 3].to_vec();
+    ///
+    /// // Environment 1 continues as environment 0 did.
+    /// pool.restore(1, &snapshot)?;
+    /// pool.step(&[0, 0, 1, 0], &mut blocks)?;
+    /// assert_eq!(Batch::new(pool.layout(), &blocks).observation()[84 * 84 * 3..], expected);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
+        self.check_env(env)?;
+        if self.was_reset { self.slots.snapshot(env) } else { Err(SnapshotError::NotReset) }
+    }
+
+    /// Puts an environment into the state of a snapshot of the same environment id, which may come from another pool with other
+    /// reset parameters. The episode continues identically. [`observe`](Pool::observe) writes its observation.
+    ///
+    /// The seeds of later episodes are the snapshot's too if both pools have the same kind of [`Seeding`](super::Seeding). An
+    /// observation of several frames repeats the snapshot's frame, as at the start of an episode.
+    ///
+    /// # Errors
+    ///
+    /// [`SnapshotError`] if there is no such environment or if `snapshot` is not a valid one of this environment id. The
+    /// environment has not changed then.
+    pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
+        self.check_env(env)?;
+        self.slots.restore(env, snapshot)
+    }
+
+    fn check_env(&self, env: usize) -> Result<(), SnapshotError> {
+        let num_envs = self.layout.num_envs();
+        if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnvironment { given: env, num_envs }) }
+    }
+
+    /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,
+    /// indexed \[row\]\[column\]\[channel\]. `out` must have [`VIEW_BYTES`] bytes.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`], [`PoolError::NoSuchEnv`] or [`PoolError::ViewSize`].
+    pub fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => return Err(PoolError::NotReset),
+            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ if out.len() != VIEW_BYTES => return Err(PoolError::ViewSize { given: out.len() }),
+            _ => self.slots.ground_truth_view(env, out),
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,4 @@
+//! Colours.
+
+/// A colour: red, green, blue.
+pub type Rgb = [u8; 3];

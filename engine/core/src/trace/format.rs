@@ -1,0 +1,115 @@
+//! The format of recorded episodes.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use flate2::read::GzDecoder;
+use serde::Deserialize;
+use serde_json::{Map, Value as Json};
+use thiserror::Error;
+
+use crate::pool::PoolError;
+
+/// One recorded environment object.
+#[derive(Debug, Deserialize)]
+pub struct Trace {
+    /// Environment id.
+    pub env: String,
+    /// Reset parameters that were given.
+    pub options: Map<String, Json>,
+    /// The episodes in the order in which they were played.
+    pub episodes: Vec<Episode>,
+}
+
+/// One recorded episode.
+#[derive(Debug, Deserialize)]
+pub struct Episode {
+    /// Seed of the reset; `None` continues the generator of the episode before.
+    pub seed: Option<u64>,
+    /// CRC-32 of the first observation.
+    pub reset_crc: u32,
+    /// The reset's info.
+    pub reset_info: Map<String, Json>,
+    /// The first vector observation; empty where there is none.
+    #[serde(default)]
+    pub reset_vector: Vec<f32>,
+    /// The steps from the first to the last.
+    pub steps: Vec<Step>,
+}
+
+/// One recorded step.
+#[derive(Debug, Deserialize)]
+#[serde(from = "StepFields")]
+pub struct Step {
+    /// One number for each branch of the action space.
+    pub action: Vec<i32>,
+    /// The reward.
+    pub reward: f64,
+    /// Whether the step ended the episode.
+    pub done: bool,
+    /// CRC-32 of the observation.
+    pub crc: u32,
+    /// The step's info.
+    pub info: Map<String, Json>,
+    /// CRC-32 of the ground-truth view, where it was recorded.
+    pub render_crc: Option<u32>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Action {
+    One(i32),
+    Several(Vec<i32>),
+}
+
+type StepWithoutRender = (Action, f64, bool, u32, Map<String, Json>);
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum StepFields {
+    Plain(StepWithoutRender),
+    Rendered(Action, f64, bool, u32, Map<String, Json>, u32),
+}
+
+impl From<StepFields> for Step {
+    fn from(fields: StepFields) -> Self {
+        let ((action, reward, done, crc, info), render_crc) = match fields {
+            StepFields::Plain(fields) => (fields, None),
+            StepFields::Rendered(action, reward, done, crc, info, render) => {
+                ((action, reward, done, crc, info), Some(render))
+            }
+        };
+        let action = match action {
+            Action::One(action) => vec![action],
+            Action::Several(action) => action,
+        };
+        Step { action, reward, done, crc, info, render_crc }
+    }
+}
+
+impl Trace {
+    /// Reads a trace file, gzipped JSON.
+    ///
+    /// # Errors
+    ///
+    /// [`TraceError::Open`] or [`TraceError::Format`].
+    pub fn open(path: &Path) -> Result<Self, TraceError> {
+        let file = File::open(path).map_err(TraceError::Open)?;
+        serde_json::from_reader(BufReader::new(GzDecoder::new(file))).map_err(TraceError::Format)
+    }
+}
+
+/// A trace that cannot be read or replayed.
+#[derive(Debug, Error)]
+pub enum TraceError {
+    /// The file cannot be opened.
+    #[error("the trace cannot be opened: {0}")]
+    Open(std::io::Error),
+    /// The file's content is not a trace.
+    #[error("the file must be a trace (gzipped JSON): {0}")]
+    Format(serde_json::Error),
+    /// The environment does not exist, or the recorded reset parameters or actions are not valid.
+    #[error(transparent)]
+    Pool(#[from] PoolError),
+}
