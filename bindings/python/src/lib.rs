@@ -12,7 +12,6 @@ mod pool;
 mod single;
 
 use std::ffi::OsString;
-use std::process::ExitCode;
 
 use endless_gym::envs;
 use pyo3::exceptions::PyRuntimeError;
@@ -28,7 +27,7 @@ fn specs() -> PyResult<String> {
 /// Runs the program `endless` and returns its exit status. `itself` is the command that starts it anew.
 #[pyfunction]
 fn endless(py: Python<'_>, arguments: Vec<OsString>, itself: Vec<OsString>) -> u8 {
-    py.detach(|| u8::from(endless_gym::cli::main(arguments, &itself) != ExitCode::SUCCESS))
+    py.detach(|| endless_gym::cli::main(arguments, &itself))
 }
 
 #[pymodule(name = "_native")]

@@ -1,4 +1,6 @@
-//! Options that several commands share.
+//! Arguments that several commands share.
+
+use std::time::Duration;
 
 use clap::ValueEnum;
 use endless_gym_core::batch::Frames;
@@ -8,39 +10,39 @@ use serde_json::{Map, Value as Json};
 
 use super::Failure;
 
-/// Auto-reset modes by Gymnasium's names.
+/// Gymnasium's auto-reset modes.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub enum AutoresetMode {
-    /// Start the next episode in the step after one ended.
+    /// The step after the one that ends an episode starts the next.
     NextStep,
-    /// Start it in the same step.
+    /// The step that ends an episode also starts the next.
     SameStep,
-    /// Wait for the trainer to reset.
+    /// The trainer resets environments whose episode has ended.
     Disabled,
 }
 
-/// What the frames are like.
+/// The format of frames.
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub struct FrameArgs {
-    /// Leave the frames out, and draw nothing.
+    /// Write no frames, and draw nothing [default: RGB frames, uint8 (84, 84, 3), indexed [x][y][channel]].
     #[arg(long, conflicts_with_all = ["grayscale", "channels_first", "row_major", "frame_stack"])]
     no_frames: bool,
-    /// Frames of brightness instead of colours, without an index for the channel.
+    /// Grayscale frames without a channel axis [default: RGB].
     #[arg(long)]
     grayscale: bool,
-    /// Frames with the channel as their first index.
+    /// Frames with the channel as the first axis [default: the last axis].
     #[arg(long)]
     channels_first: bool,
-    /// Frames indexed [row][column] instead of [x][y].
+    /// Frames indexed [row][column] [default: [x][y]].
     #[arg(long)]
     row_major: bool,
-    /// The last N frames of the episode as one observation, oldest first.
+    /// Stack the last N frames of the episode in one observation, oldest first: 1 to 64.
     #[arg(long, value_name = "N", default_value_t = 1)]
     frame_stack: usize,
 }
 
 impl FrameArgs {
-    /// What the batch is to have.
+    /// The frames of a batch; `None` for none.
     pub fn frames(self) -> Option<Frames> {
         let FrameArgs { no_frames, grayscale, channels_first, row_major, frame_stack } = self;
         let format = PixelFormat { grayscale, channels_first, row_major };
@@ -48,26 +50,28 @@ impl FrameArgs {
     }
 }
 
-/// What the environments are like.
+/// Reset parameters and seeds.
 #[derive(clap::Args, Clone, Debug)]
 pub struct EnvironmentArgs {
-    /// Reset parameter of all environments, such as `arena_size=6` or `command_count=[5,10]`; may be given several times.
+    /// Reset parameter of all environments, such as `arena_size=6` or `command_count=[5,10]`; may be repeated [default: the
+    /// environment's own, which `endless list ID` shows].
     #[arg(long = "option", value_name = "NAME=VALUE")]
     options: Vec<String>,
-    /// Reset parameters of one environment as a JSON object; given once for each environment of all groups, in their order.
+    /// Reset parameters of one environment as a JSON object; repeated for every environment of all groups, in order.
     #[arg(long, value_name = "JSON", conflicts_with = "options")]
     env_options: Vec<String>,
-    /// Seed: environment i starts with SEED + i. From the system's entropy if left out.
+    /// Seed: environment i, counted over all groups, is seeded with SEED + i [default: entropy of the operating system].
     #[arg(long)]
     seed: Option<u64>,
-    /// Draw each episode's seed from START..END (END excluded), as the paper's training does from 0..100000.
+    /// Draw the seed of each episode from START to END - 1, as the training in the paper does from 0..100000.
     #[arg(long, value_name = "START..END", value_parser = seed_range)]
     seed_range: Option<(u64, u64)>,
-    /// Play these seeds in turn, and again from the start.
+    /// Seeds of the episodes, in turn, repeated from the start.
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
 }
 
+/// Parses `START..END`.
 fn seed_range(text: &str) -> Result<(u64, u64), String> {
     let (start, end) = text.split_once("..").ok_or("expected START..END")?;
     let number = |text: &str| text.parse::<u64>().map_err(|error| format!("`{text}`: {error}"));
@@ -75,7 +79,7 @@ fn seed_range(text: &str) -> Result<(u64, u64), String> {
 }
 
 impl EnvironmentArgs {
-    /// The arguments that say the same to another `endless`.
+    /// These arguments as text, for another process.
     pub fn arguments(&self) -> Vec<String> {
         let mut arguments: Vec<String> =
             self.options.iter().flat_map(|option| ["--option".to_owned(), option.clone()]).collect();
@@ -89,14 +93,14 @@ impl EnvironmentArgs {
         arguments
     }
 
-    /// A pool's configuration with these options.
+    /// The configuration of a pool with these arguments.
     pub fn configure(&self, id: &str, num_envs: usize) -> Result<PoolConfig, Failure> {
         let mut options = Map::new();
         for option in &self.options {
             let (name, value) = option
                 .split_once('=')
                 .ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
-            // What is no JSON is passed on as text, so that the check of the parameter says what it should be.
+            // Text that is not JSON is passed on as a string; the parameter's own check then reports the allowed values.
             let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
             options.insert(name.to_owned(), value);
         }
@@ -122,5 +126,13 @@ impl From<AutoresetMode> for Autoreset {
             AutoresetMode::SameStep => Autoreset::SameStep,
             AutoresetMode::Disabled => Autoreset::Disabled,
         }
+    }
+}
+
+/// The duration that `--seconds` gives.
+pub fn seconds(given: f64) -> Result<Duration, Failure> {
+    match Duration::try_from_secs_f64(given) {
+        Ok(duration) if given > 0.0 => Ok(duration),
+        _ => Err(format!("--seconds must be finite and positive, got {given}").into()),
     }
 }
