@@ -222,6 +222,7 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["serve", "--num-envs", "2", "--env-options", "{}"], "1 "),
         (vec!["serve", "--num-envs", "0"], "0 environments"),
         (vec!["serve", "--groups", "0"], "0 groups"),
+        (vec!["serve", "--num-envs", "9223372036854775808", "--groups", "4"], "9223372036854775808"),
         (vec!["serve", "--service", "a/b"], "`a/b` cannot name an engine"),
         (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["demo", "--num-envs", "0"], "0 environments"),

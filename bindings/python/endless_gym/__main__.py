@@ -1,4 +1,4 @@
-"""`python -m endless_gym`: the environments, and how fast they are on this machine."""
+"""Measure the steps per second of all environments on this machine."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from endless_gym import EndlessVectorEnv
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m endless_gym", description=__doc__)
-    parser.add_argument("--num-envs", type=int, default=256, help="environments (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=0.5, help="for each measurement (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--num-envs", type=int, default=256, help="number of environments (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=0.5, help="seconds of each measurement (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print JSON (default: a table)")
     arguments = parser.parse_args()
     rows = []
     if not arguments.json:

@@ -1,4 +1,4 @@
-"""The engine, as the native module offers it; the package wraps it."""
+"""Types of the native module, which the package wraps."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,13 +8,18 @@ from numpy.typing import NDArray
 
 __version__: str
 
+# Most environments in a group, and most groups.
+MAX_ENVS: int
+MAX_GROUPS: int
+
 class EngineLost(ConnectionError):
-    """The engine has ended, or was replaced by another one."""
+    """The engine has ended, or has been replaced by another engine."""
 
 class TooManyBatchesHeld(BufferError):
-    """All batches that the engine can lend are held by arrays of this process."""
+    """Arrays of this process hold all batches that the engine can lend."""
 
-# All environments with the seed `s + i`, or for each environment 0, 1 or 2 and a seed.
+# A seed `s`: environment `i` is reset with `s + i`. Or a mask and seeds, one of each per environment: 0 does not reset, 1 starts
+# the next episode, 2 starts one with the seed.
 Reset = int | tuple[Sequence[int], Sequence[int]]
 Arrays = tuple[NDArray[Any], ...]
 SingleArrays = tuple[NDArray[np.uint8], NDArray[np.float32] | None, NDArray[np.float64] | None]
@@ -25,6 +30,7 @@ class Pool:
         id: str,
         num_envs: int,
         *,
+        group: int,
         first_env: int,
         total_envs: int,
         threads: Threads,
@@ -40,6 +46,9 @@ class Pool:
     def sections(self) -> list[str]: ...
     def reset(self, request: Reset | None = None, options: str | None = None) -> Arrays: ...
     def step(self, actions: Any) -> Arrays: ...
+    def send(self, actions: Any) -> None: ...
+    def send_reset(self, request: Reset | None = None, options: str | None = None) -> None: ...
+    def receive(self) -> Arrays: ...
     def snapshot(self, env: int) -> bytes: ...
     def restore(self, env: int, snapshot: bytes) -> None: ...
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]: ...
@@ -67,7 +76,9 @@ class Connection:
     def reconnect(self, timeout: float) -> None: ...
 
 def running_engines() -> list[str]: ...
-def dlpack(array: NDArray[Any]) -> Any: ...
+def segment_prefix() -> str: ...
+def dlpack(array: NDArray[Any], read_only_flag: bool) -> Any: ...
+def dlpack_unchecked(array: NDArray[Any]) -> Any: ...
 def ended_episodes(
     ended: NDArray[np.bool_],
     episode_return: NDArray[np.float64],
@@ -75,6 +86,8 @@ def ended_episodes(
     info: NDArray[np.float64],
     integers: Sequence[bool],
     seconds: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64], list[NDArray[Any]]] | None: ...
-def endless(arguments: Sequence[str], itself: Sequence[str]) -> int: ...
+) -> (
+    tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.int32], NDArray[np.float64], list[NDArray[Any]]] | None
+): ...
+def endless(arguments: Sequence[str], executable: Sequence[str]) -> int: ...
 def specs() -> str: ...

@@ -1,4 +1,4 @@
-"""One environment, as the original's class."""
+"""One environment with the interface of the original's class."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from endless_gym import _native
+from endless_gym.arguments import integer
 from endless_gym.specs import options_text, spec
 
 Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
 
-#: Environments whose ground truth the original makes of integers.
+#: Ids whose ground truth is an integer array in the original.
 _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
 #: Side of the ground-truth view in pixels.
@@ -23,16 +24,19 @@ _VIEW = 336
 
 
 class Env(gymnasium.Env[Any, Any]):
-    """A Memory Gym environment: observations, rewards, flags and infos equal the original's byte for byte.
+    """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 
-    Observations are uint8 (84, 84, 3), indexed [x][y][channel] as the original returns them; the ids with `MortarMayhemB`
-    return a dict of `visual_observation` and `vector_observation` (float32 (180,)).
+    Observations are uint8 (84, 84, 3), indexed [x][y][channel] as in the original; the ids with `MortarMayhemB` return a dict of
+    `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
-        render_mode: What `render` returns: `rgb_array` the frame as uint8 (84, 84, 3), `debug_rgb_array` the ground-truth view
-            as uint8 (336, 336, 3), both indexed [row][column][channel]. `human` shows that view in a window (needs pygame).
-        options: Reset parameters for every episode; those that `reset` is given are laid over them.
+        render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
+            (336, 336, 3); both indexed [row][column][channel]. `human`: every step shows that view in a window (needs pygame).
+        options: Reset parameters for every episode. Options of `reset` override them.
+
+    Raises:
+        ValueError: The id or the render mode is unknown, or a reset parameter is unknown or out of its range.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
@@ -43,7 +47,8 @@ class Env(gymnasium.Env[Any, Any]):
     def __init__(self, id: str, render_mode: str | None = None, options: dict[str, Any] | None = None) -> None:
         self._spec = spec(id)
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"no render mode `{render_mode}`; there are {', '.join(self.metadata['render_modes'])}")
+            known = ", ".join(self.metadata["render_modes"])
+            raise ValueError(f"render_mode must be None or one of {known}, got {render_mode!r}")
         # The frame rate differs from id to id.
         self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
         self.render_mode = render_mode
@@ -64,7 +69,7 @@ class Env(gymnasium.Env[Any, Any]):
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which an episode ends, by the current reset parameters; -1 for none. As in the original."""
+        """The step limit of an episode with the current reset parameters, as in the original; -1 for none."""
         return self._spec.max_episode_steps(self.reset_params)
 
     def reset(
@@ -73,12 +78,13 @@ class Env(gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: Seeds the environment as numpy's `default_rng` does. `None` goes on with its generator.
-            options: Reset parameters by the original's names. `None` stands for those given to the constructor.
+            seed: Seed of the environment's generator, as of numpy's `default_rng`. `None` continues the generator.
+            options: Reset parameters by the original's names, which override those given to the constructor.
 
         Raises:
-            ValueError: A reset parameter is unknown or out of its range.
+            ValueError: The seed is out of its range, or a reset parameter is unknown or out of its range.
         """
+        seed = None if seed is None else integer("seed", seed)
         super().reset(seed=seed)
         given = {**self._options, **(options or {})}
         arrays = self._native.reset(seed, options_text(given))
@@ -91,7 +97,13 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), self._info(arrays)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Play one step. As in the original, every end of an episode is reported as `terminated`, also by the step limit."""
+        """Play one step. As in the original, `terminated` reports every end of an episode, also by the step limit.
+
+        Raises:
+            ResetNeeded: The environment has not been reset.
+            TypeError: The action is no integer or sequence of integers.
+            ValueError: The action is out of its range.
+        """
         if not self._was_reset:
             raise ResetNeeded("call `env.reset()` before `env.step()`")
         arrays, reward, terminated, end = self._native.step(action)
@@ -106,7 +118,7 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), reward, terminated, False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The current picture in the render mode; `None` where it is shown in a window or no mode was given."""
+        """The current frame or view of the render mode; `None` for `human` and without a render mode."""
         if self.render_mode == "rgb_array":
             return self._native.rgb_array()
         if self.render_mode == "debug_rgb_array":

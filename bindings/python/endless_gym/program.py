@@ -1,18 +1,18 @@
-"""The program `endless`, as the package brings it along."""
+"""The program `endless` of this package."""
 
 import sys
 
 from endless_gym import _native
 
-# Loads the native module from its file, without the package around it, which takes numpy and Gymnasium along.
+# Loads the native module from its file, so that neither this package nor numpy and Gymnasium are imported.
 _PROGRAM = """
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 spec = spec_from_file_location("_native", sys.argv[1])
 native = module_from_spec(spec)
 spec.loader.exec_module(native)
-itself = [sys.executable, "-I", "-S", "-c", sys.orig_argv[sys.orig_argv.index("-c") + 1], sys.argv[1]]
-sys.exit(native.endless(sys.argv[2:], itself))
+executable = [sys.executable, "-I", "-S", "-c", sys.orig_argv[sys.orig_argv.index("-c") + 1], sys.argv[1]]
+sys.exit(native.endless(sys.argv[2:], executable))
 """
 
 
@@ -22,5 +22,5 @@ def program() -> list[str]:
 
 
 def main() -> int:
-    """Runs the program with this process's arguments."""
+    """Run the program with this process's arguments, and return its exit status."""
     return _native.endless(sys.argv[1:], program())

@@ -1,4 +1,4 @@
-"""What is fixed about each environment id: spaces, reset parameters, infos."""
+"""The specification of each environment id: spaces, reset parameters, infos."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ import numpy as np
 from gymnasium import spaces
 
 from endless_gym import _native
+from endless_gym.arguments import integer
 
 SCREEN = 84
 
 
 @dataclass(frozen=True)
 class Frames:
-    """What the frames of an observation look like. The default is the original's: uint8 (84, 84, 3), [x][y][channel].
+    """The format of the frames of an observation. The default is the original's: uint8 (84, 84, 3), indexed [x][y][channel].
 
-    The engine writes them so, with nothing to convert afterwards, and only the pixels that change.
+    The engine writes this format directly, and only the pixels that change. There is no conversion.
     """
 
-    #: Brightness instead of colours, without an index for the channel, as Gymnasium's `GrayscaleObservation`.
+    #: Grayscale without a channel axis, as Gymnasium's `GrayscaleObservation`.
     grayscale: bool = False
-    #: The channel is the first index of a frame, as PyTorch's convolutions want it.
+    #: The channel is the first axis of a frame, as in PyTorch's convolutions.
     channels_first: bool = False
-    #: [row][column] instead of [x][y].
+    #: Indexed [row][column] instead of [x][y].
     row_major: bool = False
-    #: The last frames of the episode in one observation, oldest first, 1 to 64; with more than 1 they are the first index, as in
-    #: Gymnasium's `FrameStackObservation`. An episode's first frame stands for those before it.
+    #: Number of stacked frames, 1 to 64: the last frames of the episode, oldest first, padded with the episode's first frame.
+    #: More than 1 add a leading axis, as Gymnasium's `FrameStackObservation`.
     stack: int = 1
 
     def shape(self) -> tuple[int, ...]:
@@ -41,36 +42,47 @@ class Frames:
         return frame if self.stack == 1 else (self.stack, *frame)
 
     def arguments(self) -> tuple[bool, bool, bool, int]:
-        """As the native module takes it."""
-        return self.grayscale, self.channels_first, self.row_major, self.stack
+        """The native module's argument.
+
+        Raises:
+            ValueError: The stack is negative.
+        """
+        return bool(self.grayscale), bool(self.channels_first), bool(self.row_major), integer("stack", self.stack)
 
     def command(self) -> list[str]:
-        """As `endless serve` takes it."""
+        """The arguments of `endless serve`.
+
+        Raises:
+            ValueError: The stack is negative.
+        """
         flags = {
             "--grayscale": self.grayscale,
             "--channels-first": self.channels_first,
             "--row-major": self.row_major,
         }
-        return [*(flag for flag, given in flags.items() if given), f"--frame-stack={self.stack}"]
+        return [*(flag for flag, given in flags.items() if given), f"--frame-stack={integer('stack', self.stack)}"]
 
     @staticmethod
     def of_specification(described: dict[str, Any] | None) -> Frames | None:
-        """What an engine says that it serves."""
+        """The frames of an engine's specification; `None` for none."""
         return None if described is None else Frames(**described["format"], stack=described["stack"])
 
 
 @dataclass(frozen=True)
 class Spec:
-    """An environment id, as the engine describes it."""
+    """The specification of an environment id."""
 
     id: str
     summary: str
-    #: Choices of each branch; one branch without `multi_discrete` is a Discrete space.
+    #: Number of choices of each branch of the action space.
     branches: tuple[int, ...]
+    #: Whether the action space is MultiDiscrete; otherwise it is Discrete, with one branch.
     multi_discrete: bool
+    #: Length of the vector observation; 0 without one.
     vector_observation: int
+    #: Length of `info["ground_truth"]`; 0 without one.
     ground_truth: int
-    #: Names of the final infos beside `reward` and `length`, and whether the original's number is an int.
+    #: Names of the final infos besides `reward` and `length`, and whether the original's value is an int.
     info: tuple[tuple[str, bool], ...]
     #: Names of the feature observation's columns.
     features: tuple[str, ...]
@@ -96,24 +108,24 @@ class Spec:
         return spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
 
     def max_episode_steps(self, options: Mapping[str, Any]) -> int:
-        """Steps after which an episode with these reset parameters ends; -1 for none. As in the original.
+        """The step limit of an episode with these reset parameters, as in the original; -1 for none.
 
         Raises:
-            ValueError: A reset parameter has no value of its kind.
+            ValueError: A reset parameter has a value of the wrong type.
         """
         parameters = {**self.reset_parameters, **options}
         try:
             if "max_steps" in parameters:
                 return int(parameters["max_steps"])
-            # Mortar Mayhem: clue and execution of the most commands at their slowest.
+            # Mortar Mayhem: the most commands with the longest durations.
             longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
             clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
             execution = longest["explosion_duration"] + longest["explosion_delay"]
             return int((clue + execution) * longest["command_count"] - longest["explosion_duration"] + 1)
         except (KeyError, OverflowError, TypeError, ValueError):
             raise ValueError(
-                f"no episode's length follows from {dict(options)}: `max_steps` is a number, and what tells of commands and "
-                "explosions is a list of numbers"
+                "options must have a number for `max_steps`, and lists of numbers for commands and explosions, "
+                f"got {dict(options)}"
             ) from None
 
     def ground_truth_space(self) -> gymnasium.Space[Any] | None:
@@ -130,33 +142,33 @@ def all_specs() -> dict[str, Spec]:
 
 
 def spec(id: str) -> Spec:
-    """The environment of that id, with or without the prefix `EndlessGym/`.
+    """The specification of an id, with or without the prefix `EndlessGym/`.
 
     Raises:
-        ValueError: There is none; the message lists those that there are.
+        ValueError: There is no such id; the message lists all ids.
     """
     known = all_specs()
     name = id.removeprefix("EndlessGym/")
     if name not in known:
-        raise ValueError(f"no environment `{id}`; there are {', '.join(known)}")
+        raise ValueError(f"id must be one of {', '.join(known)}, got {id!r}")
     return known[name]
 
 
 def options_text(options: Mapping[str, Any] | None) -> str:
-    """Reset parameters as the engine reads them."""
+    """Reset parameters as JSON text."""
     return "{}" if not options else json_text(dict(options))
 
 
 def json_text(value: Any) -> str:
-    """JSON, also of numpy's numbers and arrays."""
+    """JSON text of a value, which may contain numpy's numbers and arrays."""
     return json.dumps(value, default=_plain)
 
 
 def _plain(value: Any) -> Any:
-    """What JSON does not know: numpy's numbers and arrays."""
+    """Numbers and arrays of numpy as Python objects."""
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
-    raise TypeError(f"{value!r} cannot be the value of a reset parameter")
+    raise TypeError(f"reset parameters must be numbers, booleans, strings or lists, got {value!r}")
 
 
 def _spec(described: dict[str, Any]) -> Spec:

@@ -88,7 +88,7 @@ impl EngineConfig {
         let total_envs = num_envs.saturating_mul(self.groups);
         (0..self.groups)
             .map(|group| {
-                let first_env = group * num_envs;
+                let first_env = group.saturating_mul(num_envs);
                 let options = match &self.pool.options {
                     Options::Shared(options) => Options::Shared(options.clone()),
                     Options::Each(each) if each.len() == total_envs => {

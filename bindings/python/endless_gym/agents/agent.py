@@ -29,7 +29,7 @@ from endless_gym.agents.naive import ObserverState, make_observer
 from endless_gym.agents.recurrent import RecurrentMemory
 from endless_gym.agents.settings import Settings
 from endless_gym.agents.transformer import TransformerMemory
-from endless_gym.interop import torch_view
+from endless_gym.interop import unchecked_torch_view
 from endless_gym.specs import Frames, Spec
 
 
@@ -245,7 +245,9 @@ class Agent(nn.Module):
         if not isinstance(observation, Mapping):
             observation = {next(iter(self._keys())): observation}
         return {
-            key: (value if isinstance(value, Tensor) else torch_view(value)).to(self.device, non_blocking=True)
+            key: (value if isinstance(value, Tensor) else unchecked_torch_view(value)).to(
+                self.device, non_blocking=True
+            )
             for key, value in observation.items()
         }
 

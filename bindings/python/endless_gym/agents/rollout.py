@@ -16,7 +16,7 @@ from endless_gym.agents.agent import Agent, AgentMemory
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.encoders import FRAME, Observation
 from endless_gym.agents.environments import Environments, Received
-from endless_gym.interop import torch_view
+from endless_gym.interop import unchecked_torch_view
 
 
 @dataclass
@@ -141,7 +141,7 @@ class Player:
         )
         segment.first[step, columns] = memory.first
         if segment.ground_truth is not None and current.ground_truth is not None:
-            segment.ground_truth[step, columns] = torch_view(current.ground_truth)
+            segment.ground_truth[step, columns] = unchecked_torch_view(current.ground_truth)
         acted = self.agent.act(current.observation, memory, self.generator)
         for key, part in acted.observation.items():
             segment.observation[key][step, columns] = part
@@ -153,7 +153,7 @@ class Player:
     def _receive(self, group: int, step: int) -> list[dict[str, float]]:
         columns, received = self._columns(group), self.environments.receive(group)
         self.current[group] = received
-        self.segment.reward[step, columns] = torch_view(received.reward)
+        self.segment.reward[step, columns] = unchecked_torch_view(received.reward)
         done = torch.from_numpy(received.done).to(self.agent.device)
         self.segment.done[step, columns] = done
         self.memories[group].forget(done)
