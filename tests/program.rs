@@ -18,7 +18,8 @@ struct Room {
 
 impl Room {
     fn new(name: &str) -> Self {
-        let root = std::env::temp_dir().join(format!("eg-{name}-{}", std::process::id()));
+        // At random, since another test run may have the same process ids in a container of its own.
+        let root = PathBuf::from(format!("/tmp/endless-{name}-{:016x}", rand::random::<u64>()));
         std::fs::create_dir_all(&root).unwrap();
         std::fs::set_permissions(&root, std::fs::Permissions::from_mode(0o700)).unwrap();
         Room { root }
@@ -37,7 +38,7 @@ impl Room {
     fn segments(&self) -> Vec<String> {
         let prefix = Namespace::at(&self.root).prefix().to_owned();
         let names = std::fs::read_dir("/dev/shm").unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
-        names.filter(|name| name.contains(&prefix)).collect()
+        names.filter(|name| name.starts_with(&prefix)).collect()
     }
 
     fn wait_for_engine(&self) {

@@ -188,7 +188,7 @@ def test_environments_may_have_options_of_their_own(where) -> None:
                 number = 2 * group + env
                 alone = endless_gym.Env("MortarMayhem-v0", options=each[number])
                 np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
-    with pytest.raises((ValueError, RuntimeError), match=r"3 .* 2 environments"):
+    with pytest.raises((ValueError, RuntimeError), match=r"3 .* 2 environments|2 environments, got 3"):
         where("MortarMayhem-v0", 2, options=each[:3])
 
 

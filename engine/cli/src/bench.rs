@@ -21,10 +21,7 @@ const ORIGINAL: &str = include_str!("original.py");
 /// Longest time that an engine may take for one step.
 const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Measures steps per second with random actions, resets included.
-///
-/// Each round measures every method once. The median over the rounds is reported, since other programs on the machine disturb single
-/// measurements.
+/// Arguments of `endless bench`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id, or `all`.
@@ -42,12 +39,13 @@ pub struct Args {
     /// Measurements of each method, at least 1.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
-    /// Also measure the original, with this Python interpreter, which must have `memory-gym` installed.
+    /// Also measure the original, with this Python interpreter, which must have `memory-gym` installed [default:
+    /// the original is not measured].
     #[arg(long, value_name = "PYTHON")]
     original: Option<String>,
     #[command(flatten)]
     environment: EnvironmentArgs,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }

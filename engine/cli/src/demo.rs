@@ -37,7 +37,7 @@ pub struct Args {
     seconds: f64,
     #[command(flatten)]
     environment: EnvironmentArgs,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }

@@ -35,6 +35,9 @@ enum Command {
     /// Serve environments in shared memory until Ctrl-C.
     Serve(serve::Args),
     /// Measure steps per second, in process and through shared memory.
+    ///
+    /// Actions are random, and resets are included. Each round measures every method once. The median over the rounds is reported,
+    /// since other programs on the machine disturb single measurements.
     Bench(bench::Args),
     /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
     Verify(verify::Args),

@@ -11,7 +11,7 @@ use super::output::{print, print_json, table};
 pub struct Args {
     /// Environment id to describe [default: list all ids].
     id: Option<String>,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }

@@ -57,16 +57,18 @@ pub struct EnvironmentArgs {
     /// environment's own, which `endless list ID` shows].
     #[arg(long = "option", value_name = "NAME=VALUE")]
     options: Vec<String>,
-    /// Reset parameters of one environment as a JSON object; repeated for every environment of all groups, in order.
+    /// Reset parameters of one environment as a JSON object; repeated for every environment of all groups, in order [default: those
+    /// of `--option` for all environments].
     #[arg(long, value_name = "JSON", conflicts_with = "options")]
     env_options: Vec<String>,
     /// Seed: environment i, counted over all groups, is seeded with SEED + i [default: entropy of the operating system].
     #[arg(long)]
     seed: Option<u64>,
-    /// Draw the seed of each episode from START to END - 1, as the training in the paper does from 0..100000.
+    /// Draw the seed of each episode from START to END - 1, as the training in the paper does from 0..100000; `--seed` seeds the
+    /// draws [default: episodes continue the generator of their environment].
     #[arg(long, value_name = "START..END", value_parser = seed_range)]
     seed_range: Option<(u64, u64)>,
-    /// Seeds of the episodes, in turn, repeated from the start.
+    /// Seeds of the episodes, in turn, repeated from the start [default: as for `--seed-range`].
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
 }

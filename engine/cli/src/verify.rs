@@ -15,7 +15,7 @@ pub struct Args {
     /// Trace files, gzip-compressed JSON (`.json.gz`).
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }
