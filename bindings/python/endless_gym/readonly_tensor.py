@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any, NoReturn
 
 import numpy as np
@@ -100,9 +99,14 @@ class ReadOnlyTensor(torch.Tensor):
     storage = untyped_storage = share_memory_ = _refuse
 
 
-@cache
+#: Results of `_effects` by operation. A dictionary, since `torch.compile` warns of `functools.cache`.
+_EFFECTS: dict[Any, tuple[tuple[tuple[int, str], ...], bool]] = {}
+
+
 def _effects(func: Any) -> tuple[tuple[tuple[int, str], ...], bool]:
     """Positions and names of the arguments that an operation writes to, and whether its results are views of its arguments."""
+    if func in _EFFECTS:
+        return _EFFECTS[func]
     schema = func._schema
     writes = tuple(
         (index, argument.name)
@@ -110,6 +114,7 @@ def _effects(func: Any) -> tuple[tuple[tuple[int, str], ...], bool]:
         if argument.alias_info is not None and argument.alias_info.is_write
     )
     is_view = any(result.alias_info is not None and not result.alias_info.is_write for result in schema.returns)
+    _EFFECTS[func] = writes, is_view
     return writes, is_view
 
 

@@ -81,6 +81,7 @@ struct Measurement {
     highest: f64,
 }
 
+/// Runs `endless bench`.
 pub fn run(args: &Args) -> Result<(), Failure> {
     options::seconds(args.seconds)?;
     let stop = stop::on_signal()?;

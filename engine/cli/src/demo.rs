@@ -61,6 +61,7 @@ const REFRESH_INTERVAL: Duration = Duration::from_millis(250);
 /// Longest time that an engine may take for one step.
 const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// Runs `endless demo`.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let spec = envs::spec(&args.id)?;
     let seconds = options::seconds(args.seconds)?;

@@ -16,6 +16,7 @@ pub struct Args {
     json: bool,
 }
 
+/// Runs `endless list`.
 pub fn run(args: &Args) -> Result<(), Failure> {
     match &args.id {
         Some(id) => {

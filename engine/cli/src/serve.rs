@@ -46,6 +46,7 @@ pub struct Args {
     child: bool,
 }
 
+/// Runs `endless serve`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let stop = stop::on_signal()?;
     if args.child {

@@ -20,7 +20,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Returns whether every trace was replayed without a difference.
+/// Runs `endless verify`. Returns whether every trace was replayed without a difference.
 pub fn run(args: &Args) -> Result<bool, Failure> {
     let bar = progress(args.files.len() as u64, "replaying {bar:40} {pos}/{len} traces");
     let replays: Vec<_> = args
