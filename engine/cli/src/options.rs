@@ -24,7 +24,7 @@ pub enum AutoresetMode {
 /// The format of frames.
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub struct FrameArgs {
-    /// Write no frames, and draw nothing [default: RGB frames, uint8 (84, 84, 3), indexed [x][y][channel]].
+    /// Write no frames, and draw nothing [default: RGB frames, uint8 (84, 84, 3), indexed `[x][y][channel]`].
     #[arg(long, conflicts_with_all = ["grayscale", "channels_first", "row_major", "frame_stack"])]
     no_frames: bool,
     /// Grayscale frames without a channel axis [default: RGB].
@@ -33,7 +33,7 @@ pub struct FrameArgs {
     /// Frames with the channel as the first axis [default: the last axis].
     #[arg(long)]
     channels_first: bool,
-    /// Frames indexed [row][column] [default: [x][y]].
+    /// Frames indexed `[row][column]` [default: `[x][y]`].
     #[arg(long)]
     row_major: bool,
     /// Stack the last N frames of the episode in one observation, oldest first: 1 to 64.
