@@ -28,6 +28,10 @@ class ReadOnlyTensor(torch.Tensor):
 
     @staticmethod
     def __new__(cls: type[ReadOnlyTensor], shared: torch.Tensor) -> ReadOnlyTensor:
+        if torch.is_inference_mode_enabled():
+            # PyTorch cannot make views of an ordinary tensor that are inference tensors.
+            with torch.inference_mode(False):
+                return ReadOnlyTensor(shared)
         tensor: ReadOnlyTensor = torch.Tensor._make_wrapper_subclass(
             cls,
             shared.size(),

@@ -195,6 +195,25 @@ def test_read_only_tensors_are_read_as_any_other(where) -> None:
         del tensor, observation, frames, features, given, call, result
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_read_only_tensors_in_modes_without_gradients(mode) -> None:
+    with endless_gym.make_vec("MortarMayhem-v0", 2, seed=1, observation="features") as envs:
+        features, _ = envs.reset()
+        outside = endless_gym.torch_view(features)
+        layer = torch.nn.Linear(features.shape[1], 3)
+        wanted = layer(torch.tensor(features))
+        with mode():
+            for tensor in (outside, endless_gym.torch_view(features)):
+                assert torch.equal(layer(tensor), wanted)
+                assert torch.equal(tensor[0], torch.tensor(features[0]))
+                assert torch.equal(tensor.clone().zero_(), torch.zeros(features.shape))
+                for write in (torch.Tensor.zero_, lambda t: t[0].zero_(), lambda t: t.view(-1).zero_()):
+                    with pytest.raises(RuntimeError, match="read-only"):
+                        write(tensor)
+        assert torch.equal(layer(outside), wanted)
+        assert torch.equal(outside[0], torch.tensor(features[0]))
+
+
 def test_arrays_of_the_user_make_ordinary_tensors() -> None:
     array = np.zeros((2, 3), np.float32)
     tensor = endless_gym.torch_view(array)
