@@ -109,7 +109,7 @@ def rust(id: str, num_envs: int, threads: int, seconds: float) -> dict[str, floa
     command = [*program(), "bench", "--json", *(f"--{name}={value}" for name, value in arguments.items())]
     (row,) = json.loads(subprocess.check_output(command, stderr=subprocess.DEVNULL))
     return {
-        f"Rust, {entry['way']}, {num_envs} environments": entry["steps_per_second"] for entry in row["measurements"]
+        f"Rust, {entry['method']}, {num_envs} environments": entry["steps_per_second"] for entry in row["measurements"]
     }
 
 

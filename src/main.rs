@@ -1,13 +1,14 @@
-//! The `endless` program.
+//! The program `endless`.
 
+use std::io::Write;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
     let arguments: Vec<_> = std::env::args_os().skip(1).collect();
     match std::env::current_exe() {
-        Ok(itself) => endless_gym::cli::main(arguments, &[itself.into()]),
+        Ok(executable) => endless_gym::cli::main(arguments, &[executable.into()]).into(),
         Err(error) => {
-            eprintln!("endless: cannot find its own program file: {error}");
+            let _ = writeln!(std::io::stderr(), "endless: cannot find the program's own file: {error}");
             ExitCode::FAILURE
         }
     }

@@ -18,7 +18,8 @@ struct Room {
 
 impl Room {
     fn new(name: &str) -> Self {
-        let root = std::env::temp_dir().join(format!("eg-{name}-{}", std::process::id()));
+        // At random, since another test run may have the same process ids in a container of its own.
+        let root = PathBuf::from(format!("/tmp/endless-{name}-{:016x}", rand::random::<u64>()));
         std::fs::create_dir_all(&root).unwrap();
         std::fs::set_permissions(&root, std::fs::Permissions::from_mode(0o700)).unwrap();
         Room { root }
@@ -37,7 +38,7 @@ impl Room {
     fn segments(&self) -> Vec<String> {
         let prefix = Namespace::at(&self.root).prefix().to_owned();
         let names = std::fs::read_dir("/dev/shm").unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
-        names.filter(|name| name.contains(&prefix)).collect()
+        names.filter(|name| name.starts_with(&prefix)).collect()
     }
 
     fn wait_for_engine(&self) {
@@ -222,15 +223,18 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["serve", "--num-envs", "2", "--env-options", "{}"], "1 "),
         (vec!["serve", "--num-envs", "0"], "num_envs must be 1 to 1048576, got 0"),
         (vec!["serve", "--groups", "0"], "groups must be 1 to 64, got 0"),
+        (vec!["serve", "--num-envs", "9223372036854775808", "--groups", "4"], "9223372036854775808"),
         (vec!["serve", "--batches-held", "20"], "batches_held must be 1 to 16, got 20"),
         (vec!["serve", "--service", "a/b"], "engine name must be 1 to 64 letters, digits, `.`, `_` or `-`, got `a/b`"),
         (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["demo", "--num-envs", "0"], "num_envs must be 1 to 1048576, got 0"),
         (vec!["demo", "--option", "arena_size=7"], "`arena_size` must be an integer, 2 to 6, got 7"),
-        (vec!["demo", "--seconds=-1"], "--seconds must be finite and not negative, got -1"),
-        (vec!["bench", "--seconds=nan"], "--seconds must be finite and not negative, got NaN"),
+        (vec!["demo", "--seconds=-1"], "--seconds must be finite and positive, got -1"),
+        (vec!["demo", "--seconds", "nan"], "--seconds must be finite and positive, got NaN"),
+        (vec!["bench", "--seconds", "inf"], "--seconds must be finite and positive, got inf"),
+        (vec!["bench", "--seconds", "0"], "--seconds must be finite and positive, got 0"),
         (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
-        (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "/no/python: "),
+        (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "cannot run /no/python: "),
     ] {
         let output = room.run(&arguments);
         let stderr = text(&output.stderr);
@@ -242,17 +246,80 @@ fn wrong_arguments_are_one_clear_line() {
 }
 
 #[test]
-fn bench_measures_every_way() {
+fn bench_measures_every_method() {
     let room = Room::new("bench");
     let output = room.run(&["bench", "--num-envs", "16", "--seconds", "0.05", "--rounds", "1", "--json"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     let json: Json = serde_json::from_slice(&output.stdout).unwrap();
     let measurements = json[0]["measurements"].as_array().unwrap();
-    let ways: Vec<&str> = measurements.iter().map(|m| m["way"].as_str().unwrap()).collect();
-    for way in ["in process, 1 thread", "service, only receives", "service, reads every byte"] {
-        assert!(ways.contains(&way), "{ways:?}");
+    let methods: Vec<&str> = measurements.iter().map(|m| m["method"].as_str().unwrap()).collect();
+    for method in ["in process, 1 thread", "service, only receives", "service, reads every byte"] {
+        assert!(methods.contains(&method), "{methods:?}");
     }
     assert!(measurements.iter().all(|m| m["steps_per_second"].as_f64().unwrap() > 0.0));
+}
+
+#[test]
+fn output_that_cannot_be_written_is_a_failure() {
+    let room = Room::new("full");
+    let traces = common::traces("MortarMayhem-Grid-v0");
+    let trace = traces[0].to_str().unwrap();
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    for arguments in [
+        vec!["--help"],
+        vec!["--version"],
+        vec!["serve", "--help"],
+        vec!["list"],
+        vec!["list", "--json"],
+        vec!["list", "MortarMayhem-v0"],
+        vec!["list", "MortarMayhem-v0", "--json"],
+        vec!["serve", "--num-envs", "1"],
+        vec!["demo", "--num-envs", "1", "--seconds", "0.1"],
+        vec!["demo", "--num-envs", "1", "--seconds", "0.1", "--json"],
+        vec!["bench", "--num-envs", "1", "--seconds", "0.01", "--rounds", "1"],
+        vec!["bench", "--num-envs", "1", "--seconds", "0.01", "--rounds", "1", "--json"],
+        vec!["verify", trace],
+        vec!["verify", "--json", trace],
+    ] {
+        let output = room.endless(&arguments).stdout(full()).output().unwrap();
+        let stderr = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
+        assert!(
+            stderr.starts_with("endless: cannot write to standard output: No space left"),
+            "{arguments:?}: {stderr}"
+        );
+        assert_eq!(stderr.lines().count(), 1, "{arguments:?}: {stderr}");
+    }
+    for (arguments, code) in [(["list", "Chess-v0"], 1), (["list", "--chess"], 2)] {
+        assert_eq!(room.endless(&arguments).stderr(full()).output().unwrap().status.code(), Some(code));
+    }
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn a_closed_pipe_is_no_failure() {
+    let room = Room::new("pipe");
+    let traces = common::traces("MortarMayhem-Grid-v0");
+    let trace = traces[0].to_str().unwrap();
+    let closed = || std::io::pipe().unwrap().1;
+    for (arguments, code) in [
+        (vec!["--help"], 0),
+        (vec!["list"], 0),
+        (vec!["list", "--json"], 0),
+        (vec!["demo", "--num-envs", "1", "--seconds", "0.1"], 0),
+        (vec!["bench", "--num-envs", "1", "--seconds", "0.01", "--rounds", "1"], 0),
+        (vec!["verify", trace], 0),
+        (vec!["verify", trace, "/nowhere.json.gz"], 1),
+    ] {
+        let output = room.endless(&arguments).stdout(closed()).output().unwrap();
+        assert_eq!(output.status.code(), Some(code), "{arguments:?}");
+        assert_eq!(text(&output.stderr), "", "{arguments:?}");
+    }
+    let mut engine = room.endless(&["serve", "--num-envs", "1"]).stdout(closed()).spawn().unwrap();
+    room.wait_for_engine();
+    signal(&engine, Signal::INT);
+    assert!(wait(&mut engine).success());
+    assert_eq!(room.segments(), [""; 0]);
 }
 
 #[test]

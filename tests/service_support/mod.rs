@@ -8,7 +8,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use endless_gym::pool::{PoolConfig, ResetRequest, Threads};
@@ -27,9 +27,8 @@ pub struct Place {
 
 impl Place {
     pub fn new() -> Self {
-        static NUMBER: AtomicUsize = AtomicUsize::new(0);
-        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        Place { namespace: Namespace::at(format!("/tmp/endless-{}-{number}", std::process::id())) }
+        // At random, since another test run may have the same process ids in a container of its own.
+        Place { namespace: Namespace::at(format!("/tmp/endless-{:016x}", rand::random::<u64>())) }
     }
 
     pub fn namespace(&self) -> &Namespace {

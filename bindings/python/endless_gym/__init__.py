@@ -1,11 +1,11 @@
-"""Endless Gym: bit-exact Memory Gym environments, vectorised, in this process or in an engine process over shared memory.
+"""Endless Gym: the Memory Gym environments, bit-exact to the original, in lockstep and in shared memory.
 
 ```python
 import endless_gym, gymnasium
 
-env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment, like the original
-envs = gymnasium.make_vec("EndlessGym/MortarMayhem-v0", num_envs=1024)    # many, in this process
-envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # many, in an engine process
+env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment
+envs = gymnasium.make_vec("EndlessGym/MortarMayhem-v0", num_envs=1024)    # a vector environment in this process
+envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # a vector environment in an engine's process
 ```
 """
 
@@ -41,7 +41,7 @@ __all__ = [
     "torch_view",
 ]
 
-# Imported lazily: they need Gymnasium 1.1, while single environments also run on Gymnasium 0.29.
+# Loaded on first use, since they need Gymnasium 1.1; the rest of the package works with 0.29.
 _LATER = {"serve": "engine", "EndlessVectorEnv": "vector", "connect": "vector", "make_vec": "vector"}
 
 

@@ -1,4 +1,4 @@
-"""`python -m endless_gym`: list the environments with their steps per second on this machine."""
+"""Measure the steps per second of all environments on this machine."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ from endless_gym import EndlessVectorEnv
 
 
 def main() -> None:
-    """Measure all environments, and print a table or JSON."""
+    """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m endless_gym", description=__doc__)
     parser.add_argument("--num-envs", type=int, default=256, help="number of environments (default: %(default)s)")
-    parser.add_argument(
-        "--seconds", type=float, default=0.5, help="duration of each measurement (default: %(default)s)"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--seconds", type=float, default=0.5, help="seconds of each measurement (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print JSON (default: a table)")
     arguments = parser.parse_args()
     rows = []
     if not arguments.json:
@@ -42,7 +40,7 @@ def main() -> None:
 
 
 def measure(envs: EndlessVectorEnv, seconds: float) -> float:
-    """Steps per second, over all environments, with random actions."""
+    """Steps per second with random actions."""
     envs.reset(seed=0)
     envs.action_space.seed(0)
     actions = [np.asarray(envs.action_space.sample()) for _ in range(64)]

@@ -12,20 +12,21 @@ from itertools import count
 from typing import Any
 
 from endless_gym import _native
+from endless_gym.arguments import integer, seed_source
+from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.program import program
 from endless_gym.specs import Frames, json_text, spec
 from endless_gym.vector import AutoresetMode, EndlessVectorEnv, Options, autoreset_mode, connect, contents
 
 _numbers = count()
 
-#: The engine gets its own process group, so that Ctrl-C reaches only this process, which then ends the engine. A new session is
-#: the fallback before Python 3.11: the Linux scheduler divides CPU time among sessions first (autogroup), which made steps a
-#: third slower.
+#: In a process group of its own, the engine does not receive Ctrl-C. This process does, and then stops the engine. Only
+#: Python 3.10 needs a session for that: Linux schedules sessions as units (autogroup), and a step takes a third longer.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
 class EngineProcess:
-    """A child process that serves environments. It ends with `end`, and when this process ends."""
+    """A child process that serves environments. `end` stops it, and it stops when this process ends."""
 
     def __init__(self, arguments: list[str]) -> None:
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
@@ -44,7 +45,7 @@ class EngineProcess:
         return self._process.pid
 
     def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
-        """Wait until the engine runs, and connect to it as its trainer."""
+        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer."""
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
@@ -54,11 +55,11 @@ class EngineProcess:
             if self.service in _native.running_engines():
                 return connect(self.service, timeout=timeout, copy=copy, engine=self)
             if time.monotonic() >= end:
-                raise TimeoutError(f"the engine has not started within {timeout} seconds")
+                raise TimeoutError(f"the engine did not start within {timeout} seconds")
             time.sleep(0.01)
 
     def end(self) -> None:
-        """End the process and wait until it has exited."""
+        """Stops the process and waits for its end."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
@@ -85,7 +86,7 @@ def serve(
     timeout: float = 30.0,
     copy: bool = False,
 ) -> EndlessVectorEnv:
-    """Start an engine in a child process, and connect to its environments. The engine ends when they are closed.
+    """Start an engine in a child process, and connect to it. It stops when the environments are closed.
 
     ```python
     with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
@@ -95,38 +96,41 @@ def serve(
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.
         num_envs: Environments in each group.
-        num_threads: Threads of the engine; `None` for one per core.
-        groups: Number of groups, which are stepped independently with `send` and `recv`.
+        num_threads: Threads of the engine; `None` or 0 for one per core.
+        groups: Groups of environments for `send` and `recv`, 1 to 64.
         seed: As for `make_vec`.
         seeds: As for `make_vec`.
         options: As for `make_vec`.
-        autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
-        observation: `rgb`, `features` or `rgb+features`.
+        autoreset: As for `make_vec`.
+        observation: As for `make_vec`.
         frames: As for `make_vec`.
-        batches_held: Number of steps of a group whose arrays can be held at the same time, 1 to 16.
-        timeout: Seconds to wait for the start of the engine, and for each of its answers.
-        copy: Return writeable copies instead of read-only views into shared memory.
+        batches_held: Batches of a group whose arrays may be referenced at a time, 1 to 16.
+        timeout: Seconds to wait for the engine to start, and for each of its answers.
+        copy: Return writable copies instead of read-only views of shared memory.
 
     Raises:
-        RuntimeError: The engine cannot start; the message contains the reason.
-        TimeoutError: The engine has not started within `timeout` seconds.
+        TypeError: A number is no integer.
+        ValueError: A number is negative, or the timeout is not finite.
+        RuntimeError: The engine cannot start; the message says why.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
     frames, features = contents(observation, frames)
+    timeout = checked_timeout(timeout)
+    seed, seed_range, seed_list = seed_source(seed, seeds)
     arguments: dict[str, Any] = {
         "--env": described.id,
-        "--num-envs": num_envs,
-        "--threads": num_threads or 0,
-        "--groups": groups,
-        "--batches-held": batches_held,
+        "--num-envs": integer("num_envs", num_envs, 1, _native.MAX_ENVS),
+        "--threads": integer("num_threads", num_threads or 0),
+        "--groups": integer("groups", groups, 1, _native.MAX_GROUPS),
+        "--batches-held": integer("batches_held", batches_held),
         "--autoreset": mode.name.lower(),
     }
     if seed is not None:
         arguments["--seed"] = seed
-    if isinstance(seeds, range):
-        arguments["--seed-range"] = f"{seeds.start}..{seeds.stop}"
-    elif seeds is not None:
-        arguments["--seed-list"] = ",".join(map(str, seeds))
+    if seed_range is not None:
+        arguments["--seed-range"] = f"{seed_range[0]}..{seed_range[1]}"
+    if seed_list is not None:
+        arguments["--seed-list"] = ",".join(map(str, seed_list))
     command = [f"{name}={value}" for name, value in arguments.items()]
     if options is None or isinstance(options, Mapping):
         command += [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]

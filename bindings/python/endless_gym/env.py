@@ -1,4 +1,4 @@
-"""A single environment with the interface of the original classes."""
+"""One environment with the interface of the original's class."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from endless_gym import _native
+from endless_gym.arguments import integer
 from endless_gym.specs import options_text, spec
 
 Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
 
-#: Environments whose ground truth has an integer dtype in the original.
+#: Ids whose ground truth is an integer array in the original.
 _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
 #: Side of the ground-truth view in pixels.
@@ -23,17 +24,19 @@ _VIEW = 336
 
 
 class Env(gymnasium.Env[Any, Any]):
-    """A Memory Gym environment; observations, rewards, flags and infos are identical to those of the original.
+    """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 
-    Observations are uint8 (84, 84, 3), indexed [x][y][channel] as the original returns them; the ids with `MortarMayhemB`
-    return a dict of `visual_observation` and `vector_observation` (float32 (180,)).
+    Observations are uint8 (84, 84, 3), indexed [x][y][channel] as in the original; the ids with `MortarMayhemB` return a dict of
+    `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
-        render_mode: `rgb_array`: `render` returns the frame as uint8 (84, 84, 3); `debug_rgb_array`: it returns the ground-truth
-            view as uint8 (336, 336, 3); both indexed [row][column][channel]. `human`: a window shows that view (needs
-            pygame).
-        options: Reset parameters of every episode; the options of `reset` override them.
+        render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
+            (336, 336, 3); both indexed [row][column][channel]. `human`: every step shows that view in a window (needs pygame).
+        options: Reset parameters for every episode. Options of `reset` override them.
+
+    Raises:
+        ValueError: The id or the render mode is unknown, or a reset parameter is unknown or out of its range.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
@@ -44,10 +47,9 @@ class Env(gymnasium.Env[Any, Any]):
     def __init__(self, id: str, render_mode: str | None = None, options: dict[str, Any] | None = None) -> None:
         self._spec = spec(id)
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f"render_mode must be None, {', '.join(self.metadata['render_modes'])}; got `{render_mode}`"
-            )
-        # The frame rate depends on the id.
+            known = ", ".join(self.metadata["render_modes"])
+            raise ValueError(f"render_mode must be None or one of {known}, got {render_mode!r}")
+        # The frame rate differs from id to id.
         self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
         self.render_mode = render_mode
         self.action_space = self._spec.action_space()
@@ -62,12 +64,12 @@ class Env(gymnasium.Env[Any, Any]):
         self._window: _Window | None = None
         self._is_shown = False
         self._was_reset = False
-        #: Reset parameters of the current episode, with the defaults.
+        #: Reset parameters of the current episode, the defaults included.
         self.reset_params: dict[str, Any] = {**self._spec.reset_parameters, **self._options}
 
     @property
     def max_episode_steps(self) -> int:
-        """Step limit of an episode with the current reset parameters; -1 for none. As in the original."""
+        """The step limit of an episode with the current reset parameters, as in the original; -1 for none."""
         return self._spec.max_episode_steps(self.reset_params)
 
     def reset(
@@ -76,12 +78,13 @@ class Env(gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: Seed of the environment's generator, as in numpy's `default_rng`. `None` continues with the current generator.
-            options: Reset parameters by the original's names; they override those of the constructor for this episode.
+            seed: Seed of the environment's generator, as of numpy's `default_rng`. `None` continues the generator.
+            options: Reset parameters by the original's names, which override those given to the constructor.
 
         Raises:
-            ValueError: A reset parameter is unknown or out of its range.
+            ValueError: The seed is out of its range, or a reset parameter is unknown or out of its range.
         """
+        seed = None if seed is None else integer("seed", seed)
         super().reset(seed=seed)
         given = {**self._options, **(options or {})}
         arrays = self._native.reset(seed, options_text(given))
@@ -94,7 +97,13 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), self._info(arrays)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Play one step. As in the original, every end of an episode is `terminated`, including the step limit."""
+        """Play one step. As in the original, `terminated` reports every end of an episode, also by the step limit.
+
+        Raises:
+            ResetNeeded: The environment has not been reset.
+            TypeError: The action is no integer or sequence of integers.
+            ValueError: The action is out of its range.
+        """
         if not self._was_reset:
             raise ResetNeeded("call `env.reset()` before `env.step()`")
         arrays, reward, terminated, end = self._native.step(action)
@@ -109,35 +118,35 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), reward, terminated, False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The current picture in the render mode; `None` in the mode `human` and without render mode."""
+        """The current frame or view of the render mode; `None` for `human` and without a render mode."""
         if self.render_mode == "rgb_array":
             return self._native.rgb_array()
         if self.render_mode == "debug_rgb_array":
             return self._native.ground_truth_view()
         if self.render_mode == "human":
-            # Gymnasium requires that `reset` and `step` show the picture; the original shows it only in `render`.
+            # `reset` and `step` show the picture, as Gymnasium asks; the original leaves that to calls of this.
             self._show()
         return None
 
     def snapshot(self) -> bytes:
-        """The complete state, including the random generator, for `restore`."""
+        """The whole state, the generator included, for `restore`."""
         return self._native.snapshot()
 
     def restore(self, snapshot: bytes) -> tuple[Observation, dict[str, Any]]:
-        """Restore a snapshot of an environment with the same id, and return the current observation and info."""
+        """Go on from a snapshot of an environment with the same id; returns what it looks like."""
         arrays = self._native.restore(snapshot)
         self._was_reset = True
         self._is_shown = False
         return self._observation(arrays), self._info(arrays)
 
     def close(self) -> None:
-        """Close the window, if it is open."""
+        """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None
 
     def _show(self) -> None:
-        """Show the current picture once: every ground-truth view of a clue advances the clue."""
+        """Shows the current picture once: the ground-truth view goes through a shown clue with each call."""
         if self._is_shown:
             return
         if self._window is None:
@@ -156,15 +165,13 @@ class Env(gymnasium.Env[Any, Any]):
 
 
 class _Window:
-    """A pygame window."""
+    """A window that shows pictures, by pygame."""
 
     def __init__(self) -> None:
         try:
             import pygame
         except ImportError as error:
-            raise ImportError(
-                'render_mode="human" needs pygame, which is not installed: pip install "endless-gym[render]"'
-            ) from error
+            raise ImportError('render_mode="human" needs pygame: pip install "endless-gym[render]"') from error
         self._pygame = pygame
         pygame.display.init()
         self._screen = pygame.display.set_mode((_VIEW, _VIEW))

@@ -1,7 +1,8 @@
-"""Zero-copy conversion of arrays to tensors of other libraries, and page-locking of their memory."""
+"""Arrays as tensors of other libraries, without a copy."""
 
 from __future__ import annotations
 
+import sys
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -12,48 +13,91 @@ from endless_gym import _native
 if TYPE_CHECKING:
     import torch
 
+#: DLPack's number of the CPU, which is the device of all arrays.
+_CPU = (1, 0)
+
 
 class DLPackView:
-    """Wraps an array for the `from_dlpack` function of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
+    """An array for `from_dlpack` of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
 
-    The tensor shares the memory of the array and keeps it alive. The common version of DLPack cannot express that memory is
-    read-only: do not write to such a tensor.
+    The tensor shares the array's memory and keeps it alive. A library that supports DLPack 1.0 receives read-only arrays with the
+    read-only flag. Libraries that do not support it, and PyTorch, which ignores the flag, receive a writable tensor if the
+    environments are in this process: the next frames in that memory are then drawn in full, so that writes do no harm, but cost
+    time. Arrays of environments in another process are not exported to such libraries: use `torch_view` for PyTorch, or
+    `DLPackView(array.copy())`.
     """
 
     def __init__(self, array: NDArray[Any]) -> None:
         self._array = array
 
-    def __dlpack__(self, **_: Any) -> Any:
-        """The DLPack capsule."""
-        return _native.dlpack(self._array)
+    def __dlpack__(
+        self,
+        *,
+        stream: Any = None,
+        max_version: tuple[int, int] | None = None,
+        dl_device: tuple[int, int] | None = None,
+        copy: bool | None = None,
+    ) -> Any:
+        """The capsule of DLPack's protocol.
+
+        Raises:
+            BufferError: The array is read-only memory of another process and the library would write to it, or another device
+                than the CPU is asked for.
+        """
+        if dl_device is not None and (int(dl_device[0]), int(dl_device[1])) != _CPU:
+            raise BufferError(f"dl_device must be the CPU, {_CPU}, got {dl_device}")
+        is_torch = sys._getframe(1).f_globals.get("__name__") == "torch.utils.dlpack"
+        has_flag = max_version is not None and max_version[0] >= 1 and not is_torch
+        return _native.dlpack(self._array.copy() if copy else self._array, has_flag)
 
     def __dlpack_device__(self) -> tuple[int, int]:
-        """The device: the CPU."""
-        return (1, 0)
+        """The CPU."""
+        return _CPU
 
 
 def torch_view(array: NDArray[Any]) -> torch.Tensor:
-    """Return a tensor that shares the memory of the array and keeps it alive.
+    """A tensor that shares the array's memory and keeps it alive.
 
-    Like `torch.from_numpy`, but without the warning for read-only arrays. Do not write to a tensor of a read-only array.
+    A tensor of a read-only array is read-only, and so are its views: an operation that would write to it raises RuntimeError. All
+    other operations read the memory without a copy and return ordinary tensors, such as `tensor.to("cuda")` and `tensor.float()`.
+    `tensor.clone()` is a writable copy. Operations of PyTorch cost some microseconds more on a read-only tensor.
+
+    `torch.from_numpy` and `torch.from_dlpack` take the arrays, too, but ignore that they are read-only. Writing to such a tensor
+    corrupts later frames of environments in this process, and kills the process for environments in another process.
+
+    Raises:
+        TypeError: The array's dtype has no counterpart in DLPack.
+    """
+    tensor = unchecked_torch_view(array)
+    if array.flags.writeable:
+        return tensor
+    from endless_gym.readonly_tensor import ReadOnlyTensor
+
+    return ReadOnlyTensor(tensor)
+
+
+def unchecked_torch_view(array: NDArray[Any]) -> torch.Tensor:
+    """As `torch_view`, but an ordinary tensor, without the cost of the checks. The caller must not write to it.
+
+    For this package's own code that only reads the tensor. A write corrupts later frames, or kills the process.
     """
     from torch.utils.dlpack import from_dlpack
 
-    tensor: torch.Tensor = from_dlpack(_native.dlpack(array))
+    tensor: torch.Tensor = from_dlpack(_native.dlpack_unchecked(array))
     return tensor
 
 
 def pin_memory(array: NDArray[Any]) -> bool:
-    """Page-lock the memory of the array, so that `tensor.to("cuda", non_blocking=True)` copies asynchronously.
+    """Page-lock the array's memory, so that `tensor.to("cuda", non_blocking=True)` is asynchronous.
 
-    The whole memory mapping is locked, with all batches in it, so one call per group of an engine's environments is sufficient.
-    Without CUDA this warns and does nothing.
+    The whole mapping is page-locked, with all batches in it; one call for each group of an engine is enough. Without CUDA, this
+    warns and does nothing.
 
     Args:
         array: Any array of a step.
 
     Returns:
-        Whether the memory is page-locked now.
+        Whether the memory is page-locked.
     """
     reason = _pin(array)
     if reason is not None:
@@ -62,11 +106,7 @@ def pin_memory(array: NDArray[Any]) -> bool:
 
 
 def mapping_of(address: int) -> tuple[int, int]:
-    """Start address and size in bytes of the memory mapping of this process that contains `address`.
-
-    Raises:
-        ValueError: There is no such mapping.
-    """
+    """First address and size in bytes of the memory mapping of this process that contains `address`."""
     with open("/proc/self/maps") as maps:
         for line in maps:
             first, end = (int(number, 16) for number in line.split(maxsplit=1)[0].split("-"))
@@ -81,7 +121,7 @@ _ALREADY_REGISTERED = 712
 
 
 def _pin(array: NDArray[Any]) -> str | None:
-    """Page-lock the mapping of the array; returns None, or the reason why it failed."""
+    """Page-locks the array's memory. Returns the reason if that fails."""
     try:
         import torch
     except ImportError:
@@ -92,10 +132,10 @@ def _pin(array: NDArray[Any]) -> str | None:
     if first in _PINNED:
         return None
     runtime = torch.cuda.cudart()
-    # Shared memory of an engine is mapped read-only, which needs a flag of its own in CUDA.
+    # An engine's memory is mapped read-only, which CUDA requires a flag for.
     for flags in (_READ_ONLY, 0):
         status = int(runtime.cudaHostRegister(first, size, flags))
         if status in (0, _ALREADY_REGISTERED):
             _PINNED.add(first)
             return None
-    return f"cudaHostRegister failed for {size} bytes with error {status}"
+    return f"CUDA refuses to register {size} bytes, with error {status}"

@@ -1,4 +1,4 @@
-"""Drop-in replacement for `import memory_gym`: registers the original ids, and defines the original classes.
+"""Replacement for `import memory_gym`: registers the original's ids and defines its classes.
 
 ```python
 import endless_gym.memory_gym as memory_gym
@@ -19,7 +19,7 @@ def _environment(name: str, id: str) -> type[Env]:
     def __init__(self: Env, render_mode: str | None = None, **kwargs: Any) -> None:  # noqa: N807
         Env.__init__(self, id, render_mode, **kwargs)
 
-    return type(name, (Env,), {"__init__": __init__, "__doc__": f"Replacement of the original class of `{id}`."})
+    return type(name, (Env,), {"__init__": __init__, "__doc__": f"`{id}`, by the name of the original's class."})
 
 
 MortarMayhemEnv = _environment("MortarMayhemEnv", "MortarMayhem-v0")

@@ -8,9 +8,10 @@ from endless_gym.specs import all_specs
 
 
 def register(namespace: str | None = "EndlessGym") -> None:
-    """Register all environments under `namespace`, such as `EndlessGym/MortarMayhem-v0`.
+    """Register all environments, as `EndlessGym/MortarMayhem-v0` and so on. Importing the package does this.
 
-    Importing the package calls this once. With `namespace=None` they are registered under the original ids, for unmodified code.
+    Args:
+        namespace: Prefix of the ids. `None` registers the original's ids, for code that uses them.
     """
     for spec in all_specs().values():
         id = spec.id if namespace is None else f"{namespace}/{spec.id}"
@@ -20,7 +21,7 @@ def register(namespace: str | None = "EndlessGym") -> None:
             entry_point="endless_gym.env:Env",
             vector_entry_point="endless_gym.vector:gymnasium_vec",
             kwargs={"id": spec.id},
-            # The environment validates its arguments itself, and these wrappers are slower than a step.
+            # The environment checks its arguments itself, and the wrappers cost more than its steps.
             disable_env_checker=True,
             order_enforce=False,
         )

@@ -1,4 +1,4 @@
-"""Vector environments (`gymnasium.vector.VectorEnv`), in this process or in an engine process."""
+"""Many environments as one `gymnasium.vector.VectorEnv`, in this process or in an engine's process."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym import _native
+from endless_gym.arguments import MAX_U64, integer, seed_source
+from endless_gym.arguments import timeout as checked_timeout
+from endless_gym.backends import Backend, InProcess, Remote
 from endless_gym.specs import Frames, Spec, options_text, spec
 
 try:
@@ -20,36 +23,36 @@ try:
     from gymnasium.vector import VectorEnv
 except ImportError as error:
     raise ImportError(
-        f"vector environments need Gymnasium 1.1 or newer, got {gymnasium.__version__}: pip install 'gymnasium>=1.1'; "
-        "`gymnasium.make` and Gymnasium's vector environments work with this version"
+        f"vector environments need Gymnasium 1.1 or newer, and {gymnasium.__version__} is installed: "
+        "pip install 'gymnasium>=1.1'; `gymnasium.make` works with this version"
     ) from error
 
 Options = Mapping[str, Any]
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
-#: Values of `observation`, and whether the batch contains frames and the feature observation.
+#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
 OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
 
 _MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
 
 
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
-    """Environments of one id that step in lockstep.
+    """Environments of one id in lockstep.
 
-    Created by `make_vec`, `serve` and `connect`. `step` returns arrays with one row per environment: observation uint8
-    (n, 84, 84, 3) or as in `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`.
-    Arrays are read-only views of the engine's memory that do not change while they are referenced; with `copy=True` they are
-    writeable copies. `torch.from_numpy` warns about read-only arrays; `endless_gym.torch_view` does not.
+    `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
+    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. The arrays are read-only
+    views of the memory that the engine wrote; their contents do not change while references to them exist. With `copy=True`
+    they are writable copies. `endless_gym.torch_view` returns read-only tensors that share their memory.
 
-    As in Gymnasium, `info` has an array for each key, and a mask under the key with a leading underscore: `ground_truth` float64
-    (n, k) if the original has it; in steps that end episodes, the final infos of the original (`reward`, `length`, ...), and
-    `episode` with return `r`, length `l` and seconds `t` since the environments were made. With same-step auto-reset the final
-    infos are in `final_info`, and `final_obs` contains the last observation of each episode that ended.
+    `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
+    (n, k) if the original has it; in steps that end episodes the original's final infos (`reward`, `length`, ...), and `episode`
+    with the return `r`, the length `l` and the seconds since the environments were created `t`. With same-step auto-reset the
+    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended.
     """
 
     def __init__(
         self,
-        backend: _Backend,
+        backend: Backend,
         *,
         described: Spec,
         num_envs: int,
@@ -101,16 +104,22 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` uses
-                the seeds that the environments were made with, and after that continues with their generators.
-            options: Reset parameters of these and all later episodes, which override those that the environments were made
-                with; and `reset_mask`, bool (n,), the environments that start an episode. Not supported if the environments
-                were made with a sequence of options.
-            group: The group to reset. `None` resets all groups, and returns the observations of the first one.
+            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` takes the
+                seeds that the environments were created with, and after their first reset continues their generators.
+            options: Reset parameters for these and all later episodes, which override those that the environments were created
+                with; and `reset_mask`, bool (n,), the environments that start an episode. Not allowed if the environments were
+                created with a sequence of options.
+            group: The group to reset. `None` resets all groups and returns the arrays of the first.
 
         Returns:
             The observations and the info.
+
+        Raises:
+            ValueError: A seed, an option or the group is out of its range. Groups with a lower number are reset.
+            RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
+        if group is not None:
+            group = self._group(group)
         given = dict(options or {})
         mask = given.pop("reset_mask", None)
         text = None
@@ -131,24 +140,44 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             actions: Integers, (n, branches) or (n,) for one branch.
 
         Raises:
-            ValueError: The number of actions is wrong, or an action is out of range. No environment was stepped.
-            EngineLost: The engine process has ended.
+            TypeError: The actions are no integers.
+            ValueError: There are too many or too few actions, or one is out of its range. No environment was stepped.
+            RuntimeError: The environments have not been reset, or the last `send` or `send_reset` has not been received.
+            EngineLost: The engine's process has ended.
             TooManyBatchesHeld: Arrays of too many earlier steps are referenced; delete them, or use `copy=True`.
         """
         return self._step(self._backend.step(actions))
 
     def send(self, actions: Any, group: int = 0) -> None:
-        """Step a group without waiting for the result, which `recv` returns. `actions` as for `step`.
+        """Step a group without waiting for the result, which `recv` returns.
 
-        In this process the step is executed by `recv`; in an engine process it starts immediately.
+        The actions are copied. An engine steps at once; environments in this process are stepped by `recv`.
+
+        Args:
+            actions: As for `step`.
+            group: The group to step.
+
+        Raises:
+            TypeError: As for `step`.
+            ValueError: As for `step`, or there is no such group.
+            RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
-        self._backend.send(actions, group)
+        self._backend.send(actions, self._group(group))
 
     def recv(self, group: int | None = None) -> Step:
-        """Wait for the result of `send`, and return it as `step` does. `None` returns the first available group; its number is
-        `info["group"]`.
+        """Wait for the result of a group's `send` or `send_reset`, and return it as `step` does.
+
+        Args:
+            group: The group to wait for; `None` waits for any. `info["group"]` is its number.
+
+        Raises:
+            ValueError: There is no such group.
+            RuntimeError: Nothing was sent to the group, or it was stepped before its first reset.
+            TimeoutError: The engine did not answer in time. The result can still be received.
+            EngineLost: As for `step`.
+            TooManyBatchesHeld: As for `step`. The result can still be received.
         """
-        number, arrays = self._backend.receive(group)
+        number, arrays = self._backend.receive(None if group is None else self._group(group))
         step = self._step(arrays)
         step[4]["group"] = number
         return step
@@ -156,44 +185,65 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def send_reset(self, group: int = 0, *, seed: int | None = None) -> None:
         """Reset a group without waiting for the result; `recv` returns its first observations with rewards of 0.
 
-        Environment `i` of the group is seeded with `seed + group * num_envs + i`.
-        """
-        self._backend.send_reset(group, seed)
-
-    def snapshot(self, env: int, group: int = 0) -> bytes:
-        """The complete state of one environment of a group, for `restore` here or in other environments of the same id.
+        Args:
+            group: The group to reset.
+            seed: Environment `i` of the group is seeded with `seed + group * num_envs + i`, as in `reset`.
 
         Raises:
-            ValueError: There is no such environment.
-            RuntimeError: The environment has not been reset, or the result of the group's `send` has not been received.
+            ValueError: The seed is out of its range, or there is no such group.
+            RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
-        return self._backend.snapshot(group, self._env(env))
+        self._backend.send_reset(self._group(group), None if seed is None else integer("seed", seed))
+
+    def snapshot(self, env: int, group: int = 0) -> bytes:
+        """The whole state of one environment of a group, for `restore` of this or of other environments.
+
+        Raises:
+            ValueError: There is no such environment or group.
+            RuntimeError: It has not been reset, or the group's last `send` or `send_reset` has not been received.
+        """
+        return self._backend.snapshot(self._group(group), self._env(env))
 
     def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
-        """Restore snapshots by environment index. All environments must have been reset at least once.
+        """Set the states of environments of a group, all of which must have been reset once, to those of snapshots.
+
+        Args:
+            snapshots: Snapshots by the number of the environment, also of other environments of the same id.
+            group: The group of the environments.
 
         Returns:
             The observations and the info of all environments of the group.
 
         Raises:
-            ValueError: There is no such environment, or a value is not a snapshot of this id. Earlier snapshots are restored.
+            ValueError: There is no such environment or group, or a value is no snapshot of that id. Environments before it in
+                the mapping are restored.
             RuntimeError: As for `snapshot`.
         """
+        group = self._group(group)
         for env, snapshot in snapshots.items():
             self._backend.restore(group, self._env(env), snapshot)
         # A reset of no environment returns the current observations.
         return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
-        """Ground-truth view of the original's `render()`, uint8 (336, 336, 3). Only for environments in this process."""
-        return self._backend.ground_truth_view(env)
+        """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed [row][column][channel].
+
+        Raises:
+            RuntimeError: The environments are in another process, or have not been reset.
+            ValueError: There is no such environment.
+        """
+        return self._backend.ground_truth_view(self._env(env))
 
     def reconnect(self, timeout: float = 30.0) -> None:
-        """Connect to an engine that replaces a lost one; the environments must then be reset."""
-        self._backend.reconnect(timeout)
+        """Connect to an engine that was started in place of a lost one. Its environments must then be reset.
+
+        Args:
+            timeout: Seconds to wait for the engine to start.
+        """
+        self._backend.reconnect(checked_timeout(timeout))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the connection, and end the engine if this object started it. Referenced arrays stay valid."""
+        """Disconnect, and stop the engine if `serve` started it. Arrays remain valid."""
         self._backend.close()
 
     def __enter__(self) -> EndlessVectorEnv:
@@ -203,30 +253,37 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.close()
 
     def _env(self, given: int) -> int:
-        if not 0 <= given < self.num_envs:
-            raise ValueError(f"no environment {given}: the index must be 0 to {self.num_envs - 1}")
-        return given
+        return integer("env", given, 0, self.num_envs - 1)
+
+    def _group(self, given: int) -> int:
+        return integer("group", given, 0, self.num_groups - 1)
 
     def _request(self, seed: int | Sequence[int | None] | None, mask: Any, group: int) -> _native.Reset | None:
-        if mask is None and (seed is None or isinstance(seed, (int, np.integer))):
-            return None if seed is None else int(seed)
+        if mask is None and not isinstance(seed, Sequence):
+            return None if seed is None else integer("seed", seed)
         if mask is None:
             chosen = self._all
         else:
             chosen = np.asarray(mask)
             if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
                 raise ValueError(
-                    f"`reset_mask` must be bool of shape ({self.num_envs},), got {chosen.dtype} of shape {chosen.shape}"
+                    f"reset_mask must be a bool array of shape ({self.num_envs},), got {chosen.dtype} {chosen.shape}"
                 )
-        seeds = seed if isinstance(seed, Sequence) else self._seeds(seed, group)
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"{len(seeds)} seeds given for {self.num_envs} environments")
+        seeds = self._seeds(seed, group)
         reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
         return reset, [given or 0 for given in seeds]
 
-    def _seeds(self, seed: int | None, group: int) -> list[int | None]:
-        first = group * self.num_envs
-        return [None if seed is None else seed + first + env for env in range(self.num_envs)]
+    def _seeds(self, seed: int | Sequence[int | None] | None, group: int) -> list[int | None]:
+        """One seed for each environment of a group."""
+        if seed is None:
+            return [None] * self.num_envs
+        if not isinstance(seed, Sequence):
+            # Sums wrap, as in the engine.
+            first = integer("seed", seed) + group * self.num_envs
+            return [(first + env) & MAX_U64 for env in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed must have {self.num_envs} items, one for each environment, got {len(seed)}")
+        return [None if given is None else integer("seed", given) for given in seed]
 
     def _observation(self, arrays: _native.Arrays, places: list[tuple[str, int]]) -> Any:
         if len(places) == 1:
@@ -253,13 +310,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self._observation(arrays, self._observed), reward, terminated, truncated, info
 
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
-        """Add the final infos of the episodes that this step ended to `info`."""
+        """Adds the infos of the episodes that this step ended, if it ended any."""
         returns, lengths, infos = (arrays[place] for place in self._ends)
         seconds = time.perf_counter() - self._start
         ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers, seconds)
         if ends is None:
             return
-        returns, lengths, times, columns = ends
+        ended, returns, lengths, times, columns = ends
         final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
         for (name, _), column in zip(self._described.info, columns, strict=True):
             final[name], final[f"_{name}"] = column, ended
@@ -278,147 +335,6 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         info["final_obs"], info["_final_obs"] = observations, ended
 
 
-class _Backend:
-    """The implementation behind `EndlessVectorEnv`: in this process or in an engine process."""
-
-    groups = 1
-
-    def reset(self, group: int, request: _native.Reset | None, options: str | None) -> _native.Arrays:
-        raise NotImplementedError
-
-    def step(self, actions: Any) -> _native.Arrays:
-        raise NotImplementedError
-
-    def send(self, actions: Any, group: int) -> None:
-        raise NotImplementedError
-
-    def send_reset(self, group: int, seed: int | None) -> None:
-        raise NotImplementedError
-
-    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
-        raise NotImplementedError
-
-    def snapshot(self, group: int, env: int) -> bytes:
-        raise NotImplementedError
-
-    def restore(self, group: int, env: int, snapshot: bytes) -> None:
-        raise NotImplementedError
-
-    def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
-        raise RuntimeError("the ground-truth view needs environments in this process; use `make_vec`")
-
-    def reconnect(self, timeout: float) -> None:
-        raise RuntimeError("the environments are in this process and have no engine to reconnect to")
-
-    def close(self) -> None:
-        raise NotImplementedError
-
-
-class _InProcess(_Backend):
-    """Environments in this process, with one pool per group."""
-
-    def __init__(self, pools: list[_native.Pool]) -> None:
-        self._pools = pools
-        self.groups = len(pools)
-        self._sent: dict[int, Any] = {}
-
-    def reset(self, group: int, request: _native.Reset | None, options: str | None) -> _native.Arrays:
-        return self._group(group).reset(request, options)
-
-    def step(self, actions: Any) -> _native.Arrays:
-        return self._group(0).step(actions)
-
-    def send(self, actions: Any, group: int) -> None:
-        pool = self._group(group)
-        self._send(group, lambda: pool.step(actions))
-
-    def send_reset(self, group: int, seed: int | None) -> None:
-        pool = self._group(group)
-        self._send(group, lambda: pool.reset(seed))
-
-    def _send(self, group: int, work: Any) -> None:
-        self._received(group)
-        self._sent[group] = work
-
-    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
-        if not self._sent or (group is not None and group not in self._sent):
-            raise RuntimeError(f"nothing was sent to group {group or 0}; `send` before `recv`")
-        group = next(iter(self._sent)) if group is None else group
-        return group, self._sent.pop(group)()
-
-    def snapshot(self, group: int, env: int) -> bytes:
-        return self._received(group).snapshot(env)
-
-    def restore(self, group: int, env: int, snapshot: bytes) -> None:
-        self._received(group).restore(env, snapshot)
-
-    def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
-        return self._group(0).ground_truth_view(env)
-
-    def close(self) -> None:
-        self._pools, self._sent = [], {}
-
-    def _received(self, group: int) -> _native.Pool:
-        """The pool of a group without pending `send`."""
-        if group in self._sent:
-            raise RuntimeError(f"group {group} has a pending answer; `recv` it first")
-        return self._group(group)
-
-    def _group(self, group: int) -> _native.Pool:
-        if not self._pools:
-            raise RuntimeError("the environments are closed")
-        if not 0 <= group < len(self._pools):
-            raise ValueError(f"no group {group}: the index must be 0 to {len(self._pools) - 1}")
-        return self._pools[group]
-
-
-class _Remote(_Backend):
-    """Environments in an engine process. `engine` is the process if this object started it, else None."""
-
-    def __init__(self, connection: _native.Connection, groups: int, timeout: float, engine: Any = None) -> None:
-        self._connection: _native.Connection | None = connection
-        self.groups = groups
-        self._timeout = timeout
-        self._engine = engine
-
-    def reset(self, group: int, request: _native.Reset | None, options: str | None) -> _native.Arrays:
-        self._connected().reset(group, request, options)
-        return self._connected().receive(group, self._timeout)[1]
-
-    def step(self, actions: Any) -> _native.Arrays:
-        connection = self._connected()
-        connection.send(0, actions)
-        return connection.receive(0, self._timeout)[1]
-
-    def send(self, actions: Any, group: int) -> None:
-        self._connected().send(group, actions)
-
-    def send_reset(self, group: int, seed: int | None) -> None:
-        self._connected().reset(group, seed)
-
-    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
-        return self._connected().receive(group, self._timeout)
-
-    def snapshot(self, group: int, env: int) -> bytes:
-        return self._connected().snapshot(group, env, self._timeout)
-
-    def restore(self, group: int, env: int, snapshot: bytes) -> None:
-        self._connected().restore(group, env, snapshot, self._timeout)
-
-    def reconnect(self, timeout: float) -> None:
-        self._connected().reconnect(timeout)
-
-    def close(self) -> None:
-        self._connection = None
-        if self._engine is not None:
-            self._engine.end()
-
-    def _connected(self) -> _native.Connection:
-        if self._connection is None:
-            raise RuntimeError("the environments are closed")
-        return self._connection
-
-
 def make_vec(
     id: str,
     num_envs: int = 1,
@@ -433,40 +349,49 @@ def make_vec(
     groups: int = 1,
     copy: bool = False,
 ) -> EndlessVectorEnv:
-    """Make environments in this process.
+    """Create environments in this process.
 
     Args:
         id: Environment id, such as `Endless-MortarMayhem-v0`.
         num_envs: Environments in each group.
-        num_threads: Threads that step them; `None` for one per core.
-        seed: Environment `i` is seeded with `seed + i` at its first reset and then continues with its generator. `None`: entropy.
-        seeds: Seeds of the episodes instead: a `range` from which each episode draws its seed, as in the paper's training with
-            `range(100_000)` (`seed` then seeds the draws), or a list that is used in order.
-        options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one mapping per
-            environment, ordered by group.
-        autoreset: `next_step`, `same_step` or `disabled`, as Gymnasium defines them.
-        observation: `rgb`, `features` (a short vector that describes the frame; nothing is drawn), or both as a dict:
-            `rgb+features`.
-        frames: Format of the frames if it differs from the original: grey, channels first, row-major, stacked.
-        groups: Number of groups, for `send` and `recv`.
-        copy: Return writeable copies instead of read-only views.
+        num_threads: Threads that step environments; `None` or 0 for one per core.
+        seed: Environment `i`, counted over all groups, is seeded with `seed + i` at its first reset; later episodes continue its
+            generator. `None` takes entropy from the operating system.
+        seeds: Seeds of the single episodes: a `range` to draw from, as the training in the paper does from `range(100_000)`, with
+            draws seeded by `seed`; or a list that is played in turn, and repeated.
+        options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each
+            environment of all groups.
+        autoreset: Gymnasium's auto-reset mode: `next_step`, `same_step` or `disabled`.
+        observation: `rgb` for frames, `features` for a vector that describes what the frame shows, without drawing it, or
+            `rgb+features` for a dict of both.
+        frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
+        groups: Groups of environments for `send` and `recv`, 1 to 64.
+        copy: Return writable copies instead of read-only views.
+
+    Raises:
+        TypeError: A number is no integer.
+        ValueError: An argument is out of its range.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
+    num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
+    groups = integer("groups", groups, 1, _native.MAX_GROUPS)
+    seed, seed_range, seed_list = seed_source(seed, seeds)
     frames, features = contents(observation, frames)
-    # As in an engine, groups share the threads, and environments are numbered across all groups.
-    threads = _native.Threads(num_threads or 0)
+    # As in an engine, groups share threads, and environments are counted over all groups.
+    threads = _native.Threads(integer("num_threads", num_threads or 0))
     pools = [
         _native.Pool(
             described.id,
             num_envs,
+            group=group,
             threads=threads,
             options=_pool_options(options, group * num_envs, num_envs, groups),
             autoreset=_name(mode),
             first_env=group * num_envs,
             total_envs=groups * num_envs,
             seed=seed,
-            seed_range=(seeds.start, seeds.stop) if isinstance(seeds, range) else None,
-            seed_list=None if seeds is None or isinstance(seeds, range) else list(seeds),
+            seed_range=seed_range,
+            seed_list=seed_list,
             frames=frames.arguments() if frames else None,
             features=features,
             final_observation=True,
@@ -474,7 +399,7 @@ def make_vec(
         for group in range(groups)
     ]
     return EndlessVectorEnv(
-        _InProcess(pools),
+        InProcess(pools),
         described=described,
         num_envs=num_envs,
         frames=frames,
@@ -489,19 +414,21 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
     """Connect to a running engine, started by `endless serve --service NAME` or by `serve`.
 
     Args:
-        service: Name of the engine.
-        timeout: Seconds to wait for the engine, and for each of its answers.
-        copy: Return writeable copies instead of read-only views into shared memory.
-        engine: The engine process; only used by `serve`.
+        service: The engine's name.
+        timeout: Seconds to wait for the engine to start, and for each of its answers.
+        copy: Return writable copies instead of read-only views of shared memory.
+        engine: Used by `serve`.
 
     Raises:
-        ConnectionError: There is no such engine, or another trainer is connected to it.
+        ConnectionError: There is no such engine, or it already has a trainer.
+        ValueError: The timeout is negative or not finite.
     """
+    timeout = checked_timeout(timeout)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
     (options, *others) = specification["options"]
     return EndlessVectorEnv(
-        _Remote(connection, specification["groups"], timeout, engine),
+        Remote(connection, specification["groups"], timeout, engine),
         described=spec(specification["id"]),
         num_envs=specification["num_envs"],
         frames=Frames.of_specification(specification["frames"]),
@@ -513,29 +440,27 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
 
 
 def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> EndlessVectorEnv:
-    """Entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
+    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
     if render_mode is not None:
-        raise gymnasium.error.Error(
-            f"vector environments do not support render_mode, got `{render_mode}`; use `gymnasium.make` to render"
-        )
+        raise gymnasium.error.Error(f"render_mode must be None for vector environments, got {render_mode!r}")
     return make_vec(id, num_envs, **kwargs)
 
 
 def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
-    """Convert the name of an auto-reset mode to Gymnasium's `AutoresetMode`."""
+    """Gymnasium's auto-reset mode, from the mode or its name."""
     mode = given if isinstance(given, AutoresetMode) else _MODES.get(given)
     if mode is None:
-        raise ValueError(f"autoreset must be {', '.join(_MODES)}; got `{given}`")
+        raise ValueError(f"autoreset must be one of {', '.join(_MODES)}, got {given!r}")
     return mode
 
 
 def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """Format of the frames in a batch, or None without frames; and whether it contains the feature observation."""
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
     if observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be {', '.join(OBSERVATIONS)}; got `{observation}`")
+        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
     has_frames, has_features = OBSERVATIONS[observation]
     if frames is not None and not has_frames:
-        raise ValueError(f"the observation `{observation}` has no frames; frames must be None, got {frames}")
+        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
     return (frames or Frames()) if has_frames else None, has_features
 
 
@@ -544,9 +469,11 @@ def _name(mode: AutoresetMode) -> str:
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
-    """Reset parameters of the environments of one group as JSON text for the native module."""
+    """The reset parameters of the environments of one group, in the native module's format."""
     if given is None or isinstance(given, Mapping):
         return options_text(given)
     if len(given) != groups * num_envs:
-        raise ValueError(f"got {len(given)} mappings of reset parameters for {groups * num_envs} environments")
+        raise ValueError(
+            f"options must have one mapping for each of {groups * num_envs} environments, got {len(given)}"
+        )
     return f"[{', '.join(options_text(each) for each in given[first : first + num_envs])}]"

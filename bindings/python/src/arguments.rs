@@ -1,14 +1,19 @@
-//! What Python hands over: actions, options, seeds.
+//! Arguments from Python: actions, reset parameters, seeds, durations.
+
+use std::time::Duration;
 
 use endless_gym::batch::Frames;
 use endless_gym::pool::{Autoreset, ResetOptions, ResetRequest, Seeding, UnknownAutoreset};
 use endless_gym::raster::PixelFormat;
+use endless_gym::service::timeout_from_seconds;
 use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use serde_json::{Map, Value as Json};
 
-/// Integers of any array-like, row after row. Whether they are in range is the engine's to check.
+use crate::errors;
+
+/// Copies the integers of an array-like into `to`, in C order. The engine checks their number and range.
 pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
     to.clear();
     if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i64>>() {
@@ -24,7 +29,7 @@ pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
         if !matches!(kind.as_str(), "i" | "u" | "b") {
             let shown = given.repr()?.to_string();
             let shown: String = shown.chars().take(80).collect();
-            return Err(PyTypeError::new_err(format!("actions are integers; {shown} given")));
+            return Err(PyTypeError::new_err(format!("actions must be integers, got {shown}")));
         }
         let array = array.call_method1("astype", ("int64",))?.cast_into::<numpy::PyArrayDyn<i64>>()?;
         append(&array.readonly(), to, clamp);
@@ -32,7 +37,7 @@ pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
     Ok(())
 }
 
-/// Appends the numbers in the order of the array's indices, whatever their order in memory.
+/// Appends the numbers in C order, for any memory order of the array.
 fn append<T: Element + Copy>(array: &PyReadonlyArrayDyn<'_, T>, to: &mut Vec<i32>, convert: impl Fn(T) -> i32) {
     match array.as_array().as_slice() {
         Some(numbers) => to.extend(numbers.iter().map(|number| convert(*number))),
@@ -40,37 +45,43 @@ fn append<T: Element + Copy>(array: &PyReadonlyArrayDyn<'_, T>, to: &mut Vec<i32
     }
 }
 
-/// What does not fit an i32 is as far out of range as what is just outside.
+/// An action outside of i32 becomes -1, which is out of range as well.
 fn clamp(action: i64) -> i32 {
     i32::try_from(action).unwrap_or(-1)
 }
 
-/// Grey, channels first, row-major, number of frames.
+/// The frames of an observation, from grayscale, channels first, row-major and number of stacked frames.
 pub fn frames((grayscale, channels_first, row_major, stack): (bool, bool, bool, usize)) -> Frames {
     Frames { format: PixelFormat { grayscale, channels_first, row_major }, stack }
 }
 
-/// Reset parameters from the JSON text of an object.
-pub fn options(text: &str) -> PyResult<Map<String, Json>> {
-    serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("options cannot be read: {error}")))
+/// A timeout from a number of seconds.
+pub fn timeout(seconds: f64) -> PyResult<Duration> {
+    timeout_from_seconds(seconds).map_err(errors::service)
 }
 
-/// The reset parameters of a pool: the JSON text of an object for all environments, or of a list of them.
+/// Reset parameters from the JSON text of an object.
+pub fn options(text: &str) -> PyResult<Map<String, Json>> {
+    serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
+}
+
+/// The reset parameters of a pool, from the JSON text of one object for all environments, or of a list with one for each.
 pub fn pool_options(text: &str) -> PyResult<ResetOptions> {
     if text.starts_with('[') {
         let each = serde_json::from_str(text);
-        each.map(ResetOptions::Each).map_err(|error| PyValueError::new_err(format!("options cannot be read: {error}")))
+        each.map(ResetOptions::Each)
+            .map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
     } else {
         options(text).map(ResetOptions::Shared)
     }
 }
 
-/// An auto-reset mode by its name.
+/// The auto-reset mode of that name.
 pub fn autoreset(name: &str) -> PyResult<Autoreset> {
     name.parse().map_err(|error: UnknownAutoreset| PyValueError::new_err(error.to_string()))
 }
 
-/// Where the seeds of episodes come from.
+/// The source of the episodes' seeds.
 pub fn seeding(seed: Option<u64>, range: Option<(u64, u64)>, list: Option<Vec<u64>>) -> Seeding {
     match (range, list) {
         (Some((start, end)), _) => Seeding::Range { start, end, seed },
@@ -79,17 +90,17 @@ pub fn seeding(seed: Option<u64>, range: Option<(u64, u64)>, list: Option<Vec<u6
     }
 }
 
-/// Which environments a reset is for.
+/// The environments that a reset applies to, and their seeds.
 #[derive(FromPyObject)]
 pub enum Reset {
-    /// All, environment `i` with this seed plus `i`.
+    /// All environments of the group; environment `i` of group `g` is seeded with this seed plus `g * num_envs + i`.
     Seed(u64),
-    /// For each environment 0 (leave alone), 1 (start the next episode) or 2 (start one with the seed), and the seeds.
+    /// A reset mask and seeds, one of each per environment: 0 does not reset, 1 starts the next episode, 2 starts one with the seed.
     Each(Vec<u8>, Vec<u64>),
 }
 
 impl Reset {
-    /// The engine's form of it.
+    /// The request to a pool or an engine; `None` resets all environments without seeds.
     pub fn request(request: Option<&Reset>) -> ResetRequest<'_> {
         match request {
             None => ResetRequest::All,

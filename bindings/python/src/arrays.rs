@@ -6,13 +6,19 @@ use endless_gym::batch::{Block, Dtype, Layout, MAX_DIMENSIONS, RowShape, Section
 use numpy::npyffi::{NPY_ARRAY_ALIGNED, NPY_ARRAY_C_CONTIGUOUS, NpyTypes, PY_ARRAY_API, PyArrayObject, npy_intp};
 use numpy::{PyArrayDescr, PyArrayDescrMethods, dtype, npyffi};
 use pyo3::PyClass;
+use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::pyclass::boolean_struct::True;
 use pyo3::types::PyTuple;
 
-/// What keeps a batch's memory as it is: for as long as the owner lives, nobody writes to the blocks that it hands out.
-pub trait Owner {
-    fn blocks(&self) -> &[Block];
+/// The owner of a batch's memory.
+///
+/// # Safety
+///
+/// The memory stays mapped while the owner lives. The engine or pool does not write to it in that time.
+pub unsafe trait Owner {
+    /// Address of the batch and its number of blocks.
+    fn memory(&self) -> (*const Block, usize);
 }
 
 /// The sections of a batch in the layout's order, each a read-only array whose base is `owner`.
@@ -21,9 +27,11 @@ pub fn sections<'py, T: PyClass<Frozen = True> + Owner + Sync>(
     layout: &Layout,
 ) -> PyResult<Bound<'py, PyTuple>> {
     let py = owner.py();
-    let blocks = owner.get().blocks();
-    // What the arrays below rely on: no section reaches beyond the blocks.
-    assert!(blocks.len() >= layout.blocks());
+    let (memory, blocks) = owner.get().memory();
+    if blocks < layout.blocks() {
+        let message = format!("a batch must have {} blocks of 64 bytes, got {blocks}", layout.blocks());
+        return Err(PyRuntimeError::new_err(message));
+    }
     let arrays = layout
         .sections()
         .iter()
@@ -34,9 +42,11 @@ pub fn sections<'py, T: PyClass<Frozen = True> + Owner + Sync>(
                 *to = *from as npy_intp;
             }
             let shape = &mut shape[..=section.shape().len()];
-            let data = blocks.as_ptr().wrapping_byte_add(section.offset());
-            // SAFETY: the section's numbers lie within the blocks, as asserted, at a multiple of 64 bytes. The blocks stay where
-            // they are and as they are while the owner lives, which the array keeps alive and does not write to.
+            let data = memory.wrapping_byte_add(section.offset());
+            // SAFETY: a layout is checked when it is made or deserialised, so the section lies within its blocks, at a multiple of
+            // 64 bytes, and there are as many blocks. The memory stays mapped and is not written to while the owner lives, which
+            // the array keeps alive. Every bit pattern is valid for the dtype: numpy takes any nonzero byte of a boolean array as
+            // true.
             unsafe { array(py, descriptor(py, section), shape, data, owner.as_any()) }
         })
         .collect::<PyResult<Vec<_>>>()?;
@@ -45,7 +55,7 @@ pub fn sections<'py, T: PyClass<Frozen = True> + Owner + Sync>(
 
 fn descriptor<'py>(py: Python<'py>, section: &Section) -> Bound<'py, PyArrayDescr> {
     match (section.dtype(), section.name().row()) {
-        // Zeros and ones.
+        // Written as 0 or 1. Rust code reads these arrays as u8, since a `bool` of another value is undefined behaviour.
         (Dtype::Uint8, RowShape::Flag) => dtype::<bool>(py),
         (Dtype::Uint8, _) => dtype::<u8>(py),
         (Dtype::Int32, _) => dtype::<i32>(py),
@@ -59,7 +69,7 @@ fn descriptor<'py>(py: Python<'py>, section: &Section) -> Bound<'py, PyArrayDesc
 ///
 /// # Safety
 ///
-/// `data` points to numbers of that type and shape in C order, which stay as they are for as long as `owner` lives.
+/// `data` points to numbers of that type and shape in C order, which stay mapped and unchanged for as long as `owner` lives.
 unsafe fn array<'py>(
     py: Python<'py>,
     descriptor: Bound<'py, PyArrayDescr>,
@@ -67,8 +77,8 @@ unsafe fn array<'py>(
     data: *const Block,
     owner: &Bound<'py, PyAny>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    // SAFETY: the arguments are what numpy's documentation asks for; both calls take over a reference to the descriptor and to
-    // the owner respectively, also where they fail.
+    // SAFETY: the arguments are what numpy's documentation asks for; both calls steal a reference, to the descriptor and to the
+    // owner, even if they fail.
     unsafe {
         let array = PY_ARRAY_API.PyArray_NewFromDescr(
             py,

@@ -3,9 +3,8 @@
 use std::time::{Duration, Instant};
 
 use endless_gym::batch::Block;
-use endless_gym::service::{
-    BatchLease, ConnectConfig, Namespace, ServiceError, Trainer, running_engines as list_engines, timeout_from_seconds,
-};
+
+use endless_gym::service::{self, BatchLease, ConnectConfig, Namespace, ServiceError, Trainer};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
@@ -14,20 +13,22 @@ use crate::arguments::{self, Reset};
 use crate::arrays::{self, Owner};
 use crate::errors;
 
-/// How long Python's signal handlers may have to wait, Ctrl-C's among them.
-const SIGNALS_EVERY: Duration = Duration::from_millis(50);
+/// Longest time between two runs of Python's signal handlers, among them that of Ctrl-C.
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// A batch in shared memory. The engine gets it back once the arrays that look into it are all gone.
+/// The owner of the arrays of one batch in shared memory. The engine writes to the memory again once all arrays are gone.
 #[pyclass(frozen)]
-struct Lent(BatchLease);
+struct Lease(BatchLease);
 
-impl Owner for Lent {
-    fn blocks(&self) -> &[Block] {
-        self.0.blocks()
+// SAFETY: the engine does not write to a batch that a trainer holds, and its memory stays mapped for as long.
+unsafe impl Owner for Lease {
+    fn memory(&self) -> (*const Block, usize) {
+        let blocks = self.0.blocks();
+        (blocks.as_ptr(), blocks.len())
     }
 }
 
-/// The trainer's side of an engine.
+/// The trainer of an engine in another process.
 #[pyclass(module = "endless_gym._native")]
 pub struct Connection {
     trainer: Trainer,
@@ -37,22 +38,22 @@ pub struct Connection {
 
 #[pymethods]
 impl Connection {
-    /// Connects to the engine of that name, waiting up to `timeout` seconds for it to appear.
+    /// Connects to the engine named `service`, and waits up to `timeout` seconds for it to start.
     #[new]
     fn new(py: Python<'_>, service: &str, timeout: f64) -> PyResult<Self> {
-        let (timeout, start) = (seconds(timeout)?, Instant::now());
+        let (timeout, start) = (arguments::timeout(timeout)?, Instant::now());
         loop {
             let left = timeout.saturating_sub(start.elapsed());
-            let config = ConnectConfig { timeout: left.min(SIGNALS_EVERY), ..ConnectConfig::new(service) };
+            let config = ConnectConfig { timeout: left.min(SIGNAL_INTERVAL), ..ConnectConfig::new(service) };
             match py.detach(|| Trainer::connect(&config)) {
                 Ok(trainer) => return Ok(Connection { trainer, actions: Vec::new(), process: std::process::id() }),
-                Err(ServiceError::UnknownEngine { .. }) if left > SIGNALS_EVERY => py.check_signals()?,
+                Err(ServiceError::UnknownEngine { .. }) if left > SIGNAL_INTERVAL => py.check_signals()?,
                 Err(error) => return Err(errors::service(error)),
             }
         }
     }
 
-    /// What the engine serves, as JSON text.
+    /// The engine's specification, as JSON text.
     fn specification(&self) -> PyResult<String> {
         let text = serde_json::to_string(self.trainer.specification());
         text.map_err(|error| PyRuntimeError::new_err(error.to_string()))
@@ -72,7 +73,7 @@ impl Connection {
         self.trainer.send(group, &self.actions).map_err(errors::service)
     }
 
-    /// The group that answered, and its arrays. `group` is the one to wait for; `None` takes whichever is first.
+    /// The number and the arrays of a group that has answered: of `group`, or of the first to answer for `None`.
     fn receive<'py>(
         &mut self,
         py: Python<'py>,
@@ -84,8 +85,8 @@ impl Connection {
             None => trainer.receive_any(slice),
         })?;
         let group = received.group();
-        let lent = Bound::new(py, Lent(received))?;
-        let arrays = arrays::sections(&lent, lent.get().0.batch().layout())?;
+        let lease = Bound::new(py, Lease(received))?;
+        let arrays = arrays::sections(&lease, lease.get().0.batch().layout())?;
         Ok((group, arrays))
     }
 
@@ -101,21 +102,21 @@ impl Connection {
         Ok(PyBytes::new(py, &bytes))
     }
 
-    /// Puts one environment of a group into the state of a snapshot.
+    /// Sets the state of one environment of a group to that of a snapshot.
     fn restore(&mut self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8], timeout: f64) -> PyResult<()> {
         self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
-    /// Goes on with an engine of the same name that was started in place of a lost one.
+    /// Connects to an engine of the same name that was started in place of a lost one.
     fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<()> {
         self.check_process()?;
-        let timeout = seconds(timeout)?;
+        let timeout = arguments::timeout(timeout)?;
         py.detach(|| self.trainer.reconnect(timeout)).map_err(errors::service)
     }
 }
 
 impl Connection {
-    /// Waits for an answer, without the interpreter, and looks for signals meanwhile.
+    /// Waits for an answer without the interpreter's lock, and runs Python's signal handlers meanwhile.
     fn wait<T: Send>(
         &mut self,
         py: Python<'_>,
@@ -123,10 +124,10 @@ impl Connection {
         mut answer: impl FnMut(&mut Trainer, Duration) -> Result<T, ServiceError> + Send,
     ) -> PyResult<T> {
         self.check_process()?;
-        let (timeout, start) = (seconds(timeout)?, Instant::now());
+        let (timeout, start) = (arguments::timeout(timeout)?, Instant::now());
         let trainer = &mut self.trainer;
         loop {
-            let slice = timeout.saturating_sub(start.elapsed()).min(SIGNALS_EVERY);
+            let slice = timeout.saturating_sub(start.elapsed()).min(SIGNAL_INTERVAL);
             match py.detach(|| answer(trainer, slice)) {
                 Ok(answer) => return Ok(answer),
                 Err(ServiceError::TimedOut { service, .. }) => {
@@ -145,17 +146,19 @@ impl Connection {
             return Ok(());
         }
         Err(PyRuntimeError::new_err(
-            "this connection belongs to the process that this one was forked from; connect in the child, to another engine",
+            "this connection belongs to the process that this process was forked from; connect to another engine in the child",
         ))
     }
 }
 
-fn seconds(given: f64) -> PyResult<Duration> {
-    timeout_from_seconds(given).map_err(errors::service)
-}
-
-/// Names of the engines that this user's processes can connect to.
+/// Names of the running engines in the default namespace.
 #[pyfunction]
 pub fn running_engines(py: Python<'_>) -> PyResult<Vec<String>> {
-    py.detach(|| list_engines(&Namespace::default())).map_err(errors::service)
+    py.detach(|| service::running_engines(&Namespace::default())).map_err(errors::service)
+}
+
+/// The prefix of all shared memory segments in the default namespace, for tests that look for leaks.
+#[pyfunction]
+pub fn segment_prefix() -> String {
+    Namespace::default().prefix().to_owned()
 }

@@ -1,4 +1,4 @@
-//! The engine's errors as Python's exceptions.
+//! Errors of the engine as Python exceptions.
 
 use endless_gym::pool::{PoolError, SnapshotError};
 use endless_gym::service::{Rejection, ServiceError};
@@ -6,21 +6,28 @@ use pyo3::create_exception;
 use pyo3::exceptions::{PyBufferError, PyConnectionError, PyOSError, PyRuntimeError, PyTimeoutError, PyValueError};
 use pyo3::prelude::*;
 
-create_exception!(endless_gym, EngineLost, PyConnectionError, "The engine has ended, or was replaced by another one.");
+create_exception!(
+    endless_gym,
+    EngineLost,
+    PyConnectionError,
+    "The engine has ended, or has been replaced by another engine."
+);
 create_exception!(
     endless_gym,
     TooManyBatchesHeld,
     PyBufferError,
-    "All batches that the engine can lend are held by arrays of this process."
+    "Arrays of this process hold all batches that the engine can lend."
 );
+
+/// The message for environments without a state, of a pool and of an engine.
+const NOT_RESET: &str = "the environments have no episodes yet; reset all of them first";
 
 /// The exception for an error of a pool.
 pub fn pool(error: PoolError) -> PyErr {
     let text = error.to_string();
     match error {
-        PoolError::NotReset | PoolError::Threads { .. } | PoolError::BatchTooShort { .. } => {
-            PyRuntimeError::new_err(text)
-        }
+        PoolError::NotReset => PyRuntimeError::new_err(NOT_RESET),
+        PoolError::Threads { .. } | PoolError::BatchTooShort { .. } => PyRuntimeError::new_err(text),
         _ => PyValueError::new_err(text),
     }
 }
@@ -29,7 +36,7 @@ pub fn pool(error: PoolError) -> PyErr {
 pub fn snapshot(error: SnapshotError) -> PyErr {
     let text = error.to_string();
     match error {
-        SnapshotError::NotReset => PyRuntimeError::new_err(text),
+        SnapshotError::NotReset => PyRuntimeError::new_err(NOT_RESET),
         _ => PyValueError::new_err(text),
     }
 }
@@ -37,11 +44,14 @@ pub fn snapshot(error: SnapshotError) -> PyErr {
 /// The exception for an error of the service.
 pub fn service(error: ServiceError) -> PyErr {
     use ServiceError as E;
-    if let E::Pool(error) = error {
-        return pool(error);
-    }
-    let text = error.to_string();
+    let text = match &error {
+        // The messages of a pool in this process.
+        E::Rejected { reason: Rejection::NotReset, .. } => NOT_RESET.to_owned(),
+        E::Rejected { message, .. } => message.clone(),
+        error => error.to_string(),
+    };
     match error {
+        E::Pool(error) => pool(error),
         E::EngineLost { .. } | E::EngineRestarted { .. } | E::SpecificationChanged { .. } => EngineLost::new_err(text),
         E::TooManyBatchesHeld { .. } => TooManyBatchesHeld::new_err(text),
         E::UnknownEngine { .. } | E::TrainerExists { .. } | E::TooManyObservers { .. } => {

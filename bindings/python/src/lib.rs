@@ -1,9 +1,10 @@
-//! The native module `endless_gym._native`: the engine for Python.
+//! The native module `endless_gym._native`: pools, engines and their batches for Python.
 //!
-//! It is a thin layer; spaces, infos and Gymnasium's interface are made in Python, in the package around it.
+//! It is a thin layer. The Python package around it defines spaces, infos and Gymnasium's interface.
 
 mod arguments;
 mod arrays;
+mod buffers;
 mod connection;
 mod dlpack;
 mod ends;
@@ -12,7 +13,6 @@ mod pool;
 mod single;
 
 use std::ffi::OsString;
-use std::process::ExitCode;
 
 use endless_gym::envs;
 use endless_gym::pool::Autoreset;
@@ -20,17 +20,17 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-/// All environments' specifications, as JSON text.
+/// The specifications of all environments, as JSON text.
 #[pyfunction]
 fn specs() -> PyResult<String> {
     let specs: Vec<_> = envs::specs().collect();
     serde_json::to_string(&specs).map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }
 
-/// Runs the program `endless` and returns its exit status. `itself` is the command that starts it anew.
+/// Runs the program `endless` and returns its exit status. `executable` is the command that starts it in a new process.
 #[pyfunction]
-fn endless(py: Python<'_>, arguments: Vec<OsString>, itself: Vec<OsString>) -> u8 {
-    py.detach(|| u8::from(endless_gym::cli::main(arguments, &itself) != ExitCode::SUCCESS))
+fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) -> u8 {
+    py.detach(|| endless_gym::cli::main(arguments, &executable))
 }
 
 #[pymodule(name = "_native")]
@@ -39,6 +39,8 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("AUTORESET_MODES", PyTuple::new(py, Autoreset::ALL.map(Autoreset::name))?)?;
     module.add("DEFAULT_ENV_ID", envs::DEFAULT_ENV_ID)?;
+    module.add("MAX_ENVS", endless_gym::pool::MAX_ENVS)?;
+    module.add("MAX_GROUPS", endless_gym::service::MAX_GROUPS)?;
     module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
     module.add_class::<pool::Pool>()?;
@@ -46,7 +48,9 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;
+    module.add_function(wrap_pyfunction!(connection::segment_prefix, module)?)?;
     module.add_function(wrap_pyfunction!(dlpack::dlpack, module)?)?;
+    module.add_function(wrap_pyfunction!(dlpack::dlpack_unchecked, module)?)?;
     module.add_function(wrap_pyfunction!(ends::ended_episodes, module)?)?;
     module.add_function(wrap_pyfunction!(endless, module)?)?;
     module.add_function(wrap_pyfunction!(specs, module)?)

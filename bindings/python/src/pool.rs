@@ -1,30 +1,21 @@
 //! Many environments in this process.
 
-use std::sync::Arc;
-
-use endless_gym::batch::{Block, SectionTable, zeroed};
+use endless_gym::batch::{Block, SectionTable};
+use endless_gym::envs::ActionError;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
-use endless_gym::pool::{self as engine, PoolConfig};
+use endless_gym::pool::{self as engine, PoolConfig, PoolError};
+use endless_gym::service::ServiceError;
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
+use serde_json::{Map, Value as Json};
 
 use crate::arguments::{self, Reset};
-use crate::arrays::{self, Owner};
-use crate::errors;
+use crate::buffers::Buffers;
+use crate::{arrays, errors};
 
-/// A batch that arrays look into. The pool writes to its memory again once they are all gone.
-#[pyclass(frozen)]
-struct Lent(Arc<Vec<Block>>);
-
-impl Owner for Lent {
-    fn blocks(&self) -> &[Block] {
-        &self.0
-    }
-}
-
-/// Threads that step environments: that many, or one for each core if 0. Several pools may share them.
+/// Threads that step environments: `count` of them, or one per core for 0. Several pools may share them.
 #[pyclass(frozen, module = "endless_gym._native")]
 pub struct Threads(engine::Threads);
 
@@ -36,25 +27,41 @@ impl Threads {
     }
 }
 
-/// Environments of one id in lockstep, and the batches that they write.
+/// A group of environments of one id that are stepped in lockstep, and the buffers of its batches.
 ///
-/// A batch whose arrays are still held is left alone: the pool writes into another one, and makes a new one where all are held.
+/// A buffer is not written to while arrays of it exist. A new one is allocated if arrays of all buffers exist.
 #[pyclass(module = "endless_gym._native")]
 pub struct Pool {
     pool: engine::Pool,
-    batches: Vec<Arc<Vec<Block>>>,
+    /// Number of the group, for messages.
+    group: usize,
+    buffers: Buffers,
+    /// The message that `receive` has not answered yet.
+    pending: Option<Message>,
+    /// The actions of the last `step`, or of the pending one.
     actions: Vec<i32>,
+    /// Memory for actions that are not checked yet.
+    unchecked: Vec<i32>,
     process: u32,
+}
+
+/// What `receive` carries out.
+enum Message {
+    /// A step with `Pool::actions`.
+    Step,
+    /// A reset.
+    Reset { request: Option<Reset>, options: Option<Map<String, Json>> },
 }
 
 #[pymethods]
 impl Pool {
     #[new]
-    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, threads, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
+    #[pyo3(signature = (id, num_envs, *, group, first_env, total_envs, threads, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         id: &str,
         num_envs: usize,
+        group: usize,
         first_env: usize,
         total_envs: usize,
         threads: &Threads,
@@ -79,10 +86,18 @@ impl Pool {
             ..PoolConfig::new(id, num_envs)
         };
         let pool = engine::Pool::new(&config, &threads.0).map_err(errors::pool)?;
-        Ok(Pool { pool, batches: Vec::new(), actions: Vec::new(), process: std::process::id() })
+        Ok(Pool {
+            pool,
+            group,
+            buffers: Buffers::default(),
+            pending: None,
+            actions: Vec::new(),
+            unchecked: Vec::new(),
+            process: std::process::id(),
+        })
     }
 
-    /// Names of the arrays that `reset` and `step` return.
+    /// Names of the arrays that `reset`, `step` and `receive` return.
     fn sections(&self) -> Vec<&'static str> {
         self.pool.layout().sections().iter().map(|section| section.name().name()).collect()
     }
@@ -95,23 +110,61 @@ impl Pool {
         options: Option<&str>,
     ) -> PyResult<Bound<'py, PyTuple>> {
         let options = options.map(arguments::options).transpose()?;
-        self.write(py, |pool, batch| pool.reset_with(Reset::request(request.as_ref()), options.as_ref(), batch))
+        self.check_process()?;
+        self.check_idle()?;
+        self.write_reset(py, request.as_ref(), options.as_ref())
     }
 
     fn step<'py>(&mut self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
-        let mut numbers = std::mem::take(&mut self.actions);
-        arguments::actions(actions, &mut numbers)?;
-        let arrays = self.write(py, |pool, batch| pool.step(&numbers, batch));
-        self.actions = numbers;
-        arrays
+        self.check_process()?;
+        arguments::actions(actions, &mut self.unchecked)?;
+        if self.pending.is_some() {
+            self.check_message()?;
+        }
+        std::mem::swap(&mut self.actions, &mut self.unchecked);
+        self.write_step(py)
+    }
+
+    /// Has `receive` play a step with these actions, which are copied.
+    fn send(&mut self, actions: &Bound<'_, PyAny>) -> PyResult<()> {
+        self.check_process()?;
+        arguments::actions(actions, &mut self.unchecked)?;
+        self.check_message()?;
+        std::mem::swap(&mut self.actions, &mut self.unchecked);
+        self.pending = Some(Message::Step);
+        Ok(())
+    }
+
+    /// Has `receive` carry out a reset.
+    #[pyo3(signature = (request=None, options=None))]
+    fn send_reset(&mut self, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
+        let options = options.map(arguments::options).transpose()?;
+        self.check_process()?;
+        self.check_idle()?;
+        self.pending = Some(Message::Reset { request, options });
+        Ok(())
+    }
+
+    /// Carries out what was sent.
+    fn receive<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        self.check_process()?;
+        match self.pending.take() {
+            None => Err(errors::service(ServiceError::NothingSent { group: self.group })),
+            Some(Message::Step) => self.write_step(py),
+            Some(Message::Reset { request, options }) => self.write_reset(py, request.as_ref(), options.as_ref()),
+        }
     }
 
     fn snapshot<'py>(&self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyBytes>> {
+        self.check_process()?;
+        self.check_idle()?;
         let bytes = self.pool.snapshot(env).map_err(errors::snapshot)?;
         Ok(PyBytes::new(py, &bytes))
     }
 
     fn restore(&mut self, env: usize, snapshot: &[u8]) -> PyResult<()> {
+        self.check_process()?;
+        self.check_idle()?;
         self.pool.restore(env, snapshot).map_err(errors::snapshot)
     }
 
@@ -124,27 +177,64 @@ impl Pool {
 }
 
 impl Pool {
-    /// Has the pool write into a batch that nobody looks into, without the interpreter.
+    fn check_process(&self) -> PyResult<()> {
+        if self.process == std::process::id() {
+            return Ok(());
+        }
+        Err(PyRuntimeError::new_err(
+            "these environments belong to the process that this process was forked from; make new ones after the fork",
+        ))
+    }
+
+    /// An error if a message is pending: the error of an engine.
+    fn check_idle(&self) -> PyResult<()> {
+        match self.pending {
+            None => Ok(()),
+            Some(_) => Err(errors::service(ServiceError::AnswerPending { group: self.group })),
+        }
+    }
+
+    /// The checks of a step with the actions in `unchecked`, in the order in which a trainer makes them for an engine.
+    fn check_message(&self) -> PyResult<()> {
+        match check_actions(&self.pool, &self.unchecked) {
+            Err(error @ PoolError::Action(ActionError::Count { .. })) => Err(errors::pool(error)),
+            checked => self.check_idle().and(checked.map_err(errors::pool)),
+        }
+    }
+
+    fn write_step<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let actions = std::mem::take(&mut self.actions);
+        let arrays = self.write(py, |pool, batch| match pool.step(&actions, batch) {
+            // An engine's trainer checks the actions first.
+            Err(PoolError::NotReset) => check_actions(pool, &actions).and(Err(PoolError::NotReset)),
+            stepped => stepped,
+        });
+        self.actions = actions;
+        arrays
+    }
+
+    fn write_reset<'py>(
+        &mut self,
+        py: Python<'py>,
+        request: Option<&Reset>,
+        options: Option<&Map<String, Json>>,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        self.write(py, |pool, batch| pool.reset_with(Reset::request(request), options, batch))
+    }
+
+    /// Writes a batch into a free buffer, without the interpreter's lock.
     fn write<'py>(
         &mut self,
         py: Python<'py>,
-        work: impl FnOnce(&mut engine::Pool, &mut [Block]) -> Result<(), engine::PoolError> + Send,
+        work: impl FnOnce(&mut engine::Pool, &mut [Block]) -> Result<(), PoolError> + Send,
     ) -> PyResult<Bound<'py, PyTuple>> {
-        if self.process != std::process::id() {
-            return Err(PyRuntimeError::new_err(
-                "these environments belong to the process that this one was forked from; make new ones after the fork",
-            ));
-        }
-        let free = self.batches.iter_mut().rposition(|batch| Arc::get_mut(batch).is_some());
-        let index = free.unwrap_or_else(|| {
-            self.batches.push(Arc::new(zeroed(self.pool.layout().blocks())));
-            self.batches.len() - 1
-        });
         let pool = &mut self.pool;
-        if let Some(batch) = Arc::get_mut(&mut self.batches[index]) {
-            py.detach(|| work(pool, batch)).map_err(errors::pool)?;
-        }
-        let lent = Bound::new(py, Lent(Arc::clone(&self.batches[index])))?;
-        arrays::sections(&lent, self.pool.layout())
+        let (index, batch) = self.buffers.free(pool.layout());
+        py.detach(|| work(pool, batch)).map_err(errors::pool)?;
+        arrays::sections(&Bound::new(py, self.buffers.lease(index))?, self.pool.layout())
     }
+}
+
+fn check_actions(pool: &engine::Pool, actions: &[i32]) -> Result<(), PoolError> {
+    Ok(pool.spec().action_space.check(pool.layout().num_envs(), actions)?)
 }

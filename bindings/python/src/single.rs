@@ -1,4 +1,4 @@
-//! One environment, as the original's class: an observation of its own for each step.
+//! One environment with the interface of the original. Every step returns newly allocated arrays.
 
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
@@ -10,7 +10,7 @@ use pyo3::types::PyBytes;
 
 use crate::{arguments, errors};
 
-/// What the original returns as arrays: frame, vector observation and ground truth; `None` where the environment has none.
+/// Frame, vector observation and ground truth; `None` for those that the environment does not have.
 type Arrays<'py> = (Bound<'py, PyAny>, Option<Bound<'py, PyAny>>, Option<Bound<'py, PyAny>>);
 
 /// One environment without auto-reset.
@@ -43,7 +43,7 @@ impl Single {
         self.arrays(py)
     }
 
-    /// The arrays, the reward, whether the episode ended, and then its return, its length and the further infos.
+    /// The arrays, the reward, and whether the episode ended; if it did, its return, its length and the info columns.
     #[allow(clippy::type_complexity)]
     fn step<'py>(
         &mut self,
@@ -63,7 +63,7 @@ impl Single {
         Ok((self.arrays(py)?, batch.reward()[0], ended, end))
     }
 
-    /// The last frame as a picture, indexed \[row\]\[column\]\[channel\].
+    /// The last frame, indexed \[row\]\[column\]\[channel\].
     fn rgb_array<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let mut picture = vec![0; FRAME_BYTES];
         rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), &mut picture);

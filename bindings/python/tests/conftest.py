@@ -1,9 +1,14 @@
 """What the tests share."""
 
 import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from endless_gym import _native
 
 
 @pytest.fixture(scope="session")
@@ -16,13 +21,25 @@ def original_python() -> str:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def own_namespace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Engines of these tests meet nobody else's, and leave nothing behind."""
-    root = tmp_path_factory.mktemp("gym", numbered=True)
-    os.environ["ENDLESS_GYM_ROOT"] = str(root)
-    # Processes that the tests start take the installed package, not the sources where they are started.
+def own_namespace() -> Iterator[Path]:
+    """A namespace root of this test run, so that runs at the same time do not see each other's engines and segments."""
+    # A short path, since it is part of the path of Unix sockets.
+    root = tempfile.mkdtemp(prefix="endless-", dir="/tmp")
+    os.environ["ENDLESS_GYM_ROOT"] = root
+    # Processes that the tests start import the installed package, not the sources in their working directory.
     os.environ["PYTHONSAFEPATH"] = "1"
-    before = set(os.listdir("/dev/shm"))
-    yield root
-    left = {name for name in set(os.listdir("/dev/shm")) - before if name.startswith("endless")}
+    yield Path(root)
+    left = _segments()
+    shutil.rmtree(root, ignore_errors=True)
     assert not left, f"left in /dev/shm: {sorted(left)}"
+
+
+@pytest.fixture(scope="session")
+def segments(own_namespace: Path) -> Callable[[], set[str]]:
+    """The shared memory segments of this test run."""
+    return _segments
+
+
+def _segments() -> set[str]:
+    prefix = _native.segment_prefix()
+    return {name for name in os.listdir("/dev/shm") if name.startswith(prefix)}

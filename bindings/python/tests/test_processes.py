@@ -134,6 +134,9 @@ def test_the_program_comes_along() -> None:
     command = [sys.executable, "-c", "import sys; from endless_gym.program import main; sys.exit(main())"]
     listed = subprocess.run([*command, "list", "--json"], capture_output=True, text=True, check=True)
     assert ID in listed.stdout
+    with open("/dev/full", "w") as full:
+        for arguments, status in ((["list"], 1), (["--help"], 1), (["list", "--chess"], 2)):
+            assert subprocess.run([*command, *arguments], stdout=full, stderr=subprocess.PIPE).returncode == status
     demo = [*command, "demo", "--seconds", "0.5", "--num-envs", "8"]
     assert subprocess.run(demo, capture_output=True, check=False).returncode == 0
     table = [sys.executable, "-m", "endless_gym", "--num-envs", "4", "--seconds", "0.01"]

@@ -69,9 +69,9 @@ def test_snapshots_go_on_identically_here_and_elsewhere(where, elsewhere) -> Non
         with pytest.raises(ValueError, match="not a snapshot"):
             others.restore({0: b"whatever"})
         for env in (3, -1):
-            with pytest.raises(ValueError, match=f"no environment {env}"):
+            with pytest.raises(ValueError, match=f"env must be 0 to 2, got {env}"):
                 others.snapshot(env)
-            with pytest.raises(ValueError, match=f"no environment {env}"):
+            with pytest.raises(ValueError, match=f"env must be 0 to 2, got {env}"):
                 others.restore({env: snapshots[0]})
         others.send(np.zeros((3, 2), np.int64), 1)
         with pytest.raises(RuntimeError, match="pending answer"):
@@ -156,7 +156,7 @@ def test_groups_are_stepped_independently(where) -> None:
         with pytest.raises(RuntimeError, match="pending answer"):
             envs.send(np.zeros((2, 2), dtype=np.int64), 1)
         assert envs.recv()[4]["group"] == 1
-        with pytest.raises(ValueError, match="group 7"):
+        with pytest.raises(ValueError, match="group must be 0 to 1, got 7"):
             envs.send(np.zeros((2, 2), dtype=np.int64), 7)
 
 
@@ -211,7 +211,7 @@ def test_environments_may_have_options_of_their_own(where) -> None:
                 number = 2 * group + env
                 alone = endless_gym.Env("MortarMayhem-v0", options=each[number])
                 np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
-    with pytest.raises((ValueError, RuntimeError), match=r"3 .* 2 environments|2 sets, one for each, got 3"):
+    with pytest.raises((ValueError, RuntimeError), match=r"2 sets, one for each, got 3|2 environments, got 3"):
         where("MortarMayhem-v0", 2, options=each[:3])
 
 

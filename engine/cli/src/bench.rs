@@ -1,68 +1,69 @@
 //! `endless bench`.
 
-use std::process::{Command, ExitCode};
+use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{Batch, zeroed};
 use endless_gym_core::envs::{self, DEFAULT_ENV_ID, EnvSpec};
 use endless_gym_core::pool::{Pool, ResetRequest, Threads};
-use endless_gym_service::timeout_from_seconds;
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;
-use super::options::EnvironmentArgs;
+use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
-use super::play::RandomPlayer;
+use super::play::RandomPolicy;
 use super::{Failure, stop};
 
-/// The script that steps the original.
+/// The Python script that measures the original.
 const ORIGINAL: &str = include_str!("original.py");
 
 /// Longest time that an engine may take for one step.
-const PATIENCE: Duration = Duration::from_secs(60);
+const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Measures steps per second: whole episodes with resets, random actions.
-///
-/// Each way of stepping is measured in several rounds, one after the other in each round, and the median is shown, since other
-/// programs on the machine disturb a measurement.
+/// Arguments of `endless bench`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id, or `all`.
     #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
     id: String,
-    /// Environments.
+    /// Number of environments.
     #[arg(long, default_value_t = 1024)]
     num_envs: usize,
-    /// Threads of the engine that the service runs; 0 for one for each core.
+    /// Threads of the engine that serves the environments; 0 for one per core.
     #[arg(long, default_value_t = 1)]
     threads: usize,
-    /// Seconds of one measurement.
+    /// Duration of one measurement in seconds.
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
-    /// Measurements of each kind.
+    /// Measurements of each method, at least 1.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
-    /// Measure the original too, with this Python, which must have `memory-gym` installed.
+    /// Also measure the original, with this Python interpreter, which must have `memory-gym` installed [default:
+    /// the original is not measured].
     #[arg(long, value_name = "PYTHON")]
     original: Option<String>,
     #[command(flatten)]
     environment: EnvironmentArgs,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }
 
-/// A way of stepping.
+/// How environments are stepped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Way {
+enum Method {
+    /// A pool in this process.
     InProcess { threads: usize },
+    /// An engine in a child process, and a trainer that does not read the batches.
     ServiceReceives,
+    /// An engine in a child process, and a trainer that reads every byte of every batch.
     ServiceReads,
+    /// The original, in Python.
     Original,
 }
 
-/// What one environment reached.
+/// The measurements of one environment.
 #[derive(Serialize)]
 struct Row {
     environment: &'static str,
@@ -73,35 +74,35 @@ struct Row {
 
 #[derive(Serialize)]
 struct Measurement {
-    way: String,
+    method: String,
     /// Median of the rounds.
     steps_per_second: f64,
     lowest: f64,
     highest: f64,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode, Failure> {
-    timeout_from_seconds(args.seconds)
-        .map_err(|_| format!("--seconds must be finite and not negative, got {}", args.seconds))?;
+/// Runs `endless bench`.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    options::seconds(args.seconds)?;
     let stop = stop::on_signal()?;
     let specs: Vec<&EnvSpec> = if args.id == "all" { envs::specs().collect() } else { vec![envs::spec(&args.id)?] };
     let cores = Threads::new(0)?.count();
-    let mut ways = vec![Way::InProcess { threads: 1 }];
+    let mut methods = vec![Method::InProcess { threads: 1 }];
     if cores > 1 {
-        ways.push(Way::InProcess { threads: cores });
+        methods.push(Method::InProcess { threads: cores });
     }
-    ways.extend([Way::ServiceReceives, Way::ServiceReads]);
-    ways.extend(args.original.as_ref().map(|_| Way::Original));
+    methods.extend([Method::ServiceReceives, Method::ServiceReads]);
+    methods.extend(args.original.as_ref().map(|_| Method::Original));
 
-    let measurements = specs.len() * ways.len() * usize::from(args.rounds);
+    let measurements = specs.len() * methods.len() * usize::from(args.rounds);
     let bar = progress(measurements as u64, "measuring {bar:40} {pos}/{len}  {msg}");
     let mut rows = Vec::new();
     for spec in &specs {
-        let mut results = vec![Vec::new(); ways.len()];
+        let mut results = vec![Vec::new(); methods.len()];
         for _ in 0..args.rounds {
-            for (way, results) in ways.iter().zip(&mut results) {
-                bar.set_message(format!("{}, {}", spec.id, name(*way)));
-                results.push(measure(args, spec, *way, &stop)?);
+            for (method, results) in methods.iter().zip(&mut results) {
+                bar.set_message(format!("{}, {}", spec.id, name(*method)));
+                results.push(measure(args, spec, *method, &stop)?);
                 if stop.load(Ordering::Relaxed) {
                     return Err("stopped before all measurements were done".into());
                 }
@@ -112,46 +113,46 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
             environment: spec.id,
             num_envs: args.num_envs,
             service_threads: Threads::new(args.threads)?.count(),
-            measurements: ways.iter().zip(results).map(|(way, results)| Measurement::new(*way, results)).collect(),
+            measurements: methods
+                .iter()
+                .zip(results)
+                .map(|(method, results)| Measurement::new(*method, results))
+                .collect(),
         });
     }
     bar.finish_and_clear();
-    if args.json {
-        print_json(&rows)?
-    } else {
-        show(args, &rows)
-    }
-    Ok(ExitCode::SUCCESS)
+    if args.json { print_json(&rows) } else { show(args, &rows) }
 }
 
-fn name(way: Way) -> String {
-    match way {
-        Way::InProcess { threads: 1 } => "in process, 1 thread".to_owned(),
-        Way::InProcess { threads } => format!("in process, {threads} threads"),
-        Way::ServiceReceives => "service, only receives".to_owned(),
-        Way::ServiceReads => "service, reads every byte".to_owned(),
-        Way::Original => "original".to_owned(),
+fn name(method: Method) -> String {
+    match method {
+        Method::InProcess { threads: 1 } => "in process, 1 thread".to_owned(),
+        Method::InProcess { threads } => format!("in process, {threads} threads"),
+        Method::ServiceReceives => "service, only receives".to_owned(),
+        Method::ServiceReads => "service, reads every byte".to_owned(),
+        Method::Original => "original".to_owned(),
     }
 }
 
 impl Measurement {
-    fn new(way: Way, mut results: Vec<f64>) -> Self {
+    fn new(method: Method, mut results: Vec<f64>) -> Self {
         results.sort_by(f64::total_cmp);
         let (lowest, highest) = (results[0], results[results.len() - 1]);
-        Measurement { way: name(way), steps_per_second: results[results.len() / 2], lowest, highest }
+        Measurement { method: name(method), steps_per_second: results[results.len() / 2], lowest, highest }
     }
 }
 
-fn show(args: &Args, rows: &[Row]) {
+/// Prints one table for each environment.
+fn show(args: &Args, rows: &[Row]) -> Result<(), Failure> {
     for row in rows {
         let plain = row.measurements[0].steps_per_second;
-        let original = row.measurements.iter().find(|m| m.way == name(Way::Original)).map(|m| m.steps_per_second);
+        let original = row.measurements.iter().find(|m| m.method == name(Method::Original)).map(|m| m.steps_per_second);
         let title = format!("{}, {} environments", row.environment, row.num_envs);
         let mut shown = table([&title, "steps per second", "lowest", "highest", "of 1 thread", "of the original"]);
         for measurement in &row.measurements {
             let speed = measurement.steps_per_second;
             shown.add_row([
-                measurement.way.clone(),
+                measurement.method.clone(),
                 grouped(speed),
                 grouped(measurement.lowest),
                 grouped(measurement.highest),
@@ -159,27 +160,27 @@ fn show(args: &Args, rows: &[Row]) {
                 original.map_or("not measured".to_owned(), |original| format!("{:.0} x", speed / original)),
             ]);
         }
-        print(format_args!("{shown}\n"));
+        print(format_args!("{shown}\n"))?;
     }
     let service = rows.first().map_or(1, |row| row.service_threads);
     let threads = if service == 1 { "1 thread".to_owned() } else { format!("{service} threads") };
     print(format_args!(
-        "Medians of {} rounds of {} s. The service's engine steps with {threads} in a process of its own.",
+        "Medians of {} rounds of {} s each. The service's engine runs with {threads} in a child process.",
         args.rounds, args.seconds
-    ));
+    ))
 }
 
-/// Steps per second in one way.
-fn measure(args: &Args, spec: &'static EnvSpec, way: Way, stop: &AtomicBool) -> Result<f64, Failure> {
-    match way {
-        Way::InProcess { threads } => in_process(args, spec, threads, stop),
-        Way::ServiceReceives => through_service(args, spec, false, stop),
-        Way::ServiceReads => through_service(args, spec, true, stop),
-        Way::Original => original(args, spec),
+/// Steps per second of one method.
+fn measure(args: &Args, spec: &'static EnvSpec, method: Method, stop: &AtomicBool) -> Result<f64, Failure> {
+    match method {
+        Method::InProcess { threads } => in_process(args, spec, threads, stop),
+        Method::ServiceReceives => through_service(args, spec, false, stop),
+        Method::ServiceReads => through_service(args, spec, true, stop),
+        Method::Original => original(args, spec),
     }
 }
 
-/// Calls `step` until time is up, a few times first to warm up. Steps per second.
+/// Calls `step` for `--seconds` after some calls to warm up, and returns the steps per second of all environments.
 fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Failure>) -> Result<f64, Failure> {
     const WARM_UP: usize = 20;
     for _ in 0..WARM_UP {
@@ -216,61 +217,63 @@ fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &Atom
     let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;
     time(args, stop, || {
-        let received = trainer.receive(0, PATIENCE)?;
+        let received = trainer.receive(0, STEP_TIMEOUT)?;
         if reads {
             std::hint::black_box(sum(&received.batch()));
         }
-        // Given back before the next step is asked for, so that the engine writes to memory that is warm in its cache.
+        // Released before the next step, so that the engine writes to memory that is still in its cache.
         drop(received);
         trainer.send(0, actions.next())?;
         Ok(())
     })
 }
 
-/// Random actions, drawn before the clock starts, as those of the original are.
+/// Random actions that are drawn before the measurement, as `original.py` does.
 struct Actions {
     numbers: Vec<i32>,
-    /// Numbers of one environment, and of all.
+    /// Numbers in the action of one environment.
     branches: usize,
+    /// Numbers in the actions of all environments.
     length: usize,
     step: usize,
 }
 
 impl Actions {
-    /// Steps after which the same actions come again, in other states.
+    /// Steps after which the actions repeat.
     const STEPS: usize = 1009;
 
     fn new(spec: &EnvSpec, num_envs: usize) -> Self {
         let branches = spec.action_space.branches().len();
         let mut numbers = vec![0; (num_envs + Self::STEPS) * branches];
-        RandomPlayer::new(spec).act(&mut numbers);
+        RandomPolicy::new(spec).act(&mut numbers);
         Actions { numbers, branches, length: num_envs * branches, step: 0 }
     }
 
-    /// The actions of all environments in one step: each plays in this one what the one after it played in the last.
+    /// The actions of all environments in the next step: those of the last step, shifted by one environment.
     fn next(&mut self) -> &[i32] {
         self.step = (self.step + 1) % Self::STEPS;
         &self.numbers[self.step * self.branches..][..self.length]
     }
 }
 
-/// Touches every byte of a batch.
+/// The sum of all bytes of a batch, read as 64-bit words.
 fn sum(batch: &Batch<'_>) -> u64 {
     let words: &[u64] = bytemuck::cast_slice(batch.bytes());
     words.iter().fold(0, |sum, word| sum.wrapping_add(*word))
 }
 
+/// Steps per second of the original.
 fn original(args: &Args, spec: &EnvSpec) -> Result<f64, Failure> {
     let python = args.original.as_deref().unwrap_or("python3");
     let output = Command::new(python)
         .args(["-c", ORIGINAL, spec.id, &args.seconds.to_string()])
         .output()
-        .map_err(|error| format!("{python}: {error}"))?;
+        .map_err(|error| format!("cannot run {python}: {error}"))?;
     let failed = || {
         let message = String::from_utf8_lossy(&output.stderr);
-        format!("{python} cannot play the original: {}", message.trim().lines().last().unwrap_or("no message"))
+        format!("{python} cannot measure the original: {}", message.trim().lines().last().unwrap_or("no message"))
     };
     let printed = String::from_utf8_lossy(&output.stdout);
-    // The original's libraries print lines of their own first.
+    // The original's libraries print other lines first.
     Ok(printed.lines().last().and_then(|line| line.trim().parse().ok()).ok_or_else(failed)?)
 }

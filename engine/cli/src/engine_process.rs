@@ -1,4 +1,4 @@
-//! An engine in a process of its own.
+//! An engine in a child process.
 
 use std::ffi::OsString;
 use std::io::Read;
@@ -11,33 +11,33 @@ use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
 
 use super::Failure;
 
-/// How long an engine may take to start.
-const START: Duration = Duration::from_secs(30);
+/// Longest time that an engine may take to start.
+const START_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// How often its start is looked for.
-const LOOK: Duration = Duration::from_millis(100);
+/// Longest wait for the engine between two checks that its process is alive.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// The command that starts `endless`, and its first arguments.
-static PROGRAM: OnceLock<Vec<OsString>> = OnceLock::new();
+/// The command that starts `endless`, with its first arguments.
+static EXECUTABLE: OnceLock<Vec<OsString>> = OnceLock::new();
 
-/// Says which command starts `endless`. Only the first call counts.
-pub fn set_program(program: &[OsString]) {
-    PROGRAM.get_or_init(|| program.to_vec());
+/// Sets the command that starts `endless`. Only the first call has an effect.
+pub fn set_executable(command: &[OsString]) {
+    EXECUTABLE.get_or_init(|| command.to_vec());
 }
 
-/// A child process that serves environments. It ends when this is dropped, and also when this process dies.
+/// A child process that serves environments. It ends when this value is dropped, and when this process dies.
 pub struct EngineProcess {
     child: Child,
     service: String,
 }
 
 impl EngineProcess {
-    /// Starts `endless serve` with these arguments under a name of its own.
+    /// Starts `endless serve` with these arguments. The engine's name contains the id of this process.
     pub fn start(arguments: &[String]) -> Result<Self, Failure> {
         let service = format!("endless-{}", std::process::id());
-        let (program, first) = PROGRAM
+        let (program, first) = EXECUTABLE
             .get()
-            .and_then(|program| program.split_first())
+            .and_then(|command| command.split_first())
             .ok_or("the command that starts an engine is empty")?;
         let child = Command::new(program)
             .args(first)
@@ -46,19 +46,19 @@ impl EngineProcess {
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
-            // A group of its own, so that Ctrl-C reaches this process alone, which then ends the engine.
+            // In a process group of its own, the engine does not receive Ctrl-C. This process does, and then stops the engine.
             .process_group(0)
             .spawn()?;
         Ok(EngineProcess { child, service })
     }
 
-    /// Connects as the engine's trainer.
+    /// Connects as the engine's trainer, and waits for the engine to start.
     pub fn connect(&mut self) -> Result<Trainer, Failure> {
         let start = Instant::now();
         loop {
-            let config = ConnectConfig { timeout: LOOK, ..ConnectConfig::new(&self.service) };
+            let config = ConnectConfig { timeout: POLL_INTERVAL, ..ConnectConfig::new(&self.service) };
             match Trainer::connect(&config) {
-                Err(ServiceError::UnknownEngine { .. }) if start.elapsed() < START => {}
+                Err(ServiceError::UnknownEngine { .. }) if start.elapsed() < START_TIMEOUT => {}
                 connected => return Ok(connected?),
             }
             if let Some(status) = self.child.try_wait()? {

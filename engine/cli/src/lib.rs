@@ -1,4 +1,4 @@
-//! The program `endless`: thin layers over the library. It is here so that the Python package brings it along.
+//! The command line program `endless`, as a library: the binary of the crate `endless-gym` and the Python package both run [`main`].
 
 mod bench;
 mod demo;
@@ -12,13 +12,13 @@ mod stop;
 mod verify;
 
 use std::ffi::OsString;
-use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-/// The Memory Gym environments, bit for bit, at memory speed, in shared memory.
+/// Memory Gym environments, bit-exact to the original, served in shared memory.
 ///
-/// Without a command: the demo.
+/// Without a command, `endless` runs `endless demo`. The environment variable ENDLESS_GYM_ROOT names the directory in which engines
+/// and trainers find each other [default: /tmp/endless-gym-UID, with the number of the user].
 #[derive(Parser)]
 #[command(name = "endless", version, about, max_term_width = 110)]
 struct Cli {
@@ -28,36 +28,64 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Show the environments, or one of them with its spaces and reset parameters.
+    /// List the environments, or describe one: spaces, reset parameters, info and features.
     List(list::Args),
-    /// Start an engine and a trainer that plays through shared memory, and show how fast and how well.
+    /// Play through shared memory, with an engine in a child process, and report speed and returns.
     Demo(demo::Args),
     /// Serve environments in shared memory until Ctrl-C.
     Serve(serve::Args),
     /// Measure steps per second, in process and through shared memory.
+    ///
+    /// Actions are random, and resets are included. Each round measures every method once. The median over the rounds is reported,
+    /// since other programs on the machine disturb single measurements.
     Bench(bench::Args),
-    /// Replay recorded traces of the original and compare every observation, reward, flag and info.
+    /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
     Verify(verify::Args),
 }
 
-/// What any command may fail with: it is shown as one line.
+/// The error of a command. The program prints it as one line.
 type Failure = Box<dyn std::error::Error>;
 
-/// Runs the program with these arguments. `itself` is the command that starts the program anew, for commands that run an engine
-/// in a process of its own.
-pub fn main(arguments: impl IntoIterator<Item = OsString>, itself: &[OsString]) -> ExitCode {
-    engine_process::set_program(itself);
+/// Exit status of a command that failed, or that found differences.
+const FAILURE: u8 = 1;
+
+/// Runs the program `endless` and returns its exit status.
+///
+/// `arguments` are the arguments without the program's name. `executable` is the command, with its first arguments, that starts the
+/// program in a new process; `demo` and `bench` start an engine with it. Only the first call of a process sets it.
+///
+/// The status is 0 after success; 1 after an error, which is printed to standard error as one line, and if `verify` finds a
+/// difference; 2 if the arguments do not follow the usage. Output that cannot be written is an error, but a closed pipe is not.
+pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
+    engine_process::set_executable(executable);
     let arguments = std::iter::once("endless".into()).chain(arguments);
-    let command = Cli::parse_from(arguments).command.unwrap_or_else(|| Command::Demo(demo::Args::default()));
-    let done = match command {
-        Command::List(args) => list::run(&args),
-        Command::Demo(args) => demo::run(&args),
-        Command::Serve(args) => serve::run(&args),
-        Command::Bench(args) => bench::run(&args),
-        Command::Verify(args) => verify::run(&args),
+    let result = match Cli::try_parse_from(arguments) {
+        Ok(cli) => run(cli.command.unwrap_or_else(|| Command::Demo(demo::Args::default()))),
+        Err(usage) if usage.use_stderr() => {
+            // Without standard error, the status is all that is left to report.
+            let _ = usage.print();
+            return u8::try_from(usage.exit_code()).unwrap_or(FAILURE);
+        }
+        Err(help) => output::print_help(&help).map(|()| true),
     };
-    done.unwrap_or_else(|error| {
-        eprintln!("endless: {error}");
-        ExitCode::FAILURE
-    })
+    match result {
+        Ok(true) => 0,
+        Ok(false) => FAILURE,
+        Err(error) => {
+            output::print_error(&*error);
+            FAILURE
+        }
+    }
+}
+
+/// Runs one command. Returns false if `verify` found a difference.
+fn run(command: Command) -> Result<bool, Failure> {
+    match command {
+        Command::List(args) => list::run(&args)?,
+        Command::Demo(args) => demo::run(&args)?,
+        Command::Serve(args) => serve::run(&args)?,
+        Command::Bench(args) => bench::run(&args)?,
+        Command::Verify(args) => return verify::run(&args),
+    }
+    Ok(true)
 }

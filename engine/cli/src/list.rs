@@ -1,39 +1,37 @@
 //! `endless list`.
 
-use std::process::ExitCode;
-
 use endless_gym_core::envs::{self, EnvSpec, SCREEN};
 use serde_json::json;
 
 use super::Failure;
 use super::output::{print, print_json, table};
 
+/// Arguments of `endless list`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Environment id to show in full; all ids if left out.
+    /// Environment id to describe [default: list all ids].
     id: Option<String>,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode, Failure> {
+/// Runs `endless list`.
+pub fn run(args: &Args) -> Result<(), Failure> {
     match &args.id {
         Some(id) => {
             let spec = envs::spec(id)?;
-            if args.json { print_json(&as_json(spec))? } else { show(spec) }
+            if args.json { print_json(&as_json(spec)) } else { print(description(spec)) }
         }
-        None if args.json => print_json(&envs::specs().map(as_json).collect::<Vec<_>>())?,
+        None if args.json => print_json(&envs::specs().map(as_json).collect::<Vec<_>>()),
         None => {
-            let mut rows = table(["environment", "actions", "observation", "what it asks for"]);
+            let mut rows = table(["environment", "actions", "observation", "task"]);
             for spec in envs::specs() {
                 rows.add_row([spec.id, &spec.action_space.to_string(), &observation(spec), spec.summary]);
             }
-            print(rows);
-            print("\n`endless list ID` shows an environment's reset parameters.");
+            print(format_args!("{rows}\n\n`endless list ID` describes one environment and its reset parameters."))
         }
     }
-    Ok(ExitCode::SUCCESS)
 }
 
 fn observation(spec: &EnvSpec) -> String {
@@ -51,26 +49,29 @@ fn as_json(spec: &EnvSpec) -> serde_json::Value {
     value
 }
 
-fn show(spec: &EnvSpec) {
-    print(format_args!("{}: {}\n", spec.id, spec.summary));
-    print(format_args!("actions      {}", spec.action_space));
-    print(format_args!("observation  {}, indexed [x][y][channel]", observation(spec)));
+/// Everything about one environment, as text.
+fn description(spec: &EnvSpec) -> String {
+    let mut parts = vec![format!("{}: {}\n", spec.id, spec.summary)];
+    parts.push(format!("actions      {}", spec.action_space));
+    parts.push(format!("observation  {}, indexed [x][y][channel]", observation(spec)));
     if spec.ground_truth > 0 {
-        print(format_args!("ground truth float64 ({},)", spec.ground_truth));
+        parts.push(format!("ground truth float64 ({},)", spec.ground_truth));
     }
-    print("");
-    let mut rows = table(["reset parameter", "default", "allowed", "meaning"]);
+    let mut rows = table(["reset parameter", "default", "allowed", "description"]);
     for parameter in spec.parameters {
         rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
     }
-    print(rows);
+    parts.push(format!("\n{rows}"));
     let info: Vec<_> = spec.info.iter().map(|column| [column.name, column.description]).collect();
     let features: Vec<_> = spec.features.iter().map(|column| [column.name, column.description]).collect();
-    for (title, columns) in [("info at an episode's end", info), ("feature (option `--features`)", features)] {
-        let mut rows = table([title, "meaning"]);
+    for (title, columns) in
+        [("info of an episode's last step", info), ("feature (`endless serve --features`)", features)]
+    {
+        let mut rows = table([title, "description"]);
         for column in columns {
             rows.add_row(column);
         }
-        print(format_args!("\n{rows}"));
+        parts.push(format!("\n{rows}"));
     }
+    parts.join("\n")
 }

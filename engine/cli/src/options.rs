@@ -1,4 +1,6 @@
-//! Options that several commands share.
+//! Arguments that several commands share.
+
+use std::time::Duration;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use endless_gym_core::batch::Frames;
@@ -8,34 +10,39 @@ use serde_json::{Map, Value as Json};
 
 use super::Failure;
 
-/// The parser of an autoreset mode, with the modes' help.
-pub fn autoreset_parser() -> impl TypedValueParser<Value = Autoreset> {
-    let values = Autoreset::ALL.map(|mode| PossibleValue::new(mode.name()).help(mode.summary()));
-    PossibleValuesParser::new(values).try_map(|name| name.parse::<Autoreset>())
+/// The value of `--autoreset` for a mode: the mode's name with hyphens.
+pub fn autoreset_value(mode: Autoreset) -> String {
+    mode.name().replace('_', "-")
 }
 
-/// What the frames are like.
+/// The parser of `--autoreset`, with the help of each mode. The mode's own name, with an underscore, is accepted too.
+pub fn autoreset_parser() -> impl TypedValueParser<Value = Autoreset> {
+    let value = |mode: Autoreset| PossibleValue::new(autoreset_value(mode)).alias(mode.name()).help(mode.summary());
+    PossibleValuesParser::new(Autoreset::ALL.map(value)).try_map(|text| text.replace('-', "_").parse::<Autoreset>())
+}
+
+/// The format of frames.
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub struct FrameArgs {
-    /// Leave the frames out, and draw nothing.
+    /// Write no frames, and draw nothing [default: RGB frames, uint8 (84, 84, 3), indexed `[x][y][channel]`].
     #[arg(long, conflicts_with_all = ["grayscale", "channels_first", "row_major", "frame_stack"])]
     no_frames: bool,
-    /// Frames of brightness instead of colours, without an index for the channel.
+    /// Grayscale frames without a channel axis [default: RGB].
     #[arg(long)]
     grayscale: bool,
-    /// Frames with the channel as their first index.
+    /// Frames with the channel as the first axis [default: the last axis].
     #[arg(long)]
     channels_first: bool,
-    /// Frames indexed [row][column] instead of [x][y].
+    /// Frames indexed `[row][column]` [default: `[x][y]`].
     #[arg(long)]
     row_major: bool,
-    /// The last N frames of the episode as one observation, oldest first.
+    /// Stack the last N frames of the episode in one observation, oldest first: 1 to 64.
     #[arg(long, value_name = "N", default_value_t = 1)]
     frame_stack: usize,
 }
 
 impl FrameArgs {
-    /// What the batch is to have.
+    /// The frames of a batch; `None` for none.
     pub fn frames(self) -> Option<Frames> {
         let FrameArgs { no_frames, grayscale, channels_first, row_major, frame_stack } = self;
         let format = PixelFormat { grayscale, channels_first, row_major };
@@ -43,26 +50,30 @@ impl FrameArgs {
     }
 }
 
-/// What the environments are like.
+/// Reset parameters and seeds.
 #[derive(clap::Args, Clone, Debug)]
 pub struct EnvironmentArgs {
-    /// Reset parameter of all environments, such as `arena_size=6` or `command_count=[5,10]`; may be given several times.
+    /// Reset parameter of all environments, such as `arena_size=6` or `command_count=[5,10]`; may be repeated [default: the
+    /// environment's own, which `endless list ID` shows].
     #[arg(long = "option", value_name = "NAME=VALUE")]
     options: Vec<String>,
-    /// Reset parameters of one environment as a JSON object; given once for each environment of all groups, in their order.
+    /// Reset parameters of one environment as a JSON object; repeated for every environment of all groups, in order [default: those
+    /// of `--option` for all environments].
     #[arg(long, value_name = "JSON", conflicts_with = "options")]
     env_options: Vec<String>,
-    /// Seed: environment i starts with SEED + i. From the system's entropy if left out.
+    /// Seed: environment i, counted over all groups, is seeded with SEED + i [default: entropy of the operating system].
     #[arg(long)]
     seed: Option<u64>,
-    /// Draw each episode's seed from START..END (END excluded), as the paper's training does from 0..100000.
+    /// Draw the seed of each episode from START to END - 1, as the training in the paper does from 0..100000; `--seed` seeds the
+    /// draws [default: episodes continue the generator of their environment].
     #[arg(long, value_name = "START..END", value_parser = seed_range)]
     seed_range: Option<(u64, u64)>,
-    /// Play these seeds in turn, and again from the start.
+    /// Seeds of the episodes, in turn, repeated from the start [default: as for `--seed-range`].
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
 }
 
+/// Parses `START..END`.
 fn seed_range(text: &str) -> Result<(u64, u64), String> {
     let (start, end) = text.split_once("..").ok_or("expected START..END")?;
     let number = |text: &str| text.parse::<u64>().map_err(|error| format!("`{text}`: {error}"));
@@ -70,7 +81,7 @@ fn seed_range(text: &str) -> Result<(u64, u64), String> {
 }
 
 impl EnvironmentArgs {
-    /// The arguments that say the same to another `endless`.
+    /// These arguments as text, for another process.
     pub fn arguments(&self) -> Vec<String> {
         let mut arguments: Vec<String> =
             self.options.iter().flat_map(|option| ["--option".to_owned(), option.clone()]).collect();
@@ -84,14 +95,14 @@ impl EnvironmentArgs {
         arguments
     }
 
-    /// A pool's configuration with these options.
+    /// The configuration of a pool with these arguments.
     pub fn configure(&self, id: &str, num_envs: usize) -> Result<PoolConfig, Failure> {
         let mut options = Map::new();
         for option in &self.options {
             let (name, value) = option
                 .split_once('=')
                 .ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
-            // What is no JSON is passed on as text, so that the check of the parameter says what it should be.
+            // Text that is not JSON is passed on as a string; the parameter's own check then reports the allowed values.
             let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
             options.insert(name.to_owned(), value);
         }
@@ -110,6 +121,14 @@ impl EnvironmentArgs {
     }
 }
 
+/// The duration that `--seconds` gives.
+pub fn seconds(given: f64) -> Result<Duration, Failure> {
+    match Duration::try_from_secs_f64(given) {
+        Ok(duration) if given > 0.0 => Ok(duration),
+        _ => Err(format!("--seconds must be finite and positive, got {given}").into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use clap::{Arg, Command};
@@ -124,8 +143,9 @@ mod tests {
         };
         for mode in Autoreset::ALL {
             assert_eq!(parse(mode.name()).unwrap(), Some(mode));
+            assert_eq!(parse(&autoreset_value(mode)).unwrap(), Some(mode));
         }
         let message = parse("never").unwrap_err().to_string();
-        assert!(Autoreset::ALL.iter().all(|mode| message.contains(mode.name())), "{message}");
+        assert!(Autoreset::ALL.iter().all(|mode| message.contains(&autoreset_value(*mode))), "{message}");
     }
 }

@@ -1,4 +1,4 @@
-"""Steps per second of the original environment: whole episodes with resets, random actions. Prints one number."""
+"""Measures the steps per second of the original with random actions, resets included. Prints one number."""
 
 import os
 import sys

@@ -1,6 +1,6 @@
-//! Tables and numbers for people, JSON for machines.
+//! Standard output and standard error: tables and numbers for people, JSON for programs.
 
-use std::io::{IsTerminal, Write};
+use std::io::{self, ErrorKind, IsTerminal, Write};
 
 use comfy_table::{ContentArrangement, LineStyle, Table, TableStyle};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -8,32 +8,54 @@ use serde::Serialize;
 
 use super::Failure;
 
-/// A table with these headings, as wide as the terminal.
+/// Width of tables if standard output is no terminal, in characters.
+const TABLE_WIDTH: u16 = 120;
+
+/// An empty table with these headings, as wide as the terminal.
 pub fn table<const N: usize>(headings: [&str; N]) -> Table {
     let mut table = Table::new();
     let line = LineStyle::none().fill('─').junction('─');
     table.load_style(TableStyle::new().header_separator(line));
     table.set_content_arrangement(ContentArrangement::Dynamic).set_header(headings);
-    if !std::io::stdout().is_terminal() {
-        table.set_width(120);
+    if !io::stdout().is_terminal() {
+        table.set_width(TABLE_WIDTH);
     }
     table
 }
 
-/// Prints to standard output. A reader that has gone away, as in `endless list | head`, ends the program quietly.
-pub fn print(text: impl std::fmt::Display) {
-    if writeln!(std::io::stdout(), "{text}").is_err() {
-        std::process::exit(0);
+/// Prints `text` and a newline to standard output.
+pub fn print(text: impl std::fmt::Display) -> Result<(), Failure> {
+    let mut stdout = io::stdout().lock();
+    check(writeln!(stdout, "{text}").and_then(|()| stdout.flush()))
+}
+
+/// Prints one JSON document to standard output.
+pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
+    print(serde_json::to_string_pretty(value)?)
+}
+
+/// Prints the text of `--help` or `--version` to standard output.
+pub fn print_help(help: &clap::Error) -> Result<(), Failure> {
+    check(help.print().and_then(|()| io::stdout().flush()))
+}
+
+/// Prints an error to standard error. Without standard error, the exit status is all that is left to report.
+pub fn print_error(error: &dyn std::error::Error) {
+    let _ = writeln!(io::stderr(), "endless: {error}");
+}
+
+/// Turns an error of standard output into a failure. A closed pipe is none: after `endless list | head -1`, the reader has what it
+/// wanted, and the command ends with the status that it would have had.
+fn check(written: io::Result<()>) -> Result<(), Failure> {
+    match written {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            Err(format!("cannot write to standard output: {error}").into())
+        }
+        _ => Ok(()),
     }
 }
 
-/// Prints one JSON document.
-pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
-    print(serde_json::to_string_pretty(value)?);
-    Ok(())
-}
-
-/// A whole number with its thousands set apart.
+/// A number rounded to an integer, with commas between its thousands.
 pub fn grouped(number: f64) -> String {
     let digits = format!("{number:.0}");
     let mut text = String::new();
@@ -46,7 +68,7 @@ pub fn grouped(number: f64) -> String {
     text
 }
 
-/// A bar of `length` steps on standard error; silent where that is no terminal.
+/// A progress bar of `length` steps on standard error, hidden if that is no terminal.
 pub fn progress(length: u64, template: &str) -> ProgressBar {
     let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
     ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr()).with_style(style)
@@ -54,12 +76,19 @@ pub fn progress(length: u64, template: &str) -> ProgressBar {
 
 #[cfg(test)]
 mod tests {
-    use super::grouped;
+    use super::*;
 
     #[test]
-    fn thousands_are_set_apart() {
+    fn thousands_are_separated_by_commas() {
         assert_eq!(grouped(0.4), "0");
         assert_eq!(grouped(999.0), "999");
         assert_eq!(grouped(1_234_567.8), "1,234,568");
+    }
+
+    #[test]
+    fn a_closed_pipe_is_no_failure() {
+        assert!(check(Err(ErrorKind::BrokenPipe.into())).is_ok());
+        let failure = check(Err(ErrorKind::StorageFull.into())).unwrap_err();
+        assert!(failure.to_string().starts_with("cannot write to standard output: "), "{failure}");
     }
 }

@@ -1,4 +1,4 @@
-//! Players for the demo and the benchmark, and what came of their episodes.
+//! Policies for the demo and the benchmark, and statistics of the episodes that they play.
 
 use clap::ValueEnum;
 use endless_gym_core::batch::Batch;
@@ -6,26 +6,28 @@ use endless_gym_core::envs::{EnvSpec, Expert, expert};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
-/// How actions are chosen.
+/// The policy that chooses actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Policy {
-    /// A script that looks at the feature observation and remembers what it has to.
+    /// A scripted policy with memory that reads the feature observation.
     Expert,
-    /// Any action, each as likely as another.
+    /// Uniformly random actions.
     Random,
 }
 
-/// Chooses actions at random.
-pub struct RandomPlayer {
+/// Uniformly random actions from a fixed seed.
+pub struct RandomPolicy {
     branches: Vec<i32>,
     random: SmallRng,
 }
 
-impl RandomPlayer {
+impl RandomPolicy {
+    /// A policy for the action space of `spec`.
     pub fn new(spec: &EnvSpec) -> Self {
-        RandomPlayer { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(0) }
+        RandomPolicy { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(0) }
     }
 
+    /// Fills `actions`: one row per environment, one number per branch of the action space.
     pub fn act(&mut self, actions: &mut [i32]) {
         for action in actions.chunks_exact_mut(self.branches.len()) {
             for (number, choices) in action.iter_mut().zip(&self.branches) {
@@ -35,19 +37,20 @@ impl RandomPlayer {
     }
 }
 
-/// A group of environments' experts, under next-step auto-reset.
-pub struct ExpertPlayer {
+/// The scripted policies of a group of environments, for next-step auto-reset.
+pub struct ExpertPolicy {
     experts: Vec<Box<dyn Expert>>,
-    /// The last step ended the episode; the next one starts another.
+    /// Whether the last step ended the episode, so that the next step starts another.
     ended: Vec<bool>,
     features: usize,
     vector_observation: usize,
     branches: usize,
 }
 
-impl ExpertPlayer {
+impl ExpertPolicy {
+    /// Policies for `num_envs` environments.
     pub fn new(spec: &EnvSpec, num_envs: usize) -> Self {
-        ExpertPlayer {
+        ExpertPolicy {
             experts: (0..num_envs).map(|_| expert(spec)).collect(),
             ended: vec![true; num_envs],
             features: spec.features.len(),
@@ -56,6 +59,7 @@ impl ExpertPlayer {
         }
     }
 
+    /// Fills `actions` for the observations of `batch`.
     pub fn act(&mut self, batch: &Batch<'_>, actions: &mut [i32]) {
         let (features, vectors) = (batch.features(), batch.vector_observation());
         let terminated = batch.terminated();
@@ -70,21 +74,24 @@ impl ExpertPlayer {
     }
 }
 
-/// Sums over the episodes that ended.
+/// Statistics of the episodes that have ended.
 #[derive(Clone, Debug)]
-pub struct Tally {
+pub struct EpisodeStatistics {
+    /// Steps of all environments.
     pub steps: u64,
+    /// Episodes that have ended.
     pub episodes: u64,
     returns: f64,
     lengths: f64,
     info: Vec<f64>,
-    /// Mean return so far of the episodes that ran when a batch was last added.
+    /// Mean return so far of the episodes in the batch that was added last.
     pub running_return: f64,
 }
 
-impl Tally {
+impl EpisodeStatistics {
+    /// Statistics of no episode.
     pub fn new(spec: &EnvSpec) -> Self {
-        Tally {
+        EpisodeStatistics {
             steps: 0,
             episodes: 0,
             returns: 0.0,
@@ -94,6 +101,7 @@ impl Tally {
         }
     }
 
+    /// Adds one step of a group.
     pub fn add(&mut self, batch: &Batch<'_>) {
         let terminated = batch.terminated();
         self.steps += terminated.len() as u64;
@@ -114,15 +122,17 @@ impl Tally {
         sum / self.episodes.max(1) as f64
     }
 
+    /// Mean return of the episodes that have ended; 0 without any.
     pub fn mean_return(&self) -> f64 {
         self.mean(self.returns)
     }
 
+    /// Mean length in steps of the episodes that have ended; 0 without any.
     pub fn mean_length(&self) -> f64 {
         self.mean(self.lengths)
     }
 
-    /// Means of the final info's columns.
+    /// Means of the info columns over the episodes that have ended.
     pub fn mean_info(&self) -> impl Iterator<Item = f64> {
         self.info.iter().map(|sum| self.mean(*sum))
     }

@@ -1,54 +1,54 @@
 //! `endless serve`.
 
-use std::process::ExitCode;
-
 use endless_gym_core::envs::DEFAULT_ENV_ID;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Threads};
 use endless_gym_service::{Engine, EngineConfig};
 
-use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser};
+use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
 use super::output::{grouped, print};
 use super::{Failure, stop};
 
+/// Arguments of `endless serve`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Environment id; `endless list` shows them.
+    /// Environment id; `endless list` lists them.
     #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
     id: String,
     /// Environments in each group.
     #[arg(long, default_value_t = 1024)]
     num_envs: usize,
-    /// Threads that step environments; 0 for one for each core.
+    /// Threads that step environments; 0 for one per core.
     #[arg(long, default_value_t = 0)]
     threads: usize,
-    /// Groups that are stepped independently, so that a trainer can work on one while the engine steps another.
+    /// Groups of environments. Groups are stepped independently, so that the trainer can process one while the engine steps another.
     #[arg(long, default_value_t = 1)]
     groups: usize,
-    /// Name that trainers connect to.
+    /// Name of the engine, to which the trainer connects: 1 to 64 letters, digits, `.`, `_` or `-`.
     #[arg(long, value_name = "NAME", default_value = "endless")]
     service: String,
     #[command(flatten)]
     environment: EnvironmentArgs,
-    /// When an episode that ended gives way to the next.
-    #[arg(long, value_name = "MODE", value_parser = autoreset_parser(), default_value_t = Autoreset::default())]
+    /// When the next episode starts after one has ended, as in Gymnasium.
+    #[arg(long, value_name = "MODE", value_parser = autoreset_parser(), default_value = autoreset_value(Autoreset::default()))]
     autoreset: Autoreset,
-    /// Keep the last observation of episodes that same-step auto-reset ends.
+    /// With `--autoreset same-step`, also write the last observation of each episode that ends.
     #[arg(long)]
     final_observation: bool,
-    /// Add the feature observation: what a frame shows, in numbers.
+    /// Also write the feature observation, a float32 vector that describes what the frame shows.
     #[arg(long)]
     features: bool,
     #[command(flatten)]
     frames: FrameArgs,
-    /// Batches of a group that a trainer may hold at a time.
+    /// Batches of each group that the trainer may hold at a time, 1 to 16.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
-    /// Say nothing, and end when standard input does: for an engine that belongs to the program that started it.
+    /// Print nothing, and stop when standard input closes: for an engine that is a child process.
     #[arg(long, hide = true)]
     child: bool,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode, Failure> {
+/// Runs `endless serve`, until a signal stops it.
+pub fn run(args: &Args) -> Result<(), Failure> {
     let stop = stop::on_signal()?;
     if args.child {
         stop::on_closed_input(&stop);
@@ -69,17 +69,14 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
         let (groups, num_envs) = (args.groups, args.num_envs);
         let groups = if groups == 1 { "1 group".to_owned() } else { format!("{groups} groups") };
         print(format_args!(
-            "serving {} as `{}`: {groups} of {num_envs} environments; Ctrl-C ends",
+            "serving {} as `{}`: {groups} of {num_envs} environments; stop with Ctrl-C",
             args.id, args.service
-        ));
+        ))?;
     }
     let summary = engine.run(&stop)?;
     if !args.child {
-        print(format_args!(
-            "{} steps in {} batches",
-            grouped(summary.env_steps as f64),
-            grouped(summary.batches as f64)
-        ));
+        let (steps, batches) = (grouped(summary.env_steps as f64), grouped(summary.batches as f64));
+        print(format_args!("{steps} steps in {batches} batches"))?;
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }

@@ -1,11 +1,11 @@
-//! Ctrl-C, and other polite requests to end.
+//! Flags that ask a command to stop.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::Failure;
 
-/// A flag that Ctrl-C, SIGTERM or SIGHUP sets.
+/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets.
 pub fn on_signal() -> Result<Arc<AtomicBool>, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);
@@ -13,7 +13,7 @@ pub fn on_signal() -> Result<Arc<AtomicBool>, Failure> {
     Ok(stop)
 }
 
-/// Sets the flag once standard input ends, as it does when the process that holds its other end dies, however it dies.
+/// Sets the flag at the end of standard input, which a parent process that dies closes.
 pub fn on_closed_input(stop: &Arc<AtomicBool>) {
     let flag = Arc::clone(stop);
     std::thread::spawn(move || {

@@ -1,7 +1,6 @@
 //! `endless verify`.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use endless_gym_core::trace::{Trace, replay};
 use rayon::prelude::*;
@@ -10,17 +9,19 @@ use serde_json::json;
 use super::Failure;
 use super::output::{print, print_json, progress};
 
+/// Arguments of `endless verify`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Trace files (`.json.gz`).
+    /// Trace files, gzip-compressed JSON (`.json.gz`).
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Print JSON.
+    /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode, Failure> {
+/// Runs `endless verify`. Returns whether every trace was replayed without a difference.
+pub fn run(args: &Args) -> Result<bool, Failure> {
     let bar = progress(args.files.len() as u64, "replaying {bar:40} {pos}/{len} traces");
     let replays: Vec<_> = args
         .files
@@ -65,7 +66,7 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
                 "verdict": text,
             }));
         } else {
-            print(format_args!("{name}: {text}"));
+            print(format_args!("{name}: {text}"))?;
         }
     }
     if args.json {
@@ -78,12 +79,12 @@ pub fn run(args: &Args) -> Result<ExitCode, Failure> {
         }))?;
     } else {
         if failures > 0 {
-            print(format_args!("{failures} traces not replayed"));
+            print(format_args!("{failures} traces not replayed"))?;
         }
         let verified = replays.len() - failures;
         print(format_args!(
             "verified {verified} traces: {episodes} episodes, {steps} steps, {differences} differences"
-        ));
+        ))?;
     }
-    Ok(if differences + failures == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(differences + failures == 0)
 }

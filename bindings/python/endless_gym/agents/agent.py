@@ -29,7 +29,7 @@ from endless_gym.agents.naive import POSITION, TransformState, make_observation_
 from endless_gym.agents.recurrent import RecurrentMemory
 from endless_gym.agents.settings import Settings
 from endless_gym.agents.transformer import TransformerMemory
-from endless_gym.interop import torch_view
+from endless_gym.interop import unchecked_torch_view
 from endless_gym.specs import Frames, Spec
 
 #: An array or tensor of n environments, (n, ...).
@@ -270,7 +270,9 @@ class Agent(nn.Module):
             key = next(key for key in self.transform.shapes if key != POSITION)
             observation = {key: observation}
         return {
-            key: (value if isinstance(value, Tensor) else torch_view(value)).to(self.device, non_blocking=True)
+            key: (value if isinstance(value, Tensor) else unchecked_torch_view(value)).to(
+                self.device, non_blocking=True
+            )
             for key, value in observation.items()
         }
 

@@ -18,7 +18,7 @@ from endless_gym.agents.agent import Agent, AgentMemory
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.encoders import FRAME, Observation
 from endless_gym.agents.environments import Environments, StepResult
-from endless_gym.interop import torch_view
+from endless_gym.interop import unchecked_torch_view
 
 
 @dataclass
@@ -160,7 +160,7 @@ class RolloutCollector:
         )
         segment.reset_mask[step, columns] = memory.reset_mask
         if segment.ground_truth is not None and current.ground_truth is not None:
-            segment.ground_truth[step, columns] = torch_view(current.ground_truth)
+            segment.ground_truth[step, columns] = unchecked_torch_view(current.ground_truth)
         output = self.agent.act(current.observation, memory, self.generator)
         for key, part in output.observation.items():
             segment.observation[key][step, columns] = part
@@ -173,7 +173,7 @@ class RolloutCollector:
     def _receive(self, group: int, step: int) -> list[dict[str, float]]:
         columns, result = self._columns(group), self.environments.receive(group)
         self.current[group] = result
-        self.segment.reward[step, columns] = torch_view(result.reward)
+        self.segment.reward[step, columns] = unchecked_torch_view(result.reward)
         done = torch.from_numpy(result.done).to(self.agent.device)
         self.segment.done[step, columns] = done
         self.memories[group].reset(done)

@@ -1,7 +1,9 @@
 //! Painting one surface onto another: copied, with a colour key, and translucent.
 
+use super::canvas::Canvas;
+use super::color::Rgb;
 use super::runs::clip;
-use super::{Canvas, Rgb, Surface};
+use super::surface::Surface;
 
 /// Blends a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26
 /// does: the change is `1/255` of the difference per unit of `alpha`, truncated towards zero.

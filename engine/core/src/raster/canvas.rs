@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
+use super::color::Rgb;
+use super::rect::Rect;
 use super::runs::{clip, copy_run, fill_run};
-use super::{Rect, Rgb};
 
 /// Borrowed pixels with a width and a height: the target of all drawing.
 ///

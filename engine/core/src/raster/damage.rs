@@ -1,6 +1,7 @@
 //! Dirty rectangles: the parts of a picture that need repainting.
 
-use super::{Canvas, Rect};
+use super::canvas::Canvas;
+use super::rect::Rect;
 
 /// Maximum number of rectangles; beyond it they are merged.
 const MAX_RECTS: usize = 8;

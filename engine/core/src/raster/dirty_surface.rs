@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use super::{Canvas, Rgb};
+use super::canvas::Canvas;
+use super::color::Rgb;
 
 /// Pixels with a dirty mask, of which only the painted ones are copied elsewhere.
 ///

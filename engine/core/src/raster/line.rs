@@ -1,6 +1,7 @@
 //! Straight lines, thin and wide.
 
-use super::{Canvas, Rgb};
+use super::canvas::Canvas;
+use super::color::Rgb;
 
 /// A point in whole pixels.
 type Point = (i64, i64);

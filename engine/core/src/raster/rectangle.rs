@@ -1,7 +1,9 @@
 //! Drawing rectangles: filled or with a border, with square or rounded corners.
 
+use super::canvas::Canvas;
 use super::circle::{Octant, falls};
-use super::{Canvas, CornerRadii, Rect, Rgb};
+use super::color::Rgb;
+use super::rect::{CornerRadii, Rect};
 
 /// Maximum coordinate of a rounded rectangle; larger ones are drawn as this, to bound the time.
 const MAX_COORDINATE: i64 = 1 << 16;

@@ -1,6 +1,6 @@
 //! Rotation of a picture.
 
-use super::Surface;
+use super::surface::Surface;
 
 impl Surface {
     /// The surface rotated counterclockwise by `degrees`, as `pygame.transform.rotate` does.

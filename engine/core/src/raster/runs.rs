@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::Rgb;
+use super::color::Rgb;
 
 /// Sets all pixels of a run to one colour.
 pub(super) fn fill_run(run: &mut [u8], color: Rgb) {

@@ -1,6 +1,6 @@
 //! Scaling of a picture.
 
-use super::Surface;
+use super::surface::Surface;
 
 impl Surface {
     /// The surface scaled to `width` by `height` pixels, each of which takes the nearest pixel

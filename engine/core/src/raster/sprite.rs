@@ -2,9 +2,13 @@
 
 use std::ops::Range;
 
+use super::blit::blend_keyed;
 use super::blit::opaque_runs;
+use super::canvas::Canvas;
+use super::circle::Disc;
+use super::rect::Rect;
 use super::runs::{clip, copy_run};
-use super::{Canvas, Disc, Rect, Surface, blend_keyed};
+use super::surface::Surface;
 
 /// A picture whose opaque pixels are stored as vertical runs, which are contiguous on a canvas.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -1,6 +1,8 @@
 //! A picture with the colour key and the alpha of a pygame surface.
 
-use super::{Canvas, CornerRadii, Rect, Rgb};
+use super::canvas::Canvas;
+use super::color::Rgb;
+use super::rect::{CornerRadii, Rect};
 
 /// An RGB picture, as a `pygame.Surface` of the display's format: 32 bits, no alpha per pixel.
 #[derive(Clone, Debug, PartialEq, Eq)]
