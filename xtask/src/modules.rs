@@ -37,7 +37,7 @@ fn collect(folder: &Path, module: &[String], files: &mut BTreeMap<Module, syn::F
     for entry in entries {
         let path = entry.map_err(|error| format!("{}: {error}", folder.display()))?.path();
         let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let child = [module, &[stem.clone()]].concat();
+        let child = [module, std::slice::from_ref(&stem)].concat();
         if path.is_dir() {
             collect(&path, &child, files)?;
         } else if path.extension().is_some_and(|extension| extension == "rs") && !stem.ends_with("tests") {
