@@ -5,11 +5,11 @@ mod actions;
 use std::sync::Arc;
 
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main, measurement::WallTime};
-use endless_gym::envs::mortar_mayhem::MortarMayhem;
-use endless_gym::envs::mystery_path::MysteryPath;
-use endless_gym::envs::searing_spotlights::SearingSpotlights;
-use endless_gym::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters};
-use endless_gym::random::Generator;
+use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
+use endless_gym_core::envs::mystery_path::MysteryPath;
+use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
+use endless_gym_core::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters};
+use endless_gym_core::random::Generator;
 use serde_json::Map;
 
 use actions::Actions;

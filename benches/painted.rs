@@ -4,12 +4,12 @@ mod actions;
 
 use std::sync::Arc;
 
-use endless_gym::envs::mortar_mayhem::MortarMayhem;
-use endless_gym::envs::mystery_path::MysteryPath;
-use endless_gym::envs::searing_spotlights::SearingSpotlights;
-use endless_gym::envs::{self, EnvSpec, Environment, Family, ResetParameters, SCREEN};
-use endless_gym::random::Generator;
-use endless_gym::raster::DirtySurface;
+use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
+use endless_gym_core::envs::mystery_path::MysteryPath;
+use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
+use endless_gym_core::envs::{self, EnvSpec, Environment, Family, ResetParameters, SCREEN};
+use endless_gym_core::random::Generator;
+use endless_gym_core::raster::DirtySurface;
 use serde_json::Map;
 
 use actions::Actions;

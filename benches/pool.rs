@@ -3,10 +3,10 @@
 mod actions;
 
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime};
+use endless_gym::batch::PixelFormat;
 use endless_gym::batch::{Frames, zeroed};
 use endless_gym::envs::{self, EnvSpec};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
-use endless_gym::raster::PixelFormat;
 
 use actions::Actions;
 

@@ -1,7 +1,7 @@
 //! Cost of numpy's generator: seeding it, and its draws.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use endless_gym::random::{Generator, SeedSequence};
+use endless_gym_core::random::{Generator, SeedSequence};
 
 fn random(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("random");

@@ -2,7 +2,7 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use endless_gym::envs::{FRAME_BYTES, SCREEN};
-use endless_gym::raster::{Canvas, DirtySurface, Disc, PixelFormat, Rect, Sprite, Surface};
+use endless_gym_core::raster::{Canvas, DirtySurface, Disc, PixelFormat, Rect, Sprite, Surface};
 
 fn round_surface(side: usize) -> Surface {
     let mut surface = Surface::new(side, side);
@@ -29,7 +29,7 @@ fn paint(criterion: &mut Criterion) {
     group.bench_function("blit_clipped", |bencher| bencher.iter(|| sprite.blit(&mut canvas, -5, 31)));
     let center = (36, 40);
     group.bench_function("blit_within", |bencher| {
-        bencher.iter(|| sprite.blit_within(&mut canvas, 30, 31, &disc, center))
+        bencher.iter(|| sprite.blit_within(&mut canvas, 30, 31, &disc, center));
     });
     group.bench_function("shaded", |bencher| bencher.iter(|| sprite.shaded(100)));
     group.bench_function("disc", |bencher| bencher.iter(|| canvas.fill_disc([1, 2, 3], center, &disc)));

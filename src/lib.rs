@@ -1,12 +1,52 @@
 //! Endless Gym: the Memory Gym environments, bit for bit, at memory speed, in shared memory, for any trainer on the host.
 //!
-//! The way of the data is the order of the modules: [`random`] and [`raster`] serve [`envs`], the rules and pictures of the
-//! environments; [`batch`] says how a step of many environments lies in memory; [`pool`] steps them in lockstep; [`service`]
-//! puts the batches into shared memory, where a trainer reads them.
+//! This crate re-exports the public API of the crates that it consists of:
+//!
+//! - [`envs`]: ids, spaces, reset parameters and scripted experts; [`pool`]: many environments in this process; [`batch`]: what a
+//!   step returns; [`trace`]: replay of recorded episodes. They are `endless-gym-core`, which does not depend on an operating
+//!   system's services and builds for WebAssembly.
+//! - [`service`]: an engine, its trainer and observers, as processes that share memory. It is `endless-gym-service`.
+//!
+//! The program `endless` is `endless-gym-cli`. What these crates export beyond this list (the rasteriser, the random numbers, the
+//! rules of single environments, the program) serves the project's own tests and benchmarks and may change in any version.
 
-pub use endless_gym_cli as cli;
-pub use endless_gym_core::{batch, envs, pool, random, raster, trace};
-pub use endless_gym_service as service;
+/// Arrays of a batch in memory.
+pub mod batch {
+    pub use endless_gym_core::batch::{
+        BLOCK_BYTES, Batch, BatchSection, Block, Dtype, Element, Frames, LAYOUT_VERSION, Layout, LayoutError,
+        MAX_STACK, Section, SectionTable, zeroed,
+    };
+    pub use endless_gym_core::raster::PixelFormat;
+}
+
+/// Environment ids: spaces, reset parameters, scripted experts.
+pub mod envs {
+    pub use endless_gym_core::envs::{
+        ActionError, ActionSpace, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, InfoColumn, Parameter,
+        ParameterError, ParameterKind, SCREEN, UnknownEnvironment, expert, spec, specs, view,
+    };
+}
+
+/// Many environments in this process, stepped in lockstep.
+pub mod pool {
+    pub use endless_gym_core::pool::{
+        Autoreset, MAX_ENVS, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, SNAPSHOT_VERSION,
+        Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
+    };
+}
+
+/// Engines that serve environments in shared memory, their trainers and observers.
+pub mod service {
+    pub use endless_gym_service::{
+        BatchLease, ConnectConfig, Engine, EngineConfig, EngineSummary, MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE,
+        Rejection, ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
+    };
+}
+
+/// Recorded episodes of the original, and their replay.
+pub mod trace {
+    pub use endless_gym_core::trace::{Difference, Episode, Replay, Step, Trace, TraceError, replay};
+}
 
 /// The examples of the README, as tests.
 #[cfg(doctest)]

@@ -4,8 +4,8 @@
 use ciborium::Value;
 use endless_gym::batch::{Block, zeroed};
 use endless_gym::envs::view::VIEW_BYTES;
-use endless_gym::envs::{self, EnvSpec, Family, ParameterKind, mortar_mayhem, mystery_path, searing_spotlights};
 use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads};
+use endless_gym_core::envs::{self, EnvSpec, Family, ParameterKind, mortar_mayhem, mystery_path, searing_spotlights};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};

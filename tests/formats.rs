@@ -4,10 +4,10 @@ mod common;
 
 use std::collections::VecDeque;
 
+use endless_gym::batch::PixelFormat;
 use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
 use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, Parameter, SCREEN};
 use endless_gym::pool::{Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads};
-use endless_gym::raster::PixelFormat;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::Value as Json;

@@ -8,12 +8,12 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym::batch::{ActionSection, Batch, Contents, action_layout, batch_layout, zeroed};
 use endless_gym::envs::{ActionError, spec};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{
     ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
 };
+use endless_gym_core::batch::{ActionSection, Batch, Contents, action_layout, batch_layout, zeroed};
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::foreign::{Foreign, RequestHeader};
 use service_support::{ID, Place, ROLE_ARGUMENTS, engine_config, play_role};

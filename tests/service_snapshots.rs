@@ -5,9 +5,9 @@ mod service_support;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use endless_gym::batch::{Block, SNAPSHOT_BYTES, zeroed};
 use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
+use endless_gym_core::batch::{Block, SNAPSHOT_BYTES, zeroed};
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::foreign::{Foreign, RequestHeader};
 use service_support::{ID, Place, play_role};

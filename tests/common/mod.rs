@@ -3,8 +3,8 @@
 
 use std::path::PathBuf;
 
+use endless_gym::batch::PixelFormat;
 use endless_gym::envs::{EnvSpec, Parameter, ParameterKind};
-use endless_gym::raster::PixelFormat;
 use proptest::prelude::*;
 use serde_json::{Map, Value as Json};
 

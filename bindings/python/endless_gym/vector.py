@@ -104,8 +104,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` takes the
-                seeds that the environments were created with, and after their first reset continues their generators.
+            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` takes
+                the seeds that the environments were created with, and after their first reset continues their generators.
             options: Reset parameters for these and all later episodes, which override those that the environments were created
                 with; and `reset_mask`, bool (n,), the environments that start an episode. Not allowed if the environments were
                 created with a sequence of options.

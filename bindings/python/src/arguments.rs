@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use endless_gym::batch::Frames;
+use endless_gym::batch::PixelFormat;
 use endless_gym::pool::{Autoreset, ResetOptions, ResetRequest, Seeding, UnknownAutoreset};
-use endless_gym::raster::PixelFormat;
 use endless_gym::service::timeout_from_seconds;
 use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn};
 use pyo3::exceptions::{PyTypeError, PyValueError};

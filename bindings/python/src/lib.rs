@@ -30,7 +30,7 @@ fn specs() -> PyResult<String> {
 /// Runs the program `endless` and returns its exit status. `executable` is the command that starts it in a new process.
 #[pyfunction]
 fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) -> u8 {
-    py.detach(|| endless_gym::cli::main(arguments, &executable))
+    py.detach(|| endless_gym_cli::main(arguments, &executable))
 }
 
 #[pymodule(name = "_native")]

@@ -4,6 +4,8 @@
 //! describes how one step of many environments lies in memory; [`pool`] steps them in lockstep; [`trace`] replays recorded
 //! episodes of the original.
 
+#![deny(unsafe_code)]
+
 pub mod batch;
 pub mod envs;
 pub mod pool;

@@ -176,7 +176,7 @@ impl RequestData {
                 copy(&mut self.seed, layout.read(payload, ActionSection::Seed));
             }
             RequestKind::Restore => {
-                copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes))
+                copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes));
             }
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot => {}
         }

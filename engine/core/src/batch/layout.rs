@@ -92,12 +92,20 @@ pub struct Layout<S: SectionTable = BatchSection> {
 pub type ActionLayout = Layout<ActionSection>;
 
 /// The layout of a batch of `num_envs` environments, 1 to [`MAX_ENVS`].
+///
+/// # Errors
+///
+/// [`LayoutError`] if `num_envs` is out of its range.
 pub fn batch_layout(spec: &EnvSpec, num_envs: usize, contents: Contents) -> Result<Layout, LayoutError> {
     let sections = BatchSection::ALL.iter();
     Layout::new(num_envs, sections.filter_map(|section| Some((*section, section.row_shape(spec, contents)?))))
 }
 
 /// The layout of the message that a trainer sends to an engine, for `num_envs` environments, 1 to [`MAX_ENVS`].
+///
+/// # Errors
+///
+/// [`LayoutError`] if `num_envs` is out of its range.
 pub fn action_layout(spec: &EnvSpec, num_envs: usize) -> Result<ActionLayout, LayoutError> {
     check_num_envs(num_envs)?;
     Layout::new(num_envs, ActionSection::ALL.iter().map(|section| (*section, section.row_shape(spec, num_envs))))

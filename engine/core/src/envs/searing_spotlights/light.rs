@@ -134,7 +134,7 @@ impl LightChange<'_> {
         for change in &self.changes {
             match change {
                 CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => {
-                    for_each_run(circle, |x, rows| canvas.mark_dirty(x..x + 1, &rows))
+                    for_each_run(circle, |x, rows| canvas.mark_dirty(x..x + 1, &rows));
                 }
                 CircleChange::Moved(from, to) => {
                     for (crescent, circle) in [(crescent(from, to), from), (crescent(to, from), to)] {
