@@ -14,7 +14,7 @@
 pub mod batch {
     pub use endless_gym_core::batch::{
         BLOCK_BYTES, Batch, BatchSection, Block, Dtype, Element, Frames, LAYOUT_VERSION, Layout, LayoutError,
-        MAX_STACK, Section, SectionTable, zeroed,
+        MAX_DIMENSIONS, MAX_STACK, RowShape, Section, SectionTable, zeroed,
     };
     pub use endless_gym_core::raster::PixelFormat;
 }
