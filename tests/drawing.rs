@@ -81,7 +81,7 @@ fn every_environment_is_drawn_alike_in_irregular_buffers() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(100))]
+    #![proptest_config(common::property_cases(100))]
 
     #[test]
     fn environments_of_any_options_are_drawn_alike_in_irregular_buffers(

@@ -1,6 +1,8 @@
 //! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot is
 //! refused or can be played; none panics.
 
+mod common;
+
 use ciborium::Value;
 use endless_gym::batch::{Block, zeroed};
 use endless_gym::envs::view::VIEW_BYTES;
@@ -288,7 +290,7 @@ fn sums_of_the_episode_stay_in_range() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(300))]
+    #![proptest_config(common::property_cases(300))]
 
     /// Several numbers at a time.
     #[test]

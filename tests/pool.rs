@@ -292,7 +292,7 @@ fn wrong_calls_are_refused_and_move_nothing() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(64))]
+    #![proptest_config(common::property_cases(64))]
 
     /// Any options within the limits, any seed, any actions: nothing panics, and two pools agree.
     #[test]

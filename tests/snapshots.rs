@@ -1,5 +1,7 @@
 //! Snapshots: an environment that is saved goes on identically, wherever it is restored.
 
+mod common;
+
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs;
 use endless_gym::pool::{
@@ -105,7 +107,7 @@ fn broken_snapshots_are_typed_errors() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(400))]
+    #![proptest_config(common::property_cases(400))]
 
     /// A forged snapshot, whose checksum fits, is refused or can be played: it never panics.
     #[test]

@@ -77,3 +77,9 @@ pub fn pixel_format() -> impl Strategy<Value = PixelFormat> {
         row_major,
     })
 }
+
+/// `cases` runs of a property, or as many as the environment variable `PROPTEST_CASES` says.
+pub fn property_cases(cases: u32) -> ProptestConfig {
+    let given = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok());
+    ProptestConfig::with_cases(given.unwrap_or(cases))
+}

@@ -12,3 +12,6 @@ pub mod pool;
 pub mod random;
 pub mod raster;
 pub mod trace;
+
+#[cfg(test)]
+mod property_cases;

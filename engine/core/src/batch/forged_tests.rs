@@ -193,7 +193,7 @@ fn use_all(layout: &Layout) -> Result<(), TestCaseError> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 2_000, ..ProptestConfig::default() })]
+    #![proptest_config(crate::property_cases::property_cases(2_000))]
 
     /// Whatever deserialises can be read, written and divided.
     #[test]

@@ -169,7 +169,7 @@ fn any_picture() -> impl Strategy<Value = Surface> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(400))]
+    #![proptest_config(crate::property_cases::property_cases(400))]
 
     #[test]
     fn shapes_of_any_numbers_are_drawn(

@@ -91,7 +91,7 @@ fn any_episodes() -> impl Strategy<Value = (&'static EnvSpec, Vec<Map<String, Js
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(150))]
+    #![proptest_config(crate::property_cases::property_cases(150))]
 
     #[test]
     fn any_options_play((spec, episodes) in any_episodes(), seed: u64, steps in 0..12_usize) {
