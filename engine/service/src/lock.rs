@@ -5,7 +5,7 @@
 //!
 //! - publish a specification, and remove what a dead engine left under its name;
 //! - close the specification service of an engine that ends;
-//! - remove the resources of dead nodes, which is skipped if the lock is not free;
+//! - remove the resources of dead nodes and orphans, which is skipped if the lock is not free;
 //! - read a specification, because the last process that closes a service removes it.
 //!
 //! Readers exclude each other too: with a shared lock, many waiting trainers could starve an engine that starts. The lock is an
