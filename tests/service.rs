@@ -297,6 +297,24 @@ fn deaths_at_any_moment_are_survived() {
 }
 
 #[test]
+fn an_engine_that_ends_keeps_its_services_until_its_specification_is_removed() {
+    let place = Place::new();
+    let engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
+    let before = place.leftovers();
+    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    lock.lock().unwrap();
+    std::thread::scope(|scope| {
+        let ending = scope.spawn(|| drop(engine));
+        // The specification cannot be removed without the lock.
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!(place.leftovers(), before);
+        lock.unlock().unwrap();
+        ending.join().unwrap();
+    });
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
+#[test]
 fn a_trainer_notices_that_its_engine_has_ended() {
     let place = Place::new();
     let engine = place.engine("gym", 1, 1);
@@ -498,8 +516,13 @@ fn a_header_that_changes_after_its_check_is_not_read_again() {
     let mut header = foreign.send(5);
     let received = observer.newest().unwrap().unwrap();
     assert_eq!((received.group(), received.step()), (0, 5));
-    header.overwrite(7, 99);
-    assert_eq!((received.group(), received.step()), (0, 5));
+    let blocks = received.blocks().len();
+    assert_eq!(blocks, specification.batch.blocks());
+    for forged in [0, 1 << 40] {
+        header.overwrite(7, 99, forged);
+        assert_eq!((received.group(), received.step(), received.blocks().len()), (0, 5, blocks));
+        assert_eq!(received.batch().reward(), [0.0]);
+    }
     engine.end();
 }
 

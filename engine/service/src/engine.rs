@@ -82,13 +82,14 @@ pub struct EngineSummary {
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Engine {
+    // Dropped first: a process that finds the specification expects all other services.
+    _published: PublishedSpecification,
     // Ports must be dropped before the node.
     groups: Vec<Group>,
     to_trainer: Notifier<Ipc>,
     to_engine: Listener<Ipc>,
     specification: ServiceSpecification,
     summary: EngineSummary,
-    _published: PublishedSpecification,
     node: NamespaceNode,
 }
 
