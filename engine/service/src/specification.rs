@@ -1,6 +1,6 @@
 //! The specification of an engine: what trainers and observers must know before they connect.
 
-use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, action_layout};
+use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, Section, action_layout};
 use endless_gym_core::envs::{self, ActionSpace};
 use endless_gym_core::pool::{Autoreset, MAX_ENVS};
 use serde::{Deserialize, Serialize};
@@ -84,7 +84,7 @@ impl ServiceSpecification {
         }
         let columns = [("info", &self.info, BatchSection::Info), ("features", &self.features, BatchSection::Features)];
         for (name, columns, section) in columns {
-            let (given, width) = (columns.len(), self.batch.section(section).map_or(0, |section| section.width()));
+            let (given, width) = (columns.len(), self.batch.section(section).map_or(0, Section::width));
             if given != width {
                 return Err(format!("{name} must name {width} columns, those of the batch's section, got {given}"));
             }
