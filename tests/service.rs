@@ -8,7 +8,7 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym::envs::{ActionError, spec};
+use endless_gym::envs::{ActionError, ActionSpace, spec};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{
     ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
@@ -102,7 +102,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
 
         assert!(matches!(trainer.reset(1, ResetRequest::All), Err(ServiceError::NoSuchGroup { given: 1, .. })));
         assert!(matches!(trainer.receive(0, SECONDS), Err(ServiceError::NothingSent { group: 0 })));
-        assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingSent { .. })));
+        assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingPending)));
         assert!(matches!(
             trainer.reset(0, ResetRequest::Each { reset: &[1, 1], seed: &[1] }),
             Err(ServiceError::ResetCount { given: 1, num_envs: 2 })
@@ -119,6 +119,9 @@ fn mistakes_of_a_trainer_are_typed_errors() {
 
         trainer.reset(0, ResetRequest::All).unwrap();
         assert!(matches!(trainer.reset(0, ResetRequest::All), Err(ServiceError::AnswerPending { group: 0 })));
+        // The number of actions is checked before the pending answer, and their range after it.
+        assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::Action(ActionError::Count { .. }))));
+        assert!(matches!(trainer.send(0, &vec![99; 2 * width]), Err(ServiceError::AnswerPending { group: 0 })));
         trainer.receive(0, SECONDS).unwrap();
 
         let mut actions = vec![0; 2 * width];
@@ -297,6 +300,24 @@ fn deaths_at_any_moment_are_survived() {
 }
 
 #[test]
+fn an_engine_that_ends_keeps_its_services_until_its_specification_is_removed() {
+    let place = Place::new();
+    let engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
+    let before = place.leftovers();
+    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    lock.lock().unwrap();
+    std::thread::scope(|scope| {
+        let ending = scope.spawn(|| drop(engine));
+        // The specification cannot be removed without the lock.
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!(place.leftovers(), before);
+        lock.unlock().unwrap();
+        ending.join().unwrap();
+    });
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
+#[test]
 fn a_trainer_notices_that_its_engine_has_ended() {
     let place = Place::new();
     let engine = place.engine("gym", 1, 1);
@@ -308,6 +329,43 @@ fn a_trainer_notices_that_its_engine_has_ended() {
         .and_then(|()| trainer.receive(0, SECONDS).map(drop))
         .unwrap_err();
     assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+}
+
+#[test]
+fn a_trainer_reports_a_lost_engine_while_the_namespace_is_locked() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 1, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 1);
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    trainer.receive(0, SECONDS).unwrap();
+    engine.kill();
+    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    lock.lock().unwrap();
+    let (report, reported) = std::sync::mpsc::channel();
+    std::thread::scope(|scope| {
+        scope.spawn(move || {
+            let sent = trainer.send_with(0, |actions| actions.fill(0));
+            report.send(sent.and_then(|()| trainer.receive(0, Duration::from_secs(60)).map(drop))).unwrap();
+        });
+        // Waiting for the lock to the end takes 5 seconds.
+        let result = reported.recv_timeout(Duration::from_secs(4));
+        lock.unlock().unwrap();
+        let error = result.expect("the trainer waits for the lock").unwrap_err();
+        assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+    });
+}
+
+#[test]
+fn a_waiting_observer_notices_that_its_engine_has_died() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 1, 1);
+    let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
+    engine.kill();
+    let (report, reported) = std::sync::mpsc::channel();
+    std::thread::spawn(move || report.send(observer.next(Duration::MAX).map(drop)));
+    let error = reported.recv_timeout(Duration::from_secs(60)).expect("the observer still waits").unwrap_err();
+    assert!(matches!(error, ServiceError::EngineLost { pid, .. } if pid == engine.id()), "{error}");
 }
 
 #[test]
@@ -399,7 +457,8 @@ const CONTENTS: Contents = Contents { frames: None, features: false, final_obser
 fn a_malformed_specification_is_an_error_and_not_a_panic() {
     let place = Place::new();
     let _engine = place.engine("gym", 1, 1);
-    let valid = place.trainer("gym").unwrap().specification().clone();
+    let published = place.trainer("gym").unwrap().specification().clone();
+    let valid = ServiceSpecification { service: "malformed".to_owned(), ..published.clone() };
     let malformed = [
         ("groups", ServiceSpecification { groups: 0, ..valid.clone() }),
         ("num_envs", ServiceSpecification { num_envs: 0, ..valid.clone() }),
@@ -410,6 +469,10 @@ fn a_malformed_specification_is_an_error_and_not_a_panic() {
             "batch",
             ServiceSpecification { batch: batch_layout(spec(ID).unwrap(), 2, CONTENTS).unwrap(), ..valid.clone() },
         ),
+        ("action space", ServiceSpecification { action_space: ActionSpace::Discrete(9), ..valid.clone() }),
+        ("info must name", ServiceSpecification { info: vec![], ..valid.clone() }),
+        ("features must name", ServiceSpecification { features: vec!["x".to_owned()], ..valid.clone() }),
+        ("service must be `malformed`, got `gym`", published),
     ];
     for (part, specification) in malformed {
         let _published = service_support::foreign::specification(place.namespace(), "malformed", &specification);
@@ -498,8 +561,13 @@ fn a_header_that_changes_after_its_check_is_not_read_again() {
     let mut header = foreign.send(5);
     let received = observer.newest().unwrap().unwrap();
     assert_eq!((received.group(), received.step()), (0, 5));
-    header.overwrite(7, 99);
-    assert_eq!((received.group(), received.step()), (0, 5));
+    let blocks = received.blocks().len();
+    assert_eq!(blocks, specification.batch.blocks());
+    for forged in [0, 1 << 40] {
+        header.overwrite(7, 99, forged);
+        assert_eq!((received.group(), received.step(), received.blocks().len()), (0, 5, blocks));
+        assert_eq!(received.batch().reward(), [0.0]);
+    }
     engine.end();
 }
 

@@ -1,5 +1,5 @@
 //! Snapshots for a search: tries every action of one environment from the same state, and plays the one whose random
-//! continuations return the most. The search knows nothing but rewards.
+//! continuations return the most. The search uses rewards only.
 //!
 //! ```console
 //! cargo run --release --example tree_search [SEED]
@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn new_pool(num_envs: usize) -> Result<Pool, Box<dyn Error>> {
     let options = json!({"reward_path_progress": 0.1, "show_goal": true});
     let mut config = PoolConfig::new(ID, num_envs);
-    // Rewards are all that the search looks at, so nothing is drawn.
+    // The search uses rewards only, so nothing is drawn.
     config.frames = None;
     config.options = serde_json::from_value(options).map(endless_gym::pool::ResetOptions::Shared)?;
     Ok(Pool::new(&config, &Threads::new(1)?)?)

@@ -16,8 +16,8 @@ const ID: &str = "MortarMayhem-v0";
 const NUM_ENVS: usize = 64;
 const STEPS: usize = 500;
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// What a policy's forward pass takes.
-const THINKING: Duration = Duration::from_micros(100);
+/// Simulated inference time of a policy.
+const INFERENCE_TIME: Duration = Duration::from_micros(100);
 
 fn main() -> Result<(), Box<dyn Error>> {
     // Usually a process of its own: `endless serve --groups 2 --service two-groups ...`.
@@ -46,7 +46,7 @@ fn play() -> Result<Duration, ServiceError> {
     for _ in 0..2 * STEPS {
         // The group that is ready first.
         let group = trainer.receive_any(TIMEOUT)?.group();
-        std::thread::sleep(THINKING);
+        std::thread::sleep(INFERENCE_TIME);
         trainer.send(group, &actions)?;
     }
     Ok(start.elapsed())

@@ -8,6 +8,7 @@ use endless_gym::service::{Namespace, ServiceSpecification};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
+use iceoryx2::service::header::publish_subscribe::Header;
 
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(transparent)]
@@ -169,19 +170,33 @@ pub struct Engine {
     _parts: Box<dyn std::any::Any>,
 }
 
-/// The header in shared memory of a message that was sent.
-pub struct SentHeader(*mut ResponseHeader);
+/// The headers in shared memory of a message that was sent.
+pub struct SentHeader {
+    header: *mut ResponseHeader,
+    /// The number of blocks of the payload in iceoryx2's header.
+    length: *mut u64,
+}
 
 impl SentHeader {
-    /// Changes group and step after the message was received.
-    pub fn overwrite(&mut self, group: u32, step: u64) {
+    /// Changes group, step and number of blocks after the message was received.
+    pub fn overwrite(&mut self, group: u32, step: u64, blocks: u64) {
         // SAFETY: the chunk is mapped as long as the publisher exists, which the tests guarantee. Its receiver holds it, so the
         // publisher does not reuse it.
         unsafe {
-            (&raw mut (*self.0).group).write_volatile(group);
-            (&raw mut (*self.0).step).write_volatile(step);
+            (&raw mut (*self.header).group).write_volatile(group);
+            (&raw mut (*self.header).step).write_volatile(step);
+            self.length.write_volatile(blocks);
         }
     }
+}
+
+/// The address of the number of elements in iceoryx2's header, whose fields are private: it is the last word of that value.
+fn number_of_elements(header: &Header, value: usize) -> *mut u64 {
+    let first = std::ptr::from_ref(header).cast::<u64>().cast_mut();
+    let words = size_of::<Header>() / size_of::<u64>();
+    // SAFETY: the header consists of that many initialised and aligned words.
+    let found = (0..words).rev().find(|word| unsafe { first.add(*word).read() } == value as u64);
+    first.wrapping_add(found.unwrap())
 }
 
 impl Engine {
@@ -217,7 +232,7 @@ impl Engine {
         let header = message.user_header_mut();
         let incarnation = self.specification.incarnation;
         *header = ResponseHeader { incarnation, step, trainer: 42, request: 1, ..ResponseHeader::default() };
-        let header = SentHeader(header);
+        let header = SentHeader { header, length: number_of_elements(message.header(), zero.len()) };
         assert_eq!(message.send().unwrap(), 1);
         header
     }

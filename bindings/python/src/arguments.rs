@@ -6,7 +6,7 @@ use endless_gym::batch::Frames;
 use endless_gym::batch::PixelFormat;
 use endless_gym::pool::{Autoreset, ResetOptions, ResetRequest, Seeding, UnknownAutoreset};
 use endless_gym::service::timeout_from_seconds;
-use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn};
+use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use serde_json::{Map, Value as Json};
@@ -17,11 +17,13 @@ use crate::errors;
 pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
     to.clear();
     if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i64>>() {
-        append(&array, to, clamp);
+        append(&array, to, action)?;
     } else if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i32>>() {
-        append(&array, to, |action| action);
+        append(&array, to, Ok)?;
     } else if let Ok(list) = given.extract::<Vec<i64>>() {
-        to.extend(list.into_iter().map(clamp));
+        for number in list {
+            to.push(action(number)?);
+        }
     } else {
         let module = given.py().import("numpy")?;
         let array = module.call_method1("asarray", (given,))?;
@@ -32,22 +34,28 @@ pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
             return Err(PyTypeError::new_err(format!("actions must be integers, got {shown}")));
         }
         let array = array.call_method1("astype", ("int64",))?.cast_into::<numpy::PyArrayDyn<i64>>()?;
-        append(&array.readonly(), to, clamp);
+        append(&array.readonly(), to, action)?;
     }
     Ok(())
 }
 
 /// Appends the numbers in C order, for any memory order of the array.
-fn append<T: Element + Copy>(array: &PyReadonlyArrayDyn<'_, T>, to: &mut Vec<i32>, convert: impl Fn(T) -> i32) {
+fn append<T: Element + Copy>(
+    array: &PyReadonlyArrayDyn<'_, T>,
+    to: &mut Vec<i32>,
+    convert: impl Fn(T) -> PyResult<i32>,
+) -> PyResult<()> {
+    to.reserve(array.len());
     match array.as_array().as_slice() {
-        Some(numbers) => to.extend(numbers.iter().map(|number| convert(*number))),
-        None => to.extend(array.as_array().iter().map(|number| convert(*number))),
+        Some(numbers) => numbers.iter().try_for_each(|number| convert(*number).map(|action| to.push(action))),
+        None => array.as_array().iter().try_for_each(|number| convert(*number).map(|action| to.push(action))),
     }
 }
 
-/// An action outside of i32 becomes -1, which is out of range as well.
-fn clamp(action: i64) -> i32 {
-    i32::try_from(action).unwrap_or(-1)
+/// An action as the engine's type.
+pub fn action(given: i64) -> PyResult<i32> {
+    let range = |_| PyValueError::new_err(format!("an action must be 0 to {}, got {given}", i32::MAX));
+    i32::try_from(given).map_err(range)
 }
 
 /// The frames of an observation, from grayscale, channels first, row-major and number of stacked frames.

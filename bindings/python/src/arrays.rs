@@ -77,7 +77,7 @@ unsafe fn array<'py>(
     data: *const Block,
     owner: &Bound<'py, PyAny>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    // SAFETY: the arguments are what numpy's documentation asks for; both calls steal a reference, to the descriptor and to the
+    // SAFETY: the arguments are as numpy's documentation requires; both calls steal a reference, to the descriptor and to the
     // owner, even if they fail.
     unsafe {
         let array = PY_ARRAY_API.PyArray_NewFromDescr(

@@ -41,16 +41,10 @@ impl Connection {
     /// Connects to the engine named `service`, and waits up to `timeout` seconds for it to start.
     #[new]
     fn new(py: Python<'_>, service: &str, timeout: f64) -> PyResult<Self> {
-        let (timeout, start) = (arguments::timeout(timeout)?, Instant::now());
-        loop {
-            let left = timeout.saturating_sub(start.elapsed());
-            let config = ConnectConfig { timeout: left.min(SIGNAL_INTERVAL), ..ConnectConfig::new(service) };
-            match py.detach(|| Trainer::connect(&config)) {
-                Ok(trainer) => return Ok(Connection { trainer, actions: Vec::new(), process: std::process::id() }),
-                Err(ServiceError::UnknownEngine { .. }) if left > SIGNAL_INTERVAL => py.check_signals()?,
-                Err(error) => return Err(errors::service(error)),
-            }
-        }
+        let config = ConnectConfig::new(service);
+        let connect = |slice| Trainer::connect(&ConnectConfig { timeout: slice, ..config.clone() });
+        let trainer = wait_for_engine(py, timeout, connect)?;
+        Ok(Connection { trainer, actions: Vec::new(), process: std::process::id() })
     }
 
     /// The engine's specification, as JSON text.
@@ -107,11 +101,11 @@ impl Connection {
         self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
-    /// Connects to an engine of the same name that was started in place of a lost one.
+    /// Connects to an engine of the same name that replaces a lost engine.
     fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<()> {
         self.check_process()?;
-        let timeout = arguments::timeout(timeout)?;
-        py.detach(|| self.trainer.reconnect(timeout)).map_err(errors::service)
+        let trainer = &mut self.trainer;
+        wait_for_engine(py, timeout, |slice| trainer.reconnect(slice))
     }
 }
 
@@ -148,6 +142,29 @@ impl Connection {
         Err(PyRuntimeError::new_err(
             "this connection belongs to the process that this process was forked from; connect to another engine in the child",
         ))
+    }
+}
+
+/// Calls `connect` with parts of the timeout until there is an engine, without the interpreter's lock, and runs Python's signal
+/// handlers between the calls.
+fn wait_for_engine<T: Send>(
+    py: Python<'_>,
+    timeout: f64,
+    mut connect: impl FnMut(Duration) -> Result<T, ServiceError> + Send,
+) -> PyResult<T> {
+    let (timeout, start) = (arguments::timeout(timeout)?, Instant::now());
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        match py.detach(|| connect(left.min(SIGNAL_INTERVAL))) {
+            Ok(connected) => return Ok(connected),
+            // The engine is not running yet, or it was replaced during the call.
+            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
+                if left > SIGNAL_INTERVAL =>
+            {
+                py.check_signals()?;
+            }
+            Err(error) => return Err(errors::service(error)),
+        }
     }
 }
 

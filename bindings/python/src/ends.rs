@@ -1,5 +1,5 @@
-//! What a step reports of the episodes that it ended, in the form of Gymnasium's vector infos: one row for each environment, zero
-//! for episodes that go on.
+//! Infos of episodes that ended in a step, in the form of Gymnasium's vector infos: one row for each environment, zero for episodes
+//! that did not end.
 //!
 //! Nearly every step of a thousand environments ends an episode, so that this is one pass in Rust. With numpy it took up to a tenth
 //! of the step.

@@ -48,6 +48,7 @@ pub fn service(error: ServiceError) -> PyErr {
         // The messages of a pool in this process.
         E::Rejected { reason: Rejection::NotReset, .. } => NOT_RESET.to_owned(),
         E::Rejected { message, .. } => message.clone(),
+        E::NothingPending => E::NothingSent { group: 0 }.to_string(),
         error => error.to_string(),
     };
     match error {
@@ -58,7 +59,7 @@ pub fn service(error: ServiceError) -> PyErr {
             PyConnectionError::new_err(text)
         }
         E::Rejected { reason: Rejection::NotReset, .. } => PyRuntimeError::new_err(text),
-        E::TimedOut { .. } => PyTimeoutError::new_err(text),
+        E::TimedOut { .. } | E::NamespaceLocked { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
         | E::InvalidTimeout { .. }
         | E::NoSuchGroup { .. }

@@ -45,7 +45,7 @@ pub struct Pool {
     process: u32,
 }
 
-/// What `receive` carries out.
+/// What `receive` executes.
 enum Message {
     /// A step with `Pool::actions`.
     Step,
@@ -125,7 +125,7 @@ impl Pool {
         self.write_step(py)
     }
 
-    /// Has `receive` play a step with these actions, which are copied.
+    /// Queues a step, which `receive` executes. The actions are copied.
     fn send(&mut self, actions: &Bound<'_, PyAny>) -> PyResult<()> {
         self.check_process()?;
         arguments::actions(actions, &mut self.unchecked)?;
@@ -135,7 +135,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Has `receive` carry out a reset.
+    /// Queues a reset, which `receive` executes.
     #[pyo3(signature = (request=None, options=None))]
     fn send_reset(&mut self, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
         let options = options.map(arguments::options).transpose()?;
@@ -145,7 +145,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Carries out what was sent.
+    /// Executes what was sent.
     fn receive<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         self.check_process()?;
         match self.pending.take() {
@@ -170,6 +170,7 @@ impl Pool {
 
     /// The ground-truth view of one environment, indexed \[row\]\[column\]\[channel\].
     fn ground_truth_view<'py>(&mut self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyAny>> {
+        self.check_process()?;
         let mut view = vec![0; VIEW_BYTES];
         self.pool.ground_truth_view(env, &mut view).map_err(errors::pool)?;
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())

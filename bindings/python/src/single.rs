@@ -52,7 +52,7 @@ impl Single {
     ) -> PyResult<(Arrays<'py>, f64, bool, Option<(f64, i32, Vec<f64>)>)> {
         if let Ok(action) = action.extract::<i64>() {
             self.action.clear();
-            self.action.push(i32::try_from(action).unwrap_or(-1));
+            self.action.push(arguments::action(action)?);
         } else {
             arguments::actions(action, &mut self.action)?;
         }

@@ -102,7 +102,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         for _ in 0..args.rounds {
             for (method, results) in methods.iter().zip(&mut results) {
                 bar.set_message(format!("{}, {}", spec.id, name(*method)));
-                results.push(measure(args, spec, *method, &stop)?);
+                results.push(measure(args, spec, *method, stop)?);
                 if stop.load(Ordering::Relaxed) {
                     return Err("stopped before all measurements were done".into());
                 }
@@ -213,7 +213,7 @@ fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &Atom
     ];
     arguments.extend(args.environment.arguments());
     let mut engine = EngineProcess::start(&arguments)?;
-    let mut trainer = engine.connect()?;
+    let mut trainer = engine.connect(stop)?;
     let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;
     time(args, stop, || {

@@ -82,7 +82,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     arguments.push("--features".to_owned());
     arguments.extend(args.environment.arguments());
     let mut engine = EngineProcess::start(&arguments)?;
-    let mut trainer = engine.connect()?;
+    let mut trainer = engine.connect(stop)?;
 
     let mut random = RandomPolicy::new(spec);
     let mut experts: Vec<_> = (0..args.groups).map(|_| ExpertPolicy::new(spec, num_envs)).collect();

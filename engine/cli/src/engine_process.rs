@@ -1,10 +1,12 @@
 //! An engine in a child process.
 
 use std::ffi::OsString;
-use std::io::Read;
+use std::io::{self, Read};
 use std::os::unix::process::CommandExt;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStderr, Command, Stdio};
 use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
@@ -14,8 +16,14 @@ use super::Failure;
 /// Longest time that an engine may take to start.
 const START_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Longest wait for the engine between two checks that its process is alive.
+/// Longest time that an engine may take to end before it is killed.
+const END_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Longest wait for the engine between two checks of the stop flag and of the engine's process.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Maximum length of an engine's message in bytes; the rest of its standard error is discarded.
+const MESSAGE_BYTES: u64 = 64 * 1024;
 
 /// The command that starts `endless`, with its first arguments.
 static EXECUTABLE: OnceLock<Vec<OsString>> = OnceLock::new();
@@ -28,7 +36,9 @@ pub fn set_executable(command: &[OsString]) {
 /// A child process that serves environments. It ends when this value is dropped, and when this process dies.
 pub struct EngineProcess {
     child: Child,
-    service: String,
+    /// Reads the child's standard error, until the child closes it.
+    stderr: Option<JoinHandle<Vec<u8>>>,
+    config: ConnectConfig,
 }
 
 impl EngineProcess {
@@ -39,33 +49,40 @@ impl EngineProcess {
             .get()
             .and_then(|command| command.split_first())
             .ok_or("the command that starts an engine is empty")?;
-        let child = Command::new(program)
-            .args(first)
-            .args(["serve", "--child", "--service", &service])
-            .args(arguments)
+        let mut command = Command::new(program);
+        command.args(first).args(["serve", "--child", "--service", &service]).args(arguments);
+        Self::spawn(command, ConnectConfig::new(&service))
+    }
+
+    fn spawn(mut command: Command, config: ConnectConfig) -> Result<Self, Failure> {
+        let mut child = command
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             // In a process group of its own, the engine does not receive Ctrl-C. This process does, and then stops the engine.
             .process_group(0)
             .spawn()?;
-        Ok(EngineProcess { child, service })
+        // In a thread, because a child that has filled the pipe would wait for a reader.
+        let stderr = child.stderr.take().map(|stderr| std::thread::spawn(|| read_message(stderr)));
+        let config = ConnectConfig { timeout: POLL_INTERVAL, ..config };
+        Ok(EngineProcess { child, stderr, config })
     }
 
-    /// Connects as the engine's trainer, and waits for the engine to start.
-    pub fn connect(&mut self) -> Result<Trainer, Failure> {
+    /// Connects as the engine's trainer, and waits for the engine to start. Setting `stop` ends the wait with an error.
+    pub fn connect(&mut self, stop: &AtomicBool) -> Result<Trainer, Failure> {
+        self.connect_within(START_TIMEOUT, stop)
+    }
+
+    fn connect_within(&mut self, timeout: Duration, stop: &AtomicBool) -> Result<Trainer, Failure> {
         let start = Instant::now();
         loop {
-            let config = ConnectConfig { timeout: POLL_INTERVAL, ..ConnectConfig::new(&self.service) };
-            match Trainer::connect(&config) {
-                Err(ServiceError::UnknownEngine { .. }) if start.elapsed() < START_TIMEOUT => {}
+            match Trainer::connect(&self.config) {
+                Err(ServiceError::UnknownEngine { .. }) => {}
                 connected => return Ok(connected?),
             }
             if let Some(status) = self.child.try_wait()? {
-                let mut message = String::new();
-                if let Some(stderr) = &mut self.child.stderr {
-                    stderr.read_to_string(&mut message)?;
-                }
+                let message = self.stderr.take().and_then(|reader| reader.join().ok()).unwrap_or_default();
+                let message = String::from_utf8_lossy(&message);
                 let message = message.trim().trim_start_matches("endless: ");
                 return Err(if message.is_empty() {
                     format!("the engine ended: {status}")
@@ -74,6 +91,12 @@ impl EngineProcess {
                 }
                 .into());
             }
+            if stop.load(Ordering::Relaxed) {
+                return Err("stopped before the engine was ready".into());
+            }
+            if start.elapsed() >= timeout {
+                return Err(format!("the engine did not start within {} s", timeout.as_secs()).into());
+            }
         }
     }
 }
@@ -81,6 +104,58 @@ impl EngineProcess {
 impl Drop for EngineProcess {
     fn drop(&mut self) {
         drop(self.child.stdin.take());
-        let _ = self.child.wait();
+        let start = Instant::now();
+        while let Ok(None) = self.child.try_wait() {
+            if start.elapsed() >= END_TIMEOUT {
+                let _ = self.child.kill();
+                let _ = self.child.wait();
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+/// Reads standard error to its end and returns the beginning.
+fn read_message(mut stderr: ChildStderr) -> Vec<u8> {
+    let mut message = Vec::new();
+    // An error ends the message.
+    let _ = stderr.by_ref().take(MESSAGE_BYTES).read_to_end(&mut message);
+    let _ = io::copy(&mut stderr, &mut io::sink());
+    message
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_service::Namespace;
+
+    use super::*;
+
+    /// The error of connecting to a shell script in place of an engine.
+    fn error(name: &str, script: &str, timeout: Duration, stop: bool) -> String {
+        let root = format!("/tmp/endless-child-{name}-{}", std::process::id());
+        let config = ConnectConfig { namespace: Namespace::at(&root), ..ConnectConfig::new("gym") };
+        let mut command = Command::new("sh");
+        command.args(["-c", script]);
+        let mut engine = EngineProcess::spawn(command, config).unwrap();
+        let error = engine.connect_within(timeout, &AtomicBool::new(stop)).map(drop).unwrap_err().to_string();
+        drop(engine);
+        std::fs::remove_dir_all(root).unwrap();
+        error
+    }
+
+    #[test]
+    fn a_long_message_does_not_block_the_engine() {
+        let script = "echo endless: no memory >&2; head -c 300000 /dev/zero >&2; exit 1";
+        let message = error("message", script, START_TIMEOUT, false);
+        assert!(message.starts_with("no memory\n"), "{}", &message[..40.min(message.len())]);
+        assert!(message.len() <= MESSAGE_BYTES as usize);
+        assert_eq!(error("silent", "exit 3", START_TIMEOUT, false), "the engine ended: exit status: 3");
+    }
+
+    #[test]
+    fn waiting_for_an_engine_ends_with_the_stop_flag_or_the_timeout() {
+        assert_eq!(error("stop", "cat", START_TIMEOUT, true), "stopped before the engine was ready");
+        assert_eq!(error("slow", "cat", Duration::ZERO, false), "the engine did not start within 0 s");
     }
 }

@@ -56,13 +56,16 @@ const FAILURE: u8 = 1;
 ///
 /// The status is 0 after success; 1 after an error, which is printed to standard error as one line, and if `verify` finds a
 /// difference; 2 if the arguments do not follow the usage. Output that cannot be written is an error, but a closed pipe is not.
+///
+/// `demo`, `serve` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. Do not run two of them at the
+/// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
     let arguments = std::iter::once("endless".into()).chain(arguments);
     let result = match Cli::try_parse_from(arguments) {
         Ok(cli) => run(cli.command.unwrap_or_else(|| Command::Demo(demo::Args::default()))),
         Err(usage) if usage.use_stderr() => {
-            // Without standard error, the status is all that is left to report.
+            // Without standard error, the exit status is the only remaining way to report.
             let _ = usage.print();
             return u8::try_from(usage.exit_code()).unwrap_or(FAILURE);
         }

@@ -83,8 +83,7 @@ fn seed_range(text: &str) -> Result<(u64, u64), String> {
 impl EnvironmentArgs {
     /// These arguments as text, for another process.
     pub fn arguments(&self) -> Vec<String> {
-        let mut arguments: Vec<String> =
-            self.options.iter().flat_map(|option| ["--option".to_owned(), option.clone()]).collect();
+        let mut arguments: Vec<String> = self.options.iter().map(|option| format!("--option={option}")).collect();
         arguments.extend(self.env_options.iter().map(|options| format!("--env-options={options}")));
         arguments.extend(self.seed.map(|seed| format!("--seed={seed}")));
         arguments.extend(self.seed_range.map(|(start, end)| format!("--seed-range={start}..{end}")));
@@ -131,9 +130,24 @@ pub fn seconds(given: f64) -> Result<Duration, Failure> {
 
 #[cfg(test)]
 mod tests {
-    use clap::{Arg, Command};
+    use clap::{Arg, Command, Parser};
 
     use super::*;
+
+    #[test]
+    fn arguments_for_another_process_parse_to_the_same() {
+        #[derive(clap::Parser)]
+        struct Arguments {
+            #[command(flatten)]
+            environment: EnvironmentArgs,
+        }
+        let given = ["", "--option=-x=1", "--option=arena_size=6", "--seed=3", "--seed-range=0..9"];
+        let parse = |arguments: &[String]| Arguments::try_parse_from(arguments).map(|parsed| parsed.environment);
+        let given = parse(&given.map(str::to_owned)).unwrap();
+        let passed = parse(&[vec![String::new()], given.arguments()].concat()).unwrap();
+        assert_eq!(format!("{passed:?}"), format!("{given:?}"));
+        assert_eq!(passed.options, ["-x=1", "arena_size=6"]);
+    }
 
     #[test]
     fn autoreset_modes_are_given_by_their_names() {

@@ -39,13 +39,13 @@ pub fn print_help(help: &clap::Error) -> Result<(), Failure> {
     check(help.print().and_then(|()| io::stdout().flush()))
 }
 
-/// Prints an error to standard error. Without standard error, the exit status is all that is left to report.
+/// Prints an error to standard error. Without standard error, the exit status is the only remaining way to report.
 pub fn print_error(error: &dyn std::error::Error) {
     let _ = writeln!(io::stderr(), "endless: {error}");
 }
 
-/// Turns an error of standard output into a failure. A closed pipe is none: after `endless list | head -1`, the reader has what it
-/// wanted, and the command ends with the status that it would have had.
+/// Turns an error of standard output into a failure. A closed pipe is none: with `endless list | head -1`, the reader closed
+/// the pipe deliberately, and the command ends with the status that it would have had.
 fn check(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {

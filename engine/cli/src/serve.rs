@@ -51,7 +51,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let stop = stop::on_signal()?;
     if args.child {
-        stop::on_closed_input(&stop);
+        stop::on_closed_input(stop);
     }
     let pool = PoolConfig {
         autoreset: args.autoreset,
@@ -73,7 +73,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             args.id, args.service
         ))?;
     }
-    let summary = engine.run(&stop)?;
+    let summary = engine.run(stop)?;
     if !args.child {
         let (steps, batches) = (grouped(summary.env_steps as f64), grouped(summary.batches as f64));
         print(format_args!("{steps} steps in {batches} batches"))?;

@@ -1,7 +1,7 @@
 //! Publication and discovery of specifications.
 //!
 //! An engine publishes its specification on a blackboard, an iceoryx2 service that stores values and can be read at any time. The
-//! service's name contains nothing but the engine's name, so holding the service is holding the name. The value is JSON text in
+//! service's name contains nothing but the engine's name, so an engine owns its name as long as it owns the service. The value is JSON text in
 //! pieces of a fixed size, preceded by a head whose form is the same in all versions: a reader recognises an engine of another
 //! version before it reads anything else.
 //!
@@ -190,8 +190,16 @@ fn writer_node(board: &Board) -> Option<UniqueNodeId> {
 /// Reads the specification of the running engine of that name; `None` if there is none.
 pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<ServiceSpecification>, ServiceError> {
     check_name(service)?;
+    read_locked(node, service, &NamespaceLock::acquire(node.root())?)
+}
+
+/// Like [`read`], for a caller that holds the lock.
+pub(crate) fn read_locked(
+    node: &NamespaceNode,
+    service: &str,
+    _lock: &NamespaceLock,
+) -> Result<Option<ServiceSpecification>, ServiceError> {
     let invalid = |reason: String| ServiceError::Specification { service: service.to_owned(), reason };
-    let _lock = NamespaceLock::acquire(node.root())?;
     let Some(board) = open(node, service)? else { return Ok(None) };
     if !writer_node(&board).is_some_and(|writer| node.is_alive(writer)) {
         return Ok(None);
@@ -211,7 +219,7 @@ pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<Service
     }
     text.truncate(head.length as usize);
     let specification: ServiceSpecification = serde_json::from_slice(&text).map_err(|e| invalid(e.to_string()))?;
-    specification.check().map_err(invalid)?;
+    specification.check(service).map_err(invalid)?;
     Ok(Some(specification))
 }
 
@@ -219,7 +227,8 @@ pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<Service
 ///
 /// # Errors
 ///
-/// [`ServiceError::Root`] if the namespace's directory cannot be used.
+/// [`ServiceError::Root`] if the namespace's directory cannot be used, and [`ServiceError::Middleware`] if iceoryx2 cannot
+/// register this process or list the services.
 pub fn running_engines(namespace: &Namespace) -> Result<Vec<String>, ServiceError> {
     list(&NamespaceNode::join(namespace)?)
 }
@@ -242,4 +251,34 @@ pub(crate) fn list(node: &NamespaceNode) -> Result<Vec<String>, ServiceError> {
     listed.map_err(|e| ServiceError::middleware("cannot list the engines")(e.to_string()))?;
     names.sort();
     Ok(names)
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::pool::{PoolConfig, Threads};
+
+    use super::*;
+    use crate::{Engine, EngineConfig};
+
+    #[test]
+    fn publication_waits_for_the_lock() {
+        let namespace = Namespace::at(format!("/tmp/endless-publish-{}", std::process::id()));
+        let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
+        let config = EngineConfig::new("model", pool, Threads::new(1).unwrap());
+        let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
+        let specification = ServiceSpecification { service: "gym".to_owned(), ..engine.specification().clone() };
+        let node = NamespaceNode::join(&namespace).unwrap();
+        let lock = NamespaceLock::acquire(node.root()).unwrap();
+        std::thread::scope(|scope| {
+            let publication = scope.spawn(|| publish(&node, &specification));
+            std::thread::sleep(Duration::from_millis(200));
+            assert_eq!(list(&node).unwrap(), ["model"]);
+            drop(lock);
+            let published = publication.join().unwrap().unwrap();
+            assert_eq!(list(&node).unwrap(), ["gym", "model"]);
+            drop(published);
+        });
+        drop((node, engine));
+        std::fs::remove_dir_all(namespace.root()).unwrap();
+    }
 }

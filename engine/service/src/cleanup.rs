@@ -89,8 +89,9 @@ pub(crate) fn remove_incomplete_nodes(config: &Config) {
 /// Removes the node counter and all orphans if the namespace has no nodes, neither running nor dead.
 ///
 /// The counter may restart at zero: a node's id also contains its process id and its start time. Orphans are recognised by their
-/// age, so that the resources of a node that joins in the meantime are kept.
-pub(crate) fn remove_orphans(config: &Config) {
+/// age, so that the resources of a node that joins in the meantime are kept. The lock keeps an engine from creating a service
+/// between the check and the removal.
+pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock) {
     let mut is_empty = true;
     let listed = Node::<Ipc>::list(config, |_| {
         is_empty = false;
@@ -194,11 +195,12 @@ mod tests {
             [("a", 0o400, 60), ("b", 0o600, 0), ("c", 0o600, 60)].map(|(n, m, s)| file(&services, &config, n, m, s));
         let nodes = root.join("nodes");
         let [young, old] = [("1", 1), ("2", 60)].map(|(n, s)| file(&nodes, &config, n, 0o600, s));
-        remove_incomplete_services(&config, &NamespaceLock::acquire(&root).unwrap());
+        let lock = NamespaceLock::acquire(&root).unwrap();
+        remove_incomplete_services(&config, &lock);
         remove_incomplete_nodes(&config);
         assert!(finished.exists() && begun.exists() && !stuck.exists());
         assert!(young.exists() && !old.exists());
-        remove_orphans(&config);
+        remove_orphans(&config, &lock);
         assert!(!finished.exists() && begun.exists(), "old resources of an empty namespace are orphans");
         fs::remove_dir_all(&root).unwrap();
     }

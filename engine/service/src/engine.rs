@@ -82,13 +82,14 @@ pub struct EngineSummary {
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Engine {
+    // Dropped first: a process that finds the specification expects all other services.
+    _published: PublishedSpecification,
     // Ports must be dropped before the node.
     groups: Vec<Group>,
     to_trainer: Notifier<Ipc>,
     to_engine: Listener<Ipc>,
     specification: ServiceSpecification,
     summary: EngineSummary,
-    _published: PublishedSpecification,
     node: NamespaceNode,
 }
 
@@ -100,7 +101,9 @@ impl Engine {
     ///
     /// [`ServiceError::InvalidName`], [`ServiceError::OutOfRange`] or [`ServiceError::Pool`] for an invalid configuration,
     /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is
-    /// running, and [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory.
+    /// running, [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory, [`ServiceError::Version`] if an engine
+    /// of another version has the name, [`ServiceError::NamespaceLocked`] if another process holds the namespace's lock for too
+    /// long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
         let node = NamespaceNode::join(&config.namespace)?;
@@ -187,7 +190,7 @@ impl Engine {
             .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
         group.memory.prefault(batch.payload_mut())?;
         // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
-        // memory, and a recycled chunk holds a batch.
+        // memory, and a recycled chunk holds an earlier response.
         let mut batch = unsafe { batch.assume_init() };
         let outcome =
             read.and_then(|kind| group.execute(kind, &request, bytemuck::cast_slice_mut(batch.payload_mut())));

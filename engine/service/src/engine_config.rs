@@ -1,4 +1,4 @@
-//! What an engine serves.
+//! Configuration of an engine.
 
 use endless_gym_core::pool::{MAX_ENVS, PoolConfig, PoolError, ResetOptions, Threads};
 
@@ -14,7 +14,7 @@ pub(crate) const MAX_BATCHES_HELD: usize = 16;
 /// Maximum number of observers of a group.
 pub(crate) const MAX_OBSERVERS: usize = 16;
 
-/// What an engine serves, and under which name.
+/// Configuration of an engine: what it serves, and under which name.
 #[derive(Clone, Debug)]
 pub struct EngineConfig {
     /// The engine's name: 1 to 64 letters, digits, `.`, `_` or `-`.

@@ -193,7 +193,10 @@ pub enum ServiceError {
         /// The group.
         group: usize,
     },
-    /// The caller holds as many batches of the group as the engine lends.
+    /// No group has a request to answer.
+    #[error("no group has a pending answer; reset or step one before receiving")]
+    NothingPending,
+    /// The caller holds the maximum number of leases on batches of the group.
     #[error(
         "{limit} batches of group {group} are held, the maximum of this engine; drop one, or copy the data to keep"
     )]

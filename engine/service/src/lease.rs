@@ -1,5 +1,6 @@
 //! Leases on batches in shared memory, and the port that receives them.
 
+use std::ptr::NonNull;
 use std::sync::Arc;
 
 use endless_gym_core::batch::{Batch, Block, LAYOUT_VERSION};
@@ -22,7 +23,8 @@ use crate::specification::ServiceSpecification;
 /// dropped. [`batches_held`](ServiceSpecification::batches_held) leases of a group may be held at a time.
 pub struct BatchLease {
     // Dropped before the port through which it was received.
-    sample: ForkGuard<Sample<Ipc, [PayloadBlock], ResponseHeader>>,
+    _sample: ForkGuard<Sample<Ipc, [PayloadBlock], ResponseHeader>>,
+    payload: Payload,
     group: usize,
     step: u64,
     specification: Arc<ServiceSpecification>,
@@ -30,9 +32,27 @@ pub struct BatchLease {
     _port: Arc<ResponsePort>,
 }
 
-// SAFETY: a shared reference only reads the payload and the length in iceoryx2's header, which are not written to while the
-// sample is held. The mutable parts of the sample are used when it is dropped, which requires ownership.
+// SAFETY: `&self` gives access to the stored pointer and length of the payload, and to fields that are `Sync`. The sample is used
+// when it is dropped, which requires ownership.
 unsafe impl Sync for BatchLease {}
+
+/// Address and length of a received payload. The length was checked when the message was received: iceoryx2 keeps it in shared
+/// memory and reads it again in every call of `Sample::payload`, and the sender can change it at any time.
+#[derive(Clone, Copy)]
+struct Payload {
+    start: NonNull<Block>,
+    blocks: usize,
+}
+
+// SAFETY: it is an address in shared memory, which is the same in all threads.
+unsafe impl Send for Payload {}
+
+impl Payload {
+    fn new(payload: &[PayloadBlock]) -> Self {
+        let blocks: &[Block] = bytemuck::cast_slice(payload);
+        Payload { start: NonNull::from(blocks).cast(), blocks: blocks.len() }
+    }
+}
 
 impl BatchLease {
     /// The arrays of the batch.
@@ -42,7 +62,10 @@ impl BatchLease {
 
     /// The memory of the batch, laid out as [`ServiceSpecification::batch`] says.
     pub fn blocks(&self) -> &[Block] {
-        bytemuck::cast_slice(self.sample.payload())
+        let Payload { start, blocks } = self.payload;
+        // SAFETY: the pointer and the length are those of the payload when it was received. The memory is mapped, and the engine
+        // does not write to it, for as long as the lease holds the sample. Every byte pattern is a valid block.
+        unsafe { std::slice::from_raw_parts(start.as_ptr(), blocks) }
     }
 
     /// The number of the batch's group.
@@ -90,7 +113,7 @@ impl Response {
     /// A copy of the snapshot; `None` if the message is something else.
     pub(crate) fn to_snapshot(&self) -> Option<Vec<u8>> {
         let ResponseContent::Snapshot { bytes } = self.content else { return None };
-        let payload: &[u8] = bytemuck::cast_slice(self.lease.sample.payload());
+        let payload: &[u8] = bytemuck::cast_slice(self.lease.blocks());
         payload.get(..bytes).map(<[u8]>::to_vec)
     }
 
@@ -157,15 +180,17 @@ impl ResponsePort {
             }
         };
         let header = copied(sample.user_header());
+        let payload = Payload::new(sample.payload());
         if header.layout_version != LAYOUT_VERSION
             || header.group as usize != self.group
             || header.incarnation != specification.incarnation
-            || sample.payload().len() < specification.batch.blocks()
+            || payload.blocks < specification.batch.blocks()
         {
             return Err(ServiceError::IncompatibleTypes { service: specification.service.clone() });
         }
         let lease = BatchLease {
-            sample: ForkGuard::new(sample),
+            _sample: ForkGuard::new(sample),
+            payload,
             group: self.group,
             step: header.step,
             specification: Arc::clone(specification),

@@ -1,8 +1,8 @@
 //! Memory Gym environments in shared memory: an engine, its trainer and its observers.
 //!
-//! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** read along. They are
-//! processes of one user on one host and find each other in a [`Namespace`]. The transport is iceoryx2: a message is written
-//! once, into the memory where its receiver reads it.
+//! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** receive the same
+//! batches. They are processes of one user on one host and find each other in a [`Namespace`]. The transport is iceoryx2: a
+//! message is written once, into the memory where its receiver reads it.
 //!
 //! # Services
 //!
@@ -36,7 +36,7 @@
 //! | a new trainer connects | it must reset all environments of a group before it steps them |
 //! | a second trainer connects | it is refused, because `act` accepts one publisher |
 //! | a trainer dies | the engine removes its resources when idle, or the next trainer does when it connects |
-//! | an engine dies or ends | the trainer's liveness check reports it; the trainer may reconnect to a new engine |
+//! | an engine dies or ends | the liveness check of its trainer and its observers reports it; a trainer may reconnect to a new engine |
 //! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
 //! | a request names another incarnation | the engine ignores it |
 //! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |

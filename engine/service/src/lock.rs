@@ -5,7 +5,7 @@
 //!
 //! - publish a specification, and remove what a dead engine left under its name;
 //! - close the specification service of an engine that ends;
-//! - remove the resources of dead nodes, which is skipped if the lock is not free;
+//! - remove the resources of dead nodes and orphans, which is skipped if the lock is not free;
 //! - read a specification, because the last process that closes a service removes it.
 //!
 //! Readers exclude each other too: with a shared lock, many waiting trainers could starve an engine that starts. The lock is an
@@ -37,6 +37,11 @@ impl NamespaceLock {
 
     /// Waits for the lock of the namespace at `root`.
     pub(crate) fn acquire(root: &Path) -> Result<Self, ServiceError> {
+        Self::acquire_within(root, LOCK_TIMEOUT)
+    }
+
+    /// Waits for the lock of the namespace at `root` up to `timeout`.
+    pub(crate) fn acquire_within(root: &Path, timeout: Duration) -> Result<Self, ServiceError> {
         let unusable = |e: std::io::Error| ServiceError::Root { path: root.to_owned(), reason: e.to_string() };
         let directory = File::open(root).map_err(unusable)?;
         let start = Instant::now();
@@ -44,8 +49,8 @@ impl NamespaceLock {
             match directory.try_lock() {
                 Ok(()) => return Ok(NamespaceLock(directory)),
                 Err(TryLockError::Error(e)) => return Err(unusable(e)),
-                Err(TryLockError::WouldBlock) if start.elapsed() >= LOCK_TIMEOUT => {
-                    return Err(ServiceError::NamespaceLocked { path: root.to_owned(), waited: LOCK_TIMEOUT });
+                Err(TryLockError::WouldBlock) if start.elapsed() >= timeout => {
+                    return Err(ServiceError::NamespaceLocked { path: root.to_owned(), waited: timeout });
                 }
                 Err(TryLockError::WouldBlock) => std::thread::sleep(RETRY_INTERVAL),
             }

@@ -29,7 +29,7 @@ const MAX_PREFIX: usize = 16;
 /// each other only within the same namespace.
 ///
 /// The default root is `/tmp/endless-gym-<uid>`, or the directory in the environment variable `ENDLESS_GYM_ROOT`. It belongs to
-/// one user and is not accessible to others. It does not depend on the login session, because engines outlive logins.
+/// one user and is not writable by others. It does not depend on the login session, because engines outlive logins.
 ///
 /// ```
 /// use endless_gym_service::Namespace;
@@ -55,16 +55,12 @@ impl Default for Namespace {
 
 impl Namespace {
     /// The namespace with the root directory `root`, an absolute path of at most 41 bytes. The directory is created when it is
-    /// first used. The prefix is derived from the path.
+    /// first used. The prefix is derived from the path, so that no two root directories share segments: a process removes
+    /// abandoned segments of its prefix.
     pub fn at(root: impl Into<PathBuf>) -> Self {
         let root = root.into();
         let prefix = format!("endless{:08x}_", crc32fast::hash(root.as_os_str().as_bytes()));
         Namespace { root, prefix }
-    }
-
-    /// The same root directory with another prefix: 1 to 16 letters, digits, `_` or `-`.
-    pub fn with_prefix(self, prefix: impl Into<String>) -> Self {
-        Namespace { prefix: prefix.into(), ..self }
     }
 
     /// The root directory.
@@ -87,13 +83,6 @@ impl Namespace {
             let length = self.root.as_os_str().len();
             return Err(unusable(format!(
                 "it must have at most {MAX_ROOT} bytes, so that the paths of Unix sockets fit into 107 bytes, got {length}"
-            )));
-        }
-        let fits = |c: u8| c.is_ascii_alphanumeric() || c == b'_' || c == b'-';
-        if !(1..=MAX_PREFIX).contains(&self.prefix.len()) || !self.prefix.bytes().all(fits) {
-            return Err(unusable(format!(
-                "the prefix must be 1 to {MAX_PREFIX} letters, digits, `_` or `-`, got `{}`",
-                self.prefix
             )));
         }
         DirBuilder::new().recursive(true).mode(0o700).create(&self.root).map_err(|e| unusable(e.to_string()))?;
@@ -154,7 +143,6 @@ mod tests {
         assert!(reason(&Namespace::at(format!("/tmp/{}", "a".repeat(MAX_ROOT)))).contains("at most"));
         assert!(reason(&Namespace::at("/dev/null")).contains("/dev/null"));
         assert!(reason(&Namespace::at("/tmp")).contains("/tmp"));
-        assert!(reason(&Namespace::at("/tmp/x").with_prefix("a/b")).contains("a/b"));
     }
 
     #[test]

@@ -98,8 +98,35 @@ impl Deref for NamespaceNode {
 impl Drop for NamespaceNode {
     fn drop(&mut self) {
         let config = self.config().clone();
-        if self.node.drop_now() {
-            cleanup::remove_orphans(&config);
+        // Without the lock, another process may be creating the files that look like orphans.
+        if self.node.drop_now()
+            && let Some(lock) = NamespaceLock::try_acquire(&self.root)
+        {
+            cleanup::remove_orphans(&config, &lock);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{self, File};
+    use std::time::SystemTime;
+
+    use super::*;
+
+    #[test]
+    fn orphans_are_kept_while_another_process_holds_the_lock() {
+        let root = PathBuf::from(format!("/tmp/endless-node-{}", std::process::id()));
+        let namespace = Namespace::at(&root);
+        let node = NamespaceNode::join(&namespace).unwrap();
+        let orphan = root.join(format!("{}orphan", namespace.prefix()));
+        File::create(&orphan).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        let lock = NamespaceLock::acquire(&root).unwrap();
+        drop(node);
+        assert!(orphan.exists());
+        drop(lock);
+        drop(NamespaceNode::join(&namespace).unwrap());
+        assert!(!orphan.exists());
+        fs::remove_dir_all(&root).unwrap();
     }
 }

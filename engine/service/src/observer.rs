@@ -1,4 +1,4 @@
-//! The observer: reads a group's batches beside the trainer.
+//! The observer: reads a group's batches in addition to the trainer.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,6 +9,7 @@ use crate::lease::{BatchLease, Response, ResponsePort};
 use crate::node::NamespaceNode;
 use crate::ports::{EngineServices, OpenMode, ServiceNames};
 use crate::specification::ServiceSpecification;
+use crate::wait::LIVENESS_INTERVAL;
 
 /// How often a waiting observer polls.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
@@ -43,8 +44,11 @@ impl Observer {
     /// # Errors
     ///
     /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::NoSuchGroup`] if it
-    /// has no such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts, and
-    /// [`ServiceError::Version`] or [`ServiceError::IncompatibleTypes`] for an engine of another version.
+    /// has no such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts,
+    /// [`ServiceError::EngineRestarted`] if the engine ended while this process connected, [`ServiceError::Version`],
+    /// [`ServiceError::IncompatibleTypes`] or [`ServiceError::Specification`] for an engine of another version,
+    /// [`ServiceError::InvalidName`] or [`ServiceError::Root`] for an invalid configuration, [`ServiceError::NamespaceLocked`] if
+    /// another process holds the namespace's lock for too long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn connect(config: &ConnectConfig, group: usize) -> Result<Self, ServiceError> {
         let (node, port, specification) = connect_to_engine(config, |node, specification| {
             let (service, groups) = (specification.service.clone(), specification.groups);
@@ -67,7 +71,8 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held.
+    /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held, and
+    /// [`ServiceError::IncompatibleTypes`] for a malformed message.
     pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
         Ok(self.port.receive(&self.specification)?.and_then(Response::into_batch))
     }
@@ -76,21 +81,28 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] if the engine has ended, and the
-    /// errors of [`newest`](Observer::newest).
+    /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] within half a second after the
+    /// engine's process has ended, and the errors of [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
+        let mut last_check = start;
         loop {
+            let is_over = start.elapsed() >= timeout;
+            let is_due = is_over || last_check.elapsed() >= LIVENESS_INTERVAL;
+            // Before the poll, which then also finds the last batch of an engine that has ended.
+            let is_lost = is_due && !self.node.is_alive(self.port.engine());
             if let Some(lease) = self.newest()? {
                 return Ok(lease);
             }
-            if start.elapsed() >= timeout {
-                let service = self.specification.service.clone();
-                return Err(if self.node.is_alive(self.port.engine()) {
-                    ServiceError::TimedOut { service, waited: timeout }
-                } else {
-                    ServiceError::EngineLost { service, pid: self.specification.engine_pid }
-                });
+            let service = || self.specification.service.clone();
+            if is_lost {
+                return Err(ServiceError::EngineLost { service: service(), pid: self.specification.engine_pid });
+            }
+            if is_over {
+                return Err(ServiceError::TimedOut { service: service(), waited: timeout });
+            }
+            if is_due {
+                last_check = Instant::now();
             }
             std::thread::sleep(POLL_INTERVAL.min(timeout));
         }

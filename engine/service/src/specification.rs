@@ -1,6 +1,6 @@
 //! The specification of an engine: what trainers and observers must know before they connect.
 
-use endless_gym_core::batch::{ActionLayout, Frames, Layout, action_layout};
+use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, Section, action_layout};
 use endless_gym_core::envs::{self, ActionSpace};
 use endless_gym_core::pool::{Autoreset, MAX_ENVS};
 use serde::{Deserialize, Serialize};
@@ -44,7 +44,7 @@ pub struct ServiceSpecification {
     pub options: Vec<Map<String, Json>>,
     /// When a new episode starts after the end of one.
     pub autoreset: Autoreset,
-    /// Frames per second at which a person would watch.
+    /// Nominal rendering rate in frames per second (`metadata["render_fps"]`).
     pub render_fps: u32,
     /// Batches of a group that a trainer or an observer may hold at a time.
     pub batches_held: usize,
@@ -57,8 +57,12 @@ impl ServiceSpecification {
         LeaseLimits { batches_held: self.batches_held, observers: self.observers }
     }
 
-    /// Checks what a malformed specification could break in a trainer. Returns the reason if it is invalid.
-    pub(crate) fn check(&self) -> Result<(), String> {
+    /// Checks what a malformed specification could break in a trainer of the engine `service`. Returns the reason if it is
+    /// invalid.
+    pub(crate) fn check(&self, service: &str) -> Result<(), String> {
+        if self.service != service {
+            return Err(format!("service must be `{service}`, got `{}`", self.service));
+        }
         let ranges = [
             ("groups", self.groups, 1, MAX_GROUPS),
             ("num_envs", self.num_envs, 1, MAX_ENVS),
@@ -77,6 +81,13 @@ impl ServiceSpecification {
         }
         if self.batch.num_envs() != self.num_envs {
             return Err(format!("batch must have {} environments, got {}", self.num_envs, self.batch.num_envs()));
+        }
+        let columns = [("info", &self.info, BatchSection::Info), ("features", &self.features, BatchSection::Features)];
+        for (name, columns, section) in columns {
+            let (given, width) = (columns.len(), self.batch.section(section).map_or(0, Section::width));
+            if given != width {
+                return Err(format!("{name} must name {width} columns, those of the batch's section, got {given}"));
+            }
         }
         Ok(())
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{ActionSection, Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::ResetRequest;
 use serde_json::{Map, Value as Json};
 
@@ -14,14 +15,15 @@ use crate::connection::EngineConnection;
 use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
 use crate::lease::{BatchLease, Response};
+use crate::lock::NamespaceLock;
 use crate::message::{RequestHeader, RequestKind};
 use crate::pending::{PendingRequests, Request};
 use crate::ports;
 use crate::specification::ServiceSpecification;
-use crate::wait::wait;
+use crate::wait::{LIVENESS_INTERVAL, wait};
 
-/// Liveness interval: how long a trainer waits for a response before it checks whether the engine is running.
-const LIVENESS_INTERVAL: Duration = Duration::from_millis(200);
+/// How long a trainer whose engine has ended waits for the namespace's lock, to find out whether another engine has replaced it.
+const SUCCESSOR_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// Steps the environments of an engine. An engine has one trainer at a time.
 ///
@@ -117,8 +119,9 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::NoSuchGroup`], [`ServiceError::AnswerPending`], [`ServiceError::ResetCount`], and
-    /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has ended.
+    /// [`ServiceError::ResetCount`] if the reset mask or the seeds have a wrong length, [`ServiceError::NoSuchGroup`],
+    /// [`ServiceError::AnswerPending`], [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has ended,
+    /// and [`ServiceError::Middleware`] if iceoryx2 cannot send the request.
     pub fn reset(&mut self, group: usize, request: ResetRequest<'_>) -> Result<(), ServiceError> {
         self.reset_with(group, request, None)
     }
@@ -128,7 +131,8 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// Those of [`reset`](Trainer::reset), and [`ServiceError::OptionsTooLong`].
+    /// Those of [`reset`](Trainer::reset), and [`ServiceError::OptionsTooLong`]. [`receive`](Trainer::receive) returns
+    /// [`ServiceError::Rejected`] for reset parameters that the environments do not accept.
     pub fn reset_with(
         &mut self,
         group: usize,
@@ -166,13 +170,19 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::Action`], [`ServiceError::NoSuchGroup`],
-    /// [`ServiceError::AnswerPending`], and [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] if the engine has
-    /// ended.
+    /// Checked in this order: [`ServiceError::Action`] for a wrong number of actions, [`ServiceError::NoSuchGroup`],
+    /// [`ServiceError::AnswerPending`], [`ServiceError::Action`] for an action out of range. [`ServiceError::EngineLost`] or
+    /// [`ServiceError::EngineRestarted`] if the engine has ended, and [`ServiceError::Middleware`] if iceoryx2 cannot send the
+    /// request. No error steps an environment.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
-        specification.action_space.check(specification.num_envs, actions)?;
+        // The order of the checks: number of actions, pending answer, range.
+        let checked = specification.action_space.check(specification.num_envs, actions);
+        if let Err(error @ ActionError::Count { .. }) = checked {
+            return Err(error.into());
+        }
         self.post(group, Request::new(RequestKind::Step), |message| {
+            checked?;
             specification.action.write::<i32>(message, ActionSection::Action).copy_from_slice(actions);
             Ok(0)
         })
@@ -200,8 +210,10 @@ impl Trainer {
     ///
     /// [`ServiceError::TimedOut`] if there is no answer in time; it stays pending and can be received later.
     /// [`ServiceError::EngineLost`] or [`ServiceError::EngineRestarted`] within half a second after the engine's process has
-    /// ended. [`ServiceError::Rejected`] if the engine rejected the request. [`ServiceError::NothingSent`],
-    /// [`ServiceError::NoSuchGroup`], and [`ServiceError::TooManyBatchesHeld`].
+    /// ended. [`ServiceError::Rejected`] if the engine rejected the request. [`ServiceError::NothingSent`] if the group has no
+    /// pending answer, [`ServiceError::NoSuchGroup`], [`ServiceError::TooManyBatchesHeld`] if
+    /// [`batches_held`](ServiceSpecification::batches_held) leases are held, [`ServiceError::IncompatibleTypes`] for a malformed
+    /// response, and [`ServiceError::Middleware`] if iceoryx2 cannot wait for a message.
     pub fn receive(&mut self, group: usize, timeout: Duration) -> Result<BatchLease, ServiceError> {
         self.check_group(group)?;
         if !self.pending.has_batch(group) {
@@ -214,10 +226,10 @@ impl Trainer {
     ///
     /// # Errors
     ///
-    /// Those of [`receive`](Trainer::receive).
+    /// [`ServiceError::NothingPending`] if no group has a pending answer, and otherwise those of [`receive`](Trainer::receive).
     pub fn receive_any(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         if !self.pending.has_any_batch() {
-            return Err(ServiceError::NothingSent { group: 0 });
+            return Err(ServiceError::NothingPending);
         }
         self.receive_batch(0..self.pending.groups(), timeout)
     }
@@ -388,10 +400,13 @@ impl Trainer {
         Ok(())
     }
 
-    /// The error for an engine that has ended, which depends on whether another one has replaced it.
+    /// The error for an engine that has ended, which depends on whether another one has replaced it. If the namespace is locked,
+    /// it is [`ServiceError::EngineLost`].
     fn lost(&self) -> ServiceError {
-        let service = self.config.service.clone();
-        match blackboard::read(&self.connection.node, &service) {
+        let (service, node) = (self.config.service.clone(), &*self.connection.node);
+        let successor = NamespaceLock::acquire_within(node.root(), SUCCESSOR_TIMEOUT)
+            .and_then(|lock| blackboard::read_locked(node, &service, &lock));
+        match successor {
             Ok(Some(other)) if other.incarnation != self.specification.incarnation => {
                 ServiceError::EngineRestarted { service }
             }

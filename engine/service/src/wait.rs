@@ -14,6 +14,9 @@ use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use crate::error::ServiceError;
 use crate::namespace::Ipc;
 
+/// Liveness interval: how long a trainer or an observer waits for a message before it checks whether the engine is running.
+pub(crate) const LIVENESS_INTERVAL: Duration = Duration::from_millis(200);
+
 /// How long a waiter spins.
 const SPIN: Duration = Duration::from_micros(3);
 /// How long a waiter spins and yields before it parks: longer than most trainers need between two steps and most engines need for
