@@ -37,7 +37,9 @@ def main() -> None:
         backend=args.backend,
     )
     rng = np.random.default_rng(args.seed)
-    highest = np.broadcast_to(vecenv.single_action_space.nvec, vecenv.action_space.shape)
+    # Numbers of choices, of each branch for MultiDiscrete.
+    space = vecenv.single_action_space
+    choices = np.broadcast_to(space.nvec if hasattr(space, "nvec") else space.n, vecenv.action_space.shape)
 
     vecenv.async_reset(args.seed)
     steps, returns = 0, []
@@ -46,7 +48,7 @@ def main() -> None:
         observations, rewards, _terminals, _truncations, infos, _env_ids, _masks = vecenv.recv()
         for info in infos:
             returns += info["episode_return"]
-        vecenv.send(rng.integers(0, highest, dtype=np.int32))
+        vecenv.send(rng.integers(0, choices, dtype=np.int32))
         steps += len(rewards)
     seconds = time.perf_counter() - start
 
