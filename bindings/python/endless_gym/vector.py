@@ -60,8 +60,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         sections: Sequence[str],
         autoreset: AutoresetMode,
         copy: bool = False,
-        copy_options: Options | None = None,
+        options: Options | None = None,
     ) -> None:
+        """Called by `make_vec` and `connect`. `options` is `None` if each environment has a mapping of its own."""
         self._backend = backend
         self._described = described
         self.num_envs = num_envs
@@ -90,7 +91,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._all.flags.writeable = False
         self._start = time.perf_counter()
         self._copy = copy
-        self._options = dict(copy_options or {})
+        self._options = None if options is None else dict(options)
         self._changed_options = False
         self._seed: int | None = None
 
@@ -123,15 +124,19 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         given = dict(options or {})
         mask = given.pop("reset_mask", None)
         text = None
-        if given or self._changed_options:
+        if given and self._options is None:
+            raise ValueError(
+                "options must be empty or contain only reset_mask, since the environments were created with one mapping each, "
+                f"got {given}"
+            )
+        if self._options is not None and (given or self._changed_options):
             text = options_text({**self._options, **given})
             self._changed_options = bool(given)
         if group is not None or self.num_groups == 1:
             return self._start_of(self._backend.reset(group or 0, self._request(seed, mask, group or 0), text))
         requests = [self._request(seed, mask, number) for number in range(self.num_groups)]
-        first, *others = (self._backend.reset(number, request, text) for number, request in enumerate(requests))
-        del others
-        return self._start_of(first)
+        batches = [self._backend.reset(number, request, text) for number, request in enumerate(requests)]
+        return self._start_of(batches[0])
 
     def step(self, actions: Any) -> Step:
         """Play one step of every environment.
@@ -300,7 +305,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
         if self._truth is None:
             return {}
-        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all}
+        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all.copy() if self._copy else self._all}
 
     def _step(self, arrays: _native.Arrays) -> Step:
         arrays = self._copied(arrays)
@@ -386,7 +391,7 @@ def make_vec(
             group=group,
             threads=threads,
             options=_pool_options(options, group * num_envs, num_envs, groups),
-            autoreset=_name(mode),
+            autoreset=mode.name.lower(),
             first_env=group * num_envs,
             total_envs=groups * num_envs,
             seed=seed,
@@ -406,7 +411,7 @@ def make_vec(
         sections=pools[0].sections(),
         autoreset=mode,
         copy=copy,
-        copy_options=options if isinstance(options, Mapping) else None,
+        options=_common_options(options),
     )
 
 
@@ -426,7 +431,7 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
     timeout = checked_timeout(timeout)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
-    (options, *others) = specification["options"]
+    options = specification["options"]
     return EndlessVectorEnv(
         Remote(connection, specification["groups"], timeout, engine),
         described=spec(specification["id"]),
@@ -435,7 +440,7 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
         sections=[section["name"] for section in specification["batch"]["sections"]],
         autoreset=_MODES[specification["autoreset"]],
         copy=copy,
-        copy_options=None if others else options,
+        options=options[0] if len(options) == 1 else None,
     )
 
 
@@ -464,8 +469,11 @@ def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bo
     return (frames or Frames()) if has_frames else None, has_features
 
 
-def _name(mode: AutoresetMode) -> str:
-    return next(name for name, known in _MODES.items() if known is mode)
+def _common_options(given: Options | Sequence[Options] | None) -> Options | None:
+    """The reset parameters of all environments; `None` if several have a mapping of their own."""
+    if given is None or isinstance(given, Mapping):
+        return given or {}
+    return given[0] if len(given) == 1 else None
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
