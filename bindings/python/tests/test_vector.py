@@ -1,4 +1,4 @@
-"""Many environments, in this process and in an engine's: both are the same class and give the same."""
+"""Many environments, in this process and in an engine process: the same class with the same results."""
 
 import contextlib
 import gc

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 @dataclass
 class Minibatch:
-    """M steps of a segment, in the order in which `Memory.forward` takes them.
+    """M steps of a segment, in the order that `Memory.forward` expects.
 
     Attributes:
         indices: Index t * N + n of each step in the flattened segment, int64 (M,), on the memory's device.
