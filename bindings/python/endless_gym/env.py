@@ -124,7 +124,7 @@ class Env(gymnasium.Env[Any, Any]):
         if self.render_mode == "debug_rgb_array":
             return self._native.ground_truth_view()
         if self.render_mode == "human":
-            # `reset` and `step` show the picture, as Gymnasium asks; the original leaves that to calls of this.
+            # `reset` and `step` show the picture, as Gymnasium requires; in the original only `render` does.
             self._show()
         return None
 

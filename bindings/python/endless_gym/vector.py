@@ -493,7 +493,7 @@ def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bo
 
 
 def _common_options(given: Options | Sequence[Options] | None) -> Options | None:
-    """The reset parameters of all environments; `None` if several have a mapping of their own."""
+    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
     if given is None or isinstance(given, Mapping):
         return given or {}
     return given[0] if len(given) == 1 else None

@@ -53,7 +53,7 @@ MinibatchT = TypeVar("MinibatchT", bound=Minibatch)
 class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
     """A memory module.
 
-    Type parameters: `StateT` is the state between two steps, `UpdateT` is what `step` hands to `update_state`, `MinibatchT` is
+    Type parameters: `StateT` is the state between two steps, `UpdateT` is what `step` passes to `update_state`, `MinibatchT` is
     the minibatch that `forward` takes.
     """
 
