@@ -1,13 +1,13 @@
-"""Steps per second beside the original's, from Rust and from Python: whole episodes with random actions, medians of rounds.
+"""Steps per second compared with the original, from Rust and from Python: complete episodes, random actions, medians of rounds.
 
-cargo xtask bench                      # sets everything up, and runs this; further arguments are passed on
+cargo xtask bench                      # installs the requirements and runs this script; other arguments are passed to it
 cargo xtask bench --markdown t.md --json t.json
 
-It wants the package with `stable-baselines3` in its own Python 3.11, and by `--original` another one with `memory-gym`. The
-original pins Gymnasium 0.29 and numpy 1: its environments run in a process that finds its Python's packages first, and
-Stable-Baselines3 among those of this one. EnvPool's own environments and a plain copy of memory show the scale; PufferLib's own
-are not among them, since they fetch sources over the network to be built. In each round every contender is measured once, one
-after the other, since other programs on the machine disturb a measurement.
+Requires Python 3.11 with this package and `stable-baselines3`, and another Python 3.11 (`--original`) with `memory-gym`. The
+original pins Gymnasium 0.29 and numpy 1. Its environments run in a process of this Python whose PYTHONPATH has the packages of
+the other Python first; Stable-Baselines3 is that of this Python. For scale, the environments of EnvPool and the memory bandwidth
+are measured as well; those of PufferLib are not, since their build downloads sources. Each round measures every contender once,
+in turn, so that the load of other programs affects all contenders.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpot
 VECTORS = ["SyncVectorEnv", "AsyncVectorEnv", "SubprocVecEnv"]
 SIZES = [64, 1024]
 
-#: EnvPool's environment that is most like ours in what it hands over, four grey frames of 84x84, and its fastest.
+#: EnvPool's environment with the most similar observations (four gray frames of 84 x 84), and its fastest environment.
 ENVPOOL = ["Pong-v5", "CartPole-v1"]
 
-#: What is promised: times the best vectorised original, times the original's single environment, share of the service's speed.
+#: Targets: multiple of the best vectorised original, multiple of the original's single environment, share of the service's speed
+#: from Rust.
 VECTORISED, SINGLE, OF_RUST = 300.0, 20.0, 0.9
 
 
 class Original:
-    """The process that steps the original."""
+    """The process that runs the original."""
 
     def __init__(self, python: str) -> None:
         where = "import sys, sysconfig; print(sys.version_info[:2] == (3, 11), sysconfig.get_path('purelib'))"
         right, packages = subprocess.check_output([python, "-c", where], text=True).split(maxsplit=1)
         if right != "True" or sys.version_info[:2] != (3, 11):
-            sys.exit("this script and the original both need Python 3.11, whose packages they share")
+            sys.exit("this script and --original must both be Python 3.11, since they share packages")
         self._process = subprocess.Popen(
             [sys.executable, "-W", "ignore", str(Path(__file__).with_name("comparison_original.py"))],
             env={**os.environ, "PYTHONPATH": packages.strip(), "OMP_NUM_THREADS": "1"},
@@ -57,18 +58,18 @@ class Original:
         )
 
     def measure(self, kind: str, id: str, num_envs: int, seconds: float) -> float:
-        """Steps per second of one kind of it."""
+        """Steps per second of one kind of environment: `single`, `independent` or a vector environment."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         asked = {"kind": kind, "id": id, "num_envs": num_envs, "seconds": seconds}
         print(json.dumps(asked), file=self._process.stdin, flush=True)
         answer = self._process.stdout.readline()
         if not answer:
-            sys.exit(f"the original's process ended at {asked}; run {self._process.args} to see why")
+            sys.exit(f"the process of the original ended during {asked}; its command was {self._process.args}")
         return float(answer)
 
     def best(self, kind: str, id: str, seconds: float) -> int:
-        """The number of environments with which a kind is fastest."""
+        """The number of environments with the highest steps per second."""
         cores = os.cpu_count() or 1
         numbers = {1, cores, 2 * cores, 4 * cores, 16, 64}
         return max(sorted(numbers), key=lambda number: self.measure(kind, id, number, seconds))
@@ -104,7 +105,7 @@ def single(id: str, seconds: float) -> float:
 
 
 def rust(id: str, num_envs: int, threads: int, seconds: float) -> dict[str, float]:
-    """Steps per second that `endless bench` reaches, by way."""
+    """Steps per second from `endless bench`, by method."""
     arguments = {"env": id, "num-envs": num_envs, "threads": threads, "seconds": seconds, "rounds": 1}
     command = [*program(), "bench", "--json", *(f"--{name}={value}" for name, value in arguments.items())]
     (row,) = json.loads(subprocess.check_output(command, stderr=subprocess.DEVNULL))
@@ -114,14 +115,14 @@ def rust(id: str, num_envs: int, threads: int, seconds: float) -> dict[str, floa
 
 
 def envpool(python: str, id: str, num_envs: int, seconds: float) -> float:
-    """Steps per second of one of EnvPool's own environments."""
+    """Steps per second of an EnvPool environment."""
     script = str(Path(__file__).with_name("comparison_envpool.py"))
     command = [python, "-W", "ignore", script, id, str(num_envs), str(seconds)]
     return float(subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True).split()[-1])
 
 
 def memory_bandwidth() -> float:
-    """Gigabytes a second that a plain copy of much memory writes, and reads as many."""
+    """Write bandwidth of a large memory copy in GB/s; it reads as much."""
     source = np.ones(1 << 28, dtype=np.uint8)
     target = np.zeros_like(source)
     start = time.perf_counter()
@@ -130,8 +131,8 @@ def memory_bandwidth() -> float:
 
 
 def scale(args: argparse.Namespace) -> dict[str, float]:
-    """Medians of what shows the scale."""
-    contenders: dict[str, Any] = {"memory, GB/s written by a plain copy": (memory_bandwidth,)}
+    """Medians of the EnvPool environments and of the memory bandwidth, for scale."""
+    contenders: dict[str, Any] = {"memory copy, GB/s written": (memory_bandwidth,)}
     if args.envpool:
         for id in ENVPOOL:
             contenders[f"EnvPool's {id}, {SIZES[0]} environments, steps/s"] = (
@@ -151,7 +152,7 @@ def scale(args: argparse.Namespace) -> dict[str, float]:
 
 
 def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, Any]:
-    """All contenders for one environment."""
+    """Measure all contenders for one environment id."""
     cores = os.cpu_count() or 1
     best = {kind: original.best(kind, id, args.seconds / 2) for kind in VECTORS}
     contenders: dict[str, Any] = {}
@@ -185,7 +186,7 @@ def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, 
 
 
 def targets(medians: dict[str, float], original: float) -> list[dict[str, Any]]:
-    """What is promised, what was reached, and whether that is enough."""
+    """The targets, the measured values, and whether they are met."""
     rows = []
     for size in SIZES:
         for way in ("make_vec", "serve"):
@@ -203,7 +204,7 @@ def targets(medians: dict[str, float], original: float) -> list[dict[str, Any]]:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Prints the tables of one environment."""
+    """Print the tables of one environment id."""
     reference = row["medians"][row["best_original"]]
     print(f"{row['id']:46}{'steps/s':>12}{'lowest':>12}{'highest':>12}{'x best original':>17}")
     for name, values in row["steps_per_second"].items():
@@ -216,8 +217,8 @@ def show(row: dict[str, Any]) -> None:
 
 
 def markdown(whole: dict[str, Any]) -> str:
-    """Everything as Markdown."""
-    lines = ["# Steps per second beside the original's", ""]
+    """The results as Markdown."""
+    lines = ["# Steps per second compared with the original", ""]
     lines += [f"- {name.replace('_', ' ')}: {value}" for name, value in whole["machine"].items()]
     lines += [f"- medians of {whole['rounds']} rounds of {whole['seconds']} s", ""]
     lines += ["| for scale | |", "| --- | ---: |"]
@@ -235,7 +236,7 @@ def markdown(whole: dict[str, Any]) -> str:
 
 
 def machine() -> dict[str, Any]:
-    """What it was measured on."""
+    """The machine and the versions of the measurement."""
     models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
         "processor": models[0].split(":")[1].strip() if models else platform.machine(),
@@ -248,22 +249,24 @@ def machine() -> dict[str, Any]:
 
 
 def progress(text: str) -> None:
-    """Says on a terminal what is being measured."""
+    """Print the current measurement if stderr is a terminal."""
     if sys.stderr.isatty():
         print(f"\r{text:110}\r", end="", file=sys.stderr, flush=True)
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--original", required=True, metavar="PYTHON", help="a Python with memory-gym 1.0.2")
-    parser.add_argument("--ids", nargs="+", default=IDS, metavar="ID", help="environments (default: %(default)s)")
+    parser.add_argument("--original", required=True, metavar="PYTHON", help="Python interpreter with memory-gym 1.0.2")
+    parser.add_argument("--ids", nargs="+", default=IDS, metavar="ID", help="environment ids (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="measurements of each contender (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=1.0, help="of one measurement (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=0, help="the engine's, 0 for one for each core (default: 0)")
-    parser.add_argument("--envpool", metavar="PYTHON", help="a Python with envpool, for its own environments")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything to this file")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables to this file")
+    parser.add_argument("--seconds", type=float, default=1.0, help="seconds of each measurement (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=0, help="engine threads; 0 for one per core (default: 0)")
+    parser.add_argument(
+        "--envpool", metavar="PYTHON", help="Python interpreter with envpool; EnvPool is measured only if given"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables to this file, as Markdown")
     args = parser.parse_args()
     described = machine()
     print(", ".join(f"{name} {value}" for name, value in described.items()))

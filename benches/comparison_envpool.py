@@ -1,4 +1,4 @@
-"""Steps EnvPool's own environments for `comparison.py`, to show the scale: they are others than Memory Gym's.
+"""Measure an EnvPool environment for `comparison.py`, for scale. EnvPool has no Memory Gym environments.
 
 Arguments: environment id, number of environments, seconds. Prints steps per second.
 """
@@ -14,7 +14,7 @@ import numpy as np  # noqa: E402
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     id, num_envs, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
     envs = envpool.make(id, env_type="gymnasium", num_envs=num_envs)
     envs.reset()

@@ -1,6 +1,7 @@
-"""Steps the original for `comparison.py`, which starts it.
+"""Measure the original for `comparison.py`, which starts this script.
 
-A JSON object on each line of the input asks for one measurement, a line with steps per second answers it.
+Each line of stdin is a JSON object that describes one measurement: `kind`, `id`, `num_envs`, `seconds`. Each line of stdout is
+the result in steps per second.
 """
 
 import json
@@ -15,7 +16,7 @@ from typing import Any
 warnings.filterwarnings("ignore")
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
-# Libraries print lines of their own, also from processes that are forked here.
+# Libraries print to stdout, also in forked processes. Their output goes to stderr.
 answers = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
 
@@ -26,7 +27,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv  # noqa: E402
 
 
 def rate(step: Callable[[int], Any], num_envs: int, seconds: float) -> float:
-    """Steps per second; a few steps first to warm up."""
+    """Steps per second, after ten warm-up steps."""
     for number in range(10):
         step(number)
     steps, start = 0, time.perf_counter()
@@ -37,7 +38,7 @@ def rate(step: Callable[[int], Any], num_envs: int, seconds: float) -> float:
 
 
 def single(id: str, num_envs: int, seconds: float) -> float:
-    """One environment as `gymnasium.make` makes it."""
+    """Steps per second of one environment from `gymnasium.make`."""
     env = gymnasium.make(id)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(1009)]
@@ -53,7 +54,7 @@ def single(id: str, num_envs: int, seconds: float) -> float:
 
 
 def vector(kind: str, id: str, num_envs: int, seconds: float) -> float:
-    """Gymnasium's and Stable-Baselines3's own vector environments."""
+    """Steps per second of a vector environment of Gymnasium or Stable-Baselines3."""
     makers = [lambda: gymnasium.make(id, disable_env_checker=True)] * num_envs
     if kind == "SyncVectorEnv":
         envs = gymnasium.vector.SyncVectorEnv(makers)
@@ -71,7 +72,7 @@ def vector(kind: str, id: str, num_envs: int, seconds: float) -> float:
 
 
 def independent(id: str, num_envs: int, seconds: float) -> float:
-    """As many processes as environments, which exchange nothing: what no vector environment can exceed."""
+    """Total steps per second of one process per environment without communication: an upper bound for vector environments."""
     context = multiprocessing.get_context("fork")
     barrier, results = context.Barrier(num_envs), context.SimpleQueue()
 
@@ -89,7 +90,7 @@ def independent(id: str, num_envs: int, seconds: float) -> float:
 
 
 def main() -> None:
-    """Answers until the input ends."""
+    """Measure until stdin ends."""
     for line in sys.stdin:
         asked = json.loads(line)
         kind, arguments = asked["kind"], (asked["id"], asked["num_envs"], asked["seconds"])

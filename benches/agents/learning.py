@@ -140,11 +140,13 @@ def report() -> None:
 def main() -> None:
     """Train, evaluate and plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=TASKS)
-    parser.add_argument("--agents", nargs="+", default=["gru", "none"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--task", choices=TASKS, help="task to train and evaluate")
+    parser.add_argument("--agents", nargs="+", default=["gru", "none"], help="agents to train (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, default=[1, 2, 3], help="seeds of the runs (default: %(default)s)"
+    )
     parser.add_argument("--threads", type=int, default=1, help="CPU threads of PyTorch (default: %(default)s)")
-    parser.add_argument("--plot", action="store_true")
+    parser.add_argument("--plot", action="store_true", help="plot all results and write learning/README.md")
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     if args.task:

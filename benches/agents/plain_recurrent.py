@@ -77,13 +77,15 @@ class Agent(nn.Module):
 def main() -> None:
     """Train, and print the number of steps after each update."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="Endless-MortarMayhem-v0")
-    parser.add_argument("--num-envs", type=int, default=8)
-    parser.add_argument("--steps", type=int, default=128)
-    parser.add_argument("--updates", type=int, default=3)
-    parser.add_argument("--minibatches", type=int, default=8)
-    parser.add_argument("--branches", default="3,3")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--env", default="Endless-MortarMayhem-v0", help="environment id (default: %(default)s)")
+    parser.add_argument("--num-envs", type=int, default=8, help="number of environments (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=int, default=128, help="rollout length: steps per environment and update (default: %(default)s)"
+    )
+    parser.add_argument("--updates", type=int, default=3, help="number of updates (default: %(default)s)")
+    parser.add_argument("--minibatches", type=int, default=8, help="minibatches per epoch (default: %(default)s)")
+    parser.add_argument("--branches", default="3,3", help="numbers of choices of the branches (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads of PyTorch (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     n, steps, branches = args.num_envs, args.steps, [int(choices) for choices in args.branches.split(",")]

@@ -70,16 +70,26 @@ def rate(times: list[tuple[float, float]], batch: int) -> tuple[float, float]:
 def main() -> None:
     """Measure, print and write the throughput."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--original", required=True)
-    parser.add_argument("--cleanrl", default="")
-    parser.add_argument("--env", default="Endless-MortarMayhem-v0")
-    parser.add_argument("--num-envs", type=int, default=8)
-    parser.add_argument("--steps", type=int, default=128)
-    parser.add_argument("--window", type=int, default=256)
-    parser.add_argument("--updates", type=int, default=3)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--original", required=True, help="Python interpreter with the original")
+    parser.add_argument(
+        "--cleanrl",
+        default="",
+        help="CleanRL's folder ppo_trxl; without it, only the GRU agent is measured",
+    )
+    parser.add_argument("--env", default="Endless-MortarMayhem-v0", help="environment id (default: %(default)s)")
+    parser.add_argument("--num-envs", type=int, default=8, help="number of environments (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=int, default=128, help="rollout length: steps per environment and update (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--window", type=int, default=256, help="attention window of the Transformer-XL (default: %(default)s)"
+    )
+    parser.add_argument("--updates", type=int, default=3, help="updates of each run (default: %(default)s)")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="CPU threads of PyTorch and of the engine (default: %(default)s)"
+    )
+    parser.add_argument("--rounds", type=int, default=2, help="runs of each program (default: %(default)s)")
+    parser.add_argument("--output", type=Path, help="also write the results to this JSON file")
     args = parser.parse_args()
     batch, rows = args.num_envs * args.steps, []
     for name in ("trxl", "gru") if args.cleanrl else ("gru",):

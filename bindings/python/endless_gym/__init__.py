@@ -5,7 +5,7 @@ import endless_gym, gymnasium
 
 env = gymnasium.make("EndlessGym/MortarMayhem-v0")                        # one environment
 envs = gymnasium.make_vec("EndlessGym/MortarMayhem-v0", num_envs=1024)    # a vector environment in this process
-envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # a vector environment in an engine's process
+envs = endless_gym.serve("MortarMayhem-v0", num_envs=1024)                # a vector environment in an engine process
 ```
 """
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 __version__: str
 
-# Most environments in a group, and most groups.
 # Names of the autoreset modes: those of Gymnasium's `AutoresetMode` in lower case.
 AUTORESET_MODES: tuple[str, ...]
 DEFAULT_ENV_ID: str
+# Most environments in a group, and most groups.
 MAX_ENVS: int
 MAX_GROUPS: int
 
@@ -21,8 +21,8 @@ class EngineLost(ConnectionError):
 class TooManyBatchesHeld(BufferError):
     """Arrays of this process hold all batches that the engine can lend."""
 
-# A seed `s`: environment `i` is reset with `s + i`. Or a mask and seeds, one of each per environment: 0 does not reset, 1 starts
-# the next episode, 2 starts one with the seed.
+# A seed `s`: environment `i` of group `g` is seeded with `s + g * num_envs + i`. Or a mask and seeds, one of each per
+# environment: 0 does not reset, 1 starts the next episode, 2 starts one with the seed.
 Reset = int | tuple[Sequence[int], Sequence[int]]
 Arrays = tuple[NDArray[Any], ...]
 SingleArrays = tuple[NDArray[np.uint8], NDArray[np.float32] | None, NDArray[np.float64] | None]

@@ -15,7 +15,7 @@ def integer(name: str, given: Any, low: int = 0, high: int = MAX_U64) -> int:
     """The argument as an int.
 
     Raises:
-        TypeError: It is no integer.
+        TypeError: It is not an integer.
         ValueError: It is less than `low` or greater than `high`.
     """
     try:
@@ -31,7 +31,7 @@ def timeout(given: float) -> float:
     """A timeout in seconds.
 
     Raises:
-        TypeError: It is no number.
+        TypeError: It is not a number.
         ValueError: It is negative, infinite or not a number.
     """
     try:
@@ -51,7 +51,7 @@ def seed_source(
     """The arguments `seed` and `seeds` as a seed, the bounds of a range, and a list; the last two exclude each other.
 
     Raises:
-        TypeError: A seed is no integer.
+        TypeError: A seed is not an integer.
         ValueError: A seed is out of range, or the range has a step other than 1.
     """
     seed = None if seed is None else integer("seed", seed)

@@ -1,4 +1,4 @@
-"""Where the environments of a vector environment run: in this process, or in an engine's process.
+"""Where the environments of a vector environment run: in this process, or in an engine process.
 
 Both have the same interface, and raise the same exceptions with the same messages for the same mistakes.
 """
@@ -36,7 +36,7 @@ class Backend:
         raise NotImplementedError
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
-        """The number and the arrays of a group that answers; `None` waits for any group."""
+        """The number and the arrays of a group whose result is ready; `None` waits for any group."""
         raise NotImplementedError
 
     def snapshot(self, group: int, env: int) -> bytes:
@@ -108,7 +108,7 @@ class InProcess(Backend):
 
 
 class Remote(Backend):
-    """Environments in an engine's process. `engine` is that process if it belongs to this object."""
+    """Environments in an engine process. `engine` is that process if it belongs to this object."""
 
     def __init__(self, connection: _native.Connection, groups: int, timeout: float, engine: Any = None) -> None:
         self._connection: _native.Connection | None = connection

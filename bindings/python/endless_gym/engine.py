@@ -109,7 +109,7 @@ def serve(
         copy: Return writable copies instead of read-only views of shared memory.
 
     Raises:
-        TypeError: A number is no integer.
+        TypeError: A number is not an integer.
         ValueError: A number is negative, or the timeout is not finite.
         RuntimeError: The engine cannot start; the message says why.
     """

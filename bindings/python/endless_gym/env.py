@@ -78,7 +78,7 @@ class Env(gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: Seed of the environment's generator, as of numpy's `default_rng`. `None` continues the generator.
+            seed: Seed of the environment's generator, passed to `numpy.random.default_rng`. `None` continues the generator.
             options: Reset parameters by the original's names, which override those given to the constructor.
 
         Raises:
@@ -101,7 +101,7 @@ class Env(gymnasium.Env[Any, Any]):
 
         Raises:
             ResetNeeded: The environment has not been reset.
-            TypeError: The action is no integer or sequence of integers.
+            TypeError: The action is not an integer or a sequence of integers.
             ValueError: The action is out of its range.
         """
         if not self._was_reset:
@@ -124,16 +124,20 @@ class Env(gymnasium.Env[Any, Any]):
         if self.render_mode == "debug_rgb_array":
             return self._native.ground_truth_view()
         if self.render_mode == "human":
-            # `reset` and `step` show the picture, as Gymnasium asks; the original leaves that to calls of this.
+            # `reset` and `step` show the picture, as Gymnasium requires; in the original only `render` does.
             self._show()
         return None
 
     def snapshot(self) -> bytes:
-        """The whole state, the generator included, for `restore`."""
+        """The complete state, including the generator, which `restore` accepts."""
         return self._native.snapshot()
 
     def restore(self, snapshot: bytes) -> tuple[Observation, dict[str, Any]]:
-        """Go on from a snapshot of an environment with the same id; returns what it looks like."""
+        """Restore the state from a snapshot of an environment with the same id. Returns the observation and the info.
+
+        Raises:
+            ValueError: It is not a snapshot of that id.
+        """
         arrays = self._native.restore(snapshot)
         self._was_reset = True
         self._is_shown = False
@@ -146,7 +150,7 @@ class Env(gymnasium.Env[Any, Any]):
             self._window = None
 
     def _show(self) -> None:
-        """Shows the current picture once: the ground-truth view goes through a shown clue with each call."""
+        """Shows the current picture once: each call of the ground-truth view advances a shown clue."""
         if self._is_shown:
             return
         if self._window is None:

@@ -38,11 +38,11 @@ class DLPackView:
         dl_device: tuple[int, int] | None = None,
         copy: bool | None = None,
     ) -> Any:
-        """The capsule of DLPack's protocol.
+        """The capsule of the DLPack protocol.
 
         Raises:
-            BufferError: The array is read-only memory of another process and the library would write to it, or another device
-                than the CPU is asked for.
+            BufferError: The array is read-only memory of another process and the library does not support read-only arrays, or
+                another device than the CPU is requested.
         """
         if dl_device is not None and (int(dl_device[0]), int(dl_device[1])) != _CPU:
             raise BufferError(f"dl_device must be the CPU, {_CPU}, got {dl_device}")

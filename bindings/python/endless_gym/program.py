@@ -1,4 +1,4 @@
-"""The program `endless` of this package."""
+"""The command-line program `endless`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""A native PufferLib environment: one `PufferEnv` with the whole batch of environments.
+"""PufferLib adapter: one native `PufferEnv` that contains all environments.
 
 ```python
 import pufferlib.vector
@@ -31,15 +31,15 @@ __all__ = ["EndlessPufferEnv"]
 
 
 class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
-    """A batch of Endless Gym environments; each environment is one agent of PufferLib.
+    """All environments as one native `PufferEnv`; `num_agents` is `num_envs`.
 
-    Buffers: `observations` uint8 (num_envs, 84, 84, 3), `rewards` float32 (num_envs,), `terminals`, `truncations` and
-    `masks` bool (num_envs,). If PufferLib passes buffers, observations are copied into them. If it does not (its native
-    backend), `observations` is a read-only view of the engine's memory, a new array after each step.
+    Arrays: `observations` uint8 (num_envs, 84, 84, 3), `rewards` float32 (num_envs,), `terminals`, `truncations` and `masks`
+    bool (num_envs,). With the buffers that PufferLib passes, observations are copied into them. Without buffers (backend
+    `PufferEnv`), `observations` is replaced after each step by a read-only view of the batch.
 
-    Auto-reset is same-step: an environment whose terminal or truncation is set returns the first observation of its next
-    episode. The infos are empty, or contain one dict with a list for each statistic of the episodes that ended in this step:
-    `episode_return`, `episode_length`, and the final infos of the original environment.
+    Auto-reset is same-step: where a terminal or truncation is set, the observation is the first of the next episode. The infos
+    are empty, or contain one dict with a list for each statistic of the episodes that ended in this step: `episode_return`,
+    `episode_length`, and the final infos of the original environment.
     """
 
     def __init__(
@@ -71,12 +71,18 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         super().__init__(buf)
 
     def reset(self, seed: int | None = None) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Start an episode in every environment; environment `i` gets the seed `seed * num_envs + i`.
+        """Start an episode in every environment; environment `i` is seeded with `seed * num_envs + i`.
 
         PufferLib gives consecutive seeds to its environments; with this seeding no two of them play the same episodes.
+
+        Returns:
+            The observations, and an empty list of infos.
+
+        Raises:
+            ValueError: The seed is out of its range.
         """
         observations, _ = self.envs.reset(seed=_first_seed(seed, self.num_agents))
-        self._show(observations)
+        self._store_observations(observations)
         self.rewards[:] = 0
         self.terminals[:] = False
         self.truncations[:] = False
@@ -86,10 +92,22 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[dict[str, list[float]]]]:
-        """Step all environments with integer `actions`, (num_envs,) or (num_envs, 2)."""
+        """Step all environments.
+
+        Args:
+            actions: Integers, (num_envs,) or (num_envs, branches).
+
+        Returns:
+            The arrays that the class describes, `observations`, `rewards`, `terminals` and `truncations`, and the infos.
+
+        Raises:
+            TypeError: The actions are not integers.
+            ValueError: The number of actions is wrong, or one is out of its range. No environment was stepped.
+            RuntimeError: The environments have not been reset.
+        """
         actions = np.reshape(actions, (self.num_agents, *(self.single_action_space.shape or ())))
         observations, rewards, terminated, truncated, info = self.envs.step(actions)
-        self._show(observations)
+        self._store_observations(observations)
         self.rewards[:] = rewards
         self.terminals[:] = terminated
         self.truncations[:] = truncated
@@ -103,7 +121,7 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         """Close the environments."""
         self.envs.close()
 
-    def _show(self, observations: np.ndarray) -> None:
+    def _store_observations(self, observations: np.ndarray) -> None:
         if self._owns_buffers:
             self.observations = observations
         else:

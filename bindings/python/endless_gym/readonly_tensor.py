@@ -16,7 +16,8 @@ class ReadOnlyTensor(torch.Tensor):
     """A tensor that operations can read but not write.
 
     It has no storage of its own. `__torch_dispatch__` passes the tensor of the shared memory to an operation, unless the schema
-    of the operation says that it writes to that argument. Views are read-only as well; all other results are plain tensors.
+    of the operation says that it writes to that argument. Results that share the storage are read-only as well; all other results
+    are plain tensors.
     Native code that bypasses the dispatcher gets an exception instead of the storage. `data_ptr()` returns the address of the
     shared memory, for comparisons: it must not be written to.
     """
@@ -54,12 +55,12 @@ class ReadOnlyTensor(torch.Tensor):
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
         kwargs = kwargs or {}
-        writes, is_view = _effects(func)
-        for index, name in writes:
-            if _holds_shared(args[index] if index < len(args) else kwargs.get(name)):
+        for index, name in _written(func):
+            if _storages(args[index] if index < len(args) else kwargs.get(name)):
                 raise RuntimeError(_MESSAGE)
-        result = func(*map(_unwrap, args), **{name: _unwrap(value) for name, value in kwargs.items()})
-        return _wrap(result) if is_view else result
+        # By storage, since some operations return aliases that their schemas do not declare, and others only sometimes an alias.
+        storages = _storages([*args, *kwargs.values()])
+        return _wrap(func(*map(_unwrap, args), **{name: _unwrap(value) for name, value in kwargs.items()}), storages)
 
     def numpy(self, *, force: bool = False) -> NDArray[Any]:
         """A read-only array of the same memory."""
@@ -85,7 +86,11 @@ class ReadOnlyTensor(torch.Tensor):
         array = self.numpy()
         if copy:
             return np.array(array, dtype)
-        return array if dtype is None or dtype == array.dtype else array.astype(dtype)
+        if dtype is None or dtype == array.dtype:
+            return array
+        if copy is not None:
+            raise ValueError(f"dtype must be {array.dtype} or None for copy=False, got {np.dtype(dtype)}")
+        return array.astype(dtype)
 
     def __dlpack__(self, **_: Any) -> NoReturn:
         raise BufferError(f"{_MESSAGE}, or export the array with endless_gym.DLPackView")
@@ -103,23 +108,19 @@ class ReadOnlyTensor(torch.Tensor):
     storage = untyped_storage = share_memory_ = _refuse
 
 
-#: Results of `_effects` by operation. A dictionary, since `torch.compile` warns of `functools.cache`.
-_EFFECTS: dict[Any, tuple[tuple[tuple[int, str], ...], bool]] = {}
+#: Results of `_written` by operation. A dictionary, since `torch.compile` warns of `functools.cache`.
+_WRITTEN: dict[Any, tuple[tuple[int, str], ...]] = {}
 
 
-def _effects(func: Any) -> tuple[tuple[tuple[int, str], ...], bool]:
-    """Positions and names of the arguments that an operation writes to, and whether its results are views of its arguments."""
-    if func in _EFFECTS:
-        return _EFFECTS[func]
-    schema = func._schema
-    writes = tuple(
-        (index, argument.name)
-        for index, argument in enumerate(schema.arguments)
-        if argument.alias_info is not None and argument.alias_info.is_write
-    )
-    is_view = any(result.alias_info is not None and not result.alias_info.is_write for result in schema.returns)
-    _EFFECTS[func] = writes, is_view
-    return writes, is_view
+def _written(func: Any) -> tuple[tuple[int, str], ...]:
+    """Positions and names of the arguments that an operation writes to."""
+    if func not in _WRITTEN:
+        _WRITTEN[func] = tuple(
+            (index, argument.name)
+            for index, argument in enumerate(func._schema.arguments)
+            if argument.alias_info is not None and argument.alias_info.is_write
+        )
+    return _WRITTEN[func]
 
 
 def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
@@ -130,11 +131,18 @@ def _unwrap(value: Any) -> Any:
     return value._shared if isinstance(value, ReadOnlyTensor) else _mapped(_unwrap, value)
 
 
-def _wrap(value: Any) -> Any:
-    return ReadOnlyTensor(value) if isinstance(value, torch.Tensor) else _mapped(_wrap, value)
+def _wrap(value: Any, storages: set[int]) -> Any:
+    """The result of an operation, with read-only tensors in place of those that have one of the storages."""
+    if isinstance(value, torch.Tensor):
+        is_shared = torch._C._has_storage(value) and value.untyped_storage()._cdata in storages
+        return ReadOnlyTensor(value) if is_shared else value
+    return _mapped(lambda item: _wrap(item, storages), value)
 
 
-def _holds_shared(value: Any) -> bool:
+def _storages(value: Any) -> set[int]:
+    """The storages of the read-only tensors in an argument, which may be a list."""
+    if isinstance(value, ReadOnlyTensor):
+        return {value._shared.untyped_storage()._cdata}
     if isinstance(value, (list, tuple)):
-        return any(map(_holds_shared, value))
-    return isinstance(value, ReadOnlyTensor)
+        return set().union(*map(_storages, value))
+    return set()

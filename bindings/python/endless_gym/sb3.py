@@ -1,4 +1,4 @@
-"""A Stable-Baselines3 `VecEnv` without a Python loop over the environments.
+"""A Stable-Baselines3 `VecEnv`. A step loops in Python only over the episodes that ended.
 
 ```python
 from sb3_contrib import RecurrentPPO
@@ -12,7 +12,6 @@ RecurrentPPO("CnnLstmPolicy", venv).learn(1_000_000)
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
 from copy import deepcopy
 from typing import Any
 
@@ -28,23 +27,23 @@ except ImportError as error:
         "endless_gym.sb3 needs Stable-Baselines3: pip install stable-baselines3 (and sb3-contrib for RecurrentPPO)"
     ) from error
 
+from endless_gym.adapters import check_adaptable
 from endless_gym.vector import EndlessVectorEnv, make_vec
 
 __all__ = ["EndlessVecEnv"]
 
 
 class EndlessVecEnv(VecEnv):
-    """A batch of Endless Gym environments for Stable-Baselines3.
+    """An `EndlessVectorEnv` as a Stable-Baselines3 `VecEnv`.
 
     `step` returns
 
     * observations: uint8 (num_envs, 84, 84, 3), or a dict of arrays if the observation space is a dict; read-only,
     * rewards: float32 (num_envs,),
-    * dones: bool (num_envs,); with same-step auto-reset, an environment that is done returns the first observation of its
-      next episode,
+    * dones: bool (num_envs,); where true, the observation is the first of the next episode,
     * infos: one dict per environment. If the environment is done, it contains `terminal_observation`,
       `TimeLimit.truncated`, `episode` (`r`, `l` and `t`, as in `Monitor`) and the final infos of the original environment.
-      The dict of every other environment is shared between steps and must not be modified.
+      The dict of an environment whose episode continues is reused in every step and must not be modified.
 
     `info` is the info of the last step as the vector environment returned it, in arrays.
     """
@@ -55,18 +54,14 @@ class EndlessVecEnv(VecEnv):
         Raises:
             ValueError: Another auto-reset mode, or several groups.
         """
-        mode = gymnasium.vector.AutoresetMode(envs.metadata["autoreset_mode"])
-        if mode is not gymnasium.vector.AutoresetMode.SAME_STEP:
-            raise ValueError(f'Stable-Baselines3 needs autoreset="same_step", got {mode.name.lower()!r}')
-        if envs.num_groups != 1:
-            raise ValueError(f"Stable-Baselines3 needs one group of environments, got {envs.num_groups} groups")
+        check_adaptable(envs, gymnasium.vector.AutoresetMode.SAME_STEP, "Stable-Baselines3")
         self.envs = envs
         self._actions: np.ndarray | None = None
         self.info: dict[str, Any] = {}
         self._running: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
-        # Stable-Baselines3 converts observations to tensors, for which PyTorch warns about read-only arrays, and only reads them.
-        # The filter applies to its modules only.
+        # Stable-Baselines3 converts observations with `torch.as_tensor`, which warns about read-only arrays, and never writes to
+        # them. The warning is suppressed for its modules only.
         module = r"(stable_baselines3|sb3_contrib)\."
         warnings.filterwarnings("ignore", "The given NumPy array is not writ", UserWarning, module)
 
@@ -76,7 +71,17 @@ class EndlessVecEnv(VecEnv):
         return cls(make_vec(env_id, num_envs=num_envs, autoreset="same_step", **kwargs))
 
     def reset(self) -> VecEnvObs:
-        """Start an episode in every environment, with the seeds of `seed` and the options of `set_options`."""
+        """Start an episode in every environment, with the seeds of `seed` and the options of `set_options`.
+
+        Returns:
+            The observations: uint8 (num_envs, 84, 84, 3), or a dict of arrays. The infos are in `reset_infos`.
+
+        Raises:
+            ValueError: The options of the environments differ, or a reset parameter is unknown or out of its range.
+            TimeoutError: A served engine did not answer in time.
+            EngineLost: A served engine has ended.
+            TooManyBatchesHeld: Arrays of too many earlier steps of a served engine are referenced.
+        """
         options = self._options[0]
         if any(other != options for other in self._options):
             raise ValueError("all environments of a batch must have the same options, got different ones")
@@ -89,11 +94,23 @@ class EndlessVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Store integer `actions`, (num_envs,) or (num_envs, 2), for `step_wait`."""
+        """Store integer `actions`, (num_envs,) or (num_envs, branches), for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments with the actions of `step_async`."""
+        """Step all environments with the actions of `step_async`.
+
+        Returns:
+            Observations, rewards, dones and infos, as the class describes.
+
+        Raises:
+            TypeError: The actions are not integers.
+            ValueError: The number of actions is wrong, or one is out of its range. No environment was stepped.
+            RuntimeError: The environments have not been reset.
+            TimeoutError: A served engine did not answer in time.
+            EngineLost: A served engine has ended.
+            TooManyBatchesHeld: Arrays of too many earlier steps of a served engine are referenced.
+        """
         observations, rewards, terminated, truncated, self.info = self.envs.step(self._actions)
         dones = np.logical_or(terminated, truncated)
         infos = self._running.copy()
@@ -113,24 +130,19 @@ class EndlessVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Not supported: the environments of a batch have no individual attributes."""
-        raise NotImplementedError(
-            f"cannot set {attr_name!r}: the environments of a batch have no individual attributes; use set_options"
-        )
+        raise NotImplementedError(f"set_attr is not supported, got {attr_name!r}; use set_options for reset parameters")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Not supported: the environments of a batch have no individual methods."""
         raise NotImplementedError(
-            f"cannot call {method_name!r}: the environments of a batch have no individual methods"
+            f"env_method is not supported, got {method_name!r}; use set_options for reset parameters"
         )
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Return true for `Monitor`, whose `episode` statistics are in the infos, and false for other wrappers."""
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
-
-    def _get_indices(self, indices: VecEnvIndices) -> Iterable[int]:
-        return range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
 
 
 def _final_row(info: dict[str, Any], index: int) -> dict[str, Any]:

@@ -66,8 +66,8 @@ class Frames:
         return [*(flag for flag, given in flags.items() if given), f"--frame-stack={integer('stack', self.stack)}"]
 
     @staticmethod
-    def of_specification(described: dict[str, Any] | None) -> Frames | None:
-        """The frames of an engine's specification; `None` for none."""
+    def from_specification(described: dict[str, Any] | None) -> Frames | None:
+        """The format of the frames in an engine's specification; `None` without frames."""
         return None if described is None else Frames(**described["format"], stack=described["stack"])
 
 

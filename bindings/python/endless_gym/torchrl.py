@@ -1,4 +1,4 @@
-"""A TorchRL environment whose batch size is the number of environments.
+"""An `EndlessVectorEnv` as a TorchRL environment with batch size [num_envs].
 
 ```python
 from endless_gym.torchrl import EndlessEnv
@@ -24,23 +24,26 @@ except ImportError as error:
     raise ImportError("endless_gym.torchrl needs TorchRL: pip install torchrl tensordict") from error
 
 from endless_gym import torch_view
+from endless_gym.adapters import check_adaptable
 from endless_gym.vector import EndlessVectorEnv, make_vec
 
 __all__ = ["EndlessEnv"]
 
 
 class EndlessEnv(EnvBase):  # type: ignore[misc]
-    """A batch of Endless Gym environments for TorchRL, with batch size [num_envs].
+    """An `EndlessVectorEnv` as a TorchRL environment with batch size [num_envs].
 
     Entries, with shapes after the batch dimension:
 
     * `observation`: uint8 (84, 84, 3); if the observation space is a dict, one entry for each of its keys,
-    * `action`: int64 () for Discrete, (2,) for MultiDiscrete spaces,
+    * `action`: int64 () for Discrete, (branches,) for MultiDiscrete spaces,
     * `reward`: float32 (1,); `done`, `terminated`, `truncated`: bool (1,).
 
-    `next` contains the last observation of an episode. Environments are reset by TorchRL, which does so automatically in rollouts
-    and collectors. On the CPU, observations are copied out of the engine's memory, since TorchRL stores them and its transforms
-    may modify them; to other devices they are transferred directly.
+    At the end of an episode, `next` holds its last observation. `rollout` and collectors then reset the environment. On the CPU,
+    observations are copied, since TorchRL stores them and transforms may modify them in place; to other devices they are
+    transferred without an intermediate copy.
+
+    `step` and `reset` raise what those of `EndlessVectorEnv` raise.
     """
 
     def __init__(self, envs: EndlessVectorEnv, device: torch.device | str = "cpu") -> None:
@@ -49,13 +52,7 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         Raises:
             ValueError: Another auto-reset mode, or several groups.
         """
-        mode = gymnasium.vector.AutoresetMode(envs.metadata["autoreset_mode"])
-        if mode is not gymnasium.vector.AutoresetMode.DISABLED:
-            raise ValueError(
-                f'TorchRL resets the environments and needs autoreset="disabled", got {mode.name.lower()!r}'
-            )
-        if envs.num_groups != 1:
-            raise ValueError(f"TorchRL needs one group of environments, got {envs.num_groups} groups")
+        check_adaptable(envs, gymnasium.vector.AutoresetMode.DISABLED, "TorchRL")
         super().__init__(device=device, batch_size=[envs.num_envs])
         self.envs = envs
         self._seed: int | None = None
@@ -88,7 +85,7 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
             mask = mask.reshape(self.batch_size).cpu().numpy()
             observations, _ = self.envs.reset(options={"reset_mask": mask})
         return TensorDict(
-            {**self._observe(observations), **self.full_done_spec.zero()},
+            {**self._to_tensors(observations), **self.full_done_spec.zero()},
             batch_size=self.batch_size,
             device=self.device,
         )
@@ -98,7 +95,7 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         observations, reward, terminated, truncated, _ = self.envs.step(actions)
         return TensorDict(
             {
-                **self._observe(observations),
+                **self._to_tensors(observations),
                 "reward": torch.tensor(reward, dtype=torch.float32, device=self.device).unsqueeze(-1),
                 "done": torch.tensor(np.logical_or(terminated, truncated), device=self.device).unsqueeze(-1),
                 "terminated": torch.tensor(terminated, device=self.device).unsqueeze(-1),
@@ -116,12 +113,12 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         super().close(**kwargs)
         self.envs.close()
 
-    def _observe(self, observations: np.ndarray | dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    def _to_tensors(self, observations: np.ndarray | dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
         if not isinstance(observations, dict):
             observations = {"observation": observations}
-        return {key: self._own(array) for key, array in observations.items()}
+        return {key: self._copied_to_device(array) for key, array in observations.items()}
 
-    def _own(self, array: np.ndarray) -> torch.Tensor:
+    def _copied_to_device(self, array: np.ndarray) -> torch.Tensor:
         """Convert an observation to a tensor that shares no memory with the engine."""
         if array.flags.writeable:
             return torch.from_numpy(array).to(self.device)
@@ -141,6 +138,6 @@ def _action_spec(space: gymnasium.Space[Any], batch: torch.Size, device: torch.d
     if isinstance(space, gymnasium.spaces.Discrete):
         return Categorical(int(space.n), shape=batch, device=device)
     assert isinstance(space, gymnasium.spaces.MultiDiscrete)
-    # All branches have the same number of choices, so one Categorical with an additional dimension describes them.
+    # All branches have the same number of choices, so a Categorical with one more dimension describes them.
     (values,) = set(space.nvec.tolist())
     return Categorical(values, shape=torch.Size((*batch, len(space.nvec))), device=device)

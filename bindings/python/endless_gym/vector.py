@@ -1,4 +1,4 @@
-"""Many environments as one `gymnasium.vector.VectorEnv`, in this process or in an engine's process."""
+"""Many environments as one `gymnasium.vector.VectorEnv`, in this process or in an engine process."""
 
 from __future__ import annotations
 
@@ -60,8 +60,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         sections: Sequence[str],
         autoreset: AutoresetMode,
         copy: bool = False,
-        copy_options: Options | None = None,
+        options: Options | None = None,
     ) -> None:
+        """Called by `make_vec` and `connect`. `options` is `None` if each environment has a mapping of its own."""
         self._backend = backend
         self._described = described
         self.num_envs = num_envs
@@ -90,7 +91,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._all.flags.writeable = False
         self._start = time.perf_counter()
         self._copy = copy
-        self._options = dict(copy_options or {})
+        self._options = None if options is None else dict(options)
         self._changed_options = False
         self._seed: int | None = None
 
@@ -104,34 +105,44 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None` takes
-                the seeds that the environments were created with, and after their first reset continues their generators.
-            options: Reset parameters for these and all later episodes, which override those that the environments were created
-                with; and `reset_mask`, bool (n,), the environments that start an episode. Not allowed if the environments were
-                created with a sequence of options.
-            group: The group to reset. `None` resets all groups and returns the arrays of the first.
+            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None`
+                uses the seeds given at creation for the first reset, and continues the generators afterwards.
+            options: Reset parameters until the next `reset`, which override those given at creation; and `reset_mask`, bool (n,),
+                the environments that start an episode. If the environments were created with one mapping each, only
+                `reset_mask`.
+            group: The group to reset. `None` resets all groups and returns the arrays of group 0.
 
         Returns:
-            The observations and the info.
+            observation: (n, ...) with the shape and dtype of `observation_space`; uint8 (n, 84, 84, 3) by default, or a dict of
+                such arrays.
+            info: `ground_truth` float64 (n, k) with its mask `_ground_truth`, bool (n,), if the original has it; otherwise empty.
 
         Raises:
             ValueError: A seed, an option or the group is out of its range. Groups with a lower number are reset.
             RuntimeError: The group's last `send` or `send_reset` has not been received.
+            TimeoutError: A served engine did not answer in time. `recv` can still return the result.
+            EngineLost: A served engine has ended; see `reconnect`.
+            TooManyBatchesHeld: Arrays of too many earlier steps of a served engine are referenced; delete them, or use
+                `copy=True`. `recv` can then return the result.
         """
         if group is not None:
             group = self._group(group)
         given = dict(options or {})
         mask = given.pop("reset_mask", None)
         text = None
-        if given or self._changed_options:
+        if given and self._options is None:
+            raise ValueError(
+                "options must be empty or contain only reset_mask, since the environments were created with one mapping each, "
+                f"got {given}"
+            )
+        if self._options is not None and (given or self._changed_options):
             text = options_text({**self._options, **given})
             self._changed_options = bool(given)
         if group is not None or self.num_groups == 1:
             return self._start_of(self._backend.reset(group or 0, self._request(seed, mask, group or 0), text))
         requests = [self._request(seed, mask, number) for number in range(self.num_groups)]
-        first, *others = (self._backend.reset(number, request, text) for number, request in enumerate(requests))
-        del others
-        return self._start_of(first)
+        batches = [self._backend.reset(number, request, text) for number, request in enumerate(requests)]
+        return self._start_of(batches[0])
 
     def step(self, actions: Any) -> Step:
         """Play one step of every environment.
@@ -139,12 +150,21 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         Args:
             actions: Integers, (n, branches) or (n,) for one branch.
 
+        Returns:
+            observation: (n, ...) with the shape and dtype of `observation_space`; uint8 (n, 84, 84, 3) by default, or a dict of
+                such arrays.
+            reward: float64 (n,).
+            terminated: bool (n,). As in the original, it is set at every end of an episode, also at the step limit.
+            truncated: bool (n,).
+            info: Arrays with their masks, as the class describes.
+
         Raises:
-            TypeError: The actions are no integers.
-            ValueError: There are too many or too few actions, or one is out of its range. No environment was stepped.
+            TypeError: The actions are not integers.
+            ValueError: The number of actions is wrong, or one is out of its range. No environment was stepped.
             RuntimeError: The environments have not been reset, or the last `send` or `send_reset` has not been received.
-            EngineLost: The engine's process has ended.
-            TooManyBatchesHeld: Arrays of too many earlier steps are referenced; delete them, or use `copy=True`.
+            TimeoutError: A served engine did not answer in time. `recv` can still return the result.
+            EngineLost: A served engine has ended; see `reconnect`.
+            TooManyBatchesHeld: As for `reset`.
         """
         return self._step(self._backend.step(actions))
 
@@ -168,14 +188,17 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Wait for the result of a group's `send` or `send_reset`, and return it as `step` does.
 
         Args:
-            group: The group to wait for; `None` waits for any. `info["group"]` is its number.
+            group: The group to wait for; `None` waits for any.
+
+        Returns:
+            observation, reward, terminated, truncated, info: As for `step`. `info["group"]` is the number of the group, an int.
 
         Raises:
             ValueError: There is no such group.
             RuntimeError: Nothing was sent to the group, or it was stepped before its first reset.
-            TimeoutError: The engine did not answer in time. The result can still be received.
-            EngineLost: As for `step`.
-            TooManyBatchesHeld: As for `step`. The result can still be received.
+            TimeoutError: A served engine did not answer in time. The result can still be received.
+            EngineLost: A served engine has ended; see `reconnect`.
+            TooManyBatchesHeld: As for `reset`. The result can still be received.
         """
         number, arrays = self._backend.receive(None if group is None else self._group(group))
         step = self._step(arrays)
@@ -196,7 +219,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._backend.send_reset(self._group(group), None if seed is None else integer("seed", seed))
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
-        """The whole state of one environment of a group, for `restore` of this or of other environments.
+        """The complete state of one environment, which `restore` accepts for any environment of the same id.
 
         Raises:
             ValueError: There is no such environment or group.
@@ -215,7 +238,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             The observations and the info of all environments of the group.
 
         Raises:
-            ValueError: There is no such environment or group, or a value is no snapshot of that id. Environments before it in
+            ValueError: There is no such environment or group, or a value is not a snapshot of that id. Environments before it in
                 the mapping are restored.
             RuntimeError: As for `snapshot`.
         """
@@ -235,10 +258,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self._backend.ground_truth_view(self._env(env))
 
     def reconnect(self, timeout: float = 30.0) -> None:
-        """Connect to an engine that was started in place of a lost one. Its environments must then be reset.
+        """Connect to an engine that replaces an engine that has ended. Its environments must then be reset.
 
         Args:
             timeout: Seconds to wait for the engine to start.
+
+        Raises:
+            ConnectionError: There is no such engine, or it already has a trainer.
+            RuntimeError: The environments are in this process.
+            ValueError: The timeout is negative or not finite.
         """
         self._backend.reconnect(checked_timeout(timeout))
 
@@ -300,7 +328,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
         if self._truth is None:
             return {}
-        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all}
+        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all.copy() if self._copy else self._all}
 
     def _step(self, arrays: _native.Arrays) -> Step:
         arrays = self._copied(arrays)
@@ -355,10 +383,10 @@ def make_vec(
         id: Environment id, such as `Endless-MortarMayhem-v0`.
         num_envs: Environments in each group.
         num_threads: Threads that step environments; `None` or 0 for one per core.
-        seed: Environment `i`, counted over all groups, is seeded with `seed + i` at its first reset; later episodes continue its
+        seed: Environment `i`, numbered over all groups, is seeded with `seed + i` at its first reset; later episodes continue its
             generator. `None` takes entropy from the operating system.
         seeds: Seeds of the single episodes: a `range` to draw from, as the training in the paper does from `range(100_000)`, with
-            draws seeded by `seed`; or a list that is played in turn, and repeated.
+            draws seeded by `seed`; or a list, used in order and repeated.
         options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each
             environment of all groups.
         autoreset: Gymnasium's auto-reset mode: `next_step`, `same_step` or `disabled`.
@@ -369,7 +397,7 @@ def make_vec(
         copy: Return writable copies instead of read-only views.
 
     Raises:
-        TypeError: A number is no integer.
+        TypeError: A number is not an integer.
         ValueError: An argument is out of its range.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
@@ -377,7 +405,7 @@ def make_vec(
     groups = integer("groups", groups, 1, _native.MAX_GROUPS)
     seed, seed_range, seed_list = seed_source(seed, seeds)
     frames, features = contents(observation, frames)
-    # As in an engine, groups share threads, and environments are counted over all groups.
+    # As in an engine, groups share threads, and environments are numbered over all groups.
     threads = _native.Threads(integer("num_threads", num_threads or 0))
     pools = [
         _native.Pool(
@@ -386,7 +414,7 @@ def make_vec(
             group=group,
             threads=threads,
             options=_pool_options(options, group * num_envs, num_envs, groups),
-            autoreset=_name(mode),
+            autoreset=mode.name.lower(),
             first_env=group * num_envs,
             total_envs=groups * num_envs,
             seed=seed,
@@ -406,7 +434,7 @@ def make_vec(
         sections=pools[0].sections(),
         autoreset=mode,
         copy=copy,
-        copy_options=options if isinstance(options, Mapping) else None,
+        options=_common_options(options),
     )
 
 
@@ -426,16 +454,16 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
     timeout = checked_timeout(timeout)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
-    (options, *others) = specification["options"]
+    options = specification["options"]
     return EndlessVectorEnv(
         Remote(connection, specification["groups"], timeout, engine),
         described=spec(specification["id"]),
         num_envs=specification["num_envs"],
-        frames=Frames.of_specification(specification["frames"]),
+        frames=Frames.from_specification(specification["frames"]),
         sections=[section["name"] for section in specification["batch"]["sections"]],
         autoreset=_MODES[specification["autoreset"]],
         copy=copy,
-        copy_options=None if others else options,
+        options=options[0] if len(options) == 1 else None,
     )
 
 
@@ -464,8 +492,11 @@ def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bo
     return (frames or Frames()) if has_frames else None, has_features
 
 
-def _name(mode: AutoresetMode) -> str:
-    return next(name for name, known in _MODES.items() if known is mode)
+def _common_options(given: Options | Sequence[Options] | None) -> Options | None:
+    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
+    if given is None or isinstance(given, Mapping):
+        return given or {}
+    return given[0] if len(given) == 1 else None
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:

@@ -23,33 +23,41 @@ State = tuple[torch.Tensor, torch.Tensor]
 @dataclass
 class Args:
     env_id: str = "Endless-MortarMayhem-v0"
-    """id of the environment; those whose observations are a dict are not for this script"""
+    """environment id; ids with dict observations are not supported"""
     total_timesteps: int = 1_000_000
-    """steps in all environments together"""
+    """environment steps in total"""
     num_envs: int = 64
-    """environments in the batch"""
+    """number of environments"""
     num_steps: int = 128
-    """steps in each environment between two updates"""
+    """rollout length: steps per environment and update"""
     num_minibatches: int = 8
-    """minibatches, each with some of the environments' whole sequences"""
+    """minibatches per epoch; each contains the complete sequences of some environments"""
     update_epochs: int = 3
-    """how often an update sees each minibatch"""
+    """epochs per update"""
     learning_rate: float = 2.75e-4
+    """learning rate of Adam"""
     gamma: float = 0.995
+    """discount factor"""
     gae_lambda: float = 0.95
+    """lambda of generalised advantage estimation"""
     clip_coef: float = 0.1
+    """clip range of the probability ratio"""
     ent_coef: float = 1e-4
+    """entropy coefficient"""
     vf_coef: float = 0.5
+    """value loss coefficient"""
     max_grad_norm: float = 0.25
+    """maximum gradient norm"""
     hidden_size: int = 256
-    """size of the LSTM"""
+    """hidden size of the LSTM"""
     seed: int = 1
+    """seed of the environments, the network and the minibatches"""
     cuda: bool = True
-    """use a GPU where there is one"""
+    """use CUDA if available"""
 
 
 class Agent(nn.Module):
-    """Convolutions, an LSTM, and one head for each dimension of the action."""
+    """A convolutional encoder, an LSTM, one policy head for each branch of the action space, and a value head."""
 
     def __init__(self, action_sizes: list[int], hidden_size: int) -> None:
         super().__init__()
@@ -63,8 +71,11 @@ class Agent(nn.Module):
         self.critic = nn.Linear(hidden_size, 1)
         nn.init.orthogonal_(self.actor.weight, 0.01)
 
-    def recall(self, obs: torch.Tensor, state: State, done: torch.Tensor) -> tuple[torch.Tensor, State]:
-        """Take frames, uint8 (steps * envs, 84, 84, 3), and forget where an episode starts, done (steps * envs,)."""
+    def encode(self, obs: torch.Tensor, state: State, done: torch.Tensor) -> tuple[torch.Tensor, State]:
+        """Return the LSTM outputs, float32 (steps * envs, hidden_size), and the last state.
+
+        `obs` is uint8 (steps * envs, 84, 84, 3). Where `done`, (steps * envs,), is 1, an episode starts and the state is zeroed.
+        """
         envs = state[0].shape[1]
         features = self.encoder(obs.permute(0, 3, 1, 2).float() / 255.0)
         outputs = []
@@ -75,12 +86,12 @@ class Agent(nn.Module):
         return torch.cat(outputs).flatten(0, 1), state
 
     def get_value(self, obs: torch.Tensor, state: State, done: torch.Tensor) -> torch.Tensor:
-        return self.critic(self.recall(obs, state, done)[0]).flatten()
+        return self.critic(self.encode(obs, state, done)[0]).flatten()
 
     def get_action_and_value(
         self, obs: torch.Tensor, state: State, done: torch.Tensor, action: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, State]:
-        hidden, state = self.recall(obs, state, done)
+        hidden, state = self.encode(obs, state, done)
         heads = [Categorical(logits=logits) for logits in self.actor(hidden).split(self.action_sizes, dim=-1)]
         if action is None:
             action = torch.stack([head.sample() for head in heads], dim=-1)
@@ -101,7 +112,7 @@ if __name__ == "__main__":
     agent = Agent(action_sizes, args.hidden_size).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
 
-    # Storage; frames stay uint8, which a GPU has four times as much room for.
+    # Rollout storage. Frames are stored as uint8, a quarter of the memory of float32.
     shape = (args.num_steps, args.num_envs)
     obs = torch.zeros(shape + envs.single_observation_space.shape, dtype=torch.uint8, device=device)
     actions = torch.zeros((*shape, len(action_sizes)), dtype=torch.long, device=device)
@@ -141,7 +152,7 @@ if __name__ == "__main__":
                 advantages[t] = last = delta + args.gamma * args.gae_lambda * (1.0 - following[1]) * last
             returns = advantages + values
 
-        # Update the policy; sequences stay whole, for the LSTM
+        # Update. Minibatches contain complete sequences, as the LSTM requires.
         for _ in range(args.update_epochs):
             for mb in torch.randperm(args.num_envs, device=device).chunk(args.num_minibatches):
                 _, newlogprob, entropy, newvalue, _ = agent.get_action_and_value(

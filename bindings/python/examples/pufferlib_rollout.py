@@ -5,9 +5,10 @@ pip install --no-deps gym==0.26.2 pettingzoo shimmy
 pip install --no-deps --no-build-isolation pufferlib==3.0.0
 python pufferlib_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 1024
 
---no-deps, because PufferLib 3.0.0 asks for NumPy 1 and Gymnasium 0.29, but works with the current ones. Its setup compiles
-games of its own from sources that it downloads from GitHub. To do without them, put NO_OCEAN=1 NO_TRAIN=1 before its line, and
-on the PYTHONPATH a folder with a file `sitecustomize.py` that says: import builtins; builtins.c_extension_paths = []
+--no-deps is needed since PufferLib 3.0.0 requires NumPy 1 and Gymnasium 0.29, although it works with the current versions. Its
+setup compiles its own games from sources that it downloads from GitHub. To skip them, set NO_OCEAN=1 NO_TRAIN=1 for its
+installation, with a folder on the PYTHONPATH that contains a file `sitecustomize.py` with the line:
+import builtins; builtins.c_extension_paths = []
 """
 
 import argparse
@@ -21,14 +22,15 @@ from endless_gym.pufferlib import EndlessPufferEnv
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0")
-    parser.add_argument("--num-envs", type=int, default=256)
-    parser.add_argument("--total-timesteps", type=int, default=500_000, help="steps in all environments together")
-    parser.add_argument("--backend", choices=["PufferEnv", "Serial", "Multiprocessing"], default="PufferEnv")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0", help="environment id")
+    parser.add_argument("--num-envs", type=int, default=256, help="number of environments")
+    parser.add_argument("--total-timesteps", type=int, default=500_000, help="environment steps in total")
+    backends = ["PufferEnv", "Serial", "Multiprocessing"]
+    parser.add_argument("--backend", choices=backends, default="PufferEnv", help="vectorisation backend of PufferLib")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the environments and the actions")
     args = parser.parse_args()
 
-    # The native backend is one batch in this process. The others make two, each with half of the environments.
+    # The native backend has one batch in this process. The other backends have two, each with half of the environments.
     batches = 1 if args.backend == "PufferEnv" else 2
     vecenv = pufferlib.vector.make(
         EndlessPufferEnv,
@@ -37,7 +39,9 @@ def main() -> None:
         backend=args.backend,
     )
     rng = np.random.default_rng(args.seed)
-    highest = np.broadcast_to(vecenv.single_action_space.nvec, vecenv.action_space.shape)
+    # Numbers of choices, of each branch for MultiDiscrete.
+    space = vecenv.single_action_space
+    choices = np.broadcast_to(space.nvec if hasattr(space, "nvec") else space.n, vecenv.action_space.shape)
 
     vecenv.async_reset(args.seed)
     steps, returns = 0, []
@@ -46,7 +50,7 @@ def main() -> None:
         observations, rewards, _terminals, _truncations, infos, _env_ids, _masks = vecenv.recv()
         for info in infos:
             returns += info["episode_return"]
-        vecenv.send(rng.integers(0, highest, dtype=np.int32))
+        vecenv.send(rng.integers(0, choices, dtype=np.int32))
         steps += len(rewards)
     seconds = time.perf_counter() - start
 

@@ -14,17 +14,17 @@ from endless_gym.sb3 import EndlessVecEnv
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0")
-    parser.add_argument("--num-envs", type=int, default=16)
-    parser.add_argument("--num-steps", type=int, default=64, help="steps in each environment between two updates")
-    parser.add_argument("--total-timesteps", type=int, default=100_000, help="steps in all environments together")
-    parser.add_argument("--hidden-size", type=int, default=128, help="size of the LSTM")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--device", default="auto")
+    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0", help="environment id")
+    parser.add_argument("--num-envs", type=int, default=16, help="number of environments")
+    parser.add_argument("--num-steps", type=int, default=64, help="rollout length: steps per environment and update")
+    parser.add_argument("--total-timesteps", type=int, default=100_000, help="environment steps in total")
+    parser.add_argument("--hidden-size", type=int, default=128, help="hidden size of the LSTM")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the environments and the network")
+    parser.add_argument("--device", default="auto", help="PyTorch device; auto uses CUDA if available")
     args = parser.parse_args()
 
     venv = EndlessVecEnv.make(args.env_id, num_envs=args.num_envs)
-    # MortarMayhemB's observations are a dict of a frame and a vector.
+    # The observations of the MortarMayhemB ids are a dict of a frame and a vector.
     policy = "MultiInputLstmPolicy" if hasattr(venv.observation_space, "spaces") else "CnnLstmPolicy"
     model = RecurrentPPO(
         policy,

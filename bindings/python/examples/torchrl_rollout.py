@@ -1,4 +1,4 @@
-"""Collect data from Endless Gym with TorchRL, with a small policy that acts on single frames.
+"""Collect rollouts from Endless Gym with TorchRL and a small policy without memory.
 
 pip install endless-gym torchrl tensordict
 python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 64 --total-timesteps 100000
@@ -20,14 +20,14 @@ from endless_gym.torchrl import EndlessEnv
 
 
 class Pixels(nn.Module):
-    """Frames uint8 (..., 84, 84, 3) to float32 (..., 3, 84, 84); not in the environment, to keep the data small."""
+    """Convert frames uint8 (..., 84, 84, 3) to float32 (..., 3, 84, 84). In the policy, so that the stored frames stay uint8."""
 
     def forward(self, frames: torch.Tensor) -> torch.Tensor:
         return frames.movedim(-1, -3) / 255.0
 
 
 def make_policy(env: TransformedEnv) -> ProbabilisticActor:
-    """A convolutional network from frames to logits, (num_envs, 4) or (num_envs, 2, 3), and an action drawn by them."""
+    """A convolutional network that computes logits, (num_envs, 4) or (num_envs, 2, 3), and samples an action from them."""
     shape = (*env.action_spec.shape[1:], env.action_spec.space.n)
     network = nn.Sequential(
         Pixels(),
@@ -51,12 +51,13 @@ def make_policy(env: TransformedEnv) -> ProbabilisticActor:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0")
-    parser.add_argument("--num-envs", type=int, default=64)
-    parser.add_argument("--num-steps", type=int, default=32, help="steps in each environment between two batches")
-    parser.add_argument("--total-timesteps", type=int, default=100_000, help="steps in all environments together")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--env-id", default="Endless-MortarMayhem-v0", help="environment id")
+    parser.add_argument("--num-envs", type=int, default=64, help="number of environments")
+    parser.add_argument("--num-steps", type=int, default=32, help="rollout length: steps per environment and batch")
+    parser.add_argument("--total-timesteps", type=int, default=100_000, help="environment steps in total")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the environments and the network")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    parser.add_argument("--device", default=device, help="PyTorch device; by default CUDA if available")
     args = parser.parse_args()
 
     torch.manual_seed(args.seed)
@@ -68,7 +69,7 @@ def main() -> None:
         make_policy(env),
         frames_per_batch=args.num_envs * args.num_steps,
         total_frames=args.total_timesteps,
-        auto_register_policy_transforms=False,  # the policy keeps no state that an episode's start would have to clear
+        auto_register_policy_transforms=False,  # the policy has no recurrent state to reset
     )
     steps, returns = 0, []
     start = time.perf_counter()
@@ -76,7 +77,7 @@ def main() -> None:
         steps += data.numel()
         done = data["next", "done"]  # bool (num_envs, num_steps, 1)
         returns += data["next", "episode_reward"][done].tolist()
-        # Here a loss module would train on `data`, whose batch size is [num_envs, num_steps].
+        # A loss module would use `data` here; its batch size is [num_envs, num_steps].
         print(
             f"batch={tuple(data.batch_size)} observation={tuple(data['observation'].shape)} episodes={int(done.sum())}"
         )

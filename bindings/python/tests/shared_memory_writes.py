@@ -3,6 +3,7 @@
 A write that is not refused kills the process, since the memory of another process is mapped read-only.
 """
 
+import contextlib
 import warnings
 from collections.abc import Callable
 
@@ -13,6 +14,9 @@ import torch.utils.dlpack
 import endless_gym
 
 ID = "MortarMayhemB-v0"
+
+#: Modes in which operations reach a tensor's `__torch_dispatch__` differently decomposed.
+MODES = [contextlib.nullcontext, torch.no_grad, torch.inference_mode]
 
 
 class Legacy:
@@ -62,6 +66,13 @@ def tensor_writes() -> dict[str, Callable[[torch.Tensor], object]]:
         "unbind": lambda t: t.unbind()[0].fill_(1),
         "split": lambda t: t.split(1)[0].fill_(1),
         "chunk": lambda t: torch.chunk(t, 2)[0].fill_(1),
+        "unsafe_split": lambda t: torch.unsafe_split(t, 1)[0].fill_(1),
+        "unsafe_split_with_sizes": lambda t: torch.unsafe_split_with_sizes(t, [1] * t.shape[0])[0].fill_(1),
+        "unsafe_chunk": lambda t: torch.unsafe_chunk(t, 2)[0].fill_(1),
+        "_unsafe_view": lambda t: torch.ops.aten._unsafe_view(t, [-1]).fill_(1),
+        "lift": lambda t: torch.ops.aten.lift(t).fill_(1),
+        "dropout": lambda t: torch.nn.functional.dropout(t, training=False).fill_(1),
+        "type_as": lambda t: t.type_as(torch.zeros(1, dtype=t.dtype)).fill_(1),
         "narrow": lambda t: t.narrow(0, 0, 1).fill_(1),
         "diagonal": lambda t: t.reshape(t.shape[0], -1).diagonal().fill_(1),
         "detach": lambda t: t.detach().fill_(1),
@@ -135,7 +146,9 @@ def main() -> None:
             kept = array.copy()
             tensor = endless_gym.torch_view(array)
             count += len(refused(array_writes(), array))
-            count += len(refused({**tensor_writes()}, tensor))
+            for mode in MODES:
+                with mode():
+                    count += len(refused(tensor_writes(), tensor))
             np.testing.assert_array_equal(array, kept)
         print(count)
 

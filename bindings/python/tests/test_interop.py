@@ -43,7 +43,7 @@ def test_every_type_and_a_part(observation: np.ndarray) -> None:
         endless_gym.torch_view(np.array(["a"]))
 
 
-def test_a_tensor_keeps_the_batch(observation: np.ndarray) -> None:
+def test_a_tensor_keeps_the_batch() -> None:
     with endless_gym.serve("MortarMayhem-v0", 4, batches_held=2) as envs:
         tensor = endless_gym.torch_view(envs.reset()[0])
         kept = tensor.clone()

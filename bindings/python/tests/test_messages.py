@@ -1,4 +1,4 @@
-"""`send`, `recv` and what is refused in between: alike in this process and in an engine's."""
+"""`send`, `recv` and which calls they refuse in between: the same in this process and in an engine process."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -16,7 +16,7 @@ ACTIONS = np.ones((NUM_ENVS, 2), np.int64)
 
 @contextlib.contextmanager
 def both() -> Iterator[list[endless_gym.EndlessVectorEnv]]:
-    """The same environments in this process and in an engine's."""
+    """The same environments in this process and in an engine process."""
     with (
         endless_gym.make_vec(ID, NUM_ENVS, groups=GROUPS, seed=4) as inside,
         endless_gym.serve(ID, NUM_ENVS, groups=GROUPS, seed=4) as outside,

@@ -54,8 +54,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 with endless_gym.serve({ID!r}, 4) as envs:
     envs.reset()
     os.kill(envs._backend._engine.pid, signal.SIGSTOP)
-    print("waiting", flush=True)
     try:
+        print("waiting", flush=True)
         envs.step([[0, 0]] * 4)
     except KeyboardInterrupt:
         print("interrupted", flush=True)

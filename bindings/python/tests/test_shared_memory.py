@@ -90,13 +90,15 @@ def test_no_write_to_a_served_batch_succeeds() -> None:
         [sys.executable, Path(writes.__file__)], capture_output=True, text=True, timeout=120, check=False
     )
     assert ran.returncode == 0, ran.stderr[-3000:]
-    assert int(ran.stdout) == 6 * (len(writes.tensor_writes()) + len(writes.array_writes()))
+    assert int(ran.stdout) == 6 * (len(writes.MODES) * len(writes.tensor_writes()) + len(writes.array_writes()))
 
 
-def test_no_write_to_a_tensor_of_this_process_succeeds() -> None:
+@pytest.mark.parametrize("mode", writes.MODES)
+def test_no_write_to_a_tensor_of_this_process_succeeds(mode) -> None:
     observation, _ = endless_gym.make_vec("MortarMayhem-v0", 2, seed=1).reset()
     kept = observation.copy()
-    writes.refused(writes.tensor_writes(), endless_gym.torch_view(observation))
+    with mode():
+        writes.refused(writes.tensor_writes(), endless_gym.torch_view(observation))
     np.testing.assert_array_equal(observation, kept)
 
 
@@ -177,6 +179,9 @@ def test_read_only_tensors_are_read_as_any_other(where) -> None:
             assert torch.equal(call(tensor), call(plain))
         assert repr(tensor[0, 0, 0]) == "ReadOnlyTensor(tensor([0, 0, 0], dtype=torch.uint8))"
         assert f"{tensor[0, 0, 0, 0]:03}" == "000"
+        assert np.asarray(tensor, copy=False).ctypes.data == frames.ctypes.data
+        with pytest.raises(ValueError, match="dtype must be uint8 or None for copy=False, got float32"):
+            np.asarray(tensor, np.float32, copy=False)
         assert not tensor.requires_grad
         buffer = io.BytesIO()
         torch.save(tensor, buffer)
@@ -207,6 +212,8 @@ def test_read_only_tensors_in_modes_without_gradients(mode) -> None:
                 assert torch.equal(layer(tensor), wanted)
                 assert torch.equal(tensor[0], torch.tensor(features[0]))
                 assert torch.equal(tensor.clone().zero_(), torch.zeros(features.shape))
+                for result in (tensor.double(), tensor.to("cpu", copy=True), tensor.type_as(torch.zeros(1).int())):
+                    assert type(result) is torch.Tensor
                 for write in (torch.Tensor.zero_, lambda t: t[0].zero_(), lambda t: t.view(-1).zero_()):
                     with pytest.raises(RuntimeError, match="read-only"):
                         write(tensor)

@@ -1,4 +1,4 @@
-"""Many environments, in this process and in an engine's: both are the same class and give the same."""
+"""Many environments, in this process and in an engine process: the same class with the same results."""
 
 import contextlib
 import gc
@@ -113,10 +113,19 @@ def test_arrays_are_views_that_stay_as_they_are(where) -> None:
 @pytest.mark.parametrize("where", WHERE)
 def test_copies_are_the_users_own(where) -> None:
     with made(where, ID, 2, seed=1, copy=True) as envs:
-        observation, _ = envs.reset()
+        observation, info = envs.reset()
+        # More steps than a served engine lends.
         held = [envs.step(np.zeros((2, 2), dtype=np.int64)) for _ in range(20)]
-        observation[:] = 0
-        assert len(held) == 20
+        with endless_gym.make_vec(ID, 2, seed=1) as twin:
+            compare((observation, info), twin.reset())
+            for step in held:
+                for given, wanted in zip(step[:4], twin.step(np.zeros((2, 2), dtype=np.int64)), strict=False):
+                    np.testing.assert_array_equal(given, wanted)
+        for *arrays, last in [(observation, info), *held]:
+            for array in (*arrays, last["ground_truth"], last["_ground_truth"]):
+                assert array.flags.owndata
+                array[:] = 0
+        assert envs.step(np.zeros((2, 2), dtype=np.int64))[4]["_ground_truth"].all()
 
 
 def test_memory_in_this_process_is_used_again() -> None:
@@ -215,6 +224,22 @@ def test_environments_may_have_options_of_their_own(where) -> None:
         where("MortarMayhem-v0", 2, options=each[:3])
 
 
+@pytest.mark.parametrize("where", WHERE)
+def test_options_of_single_environments_are_kept_at_reset(where) -> None:
+    each = [{"arena_size": 2}, {"arena_size": 5}]
+    with made(where, "MortarMayhem-v0", 2, seed=1, options=each) as envs:
+        first, _ = envs.reset(seed=1)
+        with pytest.raises(ValueError, match=r"one mapping each, got \{'arena_size': 3\}"):
+            envs.reset(seed=1, options={"arena_size": 3})
+        for options in (None, {"reset_mask": np.ones(2, dtype=bool)}):
+            np.testing.assert_array_equal(envs.reset(seed=1, options=options)[0], first)
+    with made(where, "MortarMayhem-v0", 1, seed=1, options=each[:1]) as envs:
+        first, _ = envs.reset(seed=1)
+        changed, _ = envs.reset(seed=1, options=each[1])
+        assert (changed != first).any()
+        np.testing.assert_array_equal(envs.reset(seed=1)[0], first)
+
+
 def test_the_feature_observation() -> None:
     envs = endless_gym.make_vec(ID, 2, seed=1, observation="features")
     observation, _ = envs.reset()
@@ -231,8 +256,10 @@ def test_gymnasium_makes_it() -> None:
     observation, _ = envs.reset()
     np.testing.assert_array_equal(observation, endless_gym.make_vec(ID, 8, seed=1).reset()[0])
     wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
-    wrapped.reset()
-    wrapped.step(envs.action_space.sample())
+    with endless_gym.make_vec(ID, 8, seed=1) as plain:
+        compare(wrapped.reset(seed=2), plain.reset(seed=2))
+        actions = envs.action_space.sample()
+        compare(wrapped.step(actions), plain.step(actions))
 
 
 def test_seeds_of_episodes() -> None:

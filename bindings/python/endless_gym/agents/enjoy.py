@@ -35,7 +35,7 @@ class EnjoyArguments:
     checkpoint: tyro.conf.Positional[Path]
     """a checkpoint file, or the folder of a run for its last checkpoint"""
     seeds: tuple[int, ...] = (EVALUATION_SEEDS.start,)
-    """seeds of the episodes, which are shown one after the other"""
+    """seeds of the episodes, which are shown in order"""
     out: Path = Path("episode.gif")
     """output file, .gif or .mp4"""
     action_seed: int = 0

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 @dataclass
 class Minibatch:
-    """M steps of a segment, in the order in which `Memory.forward` takes them.
+    """M steps of a segment, in the order that `Memory.forward` expects.
 
     Attributes:
         indices: Index t * N + n of each step in the flattened segment, int64 (M,), on the memory's device.
@@ -53,7 +53,7 @@ MinibatchT = TypeVar("MinibatchT", bound=Minibatch)
 class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
     """A memory module.
 
-    Type parameters: `StateT` is the state between two steps, `UpdateT` is what `step` hands to `update_state`, `MinibatchT` is
+    Type parameters: `StateT` is the state between two steps, `UpdateT` is what `step` passes to `update_state`, `MinibatchT` is
     the minibatch that `forward` takes.
     """
 

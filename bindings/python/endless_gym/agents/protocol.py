@@ -39,7 +39,7 @@ class EvalArguments:
     last: bool = False
     """evaluate only the last checkpoint of each run"""
     first_seed: int = EVALUATION_SEEDS.start
-    """first seed; the others are the consecutive numbers"""
+    """first seed; the seeds are consecutive"""
     seeds: int = len(EVALUATION_SEEDS)
     """number of seeds"""
     repetitions: int = REPETITIONS

@@ -49,7 +49,7 @@ class SearchArguments:
     folder: str = ""
     """folder of the search, with the study and the runs of the trials; empty for searches/ENV/AGENT"""
     stage: Literal["both", "single", "combinations"] = "both"
-    """single: single changes; combinations: combinations proposed by the TPE; both: one after the other"""
+    """single: single changes; combinations: combinations proposed by the TPE; both: first single changes, then combinations"""
     trials: int = 50
     """total number of combinations; the trials with single changes are additional"""
     parameters: tuple[str, ...] = ()

@@ -143,7 +143,7 @@ class Interrupt:
     """Context manager that turns the first SIGINT into a request to stop; the second one raises `KeyboardInterrupt`.
 
     Attributes:
-        requested: Whether the run is to stop after the current update.
+        requested: Whether the run should stop after the current update.
     """
 
     def __init__(self) -> None:

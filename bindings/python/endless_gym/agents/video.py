@@ -65,7 +65,7 @@ def check(file: Path) -> None:
 
 
 def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
-    """Write a video; if this is interrupted, no partial file is left.
+    """Write a video; if writing is interrupted, no partial file remains.
 
     Args:
         file: Output file, with the suffix `.gif` or `.mp4`.
