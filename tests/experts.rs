@@ -75,7 +75,7 @@ fn finite_mystery_path_is_solved() {
     }
 }
 
-/// Where the way turns left, nobody can go on: the agent of this id cannot walk there.
+/// Where the way turns left, no agent can continue: that of this id cannot walk there.
 #[test]
 fn endless_mystery_path_goes_on() {
     let ended = play("Endless-MysteryPath-v0", 30, 10_000).iter().flatten().count();

@@ -159,12 +159,12 @@ fn the_vector_observation_is_kept_too() {
 }
 
 #[test]
-fn without_autoreset_the_trainer_resets_whom_it_wants() {
+fn disabled_autoreset_leaves_resets_to_the_trainer() {
     let mut player = Player::new(&PoolConfig { autoreset: Autoreset::Disabled, ..config(3) }, 2);
     for _ in 0..30 {
         player.step_at_random();
     }
-    assert_eq!(player.batch().episode_length(), [30; 3], "nobody starts over by itself");
+    assert_eq!(player.batch().episode_length(), [30; 3], "no environment resets");
     let before = player.frame(0);
     player.pool.reset(ResetRequest::Each { reset: &[0, 1, 2], seed: &[0, 0, 77] }, &mut player.blocks).unwrap();
     assert_eq!(player.batch().episode_length(), [30, 0, 0]);
@@ -255,7 +255,7 @@ fn wrong_configurations_are_refused() {
         |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
     assert_eq!(refused(config(0)).to_string(), "num_envs must be 1 to 1048576, got 0");
-    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2)] {
+    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2), (0, 1 << 32)] {
         let outside = PoolConfig { first_env, total_envs, ..config(3) };
         assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
     }

@@ -101,8 +101,12 @@ fn broken_snapshots_are_typed_errors() {
     }
     let mut other = Pool::new(&config("MortarMayhem-Grid-v0", 1), &Threads::new(1).unwrap()).unwrap();
     assert_eq!(other.snapshot(0).unwrap_err(), SnapshotError::NotReset);
+    assert_eq!(refused(&mut other, &snapshot), SnapshotError::NotReset);
+    assert_eq!(refused(&mut other, b""), SnapshotError::NotReset, "before the snapshot is read");
+    let mut blocks = zeroed(other.layout().blocks());
+    other.reset(ResetRequest::All, &mut blocks).unwrap();
     assert!(matches!(refused(&mut other, &snapshot), SnapshotError::OtherEnvironment { .. }));
-    assert!(matches!(pool.snapshot(1), Err(SnapshotError::NoSuchEnvironment { given: 1, num_envs: 1 })));
+    assert!(matches!(pool.snapshot(1), Err(SnapshotError::NoSuchEnv { given: 1, num_envs: 1 })));
     assert_eq!(pool.snapshot(0).unwrap(), snapshot, "nothing has changed");
 }
 

@@ -4,7 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::block::{BLOCK_BYTES, Block, blocks_for};
 use super::dtype::{Dtype, Element};
-use super::layout_error::{LayoutError, MAX_ENVS};
+use super::layout_error::LayoutError;
+use super::limits::MAX_ENVS;
 use super::sections::{ActionSection, BatchSection, Contents, RowShape, SectionTable};
 use crate::envs::EnvSpec;
 

@@ -4,6 +4,7 @@ use std::fmt;
 
 use super::dtype::{Dtype, Element};
 use super::frames::Frames;
+use super::sealed::Sealed;
 use crate::envs::EnvSpec;
 
 /// Maximum length of a message's reset parameters, in bytes of JSON text.
@@ -15,8 +16,8 @@ pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 
 /// The sections that a kind of memory may have: [`BatchSection`] or [`ActionSection`].
 ///
-/// A [`Layout`](super::Layout) says where each of them lies. The trait is not meant for other types.
-pub trait SectionTable: Copy + Eq + fmt::Debug + fmt::Display + 'static {
+/// A [`Layout`](super::Layout) says where each of them lies. The trait is sealed: other crates cannot implement it.
+pub trait SectionTable: Sealed + Copy + Eq + fmt::Debug + fmt::Display + 'static {
     /// All sections, in the order in which they lie in memory.
     const ALL: &'static [Self];
 
@@ -143,6 +144,8 @@ macro_rules! section_table {
                 $variant,
             )*
         }
+
+        impl Sealed for $table {}
 
         impl SectionTable for $table {
             const ALL: &'static [Self] = &[$($table::$variant),*];
