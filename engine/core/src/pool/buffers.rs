@@ -114,7 +114,7 @@ mod tests {
         assert!(write(&mut buffers, &layout, &mut batch).current);
         assert!(!write(&mut buffers, &layout, &mut copy).current, "the record is of the original's second write");
         let mut later = batch.clone();
-        assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is as good");
+        assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is current");
         assert!(!write(&mut buffers, &layout, &mut batch).current, "but only one of the two");
     }
 

@@ -11,7 +11,7 @@ use crate::batch::{Contents, Frames, MAX_STACK};
 /// Reset parameters by the original's names, as a JSON object.
 pub type OptionMap = Map<String, Json>;
 
-/// Reset parameters of a pool's environments. Parameters that are not given have the original's defaults.
+/// Reset parameters of a pool's environments. Omitted parameters have the original's defaults.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ResetOptions {
     /// The same for all environments.
@@ -42,7 +42,7 @@ pub struct PoolConfig {
     pub final_observation: bool,
     /// Source of the episodes' seeds.
     pub seeding: Seeding,
-    /// Format of the frames; `None` leaves them out, and nothing is drawn.
+    /// Format of the frames; `None` omits them, and nothing is drawn.
     pub frames: Option<Frames>,
     /// Whether the batch has the feature observation.
     pub features: bool,
@@ -111,14 +111,14 @@ impl PoolConfig {
 /// Which environments start an episode.
 #[derive(Clone, Copy, Debug)]
 pub enum ResetRequest<'a> {
-    /// All, each with the seed that [`Seeding`] gives it.
+    /// All, each with the next seed of [`Seeding`].
     All,
     /// All; environment `i` of the pool is seeded with `seed + first_env + i` (wrapping), where `first_env` is
     /// [`PoolConfig::first_env`].
     Seed(u64),
     /// Per environment, by `reset`.
     Each {
-        /// For each environment: 0 leaves it alone, 1 starts an episode with the seed that [`Seeding`] gives it, 2 starts one with
+        /// For each environment: 0 does not reset it, 1 starts an episode with the next seed of [`Seeding`], 2 starts one with
         /// its item of `seed`. Other values count as 2.
         reset: &'a [u8],
         /// For each environment a seed, which is used where `reset` is 2.

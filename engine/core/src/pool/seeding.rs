@@ -40,8 +40,8 @@ impl Seeding {
     }
 }
 
-/// Entropy for unseeded pools. One draw of the system's entropy serves all environments: each gets a stream
-/// of its own by a spawn key, as with numpy's `SeedSequence.spawn`.
+/// Entropy for unseeded pools. One draw of the system's entropy serves all environments: each gets its own
+/// stream by a spawn key, as with numpy's `SeedSequence.spawn`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Unseeded(SeedSequence);
 
@@ -65,7 +65,7 @@ impl Unseeded {
         Generator::from_seed_sequence(&self.0.with_spawn_key(&[env as u32, 1]))
     }
 
-    /// A number that no other pool has, neither of this process nor, where there is entropy, of another.
+    /// A number that differs from those of all other pools of this process and, with entropy, of other processes.
     pub(super) fn identity(self) -> u64 {
         static POOLS: AtomicU32 = AtomicU32::new(0);
         let number = POOLS.fetch_add(1, Ordering::Relaxed);

@@ -17,7 +17,7 @@ pub struct Threads {
 
 #[cfg(feature = "threads")]
 impl Threads {
-    /// `count` threads, the calling one included; 0 stands for one for each core.
+    /// `count` threads, the calling one included; 0 means one for each core.
     ///
     /// # Errors
     ///

@@ -31,7 +31,7 @@ pub(super) struct Workers {
 /// A function of the thread's number. It is borrowed for the time of one call.
 type Task = &'static (dyn Fn(usize) + Sync);
 
-/// What the caller and its workers share. Counters that different threads write lie in cache lines of their own.
+/// What the caller and its workers share. Counters that different threads write have separate cache lines.
 #[derive(Default)]
 struct Shared {
     /// Generation counter of calls: incremented when a call opens and when it closes, so odd while workers may join.
@@ -103,7 +103,7 @@ struct Call<'a>(&'a Shared);
 
 impl<'a> Call<'a> {
     fn open(shared: &'a Shared, task: Task, helpers: usize) -> Self {
-        // A panic is left over where the caller of an earlier call panicked as well.
+        // An earlier call's panic is still here if its caller panicked as well.
         *lock(&shared.panic) = None;
         shared.helpers.store(helpers, Ordering::SeqCst);
         *lock(&shared.open) = Some(task);
@@ -186,7 +186,7 @@ mod tests {
     use crate::pool::Threads;
 
     #[test]
-    fn all_is_done_when_it_returns_and_no_thread_comes_twice() {
+    fn all_work_is_done_on_return_and_no_thread_runs_twice() {
         let threads = Threads::new(4).unwrap();
         for round in 0..2_000 {
             let left = Mutex::new((0..64).collect::<Vec<usize>>());
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn workers_that_sleep_wake_up() {
+    fn parked_workers_wake_up() {
         let threads = Threads::new(2).unwrap();
         for _ in 0..5 {
             thread::sleep(PARK_AFTER * 20);
