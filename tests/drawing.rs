@@ -1,4 +1,4 @@
-//! Frames that are brought up to date equal frames that are drawn in full, whatever buffers they lie in.
+//! Updated frames equal frames that are drawn in full, in every buffer.
 //!
 //! Every pool here checks what it draws, so that a step fails if a frame is wrong. The replay of the recorded
 //! traces checks the same.

@@ -1,4 +1,4 @@
-//! The tables of sections: the one list from which layouts, their checks, the views of a batch and this documentation are made.
+//! The tables of sections: the single source of layouts, their checks, the views of a batch and this documentation.
 
 use std::fmt;
 
