@@ -53,7 +53,7 @@ fn threads(criterion: &mut Criterion) {
     }
 }
 
-/// What the formats cost beside the original's.
+/// What the formats cost in addition to the original's.
 fn formats(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("pool/formats");
     let spec = envs::spec("Endless-MysteryPath-v0").unwrap();

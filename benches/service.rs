@@ -1,4 +1,4 @@
-//! Cost of a step through shared memory, to an engine in a process of its own: from sending actions to holding the batch.
+//! Cost of a step through shared memory, to an engine in a separate process: from sending actions to holding the batch.
 
 mod actions;
 

@@ -13,8 +13,8 @@
 /// Arrays of a batch in memory.
 pub mod batch {
     pub use endless_gym_core::batch::{
-        BLOCK_BYTES, Batch, BatchSection, Block, Dtype, Element, Frames, LAYOUT_VERSION, Layout, LayoutError,
-        MAX_DIMENSIONS, MAX_STACK, RowShape, Section, SectionTable, zeroed,
+        ActionLayout, ActionSection, BLOCK_BYTES, Batch, BatchSection, Block, Dtype, Element, Frames, LAYOUT_VERSION,
+        Layout, LayoutError, MAX_DIMENSIONS, MAX_STACK, RowShape, Section, SectionTable, zeroed,
     };
     pub use endless_gym_core::raster::PixelFormat;
 }
@@ -22,8 +22,9 @@ pub mod batch {
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{
-        ActionError, ActionSpace, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, InfoColumn, Parameter,
-        ParameterError, ParameterKind, SCREEN, UnknownEnvironment, expert, spec, specs, view,
+        ActionError, ActionSpace, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family, InfoColumn,
+        InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
+        ParameterError, ParameterKind, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec, specs, view,
     };
 }
 
@@ -33,6 +34,7 @@ pub mod pool {
         Autoreset, MAX_ENVS, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, SNAPSHOT_VERSION,
         Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
     };
+    pub use endless_gym_core::random::EntropyError;
 }
 
 /// Engines that serve environments in shared memory, their trainers and observers.

@@ -9,12 +9,12 @@ use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetRequest, Seeding, Thre
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
-/// The system's allocator, which counts what it is asked for.
+/// The system's allocator, with a count of the allocations.
 struct Counting;
 
 static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
 
-// SAFETY: everything is handed on to the system's allocator as it comes.
+// SAFETY: All calls are forwarded unchanged to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);

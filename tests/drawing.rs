@@ -1,6 +1,6 @@
-//! Frames that are brought up to date equal frames that are drawn in full, whatever buffers they lie in.
+//! Updated frames equal frames that are drawn in full, in every buffer.
 //!
-//! Every pool here checks what it draws, so that a step fails where a frame is not what it should be. The replay of the recorded
+//! Every pool here checks what it draws, so that a step fails if a frame is wrong. The replay of the recorded
 //! traces checks the same.
 
 mod common;
@@ -109,7 +109,7 @@ proptest! {
 
 /// A check that never fails would prove nothing.
 #[test]
-fn a_pixel_that_somebody_changed_is_found() {
+fn a_pixel_changed_from_outside_is_found() {
     let spec = envs::spec("MortarMayhem-Grid-v0").unwrap();
     let mut pool = pool(&config(spec));
     let layout = pool.layout().clone();

@@ -75,9 +75,9 @@ fn finite_mystery_path_is_solved() {
     }
 }
 
-/// Where the way turns left, nobody can go on: the agent of this id cannot walk there.
+/// Where the way turns left, no agent can continue: that of this id cannot walk there.
 #[test]
-fn endless_mystery_path_goes_on() {
+fn endless_mystery_path_continues() {
     let ended = play("Endless-MysteryPath-v0", 30, 10_000).iter().flatten().count();
     assert!(ended <= 1, "{ended} of 30 ended");
 }

@@ -248,7 +248,7 @@ fn field<'a>(value: &'a mut Value, name: &str) -> &'a mut Value {
 
 #[test]
 fn an_even_increment_is_refused() {
-    // PCG64 with state 0 and increment 0 gives zeros only, which rejection sampling draws again for ever.
+    // PCG64 with state 0 and increment 0 returns only zeros, which rejection sampling redraws forever.
     let spec = envs::spec("MysteryPath-v0").unwrap();
     let mut game = Game::new(spec, Seeding::Range { start: 0, end: 100_000, seed: Some(3) }, Map::new());
     let content = game.content();

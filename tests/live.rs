@@ -23,7 +23,7 @@ use serde_json::{Map, Value as Json, json};
 /// Steps that an episode is played at most.
 const MAX_STEPS: usize = 400;
 
-/// The original in a process of its own.
+/// The original in a separate process.
 struct Original {
     child: Child,
     requests: ChildStdin,

@@ -159,12 +159,12 @@ fn the_vector_observation_is_kept_too() {
 }
 
 #[test]
-fn without_autoreset_the_trainer_resets_whom_it_wants() {
+fn disabled_autoreset_leaves_resets_to_the_trainer() {
     let mut player = Player::new(&PoolConfig { autoreset: Autoreset::Disabled, ..config(3) }, 2);
     for _ in 0..30 {
         player.step_at_random();
     }
-    assert_eq!(player.batch().episode_length(), [30; 3], "nobody starts over by itself");
+    assert_eq!(player.batch().episode_length(), [30; 3], "no environment resets");
     let before = player.frame(0);
     player.pool.reset(ResetRequest::Each { reset: &[0, 1, 2], seed: &[0, 0, 77] }, &mut player.blocks).unwrap();
     assert_eq!(player.batch().episode_length(), [30, 0, 0]);
@@ -173,7 +173,7 @@ fn without_autoreset_the_trainer_resets_whom_it_wants() {
 }
 
 #[test]
-fn seeds_come_as_the_policy_says() {
+fn seeds_follow_the_seeding() {
     let first_frames = |seeding: Seeding, episodes: usize| -> Vec<Vec<u8>> {
         let mut player = Player::new(&PoolConfig { seeding, ..PoolConfig::new(ID, 2) }, 1);
         let mut frames = vec![player.frame(0), player.frame(1)];
@@ -194,7 +194,7 @@ fn seeds_come_as_the_policy_says() {
 }
 
 #[test]
-fn a_seeded_reset_starts_everything_over() {
+fn a_seeded_reset_resets_all() {
     let mut player = Player::new(&config(2), 1);
     player.step_at_random();
     player.pool.reset(ResetRequest::Seed(50), &mut player.blocks).unwrap();
@@ -202,7 +202,7 @@ fn a_seeded_reset_starts_everything_over() {
 }
 
 #[test]
-fn each_environment_may_have_options_of_its_own() {
+fn each_environment_may_have_its_own_options() {
     let each = vec![options(json!({})), options(json!({"agent_scale": 0.4})), options(json!({}))];
     let seeding = Seeding::List(vec![8]);
     let player = Player::new(
@@ -215,7 +215,7 @@ fn each_environment_may_have_options_of_its_own() {
 }
 
 #[test]
-fn a_reset_may_bring_other_options() {
+fn a_reset_may_change_the_options() {
     let other = options(json!({"initial_command_count": 4, "agent_scale": 0.5}));
     let mut fresh = Player::new(&PoolConfig { options: ResetOptions::Shared(other.clone()), ..config(2) }, 1);
     let mut player = Player::new(&config(2), 1);
@@ -232,7 +232,7 @@ fn a_reset_may_bring_other_options() {
     let wrong = options(json!({"agent_scale": "large"}));
     let refused = player.pool.reset_with(ResetRequest::All, Some(&wrong), &mut player.blocks);
     assert!(matches!(refused, Err(PoolError::Parameters(_))));
-    assert_eq!(player.pool.snapshot(0).unwrap(), before, "nothing has moved");
+    assert_eq!(player.pool.snapshot(0).unwrap(), before, "nothing has changed");
 }
 
 #[test]
@@ -255,7 +255,7 @@ fn wrong_configurations_are_refused() {
         |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
     assert_eq!(refused(config(0)).to_string(), "num_envs must be 1 to 1048576, got 0");
-    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2)] {
+    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2), (0, 1 << 32)] {
         let outside = PoolConfig { first_env, total_envs, ..config(3) };
         assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
     }
@@ -273,7 +273,7 @@ fn wrong_configurations_are_refused() {
 }
 
 #[test]
-fn wrong_calls_are_refused_and_move_nothing() {
+fn wrong_calls_are_refused_and_change_nothing() {
     let mut pool = Pool::new(&config(2), &Threads::new(1).unwrap()).unwrap();
     let mut blocks = zeroed(pool.layout().blocks());
     assert!(matches!(pool.step(&[0; 4], &mut blocks), Err(PoolError::NotReset)));

@@ -1,4 +1,4 @@
-//! Snapshots: an environment that is saved goes on identically, wherever it is restored.
+//! Snapshots: a restored environment continues identically in any pool.
 
 mod common;
 
@@ -32,7 +32,7 @@ fn bytes<'a>(pool: &'a Pool, blocks: &'a [Block]) -> &'a [u8] {
 }
 
 #[test]
-fn a_restored_environment_goes_on_identically() {
+fn a_restored_environment_continues_identically() {
     for spec in envs::specs() {
         for played in [0, 1, 7, 130] {
             let (mut original, mut blocks) = pool(&config(spec.id, 4));
@@ -60,7 +60,7 @@ fn a_restored_environment_goes_on_identically() {
 }
 
 #[test]
-fn the_snapshots_options_come_along() {
+fn a_snapshot_contains_the_options() {
     let id = "MortarMayhem-v0";
     let options = json!({"arena_size": 3, "agent_scale": 0.4}).as_object().unwrap().clone();
     let (original, blocks) = pool(&PoolConfig { options: ResetOptions::Shared(options), ..config(id, 1) });
@@ -71,7 +71,7 @@ fn the_snapshots_options_come_along() {
 }
 
 #[test]
-fn the_seeds_to_come_are_part_of_it() {
+fn a_snapshot_contains_the_position_in_the_seeds() {
     let seeding = Seeding::Range { start: 0, end: 100_000, seed: Some(1) };
     let with_range = PoolConfig { seeding, ..config("MortarMayhem-v0", 0) };
     let (mut original, mut blocks) = pool(&with_range);
@@ -101,8 +101,12 @@ fn broken_snapshots_are_typed_errors() {
     }
     let mut other = Pool::new(&config("MortarMayhem-Grid-v0", 1), &Threads::new(1).unwrap()).unwrap();
     assert_eq!(other.snapshot(0).unwrap_err(), SnapshotError::NotReset);
+    assert_eq!(refused(&mut other, &snapshot), SnapshotError::NotReset);
+    assert_eq!(refused(&mut other, b""), SnapshotError::NotReset, "before the snapshot is read");
+    let mut blocks = zeroed(other.layout().blocks());
+    other.reset(ResetRequest::All, &mut blocks).unwrap();
     assert!(matches!(refused(&mut other, &snapshot), SnapshotError::OtherEnvironment { .. }));
-    assert!(matches!(pool.snapshot(1), Err(SnapshotError::NoSuchEnvironment { given: 1, num_envs: 1 })));
+    assert!(matches!(pool.snapshot(1), Err(SnapshotError::NoSuchEnv { given: 1, num_envs: 1 })));
     assert_eq!(pool.snapshot(0).unwrap(), snapshot, "nothing has changed");
 }
 

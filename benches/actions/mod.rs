@@ -1,4 +1,4 @@
-//! Random actions, drawn before the clock starts, since drawing them takes as long as many a step.
+//! Random actions, drawn before the clock starts, since drawing them takes about as long as a step.
 
 use endless_gym::envs::EnvSpec;
 use rand::rngs::SmallRng;

@@ -1,7 +1,7 @@
 //! The Memory Gym environments, bit for bit, at memory speed.
 //!
 //! The modules follow the data: [`random`] and [`raster`] serve [`envs`], the rules and pictures of the environments; [`batch`]
-//! describes how one step of many environments lies in memory; [`pool`] steps them in lockstep; [`trace`] replays recorded
+//! describes the memory layout of one step of many environments; [`pool`] steps them in lockstep; [`trace`] replays recorded
 //! episodes of the original.
 
 #![deny(unsafe_code)]

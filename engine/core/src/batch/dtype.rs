@@ -5,6 +5,8 @@ use std::fmt;
 use bytemuck::Pod;
 use serde::{Deserialize, Serialize};
 
+use super::sealed::Sealed;
+
 /// Number type of a section. In JSON it is written as [`name`](Dtype::name).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -50,13 +52,18 @@ impl fmt::Display for Dtype {
 }
 
 /// A Rust number type that has a [`Dtype`].
-pub trait Element: Pod + Send + Sync {
+///
+/// The trait is sealed: other crates cannot implement it.
+pub trait Element: Sealed + Pod + Send + Sync {
     /// The number type's description in a layout.
     const DTYPE: Dtype;
 }
 
 macro_rules! element {
-    ($($rust:ty => $dtype:ident),*) => { $(impl Element for $rust { const DTYPE: Dtype = Dtype::$dtype; })* };
+    ($($rust:ty => $dtype:ident),*) => { $(
+        impl Sealed for $rust {}
+        impl Element for $rust { const DTYPE: Dtype = Dtype::$dtype; }
+    )* };
 }
 element!(u8 => Uint8, i32 => Int32, u64 => Uint64, f32 => Float32, f64 => Float64);
 

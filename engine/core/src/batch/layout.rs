@@ -1,10 +1,11 @@
-//! Where each section of a batch lies in memory.
+//! The position of each section of a batch in memory.
 
 use serde::{Deserialize, Serialize};
 
 use super::block::{BLOCK_BYTES, Block, blocks_for};
 use super::dtype::{Dtype, Element};
-use super::layout_error::{LayoutError, MAX_ENVS};
+use super::layout_error::LayoutError;
+use super::limits::MAX_ENVS;
 use super::sections::{ActionSection, BatchSection, Contents, RowShape, SectionTable};
 use crate::envs::EnvSpec;
 
@@ -211,7 +212,7 @@ impl<S: SectionTable> Builder<S> {
         let count = shape.iter().try_fold(self.num_envs, |count, length| count.checked_mul((*length).max(1)));
         let largest =
             count.and_then(|count| count.checked_mul(name.dtype().size())).and_then(|n| n.checked_add(offset));
-        // A slice has at most isize::MAX bytes; the last block and the stamp have to fit too.
+        // A slice has at most isize::MAX bytes; the last block and the stamp must fit too.
         largest.filter(|end| *end <= isize::MAX as usize - 2 * BLOCK_BYTES).ok_or_else(too_large)?;
         let width: usize = shape.iter().product();
         let bytes = self.num_envs * width * name.dtype().size();

@@ -4,9 +4,7 @@ use thiserror::Error;
 
 use super::block::BLOCK_BYTES;
 use super::dtype::Dtype;
-
-/// Maximum number of environments in a batch.
-pub const MAX_ENVS: usize = 1 << 20;
+use super::limits::MAX_ENVS;
 
 /// A description of a layout that is not valid.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]

@@ -1,15 +1,15 @@
 //! The layout of a batch in memory.
 //!
 //! A **batch** is the result of one step of a group of environments: one contiguous piece of memory, in this process or in shared
-//! memory, with an array for each quantity, a *section*. [`BatchSection`] is the table of the sections, [`Layout`] says where they
-//! lie, and [`Batch`] reads them. The message with which a trainer steps or resets a group is laid out likewise:
+//! memory, with an array for each quantity, a *section*. [`BatchSection`] is the table of the sections, [`Layout`] describes where
+//! they are, and [`Batch`] reads them. The message with which a trainer steps or resets a group has a layout of the same kind:
 //! [`ActionSection`], [`ActionLayout`].
 //!
 //! Every section starts at a multiple of 64 bytes and has `num_envs` rows in C order.
 //!
-//! Behind the sections of a batch lies one [`Block`] for the pool's generation stamp. A pool that finds the stamp of its own last
-//! write into that memory repaints only what has changed since; with any other stamp it draws every frame in full. After a change
-//! to the frames of a batch that a pool is to write into again, call [`Layout::forget_frames`].
+//! The sections of a batch are followed by one [`Block`] for the pool's generation stamp. A pool that finds the stamp of its own
+//! last write into that memory repaints only what has changed since; with any other stamp it draws every frame in full. After a
+//! change to the frames of a batch that a pool will write into again, call [`Layout::forget_frames`].
 
 mod block;
 mod dtype;
@@ -18,6 +18,8 @@ mod forged_tests;
 mod frames;
 mod layout;
 mod layout_error;
+pub(crate) mod limits;
+mod sealed;
 mod sections;
 mod stamp;
 mod view;
@@ -26,7 +28,7 @@ pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use dtype::{Dtype, Element};
 pub use frames::{Frames, MAX_STACK};
 pub use layout::{ActionLayout, Layout, MAX_DIMENSIONS, Section, action_layout, batch_layout};
-pub use layout_error::{LayoutError, MAX_ENVS};
+pub use layout_error::LayoutError;
 pub use sections::{ActionSection, BatchSection, Contents, OPTIONS_BYTES, RowShape, SNAPSHOT_BYTES, SectionTable};
 pub(crate) use stamp::Stamp;
 pub use view::Batch;

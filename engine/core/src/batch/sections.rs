@@ -1,22 +1,23 @@
-//! The tables of sections: the one list from which layouts, their checks, the views of a batch and this documentation are made.
+//! The tables of sections: the single source of layouts, their checks, the views of a batch and this documentation.
 
 use std::fmt;
 
 use super::dtype::{Dtype, Element};
 use super::frames::Frames;
+use super::sealed::Sealed;
 use crate::envs::EnvSpec;
 
 /// Maximum length of a message's reset parameters, in bytes of JSON text.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
 
-/// Maximum length of a snapshot in a message, in bytes. Most snapshots have less than a kilobyte beside their reset parameters;
-/// one with 1,000 spotlights has about 80 kilobytes, and reset parameters allow twice as many.
+/// Maximum length of a snapshot in a message, in bytes. Most snapshots have less than a kilobyte in addition to their reset
+/// parameters; one with 1,000 spotlights has about 80 kilobytes, and reset parameters allow twice as many.
 pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 
 /// The sections that a kind of memory may have: [`BatchSection`] or [`ActionSection`].
 ///
-/// A [`Layout`](super::Layout) says where each of them lies. The trait is not meant for other types.
-pub trait SectionTable: Copy + Eq + fmt::Debug + fmt::Display + 'static {
+/// A [`Layout`](super::Layout) describes where each of them is. The trait is sealed: other crates cannot implement it.
+pub trait SectionTable: Sealed + Copy + Eq + fmt::Debug + fmt::Display + 'static {
     /// All sections, in the order in which they lie in memory.
     const ALL: &'static [Self];
 
@@ -52,7 +53,7 @@ pub enum RowShape {
     Vector,
     /// Frames as [`Frames`] describes them: 2 to 4 dimensions.
     Frames,
-    /// Bytes that run on over all rows: `(k,)`, such that all rows together have at least this many.
+    /// One byte string stored across all rows: `(k,)`, at least this many bytes in all.
     Bytes(usize),
 }
 
@@ -144,6 +145,8 @@ macro_rules! section_table {
             )*
         }
 
+        impl Sealed for $table {}
+
         impl SectionTable for $table {
             const ALL: &'static [Self] = &[$($table::$variant),*];
             const STAMP_BLOCKS: usize = $stamp_blocks;
@@ -187,7 +190,7 @@ macro_rules! batch_sections {
         $macro! {
             $($before)*
             Observation observation: u8, Frames, optional,
-                "the frames; absent where frames are turned off";
+                "the frames; absent if frames are turned off";
             VectorObservation vector_observation: f32, Vector, optional,
                 "the commands, one-hot; ids with `MortarMayhemB` only";
             Features features: f32, Vector, optional,
@@ -209,11 +212,11 @@ macro_rules! batch_sections {
             FinalObservation final_observation: u8, Frames, optional,
                 "`observation` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalVectorObservation final_vector_observation: f32, Vector, optional,
-                "`vector_observation` likewise";
+                "`vector_observation` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalFeatures final_features: f32, Vector, optional,
-                "`features` likewise";
+                "`features` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalGroundTruth final_ground_truth: f64, Vector, optional,
-                "`ground_truth` likewise";
+                "`ground_truth` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
         }
     };
 }
@@ -233,13 +236,13 @@ section_table! {
     Action action: i32, Vector, required,
         "for a step, one number for each branch of the action space";
     Reset reset: u8, Scalar, required,
-        "for a reset of some environments: 0 leaves the environment alone, 1 starts its next episode, 2 starts an episode with `seed`";
+        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`";
     Seed seed: u64, Scalar, required,
         "for a reset of some environments: the seed where `reset` is 2";
     Options options: u8, Bytes(OPTIONS_BYTES), required,
-        "for a reset with other reset parameters: JSON text that runs on over the rows, at least [`OPTIONS_BYTES`] in all";
+        "for a reset with other reset parameters: one JSON text stored across all rows, at least [`OPTIONS_BYTES`] in all";
     Snapshot snapshot: u8, Bytes(SNAPSHOT_BYTES), required,
-        "for restoring an environment: its snapshot, which runs on over the rows, at least [`SNAPSHOT_BYTES`] in all";
+        "for restoring an environment: its snapshot, one byte string stored across all rows, at least [`SNAPSHOT_BYTES`] in all";
 }
 
 /// Which optional sections a batch has.

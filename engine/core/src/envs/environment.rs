@@ -92,7 +92,7 @@ pub trait Environment: Send + Sync {
     fn info(&self, out: &mut [f64]);
 }
 
-/// What one step returns beside the observation.
+/// What one step returns in addition to the observation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
     /// The reward, in the precision of the original's Python float.

@@ -2,7 +2,7 @@
 
 /// Plays an environment from its feature and vector observations, and remembers what an agent would need to remember.
 pub trait Expert: Send {
-    /// Forgets the last episode.
+    /// Resets the expert's memory.
     fn reset(&mut self);
 
     /// Chooses an action. The caller must call it once for each observation, including the first of an episode.

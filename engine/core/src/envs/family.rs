@@ -16,7 +16,7 @@ pub enum Family {
 pub struct MortarMayhemVariant {
     /// How the agent moves.
     pub locomotion: Locomotion,
-    /// The commands are given as a vector observation and never shown.
+    /// The commands are provided as a vector observation and never shown.
     pub commands_given: bool,
     /// The sequence of commands grows until the agent fails.
     pub endless: bool,

@@ -1,8 +1,8 @@
 //! The environments: the trait that each family implements, the registry of ids, and the reset parameters.
 
 mod action_space;
-pub mod character;
-pub mod character_sprites;
+mod character;
+mod character_sprites;
 mod environment;
 mod expert;
 mod family;

@@ -42,7 +42,7 @@ pub struct EnvSpec {
     pub vector_observation: usize,
     /// Numbers in the ground truth (float64 in 0..=1), 0 if there is none.
     pub ground_truth: usize,
-    /// Columns of the final info beside `reward` and `length`.
+    /// Columns of the final info in addition to `reward` and `length`.
     pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32), which the original does not have.
     pub features: &'static [Column],

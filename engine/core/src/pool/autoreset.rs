@@ -28,7 +28,7 @@ pub enum Autoreset {
     NextStep,
     /// In the same step: the observation is already the new episode's; reward, flags and info are the old one's.
     SameStep,
-    /// Never: the trainer resets with [`Pool::reset`](super::Pool::reset). Until then the episode goes on, as in the original.
+    /// Never: the trainer resets with [`Pool::reset`](super::Pool::reset). Until then the episode continues, as in the original.
     Disabled,
 }
 

@@ -11,12 +11,15 @@ use crate::batch::{Block, Layout, Stamp};
 /// Maximum number of buffers that are recorded at a time. A trainer and its observers hold fewer.
 const MAX_BUFFERS: usize = 32;
 
+/// The generation of a record that is being written. No stamp has it, and the record is the first to be replaced.
+const UNFINISHED: u64 = 0;
+
 /// The records of a pool's buffers.
 #[derive(Debug)]
 pub(super) struct Buffers {
     /// The pool's random identity, in its stamps.
     pool: u64,
-    /// For each buffer, the generation of the last write into it.
+    /// For each buffer, the generation of the last write into it, or [`UNFINISHED`].
     writes: Vec<u64>,
     /// The generation counter.
     last_write: u64,
@@ -35,16 +38,18 @@ impl Buffers {
     /// No records. `identity` distinguishes this pool's stamps from those of other pools.
     pub fn new(identity: u64) -> Self {
         // All zeros are no stamp.
-        Buffers { pool: identity | 1, writes: Vec::new(), last_write: 0 }
+        Buffers { pool: identity | 1, writes: Vec::new(), last_write: UNFINISHED }
     }
 
-    /// Finds the record of a buffer that is to be written into, or makes one, and removes the buffer's stamp: until
-    /// [`finish`](Buffers::finish) its content counts as unknown.
+    /// Returns the record of the buffer of the next write, a new one if it has none, and removes the buffer's stamp. Until
+    /// [`finish`](Buffers::finish) no buffer is current for that record, since its drawn scenes change during the write: neither
+    /// this one, nor a copy of it, nor the one that the record belonged to before.
     pub fn begin(&mut self, layout: &Layout, batch: &mut [Block]) -> Buffer {
         let stamp = Stamp::read(layout, batch);
         let index = usize::try_from(stamp.buffer).ok().filter(|_| stamp.pool == self.pool);
         let current = index.filter(|index| self.writes.get(*index) == Some(&stamp.generation));
         let buffer = current.map_or_else(|| self.take_record(), |index| Buffer { index, current: true });
+        self.writes[buffer.index] = UNFINISHED;
         layout.forget_frames(batch);
         // If this process ends during the write, the stamp must be gone before the first pixel has changed.
         fence(Ordering::SeqCst);
@@ -63,7 +68,7 @@ impl Buffers {
     fn take_record(&mut self) -> Buffer {
         let oldest = (0..self.writes.len()).min_by_key(|index| self.writes[*index]);
         let index = oldest.filter(|_| self.writes.len() == MAX_BUFFERS).unwrap_or_else(|| {
-            self.writes.push(0);
+            self.writes.push(UNFINISHED);
             self.writes.len() - 1
         });
         Buffer { index, current: false }
@@ -109,7 +114,7 @@ mod tests {
         assert!(write(&mut buffers, &layout, &mut batch).current);
         assert!(!write(&mut buffers, &layout, &mut copy).current, "the record is of the original's second write");
         let mut later = batch.clone();
-        assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is as good");
+        assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is current");
         assert!(!write(&mut buffers, &layout, &mut batch).current, "but only one of the two");
     }
 
@@ -120,6 +125,27 @@ mod tests {
         write(&mut buffers, &layout, &mut batch);
         assert!(buffers.begin(&layout, &mut batch).current);
         assert!(!write(&mut buffers, &layout, &mut batch).current);
+    }
+
+    #[test]
+    fn a_copy_of_a_buffer_whose_write_was_not_finished_is_not_current() {
+        let (mut buffers, layout) = (Buffers::new(1), layout());
+        let mut batch = zeroed(layout.blocks());
+        write(&mut buffers, &layout, &mut batch);
+        let mut copy = batch.clone();
+        assert!(buffers.begin(&layout, &mut batch).current);
+        assert!(!write(&mut buffers, &layout, &mut copy).current);
+    }
+
+    #[test]
+    fn a_buffer_whose_record_was_taken_by_an_unfinished_write_is_not_current() {
+        let (mut buffers, layout) = (Buffers::new(1), layout());
+        let mut batches = vec![zeroed(layout.blocks()); MAX_BUFFERS + 1];
+        let (taker, recorded) = batches.split_last_mut().unwrap();
+        recorded.iter_mut().for_each(|batch| assert!(!write(&mut buffers, &layout, batch).current));
+        assert_eq!(buffers.begin(&layout, taker), Buffer { index: 0, current: false });
+        assert_eq!(write(&mut buffers, &layout, &mut recorded[0]), Buffer { index: 0, current: false });
+        assert!(write(&mut buffers, &layout, &mut recorded[1]).current);
     }
 
     #[test]

@@ -1,16 +1,17 @@
-//! What a pool is made of, and what a reset is asked for.
+//! Configuration of a pool, and reset requests.
 
 use serde_json::{Map, Value as Json};
 
 use super::autoreset::Autoreset;
 use super::error::PoolError;
-use super::seeding::Seeding;
-use crate::batch::{Contents, Frames, MAX_ENVS, MAX_STACK};
+use super::seeding::{MAX_TOTAL_ENVS, Seeding};
+use crate::batch::limits::MAX_ENVS;
+use crate::batch::{Contents, Frames, MAX_STACK};
 
 /// Reset parameters by the original's names, as a JSON object.
 pub type OptionMap = Map<String, Json>;
 
-/// Reset parameters of a pool's environments. Parameters that are not given have the original's defaults.
+/// Reset parameters of a pool's environments. Omitted parameters have the original's defaults.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ResetOptions {
     /// The same for all environments.
@@ -25,7 +26,7 @@ impl Default for ResetOptions {
     }
 }
 
-/// What a pool is made of.
+/// Configuration of a pool.
 #[derive(Clone, Debug)]
 pub struct PoolConfig {
     /// Environment id, such as `MortarMayhem-v0`.
@@ -41,16 +42,16 @@ pub struct PoolConfig {
     pub final_observation: bool,
     /// Source of the episodes' seeds.
     pub seeding: Seeding,
-    /// Format of the frames; `None` leaves them out, and nothing is drawn.
+    /// Format of the frames; `None` omits them, and nothing is drawn.
     pub frames: Option<Frames>,
     /// Whether the batch has the feature observation.
     pub features: bool,
     /// Whether every frame is drawn a second time, in full, and compared; a difference is [`PoolError::WrongFrame`]. For tests.
     pub check_drawing: bool,
     /// Number of this pool's first environment among all environments, for [`seeding`](Self::seeding) and [`ResetRequest::Seed`]:
-    /// an engine that serves several groups numbers its environments through.
+    /// an engine that serves several groups numbers the environments of all groups consecutively.
     pub first_env: usize,
-    /// Number of environments in all pools together, for [`seeding`](Self::seeding): at least `first_env + num_envs`.
+    /// Number of environments in all pools together, for [`seeding`](Self::seeding): `first_env + num_envs` to 2^32 - 1.
     pub total_envs: usize,
 }
 
@@ -84,7 +85,7 @@ impl PoolConfig {
             return Err(PoolError::Stack { given });
         }
         let end = self.first_env.checked_add(self.num_envs);
-        if end.is_none_or(|end| end > self.total_envs) {
+        if end.is_none_or(|end| end > self.total_envs) || self.total_envs > MAX_TOTAL_ENVS {
             let PoolConfig { first_env, num_envs, total_envs, .. } = *self;
             return Err(PoolError::EnvNumbers { first_env, num_envs, total_envs });
         }
@@ -110,14 +111,14 @@ impl PoolConfig {
 /// Which environments start an episode.
 #[derive(Clone, Copy, Debug)]
 pub enum ResetRequest<'a> {
-    /// All, each with the seed that [`Seeding`] gives it.
+    /// All, each with the next seed of [`Seeding`].
     All,
     /// All; environment `i` of the pool is seeded with `seed + first_env + i` (wrapping), where `first_env` is
     /// [`PoolConfig::first_env`].
     Seed(u64),
-    /// Each environment as its own flag says.
+    /// Per environment, by `reset`.
     Each {
-        /// For each environment: 0 leaves it alone, 1 starts an episode with the seed that [`Seeding`] gives it, 2 starts one with
+        /// For each environment: 0 does not reset it, 1 starts an episode with the next seed of [`Seeding`], 2 starts one with
         /// its item of `seed`. Other values count as 2.
         reset: &'a [u8],
         /// For each environment a seed, which is used where `reset` is 2.

@@ -4,7 +4,8 @@ use std::sync::{Mutex, PoisonError};
 
 use super::drawn_scene::{DrawnScene, WrongFrame};
 use super::env_slot::EnvSlot;
-use super::threads::{Threads, lock};
+use super::lock::lock;
+use super::threads::Threads;
 use crate::batch::BatchMut;
 use crate::envs::Environment;
 

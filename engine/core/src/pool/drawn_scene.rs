@@ -126,6 +126,6 @@ pub struct WrongFrame {
     pub found: u8,
     /// The scene that the frame showed before, or `unknown`, in the notation of `Debug`.
     pub before: String,
-    /// The scene that the frame is to show, likewise.
+    /// The scene that the frame should show, in the notation of `Debug`.
     pub scene: String,
 }

@@ -3,7 +3,9 @@
 use thiserror::Error;
 
 use super::drawn_scene::WrongFrame;
-use crate::batch::{BLOCK_BYTES, LayoutError, MAX_ENVS, MAX_STACK};
+use super::seeding::MAX_TOTAL_ENVS;
+use crate::batch::limits::MAX_ENVS;
+use crate::batch::{BLOCK_BYTES, LayoutError, MAX_STACK};
 use crate::envs::view::VIEW_BYTES;
 use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
 use crate::random::EntropyError;
@@ -44,8 +46,10 @@ pub enum PoolError {
         /// The number that was given.
         given: usize,
     },
-    /// The pool's environments are not among all environments.
-    #[error("first_env + num_envs must be at most total_envs, got {first_env} + {num_envs} and {total_envs}")]
+    /// The pool's environments are not among all environments, or those are too many.
+    #[error(
+        "total_envs must be first_env + num_envs to {MAX_TOTAL_ENVS}, got {total_envs} with first_env {first_env} and num_envs {num_envs}"
+    )]
     EnvNumbers {
         /// Number of the pool's first environment.
         first_env: usize,
@@ -83,7 +87,7 @@ pub enum PoolError {
         source: std::io::Error,
     },
     /// A call that needs running episodes came before the first reset of all environments.
-    #[error("the environments must be reset once before the first step")]
+    #[error("all environments must be reset before any other call")]
     NotReset,
     /// Actions of a wrong number or out of range.
     #[error(transparent)]

@@ -1,7 +1,7 @@
 //! Many environments of one id, stepped in lockstep by the calling thread and worker threads.
 //!
-//! [`Pool`] owns the environments and writes batches, [`PoolConfig`] says what it is made of, and [`Threads`] are the threads that
-//! it may use.
+//! [`Pool`] owns the environments and writes batches, [`PoolConfig`] configures it, and [`Threads`] are the threads that it may
+//! use.
 
 mod autoreset;
 mod buffers;
@@ -12,13 +12,14 @@ mod env_slot;
 mod error;
 mod family_slots;
 mod frame_stack;
+mod lock;
 #[expect(clippy::module_inception, reason = "the file of the type `Pool`")]
 mod pool;
 mod seeding;
 mod snapshot;
 mod threads;
 
-pub use crate::batch::MAX_ENVS;
+pub use crate::batch::limits::MAX_ENVS;
 pub use autoreset::{Autoreset, UnknownAutoreset};
 pub use config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 pub use drawn_scene::WrongFrame;

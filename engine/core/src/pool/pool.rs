@@ -19,8 +19,8 @@ use crate::raster::PixelFormat;
 
 /// Environments of one id in lockstep.
 ///
-/// Every call that advances the environments writes a batch, whose memory the caller gives: [`Layout::blocks`] blocks. The same
-/// memory may be given again, also after others, in which case only changed pixels are written.
+/// Every call that advances the environments writes a batch, [`Layout::blocks`] blocks, into memory of the caller; if a buffer is
+/// reused, only changed pixels are written.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
@@ -193,7 +193,7 @@ impl Pool {
     ///
     /// # Errors
     ///
-    /// [`SnapshotError::NoSuchEnvironment`] or [`SnapshotError::NotReset`].
+    /// [`SnapshotError::NoSuchEnv`] or [`SnapshotError::NotReset`].
     ///
     /// ```
     /// # use endless_gym_core::batch::{Batch, zeroed};
@@ -225,16 +225,16 @@ impl Pool {
     ///
     /// # Errors
     ///
-    /// [`SnapshotError`] if there is no such environment or if `snapshot` is not a valid one of this environment id. The
-    /// environment has not changed then.
+    /// [`SnapshotError`] if there is no such environment, if the environments were not reset yet, or if `snapshot` is not a valid
+    /// one of this environment id. The environment has not changed then.
     pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
         self.check_env(env)?;
-        self.slots.restore(env, snapshot)
+        if self.was_reset { self.slots.restore(env, snapshot) } else { Err(SnapshotError::NotReset) }
     }
 
     fn check_env(&self, env: usize) -> Result<(), SnapshotError> {
         let num_envs = self.layout.num_envs();
-        if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnvironment { given: env, num_envs }) }
+        if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnv { given: env, num_envs }) }
     }
 
     /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,

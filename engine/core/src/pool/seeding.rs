@@ -6,6 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::random::{EntropyError, Generator, SeedSequence, entropy};
 
+/// Maximum number of environments in all pools together: the number of an environment is one word of a spawn key.
+pub(super) const MAX_TOTAL_ENVS: usize = u32::MAX as usize;
+
 /// The source of the episodes' seeds. Environments are numbered over all groups of an engine, so that results depend neither on
 /// the number of threads nor on the division into groups.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -37,8 +40,8 @@ impl Seeding {
     }
 }
 
-/// The randomness of a pool that no seed fixes. One draw of the system's entropy serves all environments: each gets a stream
-/// of its own by a spawn key, as with numpy's `SeedSequence.spawn`.
+/// Entropy for unseeded pools. One draw of the system's entropy serves all environments: each gets its own
+/// stream by a spawn key, as with numpy's `SeedSequence.spawn`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Unseeded(SeedSequence);
 
@@ -62,7 +65,7 @@ impl Unseeded {
         Generator::from_seed_sequence(&self.0.with_spawn_key(&[env as u32, 1]))
     }
 
-    /// A number that no other pool has, neither of this process nor, where there is entropy, of another.
+    /// A number that differs from those of all other pools of this process and, with entropy, of other processes.
     pub(super) fn identity(self) -> u64 {
         static POOLS: AtomicU32 = AtomicU32::new(0);
         let number = POOLS.fetch_add(1, Ordering::Relaxed);

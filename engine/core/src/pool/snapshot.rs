@@ -70,14 +70,14 @@ impl<S: DeserializeOwned> Saved<S> {
 pub enum SnapshotError {
     /// The pool has no environment of that number.
     #[error("env must be 0 to {}, got {given}", num_envs - 1)]
-    NoSuchEnvironment {
+    NoSuchEnv {
         /// The number that was given.
         given: usize,
         /// Number of environments in the pool.
         num_envs: usize,
     },
     /// The environments have no state before their first reset.
-    #[error("the environments must be reset once before a snapshot is taken")]
+    #[error("all environments must be reset before a snapshot is taken or restored")]
     NotReset,
     /// The bytes are too few, or do not start with `EGYM`.
     #[error("the bytes are not a snapshot")]

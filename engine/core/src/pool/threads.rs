@@ -1,10 +1,8 @@
 //! How many threads step a pool's environments.
 
 #[cfg(feature = "threads")]
-#[allow(unsafe_code)] // The only room of the crate that needs it: see its SAFETY comment.
+#[allow(unsafe_code)] // The crate's only module with unsafe code: see its SAFETY comment.
 mod workers;
-
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::error::PoolError;
 
@@ -19,7 +17,7 @@ pub struct Threads {
 
 #[cfg(feature = "threads")]
 impl Threads {
-    /// `count` threads, the calling one included; 0 stands for one for each core.
+    /// `count` threads, the calling one included; 0 means one for each core.
     ///
     /// # Errors
     ///
@@ -70,9 +68,4 @@ impl Threads {
     pub(super) fn run(&self, _helpers: usize, work: &(dyn Fn(usize) + Sync)) {
         work(0);
     }
-}
-
-/// Locks a mutex that a panic may have poisoned: nothing is done under these locks that could leave their data half written.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

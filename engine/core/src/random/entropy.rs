@@ -4,12 +4,12 @@ use thiserror::Error;
 
 /// 128 bits of the operating system's entropy, what numpy draws for `SeedSequence()`.
 ///
-/// The bits come straight from the system: a generator kept by the process would repeat itself in the children of a fork, which
-/// is how Python starts parallel environments.
+/// The bits are read from the system on every call: a process-wide generator would repeat its output in the child of a fork,
+/// which is how Python starts parallel environments.
 ///
 /// # Errors
 ///
-/// If the system has no entropy to give, and always in builds without the feature `entropy`.
+/// If the system call fails, and always in builds without the feature `entropy`.
 pub fn entropy() -> Result<u128, EntropyError> {
     #[cfg(feature = "entropy")]
     {

@@ -48,7 +48,7 @@ impl Generator {
     }
 
     /// An unseeded generator, `Generator(PCG64())`: from 128 bits of the operating system's
-    /// [`entropy`], as Gymnasium takes where a reset brings no seed.
+    /// [`entropy`], as Gymnasium takes for a reset without a seed.
     ///
     /// # Errors
     ///
@@ -149,7 +149,7 @@ impl Generator {
         (product >> 64) as u64
     }
 
-    /// A 32-bit draw: each step of the bit generator serves two, the low half first.
+    /// A 32-bit draw: one 64-bit output yields two 32-bit draws, the low half first.
     #[inline]
     fn next_u32(&mut self) -> u32 {
         self.kept.take().unwrap_or_else(|| {
@@ -170,7 +170,7 @@ struct UncheckedGenerator {
 impl TryFrom<UncheckedGenerator> for Generator {
     type Error = &'static str;
 
-    /// Refuses an even increment. It shortens the period, down to a generator that only gives zeros, on which the rejection
+    /// Refuses an even increment. It shortens the period, down to a generator that only returns zeros, on which the rejection
     /// sampling of [`Generator::integers`] does not end.
     fn try_from(unchecked: UncheckedGenerator) -> Result<Self, Self::Error> {
         let UncheckedGenerator { bits, kept } = unchecked;

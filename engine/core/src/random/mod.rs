@@ -3,6 +3,11 @@
 //! The original environments use `numpy.random.Generator(PCG64(SeedSequence(seed)))`, the generator
 //! of Gymnasium's `np_random(seed)`. The same seed must give the same episodes here, so the draws
 //! equal those of numpy 1.26 and 2.x, which agree, including the number of bits that each consumes.
+//!
+//! # Stability
+//!
+//! [`EntropyError`] is part of the crate's interface. All else is public for the benchmarks and for
+//! [`Environment`](crate::envs::Environment), and may change in any version.
 
 mod entropy;
 mod generator;
@@ -121,9 +126,9 @@ mod tests {
     }
 
     #[test]
-    fn a_saved_generator_goes_on_where_it_was() {
+    fn a_saved_generator_continues_its_draws() {
         let mut rng = Generator::from_seed(11);
-        // One 32-bit draw leaves the other half of its word waiting.
+        // One 32-bit draw buffers the high half of the word.
         rng.integers(0, 10);
         let saved = serde_json::to_string(&rng).unwrap();
         let mut restored: Generator = serde_json::from_str(&saved).unwrap();
@@ -135,7 +140,6 @@ mod tests {
         assert_eq!(format!("{restored:?}"), format!("{rng:?}"));
     }
 
-    #[cfg(feature = "entropy")]
     #[test]
     fn an_even_increment_is_refused() {
         let text = |increment: u128| format!(r#"{{"bits":{{"state":5,"increment":{increment}}},"kept":null}}"#);
@@ -149,6 +153,7 @@ mod tests {
         }
     }
 
+    #[cfg(feature = "entropy")]
     #[test]
     fn unseeded_generators_differ() {
         assert_ne!(Generator::from_entropy().unwrap(), Generator::from_entropy().unwrap());
@@ -168,7 +173,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "index out of bounds")]
-    fn nothing_to_choose_from() {
+    fn a_choice_from_nothing_panics() {
         Generator::from_seed(0).choice::<u8>(&[]);
     }
 

@@ -50,7 +50,7 @@ impl SeedSequence {
 
     /// `SeedSequence(entropy)` for entropy of any size, given as its 32-bit words, least
     /// significant first. It equals numpy's for a list of such words as well, and an empty slice
-    /// counts as 0.
+    /// is equivalent to 0.
     pub fn from_words(entropy: &[u32]) -> Self {
         let mut hash = ABSORB;
         let mut pool: [u32; POOL_SIZE] = array::from_fn(|index| hash.next(entropy.get(index).copied().unwrap_or(0)));

@@ -36,12 +36,12 @@ impl PixelFormat {
     }
 
     /// Whether a [`Canvas`](super::Canvas) can be laid over a frame in this format.
-    pub fn is_canvas(self) -> bool {
+    pub(crate) fn is_canvas(self) -> bool {
         !self.row_major && !self.grayscale && !self.channels_first
     }
 
     /// The pixel (x, y) that a byte of a frame belongs to.
-    pub fn pixel_of(self, byte: usize, width: usize, height: usize) -> (usize, usize) {
+    pub(crate) fn pixel_of(self, byte: usize, width: usize, height: usize) -> (usize, usize) {
         let pixel = match self {
             PixelFormat { grayscale: true, .. } => byte,
             PixelFormat { channels_first: true, .. } => byte % (width * height),

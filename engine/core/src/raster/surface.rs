@@ -86,7 +86,7 @@ impl Surface {
     /// Sets or removes the colour key.
     pub fn set_color_key(&mut self, color_key: Option<Rgb>) {
         self.color_key = color_key;
-        // pygame drops the encoding whenever it sets a key, but not when it takes one away.
+        // pygame drops the encoding whenever it sets a key, but not when it removes one.
         self.run_length_encoded &= color_key.is_none();
     }
 

@@ -120,7 +120,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
     Ok(replay)
 }
 
-/// The info dictionary as the original gives it.
+/// The info dictionary in the original's form.
 fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static str, Vec<f64>)> {
     let batch = Batch::new(pool.layout(), blocks);
     let mut info = Vec::new();

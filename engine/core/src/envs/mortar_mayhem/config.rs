@@ -7,7 +7,7 @@ use crate::envs::screen::SCREEN;
 /// Side of a tile in pixels.
 pub const TILE: i32 = 14;
 
-/// Everything that the rules need beside the state.
+/// Everything that the rules need in addition to the state.
 #[derive(Clone, Debug)]
 pub struct Config {
     /// The variant of the rules.

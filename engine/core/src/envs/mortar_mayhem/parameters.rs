@@ -30,9 +30,9 @@ pub struct Parameters {
     pub command_count: Vec<i64>,
     /// Commands at the start of an episode of the endless id.
     pub initial_command_count: usize,
-    /// Steps that one command is shown, to draw from; empty if the commands are given.
+    /// Steps that one command is shown, to draw from; empty if the commands are provided as a vector.
     pub command_show_duration: Vec<i64>,
-    /// Steps between two shown commands, to draw from; empty if the commands are given.
+    /// Steps between two shown commands, to draw from; empty if the commands are provided as a vector.
     pub command_show_delay: Vec<i64>,
     /// Steps that the tiles burn, to draw from; 1 to 1000.
     pub explosion_duration: Vec<i64>,

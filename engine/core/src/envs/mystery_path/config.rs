@@ -11,7 +11,7 @@ pub const TILE: i32 = SCREEN as i32 / GRID;
 /// Largest number of tiles to the left of the endless agent that are on the screen.
 const MAX_CAMERA_OFFSET: f64 = 5.5;
 
-/// Everything that the rules need beside the state.
+/// Everything that the rules need in addition to the state.
 #[derive(Clone, Debug)]
 pub struct Config {
     /// The variant of the rules.

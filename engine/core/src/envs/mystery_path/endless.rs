@@ -26,7 +26,7 @@ pub enum Direction {
     Down,
 }
 
-/// State of the endless id beside what it shares with the finite ids. In the finite ids it keeps its default, a screen
+/// State of the endless id in addition to what it shares with the finite ids. In the finite ids it keeps its default, a screen
 /// that does not scroll.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EndlessState {

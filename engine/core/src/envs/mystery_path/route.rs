@@ -19,7 +19,7 @@ struct Segment {
     first: usize,
     /// Tiles that the agent has visited in the episode. The route's first tile always counts as visited.
     seen: TileSet,
-    /// Tiles that the agent has visited since its last fall, likewise.
+    /// Tiles that the agent has visited since its last fall; before the first fall, the route's first tile too.
     seen_since_fall: TileSet,
 }
 

@@ -13,7 +13,7 @@ pub const HEALTH_WIDTH: usize = SCREEN / 2;
 /// Bound of all coordinates in pixels.
 pub const MAX_COORDINATE: u32 = 1 << 13;
 
-/// Everything that the rules need beside the state.
+/// Everything that the rules need in addition to the state.
 #[derive(Clone, Debug)]
 pub struct Config {
     /// The variant of the rules.
