@@ -65,7 +65,7 @@ class Original:
         print(json.dumps(asked), file=self._process.stdin, flush=True)
         answer = self._process.stdout.readline()
         if not answer:
-            sys.exit(f"the process of the original ended during {asked}; its command was {self._process.args}")
+            sys.exit(f"the process of the original ended during {asked}; its command was {self._process.args!r}")
         return float(answer)
 
     def best(self, kind: str, id: str, seconds: float) -> int:
