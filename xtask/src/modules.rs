@@ -1,8 +1,8 @@
 //! Import cycles: a file of the crates under `engine/` imports only files that do not, directly or through others, import it.
 //!
 //! A file is a node. A path that begins with `crate`, `self`, `super` or a child module is an edge to the deepest file that it
-//! names. A folder's `mod.rs` is a node too, so files of a folder import each other by name and not through it. The root of
-//! a crate may call its modules (`list::run()`) although they use its items; only its imports are edges. Tests are ignored.
+//! names. A folder's `mod.rs` is a node too, so files of a folder import each other by name and not through it.
+//! Tests are ignored.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -52,9 +52,9 @@ fn collect(folder: &Path, module: &[String], files: &mut BTreeMap<Module, syn::F
 
 /// The modules that a file's paths name.
 fn imports_of(module: &Module, file: &syn::File, modules: &BTreeSet<Module>) -> BTreeSet<Module> {
-    let mut paths = Paths { found: Vec::new(), is_root: module.is_empty() };
+    let mut paths = Paths::default();
     paths.visit_file(file);
-    paths.found.iter().filter_map(|path| resolve(module, path, modules)).filter(|target| target != module).collect()
+    paths.0.iter().filter_map(|path| resolve(module, path, modules)).filter(|target| target != module).collect()
 }
 
 /// The deepest module that a path names, if it is one of this crate.
@@ -108,19 +108,17 @@ fn show(module: &Module) -> String {
 }
 
 /// Collects the paths of a file's imports and expressions, without those of tests.
-struct Paths {
-    found: Vec<Vec<String>>,
-    is_root: bool,
-}
+#[derive(Default)]
+struct Paths(Vec<Vec<String>>);
 
 impl Paths {
     fn add_tree(&mut self, prefix: &[String], tree: &syn::UseTree) {
         let with = |name: &syn::Ident| [prefix, &[name.to_string()]].concat();
         match tree {
             syn::UseTree::Path(path) => self.add_tree(&with(&path.ident), &path.tree),
-            syn::UseTree::Name(name) => self.found.push(with(&name.ident)),
-            syn::UseTree::Rename(name) => self.found.push(with(&name.ident)),
-            syn::UseTree::Glob(_) => self.found.push(prefix.to_vec()),
+            syn::UseTree::Name(name) => self.0.push(with(&name.ident)),
+            syn::UseTree::Rename(name) => self.0.push(with(&name.ident)),
+            syn::UseTree::Glob(_) => self.0.push(prefix.to_vec()),
             syn::UseTree::Group(group) => group.items.iter().for_each(|item| self.add_tree(prefix, item)),
         }
     }
@@ -139,9 +137,8 @@ impl Visit<'_> for Paths {
 
     fn visit_path(&mut self, path: &syn::Path) {
         let segments: Vec<String> = path.segments.iter().map(|segment| segment.ident.to_string()).collect();
-        let is_prefixed = ["crate", "self", "super"].contains(&segments[0].as_str());
-        if segments.len() > 1 && (is_prefixed || !self.is_root) {
-            self.found.push(segments);
+        if segments.len() > 1 {
+            self.0.push(segments);
         }
         visit::visit_path(self, path);
     }
@@ -180,12 +177,6 @@ mod tests {
         let files = [("a", "mod x; struct S(x::T, y::U);"), ("a/x", "use super::f;"), ("y", "")];
         assert_eq!(imports(&files)[&module("a")], [module("a/x")].into());
         assert_eq!(in_cycles(&imports(&files)), [(module("a"), module("a/x")), (module("a/x"), module("a"))]);
-    }
-
-    #[test]
-    fn the_root_may_call_its_modules() {
-        let files = [("", "mod a; mod b; use b::X; fn main() { a::run() }"), ("a", "use super::main;"), ("b", "")];
-        assert_eq!(imports(&files)[&module("")], [module("b")].into());
     }
 
     #[test]

@@ -10,10 +10,11 @@ use endless_gym_core::pool::{Pool, ResetRequest, Threads};
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;
+use super::failure::Failure;
 use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
 use super::play::RandomPolicy;
-use super::{Failure, stop};
+use super::stop;
 
 /// The Python script that measures the original.
 const ORIGINAL: &str = include_str!("original.py");

@@ -9,10 +9,11 @@ use endless_gym_core::pool::ResetRequest;
 use serde_json::{Map, Value as Json, json};
 
 use super::engine_process::EngineProcess;
+use super::failure::Failure;
 use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
 use super::play::{EpisodeStatistics, ExpertPolicy, Policy, RandomPolicy};
-use super::{Failure, stop};
+use super::stop;
 
 /// Arguments of `endless demo`.
 #[derive(clap::Args)]

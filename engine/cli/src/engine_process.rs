@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
 
-use super::Failure;
+use super::failure::Failure;
 
 /// Longest time that an engine may take to start.
 const START_TIMEOUT: Duration = Duration::from_secs(30);

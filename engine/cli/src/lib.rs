@@ -3,6 +3,7 @@
 mod bench;
 mod demo;
 mod engine_process;
+mod failure;
 mod list;
 mod options;
 mod output;
@@ -14,6 +15,8 @@ mod verify;
 use std::ffi::OsString;
 
 use clap::{Parser, Subcommand};
+
+use failure::Failure;
 
 /// Memory Gym environments, bit-exact to the original, served in shared memory.
 ///
@@ -42,9 +45,6 @@ enum Command {
     /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
     Verify(verify::Args),
 }
-
-/// The error of a command. The program prints it as one line.
-type Failure = Box<dyn std::error::Error>;
 
 /// Exit status of a command that failed, or that found differences.
 const FAILURE: u8 = 1;

@@ -3,7 +3,7 @@
 use endless_gym_core::envs::{self, EnvSpec, SCREEN};
 use serde_json::json;
 
-use super::Failure;
+use super::failure::Failure;
 use super::output::{print, print_json, table};
 
 /// Arguments of `endless list`.

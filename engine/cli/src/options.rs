@@ -8,7 +8,7 @@ use endless_gym_core::pool::{Autoreset, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::raster::PixelFormat;
 use serde_json::{Map, Value as Json};
 
-use super::Failure;
+use super::failure::Failure;
 
 /// The value of `--autoreset` for a mode: the mode's name with hyphens.
 pub fn autoreset_value(mode: Autoreset) -> String {

@@ -6,7 +6,7 @@ use comfy_table::{ContentArrangement, LineStyle, Table, TableStyle};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
-use super::Failure;
+use super::failure::Failure;
 
 /// Width of tables if standard output is no terminal, in characters.
 const TABLE_WIDTH: u16 = 120;

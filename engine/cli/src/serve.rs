@@ -4,9 +4,10 @@ use endless_gym_core::envs::DEFAULT_ENV_ID;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Threads};
 use endless_gym_service::{Engine, EngineConfig};
 
+use super::failure::Failure;
 use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
 use super::output::{grouped, print};
-use super::{Failure, stop};
+use super::stop;
 
 /// Arguments of `endless serve`.
 #[derive(clap::Args)]

@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::Failure;
+use super::failure::Failure;
 
 /// The flag of the running command. A process has one set of signal handlers, so all commands of a process share it.
 static STOP: AtomicBool = AtomicBool::new(false);

@@ -6,7 +6,7 @@ use endless_gym_core::trace::{Trace, replay};
 use rayon::prelude::*;
 use serde_json::json;
 
-use super::Failure;
+use super::failure::Failure;
 use super::output::{print, print_json, progress};
 
 /// Arguments of `endless verify`.
