@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::Once;
 
+use endless_gym::service::Namespace;
 use rustix::process::{Pid, Signal, kill_process};
 
 /// A namespace of one test: engines of other tests and users are not visible in it.
@@ -27,8 +28,15 @@ impl Root {
     }
 }
 
+/// Removes what a failed test leaves behind: an engine that is killed cannot remove its segments.
 impl Drop for Root {
     fn drop(&mut self) {
+        let prefix = Namespace::at(&self.0).prefix().to_owned();
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&prefix) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
         let _ = std::fs::remove_dir_all(&self.0);
     }
 }
