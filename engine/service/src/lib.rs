@@ -41,8 +41,6 @@
 //! | a request names another incarnation | the engine ignores it |
 //! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |
 
-#![warn(missing_docs)]
-
 mod blackboard;
 mod cleanup;
 mod connect;
