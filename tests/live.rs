@@ -35,7 +35,7 @@ impl Original {
         let python = std::env::var("ENDLESS_ORIGINAL_PYTHON").expect(
             "run `cargo xtask test`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
         );
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/live/original.py");
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/reference/play.py");
         let mut child = Command::new(python)
             .arg(script)
             .stdin(Stdio::piped())
@@ -126,7 +126,7 @@ fn play(spec: &'static EnvSpec, case: &Case) -> Json {
         }
         episodes.push(json!({"seed": seed, "actions": actions}));
     }
-    json!({"env": spec.id, "options": case.options, "render": true, "episodes": episodes})
+    json!({"env": spec.id, "options": case.options, "views": true, "episodes": episodes})
 }
 
 /// Reset parameters of version 1.0.3 that the original from PyPI, 1.0.2, does not know; the traces cover them.

@@ -2,6 +2,11 @@
 
 mod common;
 
+use std::io::Read;
+
+use endless_gym::batch::{Batch, zeroed};
+use endless_gym::envs;
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use endless_gym::trace::{Trace, TraceError, replay};
 
 /// Replays all traces of an id, those with ground-truth views last.
@@ -71,6 +76,94 @@ fn every_kind_of_difference_is_found() {
         let first = replay(&trace).unwrap().first.unwrap_or_else(|| panic!("{what} was not compared"));
         assert_eq!((first.what.as_str(), first.episode), (what, 1), "{first}");
     }
+}
+
+/// A checksum tells that a frame differs; the recorded frames tell where.
+#[test]
+fn the_first_frames_are_the_same_byte_by_byte() {
+    for spec in envs::specs() {
+        let trace = Trace::open(&common::reference().join(format!("traces/{}.04.mixed20.json.gz", spec.id))).unwrap();
+        let expected = recorded_frames(spec.id);
+        let found = frames(&trace, expected.len());
+        assert_eq!((expected.len(), found.len()), (40, 40), "{}", spec.id);
+        for (number, (expected, (found, crc))) in expected.iter().zip(&found).enumerate() {
+            assert_eq!(
+                difference(expected, found),
+                None,
+                "{}, frame {number}: [x, y, channel], expected, found",
+                spec.id
+            );
+            assert_eq!(crc32fast::hash(expected), *crc, "{}, frame {number}: the trace's checksum is another", spec.id);
+        }
+    }
+}
+
+/// The traces alone cover these reset parameters: the published original, with which `tests/live.rs` compares, lacks them.
+#[test]
+fn traces_have_the_newest_reset_parameters() {
+    for (trace, parameter) in [
+        ("Endless-MortarMayhem-v0.05.mixed02", "reward_new_command_success"),
+        ("Endless-MysteryPath-v0.05.mixed02", "reward_path_progress_dense"),
+        ("Endless-SearingSpotlights-v0.13.mixed02", "coin_enabled"),
+    ] {
+        let trace = Trace::open(&common::reference().join(format!("traces/{trace}.json.gz"))).unwrap();
+        assert!(trace.options.contains_key(parameter), "{parameter}: {:?}", trace.options);
+    }
+}
+
+#[test]
+fn a_byte_that_differs_is_found() {
+    let frame = recorded_frames("MysteryPath-v0").remove(0);
+    let mut other = frame.clone();
+    other[(7 * 84 + 30) * 3 + 2] ^= 4;
+    assert_eq!(difference(&frame, &frame), None);
+    let (place, expected, found) = difference(&frame, &other).unwrap();
+    assert_eq!((place, expected ^ found), ([7, 30, 2], 4));
+}
+
+/// The raw frames that were recorded of an id.
+fn recorded_frames(id: &str) -> Vec<Vec<u8>> {
+    let file = std::fs::File::open(common::reference().join(format!("frames/{id}.gz"))).unwrap();
+    let mut bytes = Vec::new();
+    flate2::read::GzDecoder::new(file).read_to_end(&mut bytes).unwrap();
+    let frames = bytes.chunks_exact(84 * 84 * 3);
+    assert!(frames.remainder().is_empty(), "{id}: {} bytes are no whole number of frames", bytes.len());
+    frames.map(<[u8]>::to_vec).collect()
+}
+
+/// The first `count` frames of the engine when it plays a trace, with the checksums of the trace.
+fn frames(trace: &Trace, count: usize) -> Vec<(Vec<u8>, u32)> {
+    let config = PoolConfig {
+        options: ResetOptions::Shared(trace.options.clone()),
+        autoreset: Autoreset::Disabled,
+        ..PoolConfig::new(&trace.env, 1)
+    };
+    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    let mut frames = Vec::new();
+    for episode in &trace.episodes {
+        if frames.len() == count {
+            break;
+        }
+        let request = episode.seed.map_or(ResetRequest::All, ResetRequest::Seed);
+        pool.reset(request, &mut blocks).unwrap();
+        frames.push((Batch::new(pool.layout(), &blocks).observation().to_vec(), episode.reset_crc));
+        for step in &episode.steps {
+            if frames.len() == count {
+                break;
+            }
+            pool.step(&step.action, &mut blocks).unwrap();
+            frames.push((Batch::new(pool.layout(), &blocks).observation().to_vec(), step.crc));
+        }
+    }
+    frames
+}
+
+/// The first byte that differs, as [x, y, channel] and both values.
+fn difference(expected: &[u8], found: &[u8]) -> Option<([usize; 3], u8, u8)> {
+    assert_eq!(expected.len(), found.len());
+    let index = expected.iter().zip(found).position(|(expected, found)| expected != found)?;
+    Some(([index / 3 / 84, index / 3 % 84, index % 3], expected[index], found[index]))
 }
 
 #[test]

@@ -1,28 +1,30 @@
 //! What several test programs need.
 #![allow(dead_code)] // Each test program uses its own part.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use endless_gym::batch::PixelFormat;
 use endless_gym::envs::{EnvSpec, Parameter, ParameterKind};
 use proptest::prelude::*;
 use serde_json::{Map, Value as Json};
 
-/// The recorded traces of an id. There is no test without them: they are expected in `../shared/reference`, or where
-/// `ENDLESS_REFERENCE` says.
+/// The recorded traces of an id.
 pub fn traces(id: &str) -> Vec<PathBuf> {
     traces_in("traces", id)
 }
 
 /// Those that have the checksums of ground-truth views.
 pub fn traces_with_views(id: &str) -> Vec<PathBuf> {
-    traces_in("traces/render", id)
+    traces_in("views", id)
+}
+
+/// The folder of the recordings; its README.md describes them.
+pub fn reference() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference")
 }
 
 fn traces_in(folder: &str, id: &str) -> Vec<PathBuf> {
-    let reference = std::env::var_os("ENDLESS_REFERENCE")
-        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/reference"), PathBuf::from);
-    let folder = reference.join(folder);
+    let folder = reference().join(folder);
     let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
     let mut files: Vec<_> = entries
         .map(|entry| entry.unwrap().path())

@@ -20,8 +20,9 @@ pub fn test() -> Result<(), String> {
             "--config",
             "bindings/python/pyproject.toml",
             "benches",
+            "tests/reference",
         ]);
-        run(&format!("{what}, benches"), &mut benches)
+        run(&format!("{what}, benches and tests/reference"), &mut benches)
     };
     ruff("ruff format", &["format", "--check"])?;
     ruff("ruff check", &["check"])?;
