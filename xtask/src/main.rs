@@ -27,6 +27,7 @@ const TEST: &[&[&str]] = &[
     &["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"],
     &["clippy", "--package", "endless-gym-core", "--no-default-features", "--locked", "--", "--deny", "warnings"],
     &["test", "--workspace", "--locked"],
+    &["test", "--locked", "--test", "live", "--", "--ignored"],
     &["doc", "--workspace", "--no-deps", "--locked"],
 ];
 
@@ -38,7 +39,7 @@ const PROPERTIES: &[&str] = &["test", "--release", "--workspace", "--locked", "-
 const PROPERTY_CASES: &str = "2000";
 
 /// The live comparison alone, optimised, since it is long.
-const LIVE: &[&str] = &["test", "--release", "--locked", "--test", "live", "--", "--nocapture"];
+const LIVE: &[&str] = &["test", "--release", "--locked", "--test", "live", "--", "--ignored", "--nocapture"];
 const LIVE_STEPS: &str = "100000";
 
 fn main() -> ExitCode {
