@@ -199,7 +199,7 @@ class Plan(NamedTuple):
         """What is recorded of it."""
         return [TRACES] if self.options or self.policy == "constant" else [TRACES, VIEWS]
 
-    def record(self, kind: Kind) -> tuple[Options, list[Any]]:
+    def record(self, kind: Kind) -> tuple[dict[str, Any], list[Any]]:
         """Play the episodes. Returns the trace and its frames."""
         original = Original(self.env_id, self.options)
         rng = Random(f"{self.env_id}|{self.policy}|{kind.salt}|{json.dumps(self.options, sort_keys=True)}")
