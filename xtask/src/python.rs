@@ -32,7 +32,7 @@ pub fn test() -> Result<(), String> {
 }
 
 /// Compares steps per second with the original's and, for scale, with EnvPool's own environments where it can be installed.
-pub fn bench(arguments: &[&str]) -> Result<(), String> {
+pub fn bench(arguments: &[String]) -> Result<(), String> {
     let folder = install("release")?;
     let envpool = venv("envpool", original::base()?, &[Install::of(&["envpool==1.2.5"])]);
     let mut script = Command::new(folder.join("bin/python"));

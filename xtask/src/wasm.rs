@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
+use crate::cargo;
 use crate::venv::execute;
 
 const TARGET: &str = "wasm32-unknown-unknown";
@@ -21,9 +22,8 @@ pub fn check() -> Result<(), String> {
 pub fn build() -> Result<(), String> {
     println!("==> cargo build --target {TARGET}");
     let start = Instant::now();
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let arguments = ["build", "--release", "--locked", "--package", "endless-gym-core", "--no-default-features"];
-    execute(Command::new(cargo).args(arguments).args(["--target", TARGET]))?;
+    execute(cargo::command().args(arguments).args(["--target", TARGET]))?;
     println!("    {:.1} s", start.elapsed().as_secs_f64());
     Ok(())
 }
