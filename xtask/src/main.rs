@@ -2,9 +2,13 @@
 
 mod cargo;
 mod instructions;
+mod interpreters;
 mod modules;
 mod original;
 mod python;
+mod requirements;
+mod runner;
+mod stages;
 mod test;
 mod venv;
 mod wasm;
@@ -12,6 +16,8 @@ mod wasm;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+
+use crate::test::Selection;
 
 /// Development tasks of Endless Gym.
 #[derive(Parser)]
@@ -23,10 +29,24 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Task {
-    /// Check formatting, lint, and run all tests, Rust's and Python's.
-    Test,
+    /// Check formatting, lint, and run all tests, Rust's and Python's, in stages side by side.
+    ///
+    /// Prints first what the machine lacks; the stages that require it are not run. The output of a stage is in target/test-logs.
+    Test {
+        /// The stages of every day, some minutes long: without the long tests and what needs further tools.
+        #[arg(long)]
+        quick: bool,
+        /// Run nothing if something is missing; the default where the environment variable CI is `true`.
+        #[arg(long)]
+        all: bool,
+    },
     /// Build the Python package, lint it, and run its tests alone.
     Python,
+    /// Run one stage of the tests.
+    Stage {
+        /// Its name in the report of `cargo xtask test`.
+        name: String,
+    },
     /// Check that the files of a crate do not import each other in cycles.
     Modules,
     /// Build the core for wasm32-unknown-unknown.
@@ -63,8 +83,10 @@ enum Task {
 impl Task {
     fn run(&self) -> Result<(), String> {
         match self {
-            Task::Test => test::run(),
-            Task::Python => python::test(),
+            Task::Test { quick: true, all } => test::run(Selection::Quick, *all),
+            Task::Test { quick: false, all } => test::run(Selection::All, *all),
+            Task::Python => test::run(Selection::Python, false),
+            Task::Stage { name } => (stages::find(name)?.run)(),
             Task::Modules => modules::check(),
             Task::Wasm => wasm::build(),
             Task::Instructions { record } => instructions::run(*record),
