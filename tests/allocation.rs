@@ -69,9 +69,13 @@ fn steps_and_resets_allocate_nothing() {
             };
             // Long enough for every list to have been as long as it gets.
             play(1500);
-            let before = ALLOCATIONS.load(Ordering::Relaxed);
-            play(500);
-            assert_eq!(ALLOCATIONS.load(Ordering::Relaxed) - before, 0, "{}, {autoreset:?}", spec.id);
+            let mut allocations = || {
+                let before = ALLOCATIONS.load(Ordering::Relaxed);
+                play(500);
+                ALLOCATIONS.load(Ordering::Relaxed) - before
+            };
+            // Twice, since the test harness allocates when it says, once, that a test takes long.
+            assert!(allocations() == 0 || allocations() == 0, "{}, {autoreset:?}", spec.id);
         }
     }
 }

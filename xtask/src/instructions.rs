@@ -2,8 +2,8 @@
 
 use std::fmt::Write;
 use std::path::PathBuf;
-use std::process::Command;
 
+use crate::cargo;
 use crate::venv::workspace;
 
 /// Environment steps that `benches/instructions.rs` counts.
@@ -47,9 +47,8 @@ fn budgets_file() -> PathBuf {
 fn count(id: &str) -> Result<u64, String> {
     const VALGRIND: &str =
         "valgrind --tool=callgrind --callgrind-out-file=/dev/null --toggle-collect=instructions::steps";
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let target = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
-    let output = Command::new(cargo)
+    let output = cargo::command()
         .args(["bench", "--locked", "--package", "endless-gym", "--bench", "instructions", "--", id])
         .env(target, VALGRIND)
         .output()

@@ -1,116 +1,109 @@
 //! Development tasks: `cargo xtask test` runs all tests.
 
+mod cargo;
 mod instructions;
+mod interpreters;
 mod modules;
 mod original;
 mod python;
+mod requirements;
+mod runner;
+mod stages;
+mod test;
 mod venv;
 mod wasm;
 
-use std::process::{Command, ExitCode, Stdio};
-use std::time::Instant;
+use std::process::ExitCode;
 
-const HELP: &str = "\
-cargo xtask test                 check formatting, lint, and run all tests, Rust's and Python's
-cargo xtask python               build the Python package, lint it, and run its tests alone
-cargo xtask modules              check that the files of a crate do not import each other in cycles
-cargo xtask wasm                 build the core for wasm32-unknown-unknown
-cargo xtask instructions         count the instructions of a step and compare with the budgets (--record: record new budgets)
-cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help lists ARGS)
-cargo xtask live [STEPS]         compare STEPS steps of each environment with the original, from new seeds (default 100000)
-cargo xtask properties [CASES]   run the property tests with CASES cases each, from new seeds (default 2000)
-cargo xtask original             set up the original in a virtual environment and print the path of its Python";
+use clap::{Parser, Subcommand};
 
-/// What `cargo xtask test` runs, in this order; the first failure ends it.
-const TEST: &[&[&str]] = &[
-    &["fmt", "--all", "--check"],
-    &["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"],
-    &["clippy", "--package", "endless-gym-core", "--no-default-features", "--locked", "--", "--deny", "warnings"],
-    &["test", "--workspace", "--locked"],
-    &["test", "--locked", "--test", "live", "--", "--ignored"],
-    &["doc", "--workspace", "--no-deps", "--locked"],
-];
+use crate::test::Selection;
 
-/// The seed of the property tests in `cargo xtask test`: a failure there is due to a change.
-const PROPERTY_SEED: (&str, &str) = ("PROPTEST_RNG_SEED", "20251122");
+/// Development tasks of Endless Gym.
+#[derive(Parser)]
+#[command(bin_name = "cargo xtask")]
+struct Cli {
+    #[command(subcommand)]
+    task: Task,
+}
 
-/// The property tests alone, optimised, since they are long.
-const PROPERTIES: &[&str] = &["test", "--release", "--workspace", "--locked", "--lib", "--tests"];
-const PROPERTY_CASES: &str = "2000";
+#[derive(Subcommand)]
+enum Task {
+    /// Check formatting, lint, and run all tests, Rust's and Python's, in stages side by side.
+    ///
+    /// Prints first what the machine lacks; the stages that require it are not run. The output of a stage is in target/test-logs.
+    Test {
+        /// The stages of every day, some minutes long: without the long tests and what needs further tools.
+        #[arg(long)]
+        quick: bool,
+        /// Run nothing if something is missing; the default where the environment variable CI is `true`.
+        #[arg(long)]
+        all: bool,
+    },
+    /// Build the Python package, lint it, and run its tests alone.
+    Python,
+    /// Run one stage of the tests.
+    Stage {
+        /// Its name in the report of `cargo xtask test`.
+        name: String,
+    },
+    /// Check that the files of a crate do not import each other in cycles.
+    Modules,
+    /// Build the core for wasm32-unknown-unknown.
+    Wasm,
+    /// Count the instructions of a step and compare with the budgets.
+    Instructions {
+        /// Write the counts as the new budgets.
+        #[arg(long)]
+        record: bool,
+    },
+    /// Compare steps per second with the original's and others'.
+    #[command(disable_help_flag = true)]
+    Bench {
+        /// Arguments of benches/comparison.py; `--help` lists them.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// Compare with the original from new seeds.
+    Live {
+        /// Steps to compare for each environment.
+        #[arg(default_value_t = 100_000)]
+        steps: u64,
+    },
+    /// Run the property tests from new seeds.
+    Properties {
+        /// Cases of each property.
+        #[arg(default_value_t = 2000)]
+        cases: u32,
+    },
+    /// Set up the original in a virtual environment and print the path of its Python.
+    Original,
+}
 
-/// The live comparison alone, optimised, since it is long.
-const LIVE: &[&str] = &["test", "--release", "--locked", "--test", "live", "--", "--ignored", "--nocapture"];
-const LIVE_STEPS: &str = "100000";
+impl Task {
+    fn run(&self) -> Result<(), String> {
+        match self {
+            Task::Test { quick: true, all } => test::run(Selection::Quick, *all),
+            Task::Test { quick: false, all } => test::run(Selection::All, *all),
+            Task::Python => test::run(Selection::Python, false),
+            Task::Stage { name } => (stages::find(name)?.run)(),
+            Task::Modules => modules::check(),
+            Task::Wasm => wasm::build(),
+            Task::Instructions { record } => instructions::run(*record),
+            Task::Bench { arguments } => python::bench(arguments),
+            Task::Live { steps } => cargo::live(*steps),
+            Task::Properties { cases } => cargo::properties(*cases),
+            Task::Original => original::python().map(|python| println!("{}", python.display())),
+        }
+    }
+}
 
 fn main() -> ExitCode {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let done = match arguments[..] {
-        ["test"] => run(TEST, &[PROPERTY_SEED])
-            .and_then(|()| mount_namespaces())
-            .and_then(|()| modules::check())
-            .and_then(|()| wasm::check())
-            .and_then(|()| instructions::run(false))
-            .and_then(|()| python::test())
-            .map(|()| println!("all passed")),
-        ["python"] => python::test(),
-        ["instructions"] => instructions::run(false),
-        ["instructions", "--record"] => instructions::run(true),
-        ["bench", ref arguments @ ..] => python::bench(arguments),
-        ["modules"] => modules::check(),
-        ["wasm"] => wasm::build(),
-        ["properties"] => run(&[PROPERTIES], &[("PROPTEST_CASES", PROPERTY_CASES)]),
-        ["properties", cases] => run(&[PROPERTIES], &[("PROPTEST_CASES", cases)]),
-        ["live"] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", LIVE_STEPS)]),
-        ["live", steps] => run(&[LIVE], &[("ENDLESS_LIVE_STEPS", steps)]),
-        ["original"] => original::python().map(|python| println!("{}", python.display())),
-        [] | ["help" | "--help" | "-h"] => {
-            println!("{HELP}");
-            Ok(())
-        }
-        _ => Err(format!("unknown task `{}`; the tasks are\n{HELP}", arguments.join(" "))),
-    };
-    match done {
+    match Cli::parse().task.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(message) => {
             eprintln!("xtask: {message}");
             ExitCode::FAILURE
         }
     }
-}
-
-/// Runs the test that needs a mount namespace of its own where the system permits it, and otherwise says that it was not run.
-fn mount_namespaces() -> Result<(), String> {
-    const NAME: &str = "too_little_shared_memory_is_an_error_and_not_a_signal";
-    let mut probe = Command::new("unshare");
-    probe.args(["--mount", "--map-root-user", "mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]).stderr(Stdio::null());
-    if probe.status().is_ok_and(|status| status.success()) {
-        return run(&[&["test", "--locked", "--test", "service", "--", "--ignored", "--exact", NAME]], &[]);
-    }
-    println!("==> not run: {NAME}, since this system refuses mount namespaces");
-    Ok(())
-}
-
-/// Runs cargo with each of the argument lists. `ENDLESS_ORIGINAL_PYTHON` names a Python with the original environments.
-fn run(commands: &[&[&str]], variables: &[(&str, &str)]) -> Result<(), String> {
-    let python = original::python()?;
-    for arguments in commands {
-        let line = format!("cargo {}", arguments.join(" "));
-        println!("==> {line}");
-        let start = Instant::now();
-        // The cargo that runs this, so that toolchain and settings are the same.
-        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let status = Command::new(cargo)
-            .args(*arguments)
-            .env("RUSTDOCFLAGS", "--deny warnings")
-            .env("ENDLESS_ORIGINAL_PYTHON", &python)
-            .envs(variables.iter().copied())
-            .status()
-            .map_err(|error| format!("`{line}` cannot be run: {error}"))?;
-        if !status.success() {
-            return Err(format!("`{line}` failed: {status}"));
-        }
-        println!("    {:.1} s", start.elapsed().as_secs_f64());
-    }
-    Ok(())
 }

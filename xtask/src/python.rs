@@ -2,40 +2,46 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Instant;
 
-use crate::original;
+use crate::requirements::Requirement;
 use crate::venv::{Install, execute, target, venv, workspace};
+use crate::{interpreters, original};
 
-/// Lints, checks types, and runs the tests.
-pub fn test() -> Result<(), String> {
-    let package = package();
-    // The profile of the tests, whose dependencies have been built.
-    let folder = install("dev")?;
-    let ruff = |what: &str, arguments: &[&str]| {
-        let program = folder.join("bin/ruff");
-        run(what, Command::new(&program).current_dir(&package).args(arguments))?;
-        let mut benches = Command::new(&program);
-        benches.current_dir(workspace()).args(arguments).args([
-            "--config",
-            "bindings/python/pyproject.toml",
-            "benches",
-            "tests/reference",
-        ]);
-        run(&format!("{what}, benches and tests/reference"), &mut benches)
-    };
-    ruff("ruff format", &["format", "--check"])?;
-    ruff("ruff check", &["check"])?;
-    run("mypy", Command::new(folder.join("bin/mypy")).current_dir(&package))?;
-    let mut pytest = Command::new(folder.join("bin/pytest"));
-    pytest.args(["-q", "--timeout", "300"]).current_dir(&package);
-    run("pytest", pytest.env("ENDLESS_ORIGINAL_PYTHON", original::python()?))
+/// The folder of the virtual environment with what the tests need; creates it if it does not exist.
+pub fn environment() -> Result<PathBuf, String> {
+    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
+    venv("python", &base, &[Install::of_file("requirements-test.txt")?, pufferlib()?])
+}
+
+/// Checks the format of the Python files and lints them.
+pub fn ruff() -> Result<(), String> {
+    let program = environment()?.join("bin/ruff");
+    for arguments in [["format", "--check"].as_slice(), &["check"]] {
+        execute(Command::new(&program).current_dir(package()).args(arguments))?;
+        let others = ["--config", "bindings/python/pyproject.toml", "benches", "tests/reference"];
+        execute(Command::new(&program).current_dir(workspace()).args(arguments).args(others))?;
+    }
+    Ok(())
+}
+
+/// Checks the types of the package.
+pub fn mypy() -> Result<(), String> {
+    execute(Command::new(environment()?.join("bin/python")).args(["-m", "mypy"]).current_dir(package()))
+}
+
+/// Runs the tests that a marker expression selects, with the package that [`install`] installed.
+pub fn pytest(markers: &str) -> Result<(), String> {
+    let mut pytest = Command::new(environment()?.join("bin/pytest"));
+    pytest.args(["-q", "--timeout", "300", "--durations", "30", "-m", markers]).current_dir(package());
+    execute(pytest.env("ENDLESS_ORIGINAL_PYTHON", original::path()?))
 }
 
 /// Compares steps per second with the original's and, for scale, with EnvPool's own environments where it can be installed.
-pub fn bench(arguments: &[&str]) -> Result<(), String> {
-    let folder = install("release")?;
-    let envpool = venv("envpool", original::base()?, &[Install::of(&["envpool==1.2.5"])]);
+pub fn bench(arguments: &[String]) -> Result<(), String> {
+    install("release")?;
+    let folder = environment()?;
+    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
+    let envpool = venv("envpool", &base, &[Install::of(&["envpool==1.2.5"])]);
     let mut script = Command::new(folder.join("bin/python"));
     script.arg(workspace().join("benches/comparison.py"));
     script.arg("--original").arg(original::python()?).args(arguments);
@@ -43,26 +49,25 @@ pub fn bench(arguments: &[&str]) -> Result<(), String> {
         Ok(folder) => drop(script.arg("--envpool").arg(folder.join("bin/python"))),
         Err(message) => eprintln!("without EnvPool: {message}"),
     }
-    run("benches/comparison.py", &mut script)
+    execute(&mut script)
 }
 
 fn package() -> PathBuf {
     workspace().join("bindings/python")
 }
 
-/// Builds the wheel and installs it into a virtual environment with the test tools. Returns the environment's folder.
-fn install(profile: &str) -> Result<PathBuf, String> {
-    let folder = venv("python", original::base()?, &[Install::of_file("requirements-test.txt")?, pufferlib()?])?;
+/// Builds the wheel in a profile of cargo and installs it into the virtual environment.
+pub fn install(profile: &str) -> Result<(), String> {
+    let folder = environment()?;
     let wheels = target()?.join("wheels");
     let _ = std::fs::remove_dir_all(&wheels);
     let mut maturin = Command::new(folder.join("bin/maturin"));
     maturin.args(["build", "--locked", "--profile", profile, "--interpreter"]).arg(folder.join("bin/python"));
     maturin.arg("--manifest-path").arg(package().join("Cargo.toml")).arg("--out").arg(&wheels);
-    run("maturin build", &mut maturin)?;
+    execute(&mut maturin)?;
     let wheel = only_file(&wheels)?;
     let install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--force-reinstall", "--no-deps"];
-    run("pip install", Command::new(folder.join("bin/python")).args(install).arg(wheel))?;
-    Ok(folder)
+    execute(Command::new(folder.join("bin/python")).args(install).arg(wheel))
 }
 
 fn only_file(folder: &Path) -> Result<PathBuf, String> {
@@ -77,12 +82,4 @@ fn pufferlib() -> Result<Install, String> {
     let path = workspace().join("xtask/pufferlib").display().to_string();
     install.environment = vec![("NO_OCEAN", "1".to_owned()), ("NO_TRAIN", "1".to_owned()), ("PYTHONPATH", path)];
     Ok(install)
-}
-
-fn run(what: &str, command: &mut Command) -> Result<(), String> {
-    println!("==> {what}");
-    let start = Instant::now();
-    execute(command)?;
-    println!("    {:.1} s", start.elapsed().as_secs_f64());
-    Ok(())
 }

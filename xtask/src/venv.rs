@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::interpreters::Interpreter;
+
 /// The root of the workspace.
 pub fn workspace() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
@@ -36,17 +38,23 @@ impl Install {
     }
 }
 
+/// The folder of the virtual environment `name`, whether or not it exists.
+pub fn folder(name: &str) -> Result<PathBuf, String> {
+    Ok(target()?.join("venvs").join(name))
+}
+
 /// The folder of the virtual environment `name`, created from the Python `base` with the packages of `installs`, in that order. An
 /// existing one with the same packages is reused.
-pub fn venv(name: &str, base: &str, installs: &[Install]) -> Result<PathBuf, String> {
-    let folder = target()?.join("venvs").join(name);
+pub fn venv(name: &str, base: &Interpreter, installs: &[Install]) -> Result<PathBuf, String> {
+    let folder = folder(name)?;
     let stamp = folder.join("packages");
     let wanted = format!("{installs:#?}");
-    if std::fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) {
+    // Its Python is a link to one that may have been removed.
+    if std::fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) && folder.join("bin/python").exists() {
         return Ok(folder);
     }
     eprintln!("==> virtual environment {}", folder.display());
-    execute(Command::new(base).args(["-m", "venv", "--clear"]).arg(&folder))?;
+    execute(Command::new(&base.path).args(["-m", "venv", "--clear"]).arg(&folder))?;
     for install in installs {
         let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
         let mut command = Command::new(folder.join("bin/python"));

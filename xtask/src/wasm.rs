@@ -1,38 +1,72 @@
 //! The core for WebAssembly: without threads and without a system's entropy.
 
-use std::path::Path;
+use std::ffi::OsString;
+use std::fmt;
+use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Instant;
 
-use crate::venv::execute;
+use crate::cargo;
+use crate::venv::{execute, target};
 
 const TARGET: &str = "wasm32-unknown-unknown";
 
-/// Builds the core where the target's standard library is installed, and otherwise says that it was not built.
-pub fn check() -> Result<(), String> {
-    if installed()? {
-        return build();
+/// A compiler with the target's standard library, or with the sources to build it from.
+pub enum Toolchain {
+    /// The one that runs this.
+    Own,
+    /// Debian's compiler in the folder where `.ci/wasm-toolchain` unpacks it; Debian has no compiled standard library of that version.
+    Debian(PathBuf),
+}
+
+impl Toolchain {
+    pub fn find() -> Option<Self> {
+        let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+        let output = Command::new(rustc).args(["--print", "target-libdir", "--target", TARGET]).output().ok()?;
+        if output.status.success() && Path::new(String::from_utf8_lossy(&output.stdout).trim()).is_dir() {
+            return Some(Toolchain::Own);
+        }
+        let folder = target().ok()?.join("wasm-toolchain/usr");
+        folder.join("bin/rustc").exists().then_some(Toolchain::Debian(folder))
     }
-    println!("==> not run: the core for {TARGET}, whose standard library is missing; `rustup target add {TARGET}`");
-    Ok(())
+
+    /// `cargo build` for the target.
+    ///
+    /// # Errors
+    ///
+    /// If the target directory or the search path is no usable path.
+    pub fn build(&self) -> Result<Command, String> {
+        let mut command = cargo::command();
+        command.args(["build", "--locked", "--target", TARGET]);
+        let Toolchain::Debian(folder) = self else { return Ok(command) };
+        let paths = |variable: &str, first: &[&str]| -> Result<OsString, String> {
+            let before = std::env::var_os(variable).unwrap_or_default();
+            let first = first.iter().map(|path| folder.join(path));
+            let all = first.chain(std::env::split_paths(&before).filter(|path| !path.as_os_str().is_empty()));
+            std::env::join_paths(all).map_err(|error| format!("{variable}: {error}"))
+        };
+        let libraries = format!("lib/{}-linux-gnu", std::env::consts::ARCH);
+        // A folder of its own, so that the two compilers do not invalidate each other's builds.
+        command.args(["-Zbuild-std=std,panic_abort", "--target-dir"]).arg(target()?.join("wasm"));
+        command.env("RUSTC", folder.join("bin/rustc")).env("RUSTC_BOOTSTRAP", "1");
+        command.env("PATH", paths("PATH", &["bin", "lib/llvm/bin"])?);
+        command.env("LD_LIBRARY_PATH", paths("LD_LIBRARY_PATH", &[&libraries, "lib/llvm/lib"])?);
+        Ok(command)
+    }
+}
+
+impl fmt::Display for Toolchain {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Toolchain::Own => f.write_str("of this toolchain"),
+            Toolchain::Debian(folder) => write!(f, "built from source by the compiler in {}", folder.display()),
+        }
+    }
 }
 
 /// Builds the core.
 pub fn build() -> Result<(), String> {
-    println!("==> cargo build --target {TARGET}");
-    let start = Instant::now();
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let arguments = ["build", "--release", "--locked", "--package", "endless-gym-core", "--no-default-features"];
-    execute(Command::new(cargo).args(arguments).args(["--target", TARGET]))?;
-    println!("    {:.1} s", start.elapsed().as_secs_f64());
-    Ok(())
-}
-
-/// Whether the toolchain has the target's standard library.
-fn installed() -> Result<bool, String> {
-    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
-    let output = Command::new(rustc).args(["--print", "target-libdir", "--target", TARGET]).output();
-    let output = output.map_err(|error| format!("rustc cannot be run: {error}"))?;
-    let folder = String::from_utf8_lossy(&output.stdout);
-    Ok(output.status.success() && Path::new(folder.trim()).is_dir())
+    let toolchain = Toolchain::find().ok_or_else(|| {
+        format!("no compiler for {TARGET}; rustup target add {TARGET}, or on Debian .ci/wasm-toolchain")
+    })?;
+    execute(toolchain.build()?.args(["--release", "--package", "endless-gym-core", "--no-default-features"]))
 }

@@ -11,6 +11,12 @@ import pytest
 from endless_gym import _native
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "original_python" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.original)
+
+
 @pytest.fixture(scope="session")
 def original_python() -> str:
     """A Python that has the original, memory-gym 1.0.2."""

@@ -1,0 +1,179 @@
+//! The stages of `cargo xtask test`.
+
+use crate::requirements::Requirement::{self, *};
+use crate::{cargo, instructions, modules, original, python, wasm};
+
+/// One part of the tests.
+#[derive(Debug)]
+pub struct Stage {
+    pub name: &'static str,
+    pub run: fn() -> Result<(), String>,
+    /// What it requires beside the requirements of the stages in `after`.
+    pub needs: &'static [Requirement],
+    /// The stages that it can only run after.
+    pub after: &'static [&'static str],
+    /// Whether cargo compiles much of it: cargo compiles for one command at a time.
+    pub compiles: bool,
+    /// Whether it is part of `cargo xtask test --quick`.
+    pub quick: bool,
+}
+
+/// All tests of the workspace, by one command line up to here: another selection of targets would compile dependencies anew.
+const RUST_TESTS: &[&str] = &["test", "--workspace", "--locked", "--no-fail-fast", "--"];
+
+/// The tests that take more than some seconds.
+const SLOW: &[&str] = &["drawn_alike_in_irregular_buffers", "steps_and_resets_allocate_nothing"];
+
+const STAGE: Stage = Stage { name: "", run: || Ok(()), needs: &[], after: &[], compiles: false, quick: false };
+const QUICK: Stage = Stage { quick: true, ..STAGE };
+
+/// In the order in which they start where nothing else decides: what is waited for first.
+pub const STAGES: &[Stage] = &[
+    Stage { name: "format", run: || cargo::run(&["fmt", "--all", "--check"]), ..QUICK },
+    Stage { name: "python environment", run: || python::environment().map(drop), needs: &[Python, Disk], ..QUICK },
+    Stage {
+        name: "rust build",
+        run: || cargo::run(&["test", "--workspace", "--locked", "--no-run"]),
+        needs: &[Linker, Disk],
+        compiles: true,
+        ..QUICK
+    },
+    Stage { name: "import cycles", run: modules::check, ..QUICK },
+    Stage {
+        name: "wheel",
+        run: || python::install("dev"),
+        after: &["python environment", "rust build"],
+        compiles: true,
+        ..QUICK
+    },
+    Stage {
+        name: "rust tests",
+        run: || {
+            let skipped: Vec<&str> = SLOW.iter().flat_map(|name| ["--skip", *name]).collect();
+            cargo::run(&[RUST_TESTS, &skipped].concat())
+        },
+        after: &["rust build"],
+        needs: &[SharedMemory],
+        ..QUICK
+    },
+    Stage {
+        name: "clippy",
+        run: || {
+            cargo::run(&["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"])?;
+            let core = ["--package", "endless-gym-core", "--no-default-features", "--locked"];
+            cargo::run(&[&["clippy"], core.as_slice(), &["--", "--deny", "warnings"]].concat())
+        },
+        needs: &[Linker],
+        compiles: true,
+        ..QUICK
+    },
+    Stage {
+        name: "original environment",
+        run: || original::python().map(drop),
+        needs: &[OriginalPython, Disk],
+        ..STAGE
+    },
+    Stage { name: "ruff", run: python::ruff, after: &["python environment"], ..QUICK },
+    Stage { name: "mypy", run: python::mypy, after: &["python environment"], ..QUICK },
+    Stage {
+        name: "pytest",
+        run: || python::pytest("not slow and not original"),
+        after: &["wheel"],
+        needs: &[SharedMemory],
+        ..QUICK
+    },
+    Stage {
+        name: "rust tests slow",
+        run: || cargo::run(&[RUST_TESTS, SLOW].concat()),
+        after: &["rust build"],
+        needs: &[SharedMemory],
+        ..STAGE
+    },
+    Stage {
+        name: "pytest slow",
+        run: || python::pytest("slow and not original"),
+        after: &["wheel"],
+        needs: &[SharedMemory],
+        ..STAGE
+    },
+    Stage {
+        name: "instructions",
+        run: || instructions::run(false),
+        needs: &[Linker, Valgrind, Disk],
+        compiles: true,
+        ..STAGE
+    },
+    Stage {
+        name: "documentation",
+        run: || cargo::run(&["doc", "--workspace", "--no-deps", "--locked"]),
+        needs: &[Linker],
+        compiles: true,
+        ..STAGE
+    },
+    Stage { name: "wasm", run: wasm::build, needs: &[Linker, Wasm], compiles: true, ..STAGE },
+    Stage {
+        name: "too little shared memory",
+        run: || {
+            let test = "too_little_shared_memory_is_an_error_and_not_a_signal";
+            cargo::run(&["test", "--locked", "--test", "service", "--", "--ignored", "--exact", test])
+        },
+        needs: &[MountNamespaces],
+        after: &["rust build"],
+        ..STAGE
+    },
+    Stage {
+        name: "live comparison with the original",
+        run: || cargo::run(&["test", "--locked", "--test", "live", "--", "--include-ignored"]),
+        after: &["rust build", "original environment"],
+        ..STAGE
+    },
+    Stage {
+        name: "pytest with the original",
+        run: || python::pytest("original"),
+        after: &["wheel", "original environment"],
+        needs: &[SharedMemory],
+        ..STAGE
+    },
+];
+
+/// The stage of that name.
+pub fn find(name: &str) -> Result<&'static Stage, String> {
+    STAGES.iter().find(|stage| stage.name == name).ok_or_else(|| {
+        let names: Vec<_> = STAGES.iter().map(|stage| format!("`{}`", stage.name)).collect();
+        format!("no stage `{name}`; the stages are {}", names.join(", "))
+    })
+}
+
+impl Stage {
+    /// All that it and the stages before it require.
+    pub fn requirements(&self) -> Vec<Requirement> {
+        let before = self.after.iter().filter_map(|name| find(name).ok()).flat_map(Stage::requirements);
+        let mut all: Vec<Requirement> = self.needs.iter().copied().chain(before).collect();
+        all.sort();
+        all.dedup();
+        all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_are_after_earlier_ones_and_quick_ones_after_quick_ones() {
+        for (position, stage) in STAGES.iter().enumerate() {
+            assert_eq!(STAGES.iter().position(|other| other.name == stage.name), Some(position), "{}", stage.name);
+            for name in stage.after {
+                let before = STAGES[..position].iter().find(|other| other.name == *name);
+                let before = before.unwrap_or_else(|| panic!("{}: no stage `{name}` before it", stage.name));
+                assert!(before.quick || !stage.quick, "{} is quick, {name} is not", stage.name);
+            }
+        }
+    }
+
+    #[test]
+    fn a_stage_requires_what_the_stages_before_it_require() {
+        let live = find("live comparison with the original").unwrap();
+        assert_eq!(live.requirements(), [Linker, OriginalPython, Disk]);
+    }
+}
