@@ -1,8 +1,11 @@
 //! Development tasks: `cargo xtask test` runs all tests.
 
+mod dist;
+mod files;
 mod instructions;
 mod modules;
 mod original;
+mod packages;
 mod python;
 mod venv;
 mod wasm;
@@ -14,6 +17,9 @@ const HELP: &str = "\
 cargo xtask test                 check formatting, lint, and run all tests, Rust's and Python's
 cargo xtask python               build the Python package, lint it, and run its tests alone
 cargo xtask modules              check that the files of a crate do not import each other in cycles
+cargo xtask files                check the project's files that no compiler reads: workflows, forms, scripts, versions, licences
+cargo xtask dist                 build what a release consists of into target/dist: wheel, source distribution, crates
+cargo xtask packages             build them, install them on each CPython there is, and use them
 cargo xtask wasm                 build the core for wasm32-unknown-unknown
 cargo xtask instructions         count the instructions of a step and compare with the budgets (--record: record new budgets)
 cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help lists ARGS)
@@ -48,6 +54,7 @@ fn main() -> ExitCode {
         ["test"] => run(TEST, &[PROPERTY_SEED])
             .and_then(|()| mount_namespaces())
             .and_then(|()| modules::check())
+            .and_then(|()| files::check())
             .and_then(|()| wasm::check())
             .and_then(|()| instructions::run(false))
             .and_then(|()| python::test())
@@ -57,6 +64,9 @@ fn main() -> ExitCode {
         ["instructions", "--record"] => instructions::run(true),
         ["bench", ref arguments @ ..] => python::bench(arguments),
         ["modules"] => modules::check(),
+        ["files"] => files::check(),
+        ["dist"] => dist::build(),
+        ["packages"] => packages::test(),
         ["wasm"] => wasm::build(),
         ["properties"] => run(&[PROPERTIES], &[("PROPTEST_CASES", PROPERTY_CASES)]),
         ["properties", cases] => run(&[PROPERTIES], &[("PROPTEST_CASES", cases)]),

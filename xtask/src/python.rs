@@ -78,7 +78,8 @@ fn pufferlib() -> Result<Install, String> {
     Ok(install)
 }
 
-fn run(what: &str, command: &mut Command) -> Result<(), String> {
+/// Runs a command, and prints what it is and how long it took.
+pub fn run(what: &str, command: &mut Command) -> Result<(), String> {
     println!("==> {what}");
     let start = Instant::now();
     execute(command)?;
