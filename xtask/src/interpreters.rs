@@ -24,6 +24,14 @@ pub fn for_package() -> Option<Interpreter> {
     found.pop()
 }
 
+/// One CPython of each minor version, in their order.
+pub fn all() -> Vec<Interpreter> {
+    let mut found = find();
+    found.sort_by_key(|python| python.minor);
+    found.dedup_by_key(|python| python.minor);
+    found
+}
+
 /// The CPython for the original.
 pub fn for_original() -> Option<Interpreter> {
     find().into_iter().find(|python| python.minor == ORIGINAL)

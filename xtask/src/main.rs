@@ -1,10 +1,13 @@
 //! Development tasks: `cargo xtask test` runs all tests.
 
 mod cargo;
+mod dist;
+mod files;
 mod instructions;
 mod interpreters;
 mod modules;
 mod original;
+mod packages;
 mod python;
 mod requirements;
 mod runner;
@@ -49,6 +52,12 @@ enum Task {
     },
     /// Check that the files of a crate do not import each other in cycles.
     Modules,
+    /// Check the files that no compiler reads: workflows, forms, scripts, versions, licences.
+    Files,
+    /// Build what a release consists of into target/dist: wheel, source distribution, crates.
+    Dist,
+    /// Build them, install them on each CPython there is, and use them.
+    Packages,
     /// Build the core for wasm32-unknown-unknown.
     Wasm,
     /// Count the instructions of a step and compare with the budgets.
@@ -88,6 +97,9 @@ impl Task {
             Task::Python => test::run(Selection::Python, false),
             Task::Stage { name } => (stages::find(name)?.run)(),
             Task::Modules => modules::check(),
+            Task::Files => files::check(),
+            Task::Dist => dist::build(),
+            Task::Packages => packages::test(),
             Task::Wasm => wasm::build(),
             Task::Instructions { record } => instructions::run(*record),
             Task::Bench { arguments } => python::bench(arguments),

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Instant;
 
 use crate::requirements::Requirement;
 use crate::venv::{Install, execute, target, venv, workspace};
@@ -82,4 +83,13 @@ fn pufferlib() -> Result<Install, String> {
     let path = workspace().join("xtask/pufferlib").display().to_string();
     install.environment = vec![("NO_OCEAN", "1".to_owned()), ("NO_TRAIN", "1".to_owned()), ("PYTHONPATH", path)];
     Ok(install)
+}
+
+/// Runs a command, and prints what it is and how long it took.
+pub fn run(what: &str, command: &mut Command) -> Result<(), String> {
+    println!("==> {what}");
+    let start = Instant::now();
+    execute(command)?;
+    println!("    {:.1} s", start.elapsed().as_secs_f64());
+    Ok(())
 }

@@ -1,7 +1,7 @@
 //! The stages of `cargo xtask test`.
 
 use crate::requirements::Requirement::{self, *};
-use crate::{cargo, instructions, modules, original, python, wasm};
+use crate::{cargo, files, instructions, modules, original, packages, python, wasm};
 
 /// One part of the tests.
 #[derive(Debug)]
@@ -94,6 +94,15 @@ pub const STAGES: &[Stage] = &[
         run: || python::pytest("slow and not original"),
         after: &["wheel"],
         needs: &[SharedMemory],
+        ..STAGE
+    },
+    Stage { name: "files", run: files::check, needs: &[Python, Disk], ..QUICK },
+    Stage {
+        name: "packages",
+        run: packages::test,
+        after: &["wheel"],
+        needs: &[SharedMemory, Linker, Disk],
+        compiles: true,
         ..STAGE
     },
     Stage {

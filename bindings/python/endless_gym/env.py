@@ -175,7 +175,10 @@ class _Window:
         try:
             import pygame
         except ImportError as error:
-            raise ImportError('render_mode="human" needs pygame: pip install "endless-gym[render]"') from error
+            raise ImportError(
+                "render_mode=\"human\" needs pygame: pip install './bindings/python[render]', or the wheel file with `[render]` "
+                "appended"
+            ) from error
         self._pygame = pygame
         pygame.display.init()
         self._screen = pygame.display.set_mode((_VIEW, _VIEW))

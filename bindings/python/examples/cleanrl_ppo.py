@@ -1,6 +1,6 @@
 """Recurrent PPO in one file, in the style of CleanRL, on Endless Gym.
 
-pip install endless-gym torch tyro
+pip install ./bindings/python torch tyro
 python cleanrl_ppo.py --env-id Endless-MortarMayhem-v0 --num-envs 64 --total-timesteps 1000000
 """
 

@@ -1,6 +1,6 @@
 """Step Endless Gym through PufferLib, with random actions.
 
-pip install endless-gym torch psutil setuptools wheel gym-notices
+pip install ./bindings/python torch psutil setuptools wheel gym-notices
 pip install --no-deps gym==0.26.2 pettingzoo shimmy
 pip install --no-deps --no-build-isolation pufferlib==3.0.0
 python pufferlib_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 1024

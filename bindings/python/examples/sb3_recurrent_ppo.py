@@ -1,6 +1,6 @@
 """Train Stable-Baselines3's recurrent PPO on Endless Gym.
 
-pip install endless-gym stable-baselines3 sb3-contrib
+pip install ./bindings/python stable-baselines3 sb3-contrib
 python sb3_recurrent_ppo.py --env-id Endless-MortarMayhem-v0 --num-envs 64 --total-timesteps 1000000
 """
 

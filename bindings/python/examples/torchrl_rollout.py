@@ -1,6 +1,6 @@
 """Collect rollouts from Endless Gym with TorchRL and a small policy without memory.
 
-pip install endless-gym torchrl tensordict
+pip install ./bindings/python torchrl tensordict
 python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 64 --total-timesteps 100000
 """
 

@@ -1,6 +1,7 @@
 """PPO agents with memory in PyTorch: the baselines of the Memory Gym paper.
 
-`pip install endless-gym[agents]` installs the dependencies; `endless-train` trains an agent.
+The extra `agents` installs the dependencies: `pip install './bindings/python[agents]'`, or the wheel file with `[agents]`
+appended. `endless-train` trains an agent.
 
 Training, from top to bottom: `train` is the training loop and `settings` its configuration; `rollout` collects segments from
 `environments`; `ppo` optimises the agent with `losses`; `agent` combines an observation transform (`naive`), `encoders`, a memory
@@ -16,7 +17,8 @@ try:
     import tyro
 except ImportError as error:
     raise ImportError(
-        f"endless_gym.agents needs {error.name}, which is not installed: pip install 'endless-gym[agents]'"
+        f"endless_gym.agents needs {error.name}, which is not installed: pip install './bindings/python[agents]', or the wheel "
+        "file with `[agents]` appended"
     ) from error
 
 from endless_gym.agents.agent import ActOutput, Agent, AgentMemory, AgentOutput, make_agent

@@ -31,7 +31,8 @@ def run(name: str, work: Callable[[], object]) -> int:
         return INTERRUPTED
     except ModuleNotFoundError as error:
         print(
-            f"{name}: {error.name} is not installed: pip install 'endless-gym[agents]'",
+            f"{name}: {error.name} is not installed: pip install './bindings/python[agents]', or the wheel file with `[agents]` "
+            "appended",
             file=sys.stderr,
         )
         return 1

@@ -1,0 +1,46 @@
+"""Checks an installed package: imports it, and steps an environment in this process and in an engine's."""
+
+import importlib.metadata
+import platform
+import sys
+
+import endless_gym
+import gymnasium
+import numpy as np
+
+ENV = "Endless-MortarMayhem-v0"
+STEPS = 50
+
+
+def play(envs: gymnasium.vector.VectorEnv) -> tuple[float, np.ndarray]:
+    """Play with the same actions in each call; returns the sum of the rewards and the last frames."""
+    actions = np.random.default_rng(1).integers(0, 3, size=(STEPS, *envs.action_space.shape))
+    observation, _ = envs.reset(seed=1)
+    rewards = 0.0
+    for action in actions:
+        observation, reward, *_ = envs.step(action)
+        rewards += float(reward.sum())
+    return rewards, np.array(observation)
+
+
+version = importlib.metadata.version("endless-gym")
+expected = sys.argv[1]
+if version != expected or endless_gym.__version__ != expected:
+    sys.exit(
+        f"the version must be {expected}, got {version} of the package and {endless_gym.__version__} of the module"
+    )
+licences = [file.name for file in importlib.metadata.files("endless-gym") or [] if "licenses" in file.parts]
+if sorted(licences) != ["LICENSE-APACHE", "LICENSE-MIT"]:
+    sys.exit(f"the package must contain both licences, got {licences}")
+
+with gymnasium.make(f"EndlessGym/{ENV}") as env:
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+in_process = gymnasium.make_vec(f"EndlessGym/{ENV}", num_envs=4)
+rewards, frames = play(in_process)
+in_process.close()
+with endless_gym.serve(ENV, num_envs=4) as served:
+    served_rewards, served_frames = play(served)
+if rewards != served_rewards or not np.array_equal(frames, served_frames) or frames.std() == 0:
+    sys.exit("an engine process and this process must give the same frames and rewards")
+print(f"CPython {platform.python_version()}: endless-gym {version}, {STEPS} steps in process and served")

@@ -1,0 +1,111 @@
+//! Installs what `cargo xtask dist` has built into clean environments, on each CPython of this machine, and uses it.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::python::run;
+use crate::requirements::Requirement;
+use crate::venv::{target, workspace};
+use crate::{dist, interpreters};
+
+/// The smallest agent, for ten updates.
+const TRAIN: &[&str] = &[
+    "--env MortarMayhem-Grid-v0 --agent none --preset quick --device cpu --environment.option command_count=[1]",
+    "--environment.num-envs 8 --ppo.steps 32 --ppo.updates 10 --ppo.epochs 1 --run run",
+];
+
+/// A virtual environment of uv, which links files from one cache. Environments with PyTorch share its gigabytes.
+struct Environment {
+    uv: PathBuf,
+    folder: PathBuf,
+}
+
+impl Environment {
+    fn create(tools: &Path, python: &Path, name: &str) -> Result<Self, String> {
+        let environment = Environment { uv: tools.join("bin/uv"), folder: target()?.join("packages").join(name) };
+        let arguments = ["venv", "--quiet", "--clear", "--no-project", "--python"];
+        run("uv venv", environment.uv(&arguments)?.arg(python).arg(&environment.folder))?;
+        Ok(environment)
+    }
+
+    fn uv(&self, arguments: &[&str]) -> Result<Command, String> {
+        let mut command = Command::new(&self.uv);
+        command.args(arguments).env("UV_CACHE_DIR", target()?.join("uv-cache")).env("UV_NO_CONFIG", "1");
+        Ok(command)
+    }
+
+    /// `uv pip install` into the environment, with the versions that this was tested with.
+    fn install(&self, arguments: &[&str]) -> Result<Command, String> {
+        let mut command = self.uv(&["pip", "install", "--quiet", "--python"])?;
+        command.arg(self.folder.join("bin/python")).args(arguments);
+        command.arg("--constraint").arg(workspace().join("xtask/packages/constraints.txt"));
+        Ok(command)
+    }
+
+    /// A program of the environment, run in its folder, so that it imports the installed package.
+    fn program(&self, name: &str) -> Command {
+        let mut command = Command::new(self.folder.join("bin").join(name));
+        command.current_dir(&self.folder).env_remove("PYTHONPATH");
+        command
+    }
+
+    fn check(&self) -> Result<(), String> {
+        let mut check = self.program("python");
+        check.arg(workspace().join("xtask/packages/check.py")).arg(env!("CARGO_PKG_VERSION"));
+        run("import, step and serve", &mut check)?;
+        run("endless list", self.program("endless").arg("list").stdout(Stdio::null()))
+    }
+}
+
+/// Tests the wheel on each CPython, and the source distribution on the oldest.
+pub fn test() -> Result<(), String> {
+    dist::build()?;
+    let tools = dist::tools()?;
+    let wheel = dist::only_file(&dist::folder()?, ".whl")?.display().to_string();
+    let pythons = interpreters::all();
+    let oldest = pythons.first().ok_or_else(|| Requirement::Python.missing())?;
+    for minor in interpreters::SUPPORTED {
+        let Some(python) = pythons.iter().find(|python| python.minor == minor) else {
+            println!("==> not run: CPython 3.{minor}, which is not installed");
+            continue;
+        };
+        println!("==> CPython 3.{minor}, {}", python.path.display());
+        let environment = Environment::create(&tools, &python.path, &format!("3.{minor}"))?;
+        run("install the wheel", &mut environment.install(&[&wheel])?)?;
+        environment.check()?;
+        train(&environment, &wheel)?;
+    }
+    println!("==> CPython 3.{}, from source", oldest.minor);
+    source(&tools, &oldest.path)
+}
+
+/// Trains the smallest agent where PyTorch has a wheel for this CPython, and otherwise says that it was not trained.
+fn train(environment: &Environment, wheel: &str) -> Result<(), String> {
+    // Only PyTorch's wheel is looked for: whatever else fails is an error.
+    let mut probe = environment.install(&["--dry-run", "--no-deps", "--only-binary", "torch", "torch"])?;
+    let probe = probe.output().map_err(|error| format!("uv cannot be run: {error}"))?;
+    if !probe.status.success() {
+        println!(
+            "==> not run: training, since PyTorch cannot be installed\n{}",
+            String::from_utf8_lossy(&probe.stderr)
+        );
+        return Ok(());
+    }
+    run("install the extra `agents`", &mut environment.install(&[&format!("{wheel}[agents]")])?)?;
+    let arguments = TRAIN.iter().flat_map(|line| line.split(' '));
+    let training = run("endless-train, ten updates", environment.program("endless-train").args(arguments));
+    training?;
+    let checkpoint = environment.folder.join("run/checkpoints/last.pt");
+    if checkpoint.is_file() { Ok(()) } else { Err(format!("training must write {}", checkpoint.display())) }
+}
+
+/// Installs the source distribution. It is built with the profile of the tests, for which the dependencies have been compiled.
+fn source(tools: &Path, python: &Path) -> Result<(), String> {
+    let archive = dist::only_file(&dist::folder()?, ".tar.gz")?.display().to_string();
+    let environment = Environment::create(tools, python, "source")?;
+    let mut install =
+        environment.install(&["--no-binary", "endless-gym", "--reinstall-package", "endless-gym", &archive])?;
+    install.env("CARGO_TARGET_DIR", target()?).env("MATURIN_PEP517_ARGS", "--profile dev");
+    run("install the source distribution", &mut install)?;
+    environment.check()
+}
