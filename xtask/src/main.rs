@@ -1,5 +1,7 @@
 //! Development tasks: `cargo xtask test` runs all tests.
 
+mod docs;
+mod error_messages;
 mod instructions;
 mod modules;
 mod original;
@@ -13,6 +15,7 @@ use std::time::Instant;
 const HELP: &str = "\
 cargo xtask test                 check formatting, lint, and run all tests, Rust's and Python's
 cargo xtask python               build the Python package, lint it, and run its tests alone
+cargo xtask docs                 build the documentation, with its links checked, into target/site
 cargo xtask modules              check that the files of a crate do not import each other in cycles
 cargo xtask wasm                 build the core for wasm32-unknown-unknown
 cargo xtask instructions         count the instructions of a step and compare with the budgets (--record: record new budgets)
@@ -50,9 +53,11 @@ fn main() -> ExitCode {
             .and_then(|()| modules::check())
             .and_then(|()| wasm::check())
             .and_then(|()| instructions::run(false))
+            .and_then(|()| docs::build())
             .and_then(|()| python::test())
             .map(|()| println!("all passed")),
         ["python"] => python::test(),
+        ["docs"] => docs::build(),
         ["instructions"] => instructions::run(false),
         ["instructions", "--record"] => instructions::run(true),
         ["bench", ref arguments @ ..] => python::bench(arguments),
