@@ -91,7 +91,8 @@ fn message<'a>(format: &str, fields: &[String], mut arguments: impl Iterator<Ite
 
 /// A placeholder for an argument of a format string.
 fn shown(argument: &str, fields: &[String]) -> String {
-    let word = argument.split(|c: char| !c.is_alphanumeric() && c != '_').find(|word| fields.contains(&(*word).to_owned()));
+    let word =
+        argument.split(|c: char| !c.is_alphanumeric() && c != '_').find(|word| fields.contains(&(*word).to_owned()));
     match word {
         // The function of `ServiceError` that writes " (process 123)".
         Some(word) if argument.starts_with("in_process") => format!(" (process <{word}>)"),

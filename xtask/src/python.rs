@@ -15,13 +15,14 @@ pub fn test() -> Result<(), String> {
     let ruff = |what: &str, arguments: &[&str]| {
         let program = folder.join("bin/ruff");
         run(what, Command::new(&program).current_dir(&package).args(arguments))?;
-        let mut benches = Command::new(&program);
-        benches.current_dir(workspace()).args(arguments).args([
+        let mut others = Command::new(&program);
+        others.current_dir(workspace()).args(arguments).args([
             "--config",
             "bindings/python/pyproject.toml",
             "benches",
+            "docs",
         ]);
-        run(&format!("{what}, benches"), &mut benches)
+        run(&format!("{what}, benches and docs"), &mut others)
     };
     ruff("ruff format", &["format", "--check"])?;
     ruff("ruff check", &["check"])?;
