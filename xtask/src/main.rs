@@ -2,6 +2,8 @@
 
 mod cargo;
 mod dist;
+mod docs;
+mod error_messages;
 mod files;
 mod instructions;
 mod interpreters;
@@ -52,6 +54,8 @@ enum Task {
     },
     /// Check that the files of a crate do not import each other in cycles.
     Modules,
+    /// Build the documentation, with its links checked, into target/site.
+    Docs,
     /// Check the files that no compiler reads: workflows, forms, scripts, versions, licences.
     Files,
     /// Build what a release consists of into target/dist: wheel, source distribution, crates.
@@ -97,6 +101,7 @@ impl Task {
             Task::Python => test::run(Selection::Python, false),
             Task::Stage { name } => (stages::find(name)?.run)(),
             Task::Modules => modules::check(),
+            Task::Docs => docs::build(),
             Task::Files => files::check(),
             Task::Dist => dist::build(),
             Task::Packages => packages::test(),

@@ -19,7 +19,7 @@ pub fn ruff() -> Result<(), String> {
     let program = environment()?.join("bin/ruff");
     for arguments in [["format", "--check"].as_slice(), &["check"]] {
         execute(Command::new(&program).current_dir(package()).args(arguments))?;
-        let others = ["--config", "bindings/python/pyproject.toml", "benches", "tests/reference"];
+        let others = ["--config", "bindings/python/pyproject.toml", "benches", "docs", "tests/reference"];
         execute(Command::new(&program).current_dir(workspace()).args(arguments).args(others))?;
     }
     Ok(())

@@ -1,7 +1,7 @@
 //! The stages of `cargo xtask test`.
 
 use crate::requirements::Requirement::{self, *};
-use crate::{cargo, files, instructions, modules, original, packages, python, wasm};
+use crate::{cargo, docs, files, instructions, modules, original, packages, python, wasm};
 
 /// One part of the tests.
 #[derive(Debug)]
@@ -114,8 +114,9 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "documentation",
-        run: || cargo::run(&["doc", "--workspace", "--no-deps", "--locked"]),
-        needs: &[Linker],
+        run: docs::build,
+        after: &["rust build"],
+        needs: &[Linker, Python, Disk],
         compiles: true,
         ..STAGE
     },

@@ -26,13 +26,13 @@ _VIEW = 336
 class Env(gymnasium.Env[Any, Any]):
     """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 
-    Observations are uint8 (84, 84, 3), indexed [x][y][channel] as in the original; the ids with `MortarMayhemB` return a dict of
-    `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
+    Observations are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB` return a dict
+    of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
         render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
-            (336, 336, 3); both indexed [row][column][channel]. `human`: every step shows that view in a window (needs pygame).
+            (336, 336, 3); both indexed `[row][column][channel]`. `human`: every step shows that view in a window (needs pygame).
         options: Reset parameters for every episode. Options of `reset` override them.
 
     Raises:

@@ -23,7 +23,7 @@ SCREEN = 84
 
 @dataclass(frozen=True)
 class Frames:
-    """The format of the frames of an observation. The default is the original's: uint8 (84, 84, 3), indexed [x][y][channel].
+    """The format of the frames of an observation. The default is the original's: uint8 (84, 84, 3), indexed `[x][y][channel]`.
 
     The engine writes this format directly, and only the pixels that change. There is no conversion.
     """
@@ -32,7 +32,7 @@ class Frames:
     grayscale: bool = False
     #: The channel is the first axis of a frame, as in PyTorch's convolutions.
     channels_first: bool = False
-    #: Indexed [row][column] instead of [x][y].
+    #: Indexed `[row][column]` instead of `[x][y]`.
     row_major: bool = False
     #: Number of stacked frames, 1 to 64: the last frames of the episode, oldest first, padded with the episode's first frame.
     #: More than 1 add a leading axis, as Gymnasium's `FrameStackObservation`.

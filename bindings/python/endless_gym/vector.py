@@ -249,7 +249,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
-        """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed [row][column][channel].
+        """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed `[row][column][channel]`.
 
         Raises:
             RuntimeError: The environments are in another process, or have not been reset.

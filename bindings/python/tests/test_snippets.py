@@ -1,0 +1,92 @@
+"""Every code block of the documentation runs as it is shown."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import groupby
+from pathlib import Path
+
+import pytest
+from snippets import ROOT, SHELL, Block, blocks, pages, programs
+
+TIMEOUT = 120
+#: As Ctrl-C ends them, so that engines remove their segments.
+END_JOBS = "kill -INT $(jobs -p) 2>/dev/null || true; wait"
+PROGRAMS = [program for page in pages() for program in programs(page)]
+#: Rust in the README is a test of the crate's documentation (`src/lib.rs`).
+DOCTESTS = ROOT / "README.md"
+LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
+
+
+@pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in PROGRAMS])
+def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], set[str]]) -> None:
+    for is_shell, part in groupby(program, lambda block: block.language in SHELL):
+        code = "\n".join(block.code for block in part)
+        shell = ["bash", "-euo", "pipefail", "-m", "-c", f"trap '{END_JOBS}' EXIT\n{code}"]
+        run(shell if is_shell else [sys.executable, "-c", code], tmp_path, program[0].name)
+    assert not segments(), "the block left segments in /dev/shm"
+
+
+def run(command: list[str], folder: Path, name: str) -> None:
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=TIMEOUT,
+    )
+    assert done.returncode == 0, f"{name} ended with {done.returncode}:\n{done.stdout}"
+
+
+def test_blocks_are_of_a_known_kind() -> None:
+    for page in pages():
+        found = list(blocks(page))
+        assert page.read_text().count("```") == 2 * len(found), f"{page} has a fence that is not recognised"
+        for block in found:
+            assert block.language in LANGUAGES, block.name
+            if block.language == "rust" and page != DOCTESTS:
+                # The examples are tested by tests/examples.rs.
+                assert block.is_included, f"{block.name}: show a file of engine/examples instead"
+
+
+def test_what_is_not_run_has_a_reason(capsys: pytest.CaptureFixture[str]) -> None:
+    left = [block for page in pages() for block in blocks(page) if block.reason]
+    with capsys.disabled():
+        print("\ncode blocks that are not run:")
+        for block in left:
+            print(f"  {block.name}: {block.reason}")
+    assert all(len(block.reason) > 10 for block in left)
+
+
+def test_links_lead_to_files() -> None:
+    """Links of documents that are not built by MkDocs; `cargo xtask docs` checks the others."""
+    documents = [*ROOT.glob("*.md"), ROOT / "bindings/python/README.md", *(ROOT / "benches").rglob("*.md")]
+    broken = [
+        f"{document.relative_to(ROOT)}: {target}"
+        for document in documents
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text())
+        if "://" not in target and not (document.parent / target).exists()
+    ]
+    assert not broken, broken
+
+
+def test_named_files_exist() -> None:
+    """Paths in inline code, such as `engine/examples/trainer.rs`."""
+    folders = "|".join(sorted(path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "target"))
+    path = re.compile(rf"`((?:{folders})/[\w./-]+)`")
+    broken = [
+        f"{page.relative_to(ROOT)}: {named}"
+        for page in pages()
+        for named in path.findall(page.read_text())
+        if not (ROOT / named).exists()
+    ]
+    assert not broken, broken

@@ -1,0 +1,88 @@
+//! The documentation: MkDocs' pages and rustdoc's reference as one site under the target directory.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::time::Instant;
+
+use crate::requirements::Requirement;
+use crate::venv::{Install, execute, target, venv, workspace};
+use crate::{error_messages, interpreters};
+
+/// Builds the site. A warning, a link to a missing page or anchor, and an error message without a cure are errors.
+pub fn build() -> Result<(), String> {
+    println!("==> documentation");
+    let start = Instant::now();
+    let data = target()?.join("docs");
+    fs::create_dir_all(&data).map_err(|error| format!("{}: {error}", data.display()))?;
+    write(&data.join("environments.json"), &environments()?)?;
+    write(&data.join("errors.json"), &error_messages::as_json()?)?;
+
+    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
+    let folder = venv("docs", &base, &[Install::of_file("requirements-docs.txt")?])?;
+    let site = target()?.join("site");
+    let mut mkdocs = Command::new(folder.join("bin/mkdocs"));
+    // Not `--quiet`: with it, warnings are not errors.
+    mkdocs.args(["build", "--strict", "--site-dir"]).arg(&site).current_dir(workspace());
+    // The second variable silences an announcement of Material for MkDocs.
+    mkdocs.env("ENDLESS_DOCS_DATA", &data).env("NO_MKDOCS_2_WARNING", "1");
+    let output = mkdocs.output().map_err(|error| format!("{mkdocs:?} cannot be run: {error}"))?;
+    if !output.status.success() {
+        return Err(format!("the documentation cannot be built:\n{}", String::from_utf8_lossy(&output.stderr)));
+    }
+
+    execute(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
+    copy(&target()?.join("doc"), &site.join("rust"))?;
+    check_links(&site.join("reference/rust.html"))?;
+    println!("    {:.1} s, {}", start.elapsed().as_secs_f64(), site.join("index.html").display());
+    Ok(())
+}
+
+/// Fails if a page's link to rustdoc's reference leads nowhere. MkDocs does not know that reference.
+fn check_links(page: &Path) -> Result<(), String> {
+    let text = fs::read_to_string(page).map_err(|error| format!("{}: {error}", page.display()))?;
+    let links: Vec<&str> = text.split("href=\"").skip(1).filter_map(|link| link.split('"').next()).collect();
+    let links: Vec<&str> = links.into_iter().filter(|link| link.starts_with("../rust/")).collect();
+    let folder = page.parent().unwrap_or(page);
+    match links.iter().find(|link| !folder.join(link).is_file()) {
+        Some(link) => Err(format!("{}: the link {link} leads nowhere", page.display())),
+        None if links.is_empty() => Err(format!("{} has no link to rustdoc's reference", page.display())),
+        None => Ok(()),
+    }
+}
+
+/// The table of environments, as `endless list --json` prints it.
+fn environments() -> Result<String, String> {
+    let mut list = cargo(&["run", "--quiet", "--locked", "--bin", "endless", "--", "list", "--json"]);
+    let output = list.output().map_err(|error| format!("{list:?} cannot be run: {error}"))?;
+    if !output.status.success() {
+        return Err(format!("{list:?} failed: {}", String::from_utf8_lossy(&output.stderr)));
+    }
+    String::from_utf8(output.stdout).map_err(|error| error.to_string())
+}
+
+fn cargo(arguments: &[&str]) -> Command {
+    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.args(arguments).current_dir(workspace());
+    command
+}
+
+fn write(path: &Path, text: &str) -> Result<(), String> {
+    fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))
+}
+
+/// Copies a folder with everything in it.
+fn copy(from: &Path, to: &Path) -> Result<(), String> {
+    let failed = |error: std::io::Error| format!("{}: {error}", from.display());
+    fs::create_dir_all(to).map_err(failed)?;
+    for entry in fs::read_dir(from).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy(&entry.path(), &target)?;
+        } else {
+            fs::copy(entry.path(), target).map_err(failed)?;
+        }
+    }
+    Ok(())
+}
