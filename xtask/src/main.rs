@@ -3,6 +3,7 @@
 mod instructions;
 mod modules;
 mod original;
+mod pictures;
 mod python;
 mod venv;
 mod wasm;
@@ -17,6 +18,7 @@ cargo xtask modules              check that the files of a crate do not import e
 cargo xtask wasm                 build the core for wasm32-unknown-unknown
 cargo xtask instructions         count the instructions of a step and compare with the budgets (--record: record new budgets)
 cargo xtask bench [ARGS]         compare steps per second with the original's and others' (--help lists ARGS)
+cargo xtask pictures             make the pictures of the documentation again, in docs/images
 cargo xtask live [STEPS]         compare STEPS steps of each environment with the original, from new seeds (default 100000)
 cargo xtask properties [CASES]   run the property tests with CASES cases each, from new seeds (default 2000)
 cargo xtask original             set up the original in a virtual environment and print the path of its Python";
@@ -56,6 +58,7 @@ fn main() -> ExitCode {
         ["instructions"] => instructions::run(false),
         ["instructions", "--record"] => instructions::run(true),
         ["bench", ref arguments @ ..] => python::bench(arguments),
+        ["pictures"] => pictures::make(),
         ["modules"] => modules::check(),
         ["wasm"] => wasm::build(),
         ["properties"] => run(&[PROPERTIES], &[("PROPTEST_CASES", PROPERTY_CASES)]),

@@ -20,8 +20,9 @@ pub fn test() -> Result<(), String> {
             "--config",
             "bindings/python/pyproject.toml",
             "benches",
+            "xtask/pictures",
         ]);
-        run(&format!("{what}, benches"), &mut benches)
+        run(&format!("{what}, benches and pictures"), &mut benches)
     };
     ruff("ruff format", &["format", "--check"])?;
     ruff("ruff check", &["check"])?;
@@ -50,7 +51,7 @@ fn package() -> PathBuf {
 }
 
 /// Builds the wheel and installs it into a virtual environment with the test tools. Returns the environment's folder.
-fn install(profile: &str) -> Result<PathBuf, String> {
+pub fn install(profile: &str) -> Result<PathBuf, String> {
     let folder = venv("python", original::base()?, &[Install::of_file("requirements-test.txt")?, pufferlib()?])?;
     let wheels = target()?.join("wheels");
     let _ = std::fs::remove_dir_all(&wheels);
@@ -78,7 +79,8 @@ fn pufferlib() -> Result<Install, String> {
     Ok(install)
 }
 
-fn run(what: &str, command: &mut Command) -> Result<(), String> {
+/// Runs a command, with its name and duration.
+pub fn run(what: &str, command: &mut Command) -> Result<(), String> {
     println!("==> {what}");
     let start = Instant::now();
     execute(command)?;
