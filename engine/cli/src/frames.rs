@@ -28,7 +28,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let view = film.ground_truth_view()?;
         match stdout.write_all(film.observation()).and_then(|()| stdout.write_all(&view)) {
             Err(error) if error.kind() == ErrorKind::BrokenPipe => break,
-            written => written?,
+            written => written.map_err(|error| format!("cannot write to standard output: {error}"))?,
         }
         if !film.step()? {
             break;
