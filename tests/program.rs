@@ -2,6 +2,8 @@
 
 mod common;
 
+use std::fs::File;
+use std::io::Read;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -9,6 +11,8 @@ use std::time::{Duration, Instant};
 
 use endless_gym::service::{ConnectConfig, Namespace, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::OpenptFlags;
+use rustix::termios::Winsize;
 use serde_json::Value as Json;
 
 /// A directory of sockets for one test alone, and what is left of its segments.
@@ -102,6 +106,74 @@ fn list_shows_environments_and_parameters() {
     assert_eq!(unknown.status.code(), Some(1));
     assert!(text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; there are MortarMayhem-v0"));
     assert_eq!(text(&unknown.stderr).lines().count(), 1);
+}
+
+/// Standard output of a program that runs in a terminal with this number of columns.
+fn in_terminal(columns: u16, command: &mut Command) -> String {
+    let terminal = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    rustix::pty::grantpt(&terminal).unwrap();
+    rustix::pty::unlockpt(&terminal).unwrap();
+    let size = Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 };
+    rustix::termios::tcsetwinsize(&terminal, size).unwrap();
+    let name = rustix::pty::ptsname(&terminal, Vec::new()).unwrap().into_string().unwrap();
+    let program_side = File::options().read(true).write(true).open(name).unwrap();
+    let mut child = command.stdout(program_side).spawn().unwrap();
+    // The command holds the program's side too; without it, reading ends when the program has ended.
+    command.stdout(Stdio::null());
+    let mut output = Vec::new();
+    // The end of a terminal's other side is the error EIO.
+    let _ = File::from(terminal).read_to_end(&mut output);
+    assert!(wait(&mut child).success());
+    text(&output).to_owned()
+}
+
+#[test]
+fn list_shows_pictures_in_terminals_with_colours() {
+    let room = Room::new("picture");
+    let list = |arguments: &[&str]| {
+        let mut command = room.endless(&[&["list", "MysteryPath-v0"], arguments].concat());
+        command.env("COLORTERM", "truecolor").env_remove("NO_COLOR");
+        command
+    };
+    let pixels = |output: &str| output.matches('▀').count();
+    let piped = |arguments: &[&str]| text(&list(arguments).output().unwrap().stdout).to_owned();
+    assert!(piped(&[]).starts_with("MysteryPath-v0: Find an invisible path"));
+    assert!(!piped(&[]).contains('\x1b'));
+    let always = piped(&["--picture", "always"]);
+    assert!(always.starts_with("observation  "), "{always}");
+    assert!(always.contains("\x1b[38;2;255;255;255;"), "no white of the path");
+    assert_eq!(pixels(&always), 2 * 42 * 21);
+    assert!(always.ends_with(&piped(&[])));
+
+    let (narrow, wide) = (in_terminal(80, &mut list(&[])), in_terminal(90, &mut list(&[])));
+    assert_eq!([pixels(&narrow), pixels(&wide)], [42 * 21, 2 * 42 * 21]);
+    let table = |output: &str| output.lines().map(|line| line.matches('─').count()).max();
+    assert_eq!([table(&narrow), table(&wide)], [Some(80), Some(90)]);
+    assert_eq!(pixels(&in_terminal(90, list(&[]).env("NO_COLOR", "1"))), 0);
+    assert_eq!(pixels(&in_terminal(90, list(&[]).env("COLORTERM", ""))), 0);
+    assert_eq!(pixels(&in_terminal(90, &mut list(&["--picture", "never"]))), 0);
+    assert_eq!(pixels(&in_terminal(90, &mut list(&["--json"]))), 0);
+}
+
+#[test]
+fn frames_are_those_of_an_episode() {
+    let room = Room::new("frames");
+    let frames = |steps: &str| room.run(&["frames", "--env", "MysteryPath-Grid-v0", "--seed", "1", "--steps", steps]);
+    let bytes = 84 * 84 * 3 + 336 * 336 * 3;
+    let whole = frames("1000").stdout;
+    assert_eq!(whole.len(), 19 * bytes); // the expert needs 18 steps
+    assert_eq!(frames("3").stdout, whole[..4 * bytes]);
+    let (observation, view) = whole[..bytes].split_at(84 * 84 * 3);
+    let pixel = |frame: &[u8], side: usize, row: usize, column: usize| frame[(row * side + column) * 3..][..3].to_vec();
+    // The path leads along the sixth of seven rows.
+    assert_eq!(pixel(view, 336, 260, 100), [255; 3]);
+    assert_ne!(pixel(view, 336, 100, 260), [255; 3]);
+    // The agent is where it is in the view.
+    let skin: Vec<usize> = (0..84 * 84).filter(|place| observation[place * 3..][..3] == [250, 204, 153]).collect();
+    assert!(!skin.is_empty());
+    for place in skin {
+        assert_eq!(pixel(view, 336, place / 84 * 4, place % 84 * 4), [250, 204, 153]);
+    }
 }
 
 #[test]

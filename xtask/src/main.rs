@@ -10,6 +10,7 @@ mod interpreters;
 mod modules;
 mod original;
 mod packages;
+mod pictures;
 mod python;
 mod requirements;
 mod runner;
@@ -62,6 +63,8 @@ enum Task {
     Dist,
     /// Build them, install them on each CPython there is, and use them.
     Packages,
+    /// Make the pictures of the documentation again, in docs/images.
+    Pictures,
     /// Build the core for wasm32-unknown-unknown.
     Wasm,
     /// Count the instructions of a step and compare with the budgets.
@@ -105,6 +108,7 @@ impl Task {
             Task::Files => files::check(),
             Task::Dist => dist::build(),
             Task::Packages => packages::test(),
+            Task::Pictures => pictures::make(),
             Task::Wasm => wasm::build(),
             Task::Instructions { record } => instructions::run(*record),
             Task::Bench { arguments } => python::bench(arguments),

@@ -48,7 +48,8 @@ pub fn folder(name: &str) -> Result<PathBuf, String> {
 pub fn venv(name: &str, base: &Interpreter, installs: &[Install]) -> Result<PathBuf, String> {
     let folder = folder(name)?;
     let stamp = folder.join("packages");
-    let wanted = format!("{installs:#?}");
+    // Without the place of the checkout, which may move.
+    let wanted = format!("{installs:#?}").replace(&workspace().display().to_string(), ".");
     // Its Python is a link to one that may have been removed.
     if std::fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) && folder.join("bin/python").exists() {
         return Ok(folder);

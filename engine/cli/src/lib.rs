@@ -4,9 +4,12 @@ mod bench;
 mod demo;
 mod engine_process;
 mod failure;
+mod film;
+mod frames;
 mod list;
 mod options;
 mod output;
+mod picture;
 mod play;
 mod serve;
 mod stop;
@@ -44,6 +47,9 @@ enum Command {
     Bench(bench::Args),
     /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
     Verify(verify::Args),
+    /// Write the raw frames of an expert's episode to standard output.
+    #[command(hide = true)]
+    Frames(frames::Args),
 }
 
 /// Exit status of a command that failed, or that found differences.
@@ -88,6 +94,7 @@ fn run(command: Command) -> Result<bool, Failure> {
         Command::Demo(args) => demo::run(&args)?,
         Command::Serve(args) => serve::run(&args)?,
         Command::Bench(args) => bench::run(&args)?,
+        Command::Frames(args) => frames::run(&args)?,
         Command::Verify(args) => return verify::run(&args),
     }
     Ok(true)

@@ -4,7 +4,8 @@ use endless_gym_core::envs::{self, EnvSpec, SCREEN};
 use serde_json::json;
 
 use super::failure::Failure;
-use super::output::{print, print_json, table};
+use super::output::{self, print, print_json, table};
+use super::picture::{When, picture};
 
 /// Arguments of `endless list`.
 #[derive(clap::Args)]
@@ -12,8 +13,11 @@ pub struct Args {
     /// Environment id to describe [default: list all ids].
     id: Option<String>,
     /// Print JSON [default: text].
-    #[arg(long)]
+    #[arg(long, conflicts_with = "picture")]
     json: bool,
+    /// When to show a picture of the environment, made of coloured characters.
+    #[arg(long, value_enum, value_name = "WHEN", default_value = "auto", requires = "id")]
+    picture: When,
 }
 
 /// Runs `endless list`.
@@ -21,7 +25,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     match &args.id {
         Some(id) => {
             let spec = envs::spec(id)?;
-            if args.json { print_json(&as_json(spec)) } else { print(description(spec)) }
+            match () {
+                _ if args.json => print_json(&as_json(spec)),
+                _ if args.picture.applies() => {
+                    print(format_args!("{}\n{}", picture(spec, output::width())?, description(spec)))
+                }
+                _ => print(description(spec)),
+            }
         }
         None if args.json => print_json(&envs::specs().map(as_json).collect::<Vec<_>>()),
         None => {

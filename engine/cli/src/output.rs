@@ -1,26 +1,29 @@
 //! Standard output and standard error: tables and numbers for people, JSON for programs.
 
-use std::io::{self, ErrorKind, IsTerminal, Write};
+use std::io::{self, ErrorKind, Write};
 
 use comfy_table::{ContentArrangement, LineStyle, Table, TableStyle};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
+use terminal_size::{Width, terminal_size_of};
 
 use super::failure::Failure;
 
-/// Width of tables if standard output is no terminal, in characters.
-const TABLE_WIDTH: u16 = 120;
+/// Width if standard output is no terminal, in characters.
+const PIPE_WIDTH: u16 = 120;
 
-/// An empty table with these headings, as wide as the terminal.
+/// An empty table with these headings, at most as wide as standard output.
 pub fn table<const N: usize>(headings: [&str; N]) -> Table {
     let mut table = Table::new();
     let line = LineStyle::none().fill('─').junction('─');
     table.load_style(TableStyle::new().header_separator(line));
-    table.set_content_arrangement(ContentArrangement::Dynamic).set_header(headings);
-    if !io::stdout().is_terminal() {
-        table.set_width(TABLE_WIDTH);
-    }
+    table.set_content_arrangement(ContentArrangement::Dynamic).set_width(width()).set_header(headings);
     table
+}
+
+/// Width of standard output in characters.
+pub fn width() -> u16 {
+    terminal_size_of(io::stdout()).map_or(PIPE_WIDTH, |(Width(columns), _)| columns)
 }
 
 /// Prints `text` and a newline to standard output.

@@ -1,0 +1,38 @@
+//! `endless frames`: the raw frames of an expert's episode, for programs that make pictures of them.
+
+use std::io::{self, ErrorKind, Write};
+
+use super::failure::Failure;
+use super::film::Film;
+use super::options::EnvironmentArgs;
+
+/// Arguments of `endless frames`.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Environment id; `endless list` lists them.
+    #[arg(long = "env", value_name = "ID")]
+    id: String,
+    /// Number of steps after which the film ends, if the episode has not ended.
+    #[arg(long, default_value_t = 1000)]
+    steps: usize,
+    #[command(flatten)]
+    environment: EnvironmentArgs,
+}
+
+/// Runs `endless frames`: for the start and each step of the first episode, writes the observation, uint8 (84, 84, 3), and the
+/// ground-truth view, uint8 (336, 336, 3), both indexed \[row\]\[column\]\[channel\].
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let mut film = Film::new(&args.environment.configure(&args.id, 1)?)?;
+    let mut stdout = io::stdout().lock();
+    for _ in 0..=args.steps {
+        let view = film.ground_truth_view()?;
+        match stdout.write_all(film.observation()).and_then(|()| stdout.write_all(&view)) {
+            Err(error) if error.kind() == ErrorKind::BrokenPipe => break,
+            written => written.map_err(|error| format!("cannot write to standard output: {error}"))?,
+        }
+        if !film.step()? {
+            break;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,165 @@
+//! A small picture of an environment, as coloured characters.
+
+use std::io::{self, IsTerminal};
+
+use clap::ValueEnum;
+use endless_gym_core::envs::view::VIEW;
+use endless_gym_core::envs::{EnvSpec, Family, SCREEN};
+use endless_gym_core::pool::{PoolConfig, Seeding};
+
+use super::failure::Failure;
+use super::film::Film;
+
+/// When to print a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum When {
+    /// In a terminal with 24-bit colours: COLORTERM is `truecolor` or `24bit`, and NO_COLOR is not set.
+    Auto,
+    /// Always.
+    Always,
+    /// Never.
+    Never,
+}
+
+impl When {
+    /// Whether to print a picture to standard output.
+    pub fn applies(self) -> bool {
+        let variable = |name| std::env::var(name).unwrap_or_default();
+        match self {
+            When::Auto => io::stdout().is_terminal() && true_colour(&variable("COLORTERM"), &variable("NO_COLOR")),
+            When::Always => true,
+            When::Never => false,
+        }
+    }
+}
+
+/// Whether these values of COLORTERM and NO_COLOR permit 24-bit colours.
+fn true_colour(colorterm: &str, no_color: &str) -> bool {
+    matches!(colorterm, "truecolor" | "24bit") && no_color.is_empty()
+}
+
+/// Pixels of the frame per pixel of the picture, in each direction.
+const SCALE: usize = 2;
+
+/// Pixels of the picture in each direction. A character shows two of them, one above the other.
+const SIDE: usize = SCREEN / SCALE;
+
+/// Spaces between two pictures.
+const GAP: usize = 2;
+
+/// The seed of the episode that is shown: long enough in every environment.
+const SEED: u64 = 15;
+
+/// Pixels of a picture, in rows.
+type Pixels = Vec<[u8; 3]>;
+
+/// The ground-truth view at a typical step of an expert's episode, in 42 columns and 22 lines; if 86 columns are available, beside
+/// the observation.
+pub fn picture(spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
+    let config = PoolConfig { seeding: Seeding::Continue { seed: Some(SEED) }, ..PoolConfig::new(spec.id, 1) };
+    let mut film = Film::new(&config)?;
+    for _ in 0..typical_step(spec) {
+        film.step()?;
+    }
+    let mut pictures = vec![("ground truth", reduced(&film.ground_truth_view()?, VIEW))];
+    if usize::from(columns) >= 2 * SIDE + GAP {
+        pictures.insert(0, ("observation", reduced(film.observation(), SCREEN)));
+    }
+    Ok(half_blocks(&pictures))
+}
+
+/// A step that shows what the environment is about: a command, the path, the spotlights.
+fn typical_step(spec: &EnvSpec) -> usize {
+    match spec.family {
+        Family::MortarMayhem(_) => 0,
+        Family::MysteryPath(_) => 12,
+        Family::SearingSpotlights(_) => 40,
+    }
+}
+
+/// Reduces a square frame, indexed \[row\]\[column\]\[channel\], to the size of the picture, by averages.
+fn reduced(frame: &[u8], side: usize) -> Pixels {
+    let (pixels, block) = (frame.as_chunks::<3>().0, side / SIDE);
+    let average = |row: usize, column: usize| {
+        std::array::from_fn(|channel| {
+            let lines = pixels.chunks_exact(side).skip(row * block).take(block);
+            let sum: usize =
+                lines.flat_map(|line| &line[column * block..][..block]).map(|pixel| usize::from(pixel[channel])).sum();
+            (sum / (block * block)) as u8
+        })
+    };
+    (0..SIDE * SIDE).map(|place| average(place / SIDE, place % SIDE)).collect()
+}
+
+/// Pictures side by side, below their titles: the upper half of a character in its foreground colour, the lower half in its
+/// background colour.
+fn half_blocks(pictures: &[(&str, Pixels)]) -> String {
+    let mut lines = vec![pictures.iter().map(|(title, _)| format!("{title:<SIDE$}")).collect::<Vec<_>>()];
+    for row in (0..SIDE).step_by(2) {
+        lines.push(pictures.iter().map(|(_, pixels)| half_block_line(&pixels[row * SIDE..][..2 * SIDE])).collect());
+    }
+    let gap = " ".repeat(GAP);
+    lines.iter().map(|line| line.join(&gap).trim_end().to_owned() + "\n").collect()
+}
+
+/// One line of characters, for two rows of pixels.
+fn half_block_line(rows: &[[u8; 3]]) -> String {
+    let (upper, lower) = rows.split_at(SIDE);
+    let (mut line, mut last) = (String::new(), None);
+    for colours @ ([r, g, b], [below_r, below_g, below_b]) in upper.iter().zip(lower) {
+        if last.replace(colours) != Some(colours) {
+            line += &format!("\x1b[38;2;{r};{g};{b};48;2;{below_r};{below_g};{below_b}m");
+        }
+        line.push('▀');
+    }
+    line + "\x1b[0m"
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::envs;
+
+    use super::*;
+
+    #[test]
+    fn colours_need_a_terminal_that_has_them_and_a_user_who_wants_them() {
+        assert!(true_colour("truecolor", "") && true_colour("24bit", ""));
+        assert!(!true_colour("", "") && !true_colour("256color", "") && !true_colour("truecolor", "1"));
+    }
+
+    #[test]
+    fn pixels_are_averages_of_the_frame() {
+        let mut frame = vec![0; SCREEN * SCREEN * 3];
+        let (row, column) = (10, 21);
+        frame[(row * SCREEN + column) * 3 + 1] = 200;
+        let mut expected = vec![[0; 3]; SIDE * SIDE];
+        expected[row / 2 * SIDE + column / 2] = [0, 50, 0];
+        assert_eq!(reduced(&frame, SCREEN), expected);
+        let magnified: Vec<u8> = (0..VIEW * VIEW * 3)
+            .map(|byte| frame[(byte / 3 / VIEW / 4 * SCREEN + byte / 3 % VIEW / 4) * 3 + byte % 3])
+            .collect();
+        assert_eq!(reduced(&magnified, VIEW), expected);
+    }
+
+    #[test]
+    fn a_line_has_both_rows_and_names_a_colour_once() {
+        let mut rows = [[0; 3]; 2 * SIDE];
+        rows[SIDE + 1] = [1, 2, 3];
+        let line = half_block_line(&rows);
+        let black = "\x1b[38;2;0;0;0;48;2;0;0;0m";
+        let rest = "▀".repeat(SIDE - 2);
+        assert_eq!(line, format!("{black}▀\x1b[38;2;0;0;0;48;2;1;2;3m▀{black}{rest}\x1b[0m"));
+    }
+
+    #[test]
+    fn every_environment_has_a_picture() {
+        for spec in envs::specs() {
+            let narrow = picture(spec, 80).unwrap();
+            let wide = picture(spec, (2 * SIDE + GAP) as u16).unwrap();
+            assert_eq!(narrow.matches('▀').count(), SIDE * SIDE / 2, "{}", spec.id);
+            assert_eq!(wide.matches('▀').count(), SIDE * SIDE, "{}", spec.id);
+            let colours: std::collections::BTreeSet<&str> = narrow.split('▀').collect();
+            assert!(colours.len() > 5, "{}: {colours:?}", spec.id);
+        }
+    }
+}

@@ -1,0 +1,209 @@
+"""Charts of measured results, each in one variant for light and one for dark pages."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.transforms import blended_transform_factory
+
+matplotlib.use("svg")
+
+
+class Theme(NamedTuple):
+    """Colours of a chart: those of the environments, as light or dark as the page requires."""
+
+    text: str
+    faint: str
+    grid: str
+    blue: str
+    grey: str
+    green: str
+    red: str
+
+
+THEMES = {
+    "light": Theme("#1f2733", "#66707f", "#dfe3e8", "#2d5ea8", "#7b8696", "#308d46", "#b3263a"),
+    "dark": Theme("#d6dce8", "#8d97a6", "#2b323d", "#6ea4f2", "#8b96a5", "#5cc27a", "#f0707e"),
+}
+
+#: Width of a chart in inches at 96 pixels each, and its font sizes in points.
+WIDTH, TITLE, BODY, SMALL = 8.6, 11.5, 9.5, 8.5
+#: Left margin as a share of the width, and the space between two groups as a share of a row.
+LEFT, SPACE = 0.012, 0.4
+
+#: Rows of the comparison by group: the name in `benches/comparison.md` (the number of environments may follow), and what it is.
+GROUPS = {
+    "Memory Gym": {
+        "original, gymnasium.make": "one environment",
+        "original, SyncVectorEnv": "SyncVectorEnv",
+        "original, AsyncVectorEnv": "AsyncVectorEnv",
+        "original, SubprocVecEnv": "SubprocVecEnv of SB3",
+    },
+    "Endless Gym": {
+        "gymnasium.make": "one environment",
+        "serve, 64 environments": "64, in shared memory",
+        "make_vec, 64 environments": "64, in process",
+        "serve, 1024 environments": "1,024, in shared memory",
+        "make_vec, 1024 environments": "1,024, in process",
+    },
+    "EnvPool, for scale": {
+        "EnvPool's Pong-v5": "Pong, 64",
+        "EnvPool's CartPole-v1": "CartPole, 64",
+    },
+}
+
+#: Agents of the learning curve.
+AGENTS = {"gru": "GRU", "trxl": "Transformer-XL", "none": "without memory"}
+#: Number of neighbouring updates whose mean is shown.
+SMOOTH = 24
+
+
+def chart(folder: Path, name: str, height: float, draw: Callable[[Figure, Theme], None]) -> None:
+    """Write both variants of a chart as SVG, without a date, so that the same data give the same files."""
+    for variant, theme in THEMES.items():
+        settings = {
+            "svg.hashsalt": name,
+            "font.size": BODY,
+            "text.color": theme.text,
+            "axes.labelcolor": theme.faint,
+            "axes.titlesize": TITLE,
+            "xtick.color": theme.faint,
+            "ytick.color": theme.text,
+            "axes.edgecolor": theme.grid,
+            "grid.color": theme.grid,
+        }
+        with matplotlib.rc_context(settings):
+            figure = pyplot.figure(figsize=(WIDTH, height), dpi=96)
+            draw(figure, theme)
+            metadata = {"Date": None, "Creator": None}
+            figure.savefig(folder / f"{name}-{variant}.svg", transparent=True, metadata=metadata)
+            pyplot.close(figure)
+
+
+def header(figure: Figure, theme: Theme, title: str, note: str) -> None:
+    """Write the title of a chart and a note below it."""
+    height = figure.get_figheight()
+    figure.text(LEFT, 1 - 0.2 / height, title, fontsize=TITLE, weight="bold", va="center")
+    figure.text(LEFT, 1 - 0.44 / height, note, fontsize=SMALL, color=theme.faint, va="center")
+
+
+def plain(axes: Axes) -> None:
+    """Remove the frame and the tick marks, and draw the grid behind the data."""
+    for side in axes.spines.values():
+        side.set_visible(False)
+    axes.tick_params(length=0, labelsize=SMALL)
+    axes.set_axisbelow(True)
+
+
+def measured(report: str) -> Iterator[tuple[str, float]]:
+    """Contender and number of each row of the tables that `benches/comparison.py` writes as Markdown."""
+    for line in report.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        number = cells[1].replace(",", "") if line.startswith("| ") and len(cells) > 1 else ""
+        if number.replace(".", "", 1).isdigit():
+            yield cells[0], float(number)
+
+
+def short(speed: float) -> tuple[str, str]:
+    """A number of steps per second with two digits or more, and its unit."""
+    size, unit = (1e6, "M") if speed >= 1e6 else (1e3, "k")
+    return f"{speed / size:.{1 if speed < 10 * size else 0}f}", unit
+
+
+def spread(low: float, high: float) -> str:
+    """The range of several measurements, such as `2.6 to 4.5 k` or `716 k to 1.2 M`."""
+    (first, unit), (last, last_unit) = short(low), short(high)
+    if (first, unit) == (last, last_unit):
+        return f"{last} {last_unit}"
+    return f"{first} to {last} {unit}" if unit == last_unit else f"{first} {unit} to {last} {last_unit}"
+
+
+def comparison(folder: Path, report: Path) -> None:
+    """Steps per second beside the original's."""
+    found = list(measured(report.read_text()))
+
+    def speeds(contender: str) -> list[float]:
+        """One number for each environment; the name may continue with the number of environments, but not with a target's."""
+        return [speed for name, speed in found if name.startswith(contender) and ", times" not in name]
+
+    groups = {
+        group: {what: speeds(contender) for contender, what in rows.items() if speeds(contender)}
+        for group, rows in GROUPS.items()
+    }
+    if not groups["Memory Gym"] or not groups["Endless Gym"]:
+        raise ValueError(f"{report} has no table of benches/comparison.py")
+    lines = sum(len(rows) for rows in groups.values()) + len(groups) * (1 + SPACE)
+    cores = report.read_text().partition("- cores: ")[2].split()[0]
+
+    def draw(figure: Figure, theme: Theme) -> None:
+        axes = figure.add_axes((0.225, 0.075, 0.675, 0.77))
+        plain(axes)
+        axes.set(xscale="log", xlim=(1.4e3, 6e6), ylim=(lines - SPACE - 0.4, -0.6))
+        axes.set_xticks([1e4, 1e5, 1e6])
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda speed, _: f"{speed:,.0f}"))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_yticks([])
+        axes.grid(axis="x", lw=1)
+        left = blended_transform_factory(figure.transFigure, axes.transData)
+        place = 0.0
+        for group, rows in groups.items():
+            colour = theme.blue if group == "Endless Gym" else theme.grey
+            axes.text(LEFT, place, group, transform=left, va="center", weight="bold")
+            for what, values in rows.items():
+                place += 1
+                low, high = min(values), max(values)
+                axes.text(LEFT, place, what, transform=left, va="center")
+                axes.plot([low, high], [place, place], color=colour, lw=5, alpha=0.35, solid_capstyle="round")
+                axes.plot(values, [place] * len(values), "o", color=colour, ms=6.5, mec="none")
+                style = {"textcoords": "offset points", "va": "center", "fontsize": SMALL, "color": colour}
+                axes.annotate(spread(low, high), (high, place), (9, 0), **style)
+            place += 1 + SPACE
+        note = "Logarithmic. A dot for each of the three endless environments; 64 or 1,024 of one are stepped at once."
+        header(figure, theme, f"Steps per second on {cores} cores", note)
+
+    chart(folder, "steps-per-second", 4.1, draw)
+
+
+def smooth(values: np.ndarray, window: int) -> np.ndarray:
+    """Means over up to `window` neighbours."""
+    sums, sizes = (np.convolve(each, np.ones(window), "same") for each in (values, np.ones_like(values)))
+    return sums / sizes
+
+
+def learning(folder: Path, results: Path) -> None:
+    """Learning curves of agents with and without memory, from a file of `benches/agents/learning.py`."""
+    data = json.loads(results.read_text())
+    colours = {"gru": "blue", "trxl": "green", "none": "red"}
+
+    def draw(figure: Figure, theme: Theme) -> None:
+        axes = figure.add_axes((0.062, 0.14, 0.77, 0.66))
+        plain(axes)
+        axes.set(xlim=(0, max(run["steps"] for run in data["runs"]) / 1e6), ylim=(0, 1.02))
+        axes.set_xlabel("million environment steps", fontsize=SMALL)
+        axes.set_yticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
+        axes.tick_params(axis="y", colors=theme.faint)
+        axes.grid(axis="y", lw=1)
+        for agent, name in AGENTS.items():
+            colour, ends = getattr(theme, colours[agent]), []
+            for run in (run for run in data["runs"] if run["agent"] == agent):
+                steps, rewards = np.array(run["curve"]).T
+                share = smooth(rewards / data["best_reward"], SMOOTH)
+                shown = np.append(np.arange(0, len(steps) - 1, SMOOTH // 4), len(steps) - 1)
+                axes.plot(steps[shown] / 1e6, share[shown], color=colour, lw=1.6, solid_capstyle="round")
+                ends.append((steps[-1] / 1e6, share[-1]))
+            axes.plot(*zip(*ends, strict=True), "o", color=colour, ms=5, mec="none", clip_on=False)
+            style = {"textcoords": "offset points", "va": "center", "color": colour, "annotation_clip": False}
+            axes.annotate(name, max(ends), (9, 0), **style)
+        note = "Share of the best possible reward during training, three commands of MortarMayhem-Grid; a line for each run."
+        header(figure, theme, "With and without memory", note)
+
+    chart(folder, "learning", 3.1, draw)
