@@ -19,9 +19,7 @@ pub struct Interpreter {
 
 /// The CPython for the tests of the package: that of the original if there is one, otherwise the newest.
 pub fn for_package() -> Option<Interpreter> {
-    let mut found = find();
-    found.sort_by_key(|python| (python.minor == ORIGINAL, python.minor));
-    found.pop()
+    for_original().or_else(|| find().max_by_key(|python| python.minor))
 }
 
 /// One CPython of each minor version, in their order.
@@ -34,19 +32,21 @@ pub fn all() -> Vec<Interpreter> {
 
 /// The CPython for the original.
 pub fn for_original() -> Option<Interpreter> {
-    find().into_iter().find(|python| python.minor == ORIGINAL)
+    find().find(|python| python.minor == ORIGINAL)
 }
 
 /// All that can make virtual environments, on the path and of pyenv.
-fn find() -> Vec<Interpreter> {
-    let names = SUPPORTED.map(|minor| format!("python3.{minor}")).chain(["python3".to_owned(), "python".to_owned()]);
+fn find() -> impl Iterator<Item = Interpreter> {
+    // The original's first: where it is there, the others are not run.
+    let minors = std::iter::once(ORIGINAL).chain(SUPPORTED.filter(|minor| *minor != ORIGINAL));
+    let names = minors.map(|minor| format!("python3.{minor}")).chain(["python3".to_owned(), "python".to_owned()]);
     let on_path = names.map(PathBuf::from);
     let versions = std::env::var_os("PYENV_ROOT")
         .map(PathBuf::from)
         .or_else(|| std::env::home_dir().map(|home| home.join(".pyenv")))
         .and_then(|root| std::fs::read_dir(root.join("versions")).ok());
     let of_pyenv = versions.into_iter().flatten().flatten().map(|version| version.path().join("bin/python3"));
-    on_path.chain(of_pyenv).filter_map(probe).collect()
+    on_path.chain(of_pyenv).filter_map(probe)
 }
 
 /// `None` for what cannot be run, is no supported CPython, or lacks `venv` or `ensurepip`, as Debian's does without python3-venv.

@@ -22,7 +22,13 @@ pub struct Stage {
 const RUST_TESTS: &[&str] = &["test", "--workspace", "--locked", "--no-fail-fast", "--"];
 
 /// The tests that take more than some seconds.
-const SLOW: &[&str] = &["drawn_alike_in_irregular_buffers", "steps_and_resets_allocate_nothing"];
+const SLOW: &[&str] = &[
+    "deaths_at_any_moment_are_survived",
+    "drawn_alike_in_irregular_buffers",
+    "every_format_is_a_plain_conversion",
+    "finite_searing_spotlights_is_solved",
+    "steps_and_resets_allocate_nothing",
+];
 
 const STAGE: Stage = Stage { name: "", run: || Ok(()), needs: &[], after: &[], compiles: false, quick: false };
 const QUICK: Stage = Stage { quick: true, ..STAGE };

@@ -9,6 +9,8 @@ from typing import Any
 import other_device
 import pytest
 
+pytestmark = pytest.mark.slow
+
 SMALL = (
     "--preset quick --environment.num-envs 2 --ppo.steps 16 --ppo.updates 1 --ppo.epochs 1 "
     "--ppo.minibatches 2 --threads 1 --environment.num-threads 1 --recurrence.hidden-size 16 --transformer.width 16 "

@@ -18,6 +18,8 @@ from endless_gym.agents.search_space import single_changes, space, value, with_c
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import train
 
+pytestmark = pytest.mark.slow
+
 QUIET = Console(quiet=True)
 
 

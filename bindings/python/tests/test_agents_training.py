@@ -29,6 +29,8 @@ from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import check_resumable, main, parse, restore_generator, train
 
+pytestmark = pytest.mark.slow
+
 GRID = "MortarMayhem-Grid-v0"
 
 
