@@ -11,7 +11,7 @@ use crate::{dist, interpreters};
 /// The smallest agent, for ten updates.
 const TRAIN: &[&str] = &[
     "--env MortarMayhem-Grid-v0 --agent none --preset quick --device cpu --environment.option command_count=[1]",
-    "--environment.num-envs 8 --ppo.steps 32 --ppo.updates 10 --ppo.epochs 1 --run run",
+    "--environment.num-envs 8 --ppo.steps 16 --ppo.updates 10 --ppo.epochs 1 --threads 1 --run run",
 ];
 
 /// A virtual environment of uv, which links files from one cache. Environments with PyTorch share its gigabytes.
@@ -93,8 +93,7 @@ fn train(environment: &Environment, wheel: &str) -> Result<(), String> {
     }
     run("install the extra `agents`", &mut environment.install(&[&format!("{wheel}[agents]")])?)?;
     let arguments = TRAIN.iter().flat_map(|line| line.split(' '));
-    let training = run("endless-train, ten updates", environment.program("endless-train").args(arguments));
-    training?;
+    run("endless-train, ten updates", environment.program("endless-train").args(arguments))?;
     let checkpoint = environment.folder.join("run/checkpoints/last.pt");
     if checkpoint.is_file() { Ok(()) } else { Err(format!("training must write {}", checkpoint.display())) }
 }
@@ -103,8 +102,7 @@ fn train(environment: &Environment, wheel: &str) -> Result<(), String> {
 fn source(tools: &Path, python: &Path) -> Result<(), String> {
     let archive = dist::only_file(&dist::folder()?, ".tar.gz")?.display().to_string();
     let environment = Environment::create(tools, python, "source")?;
-    let mut install =
-        environment.install(&["--no-binary", "endless-gym", "--reinstall-package", "endless-gym", &archive])?;
+    let mut install = environment.install(&["--reinstall-package", "endless-gym", &archive])?;
     install.env("CARGO_TARGET_DIR", target()?).env("MATURIN_PEP517_ARGS", "--profile dev");
     run("install the source distribution", &mut install)?;
     environment.check()
