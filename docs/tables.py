@@ -38,7 +38,8 @@ def overview(specs: Iterable[Spec]) -> str:
 def actions(spec: Spec) -> str:
     """The action space as Gymnasium writes it."""
     ((kind, choices),) = spec["action_space"].items()
-    return f"{kind}({choices})"
+    # A line does not break in it.
+    return f"{kind}({choices})".replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def spaces(spec: Spec) -> str:
