@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from snippets import ROOT, SHELL, Block, blocks, pages, programs
 
-TIMEOUT = 120
-#: As Ctrl-C ends them, so that engines remove their segments.
-END_JOBS = "kill -INT $(jobs -p) 2>/dev/null || true; wait"
+TIMEOUT = 280
+#: Engines remove their segments. Not SIGINT, which Python's start would swallow.
+END_JOBS = "kill -TERM $(jobs -p) 2>/dev/null || true; wait"
 PROGRAMS = [program for page in pages() for program in programs(page)]
 #: Rust in the README is a test of the crate's documentation (`src/lib.rs`).
 DOCTESTS = ROOT / "README.md"
