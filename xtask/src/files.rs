@@ -146,7 +146,7 @@ fn dependencies() -> Result<(), String> {
     }
     println!("==> cargo deny");
     // Advisories need a download, and change without a change here.
-    let checks = ["--log-level", "error", "check", "--show-stats", "bans", "licenses", "sources"];
+    let checks = ["--workspace", "--log-level", "error", "check", "--show-stats", "bans", "licenses", "sources"];
     execute(Command::new("cargo-deny").current_dir(workspace()).args(checks))
 }
 
