@@ -204,7 +204,7 @@ fn extremes() -> Vec<Value> {
 fn seedings() -> [Seeding; 3] {
     [
         Seeding::Continue { seed: Some(3) },
-        Seeding::Range { start: 0, end: 100_000, seed: Some(3) },
+        Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
         Seeding::List(vec![5, 6, 7]),
     ]
 }
@@ -250,7 +250,7 @@ fn field<'a>(value: &'a mut Value, name: &str) -> &'a mut Value {
 fn an_even_increment_is_refused() {
     // PCG64 with state 0 and increment 0 returns only zeros, which rejection sampling redraws forever.
     let spec = envs::spec("MysteryPath-v0").unwrap();
-    let mut game = Game::new(spec, Seeding::Range { start: 0, end: 100_000, seed: Some(3) }, Map::new());
+    let mut game = Game::new(spec, Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) }, Map::new());
     let content = game.content();
     for increment in [0, 2, u64::MAX - 1] {
         let mut forged = content.clone();

@@ -80,7 +80,7 @@ class Environments:
 
     def send(self, actions: NDArray[np.int64], group: int) -> None:
         """Start a step of a group with actions int64 (n, branches), without waiting for the result."""
-        self._envs.send(actions, group)
+        self._envs.send(self.spec.batched_actions(actions), group)
         if self._thread is not None:
             self._results[group] = self._thread.submit(self._envs.recv, group)
 
