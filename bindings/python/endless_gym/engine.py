@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -79,6 +80,10 @@ class EngineProcess:
             self._process.kill()
             self._process.wait()
         self._errors.close()
+        if self._process.returncode:
+            # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
+            with contextlib.suppress(OSError, RuntimeError):
+                _native.running_engines()
 
 
 def serve(

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -141,6 +142,15 @@ def test_the_program_comes_along() -> None:
     assert subprocess.run(demo, capture_output=True, check=False).returncode == 0
     table = [sys.executable, "-m", "endless_gym", "--num-envs", "4", "--seconds", "0.01"]
     assert ID in subprocess.run(table, capture_output=True, text=True, check=True).stdout
+
+
+def test_a_killed_engine_leaves_nothing(segments: Callable[[], set[str]]) -> None:
+    before = segments()
+    envs = endless_gym.serve(ID, 4)
+    assert segments() > before
+    os.kill(envs._backend._engine.pid, signal.SIGKILL)
+    envs.close()
+    assert segments() <= before
 
 
 def test_a_running_engine_without_final_observations() -> None:
