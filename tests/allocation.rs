@@ -44,7 +44,7 @@ fn steps_and_resets_allocate_nothing() {
         // As few as one thread steps, and enough for two.
         for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
             let config = PoolConfig {
-                seeding: Seeding::Range { start: 0, end: 100_000, seed: Some(1) },
+                seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
                 autoreset,
                 final_observation: true,
                 features: true,

@@ -1,7 +1,10 @@
 //! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot is
-//! refused or can be played; none panics.
+//! refused or can be played; none panics, and none hangs.
 
 mod common;
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use ciborium::Value;
 use endless_gym::batch::{Block, zeroed};
@@ -80,6 +83,7 @@ struct Game {
     random: SmallRng,
     codec: Codec,
     head: [u8; HEAD],
+    watchdog: Watchdog,
 }
 
 impl Game {
@@ -96,7 +100,7 @@ impl Game {
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
         let random = SmallRng::seed_from_u64(1);
-        Game { spec, pool, blocks, random, codec: Codec::for_spec(spec), head: [0; HEAD] }
+        Game { spec, pool, blocks, random, codec: Codec::for_spec(spec), head: [0; HEAD], watchdog: Watchdog::new() }
     }
 
     fn play(&mut self, steps: usize) {
@@ -127,6 +131,13 @@ impl Game {
     /// Restores forged content and, if it is not refused, plays it: to the end of the episode or not, and in another
     /// episode.
     fn try_to_play(&mut self, content: &Value) -> Outcome {
+        self.watchdog.set(Some(content));
+        let outcome = self.outcome(content);
+        self.watchdog.set(None);
+        outcome
+    }
+
+    fn outcome(&mut self, content: &Value) -> Outcome {
         match self.restore(content) {
             None => Outcome::NotEncodable,
             Some(Err(_)) => Outcome::Refused,
@@ -141,6 +152,37 @@ impl Game {
                 Outcome::Played
             }
         }
+    }
+}
+
+/// Ends the process, with the forged content, if a case takes longer than any snapshot may.
+struct Watchdog {
+    /// When the running case started, and its content.
+    case: Arc<Mutex<Option<(Instant, Value)>>>,
+}
+
+impl Watchdog {
+    fn new() -> Self {
+        let case = Arc::new(Mutex::new(None::<(Instant, Value)>));
+        let watched = Arc::downgrade(&case);
+        std::thread::spawn(move || {
+            while let Some(case) = watched.upgrade() {
+                if let Some((start, content)) = &*case.lock().unwrap()
+                    && start.elapsed() > Duration::from_secs(60)
+                {
+                    let content: String = format!("{content:?}").chars().take(5000).collect();
+                    eprintln!("a forged snapshot hangs: {content}");
+                    std::process::abort();
+                }
+                drop(case);
+                std::thread::sleep(Duration::from_millis(200));
+            }
+        });
+        Watchdog { case }
+    }
+
+    fn set(&self, content: Option<&Value>) {
+        *self.case.lock().unwrap() = content.map(|content| (Instant::now(), content.clone()));
     }
 }
 
@@ -200,11 +242,39 @@ fn extremes() -> Vec<Value> {
     integers.chain(floats.into_iter().map(Value::Float)).chain(others).collect()
 }
 
+/// Number of items of a forged list: more than any list has by play within a test.
+const MANY: usize = 100_000;
+
+#[test]
+fn every_list_can_be_long() {
+    for spec in envs::specs() {
+        let mut game = Game::new(spec, Seeding::Continue { seed: Some(3) }, Map::new());
+        game.play(45);
+        let mut content = game.content();
+        for path in paths(&mut content) {
+            let mut forged = content.clone();
+            let Value::Array(items) = at(&mut forged, &path) else { continue };
+            let Some(item) = items.last().cloned() else { continue };
+            items.resize(MANY, item);
+            game.try_to_play(&forged);
+        }
+        if matches!(spec.family, Family::SearingSpotlights(_)) {
+            for name in ["coins", "spotlights", "lit"] {
+                let mut forged = content.clone();
+                let Value::Array(items) = field(field(&mut forged, "state"), name) else { panic!("{name} is no list") };
+                let item = items.last().cloned().unwrap_or_else(|| panic!("{name} is empty"));
+                items.resize(MANY, item);
+                assert!(matches!(game.restore(&forged), Some(Err(SnapshotError::State(_)))), "{name}");
+            }
+        }
+    }
+}
+
 /// Each of the policies, whose place in the sequence of seeds a snapshot holds.
 fn seedings() -> [Seeding; 3] {
     [
         Seeding::Continue { seed: Some(3) },
-        Seeding::Range { start: 0, end: 100_000, seed: Some(3) },
+        Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
         Seeding::List(vec![5, 6, 7]),
     ]
 }
@@ -250,7 +320,7 @@ fn field<'a>(value: &'a mut Value, name: &str) -> &'a mut Value {
 fn an_even_increment_is_refused() {
     // PCG64 with state 0 and increment 0 returns only zeros, which rejection sampling redraws forever.
     let spec = envs::spec("MysteryPath-v0").unwrap();
-    let mut game = Game::new(spec, Seeding::Range { start: 0, end: 100_000, seed: Some(3) }, Map::new());
+    let mut game = Game::new(spec, Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) }, Map::new());
     let content = game.content();
     for increment in [0, 2, u64::MAX - 1] {
         let mut forged = content.clone();

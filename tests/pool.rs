@@ -2,9 +2,13 @@
 
 mod common;
 
+use std::collections::HashSet;
+
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::{self, ActionError};
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym::pool::{
+    Autoreset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
+};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -67,7 +71,7 @@ fn first_frame(seed: u64) -> Vec<u8> {
 fn results_do_not_depend_on_the_number_of_threads() {
     for spec in envs::specs() {
         let config = PoolConfig {
-            seeding: Seeding::Range { start: 0, end: 100_000, seed: Some(1) },
+            seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
             features: true,
             ..PoolConfig::new(spec.id, 131)
         };
@@ -186,11 +190,65 @@ fn seeds_follow_the_seeding() {
     let seeds = |seeds: &[u64]| seeds.iter().map(|seed| first_frame(*seed)).collect::<Vec<_>>();
     assert_eq!(first_frames(Seeding::List(vec![10, 11, 12]), 3), seeds(&[10, 11, 12, 10, 11, 12]));
     assert_eq!(first_frames(Seeding::Continue { seed: Some(20) }, 1), seeds(&[20, 21]));
-    assert_eq!(first_frames(Seeding::Range { start: 30, end: 31, seed: None }, 2), seeds(&[30; 4]));
-    let drawn = first_frames(Seeding::Range { start: 0, end: 100_000, seed: Some(1) }, 20);
-    assert_eq!(drawn, first_frames(Seeding::Range { start: 0, end: 100_000, seed: Some(1) }, 20));
-    assert_ne!(drawn, first_frames(Seeding::Range { start: 0, end: 100_000, seed: Some(2) }, 20));
+    assert_eq!(first_frames(Seeding::Range { start: 30, end: 31, step: 1, seed: None }, 2), seeds(&[30; 4]));
+    let drawn = first_frames(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) }, 20);
+    assert_eq!(drawn, first_frames(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) }, 20));
+    assert_ne!(drawn, first_frames(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(2) }, 20));
     assert_ne!(drawn[0], drawn[1], "environments draw independently");
+}
+
+#[test]
+fn ranges_of_seeds_may_have_a_step() {
+    let seeding = Seeding::Range { start: 4, end: 12, step: 3, seed: Some(1) };
+    let player = Player::new(&PoolConfig { seeding, ..PoolConfig::new(ID, 64) }, 1);
+    let expected: HashSet<Vec<u8>> = [4, 7, 10].map(first_frame).into();
+    assert_eq!((0..64).map(|env| player.frame(env)).collect::<HashSet<_>>(), expected);
+}
+
+#[test]
+fn all_episodes_after_a_seeded_reset_follow_from_its_seed() {
+    let range = |seed| Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(seed) };
+    let pairs = [
+        [Seeding::Continue { seed: Some(3) }, Seeding::Continue { seed: Some(4) }],
+        [range(3), range(4)],
+        [Seeding::List(vec![5, 6, 7]), Seeding::List(vec![5, 6, 7])],
+    ];
+    for pair in pairs {
+        // One reset by the seed of all, the other one environment at a time and after another number of episodes.
+        let each = [ResetRequest::Seed(50), ResetRequest::Each { reset: &[2, 2], seed: &[50, 51] }];
+        let shown = pair.clone().into_iter().zip(each).enumerate().map(|(before, (seeding, request))| {
+            let mut player = Player::new(&PoolConfig { seeding, ..config(2) }, 1);
+            for _ in 0..before {
+                player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
+            }
+            player.pool.reset(request, &mut player.blocks).unwrap();
+            let mut frames = vec![player.frame(0), player.frame(1)];
+            for _ in 0..4 {
+                player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
+                frames.extend([player.frame(0), player.frame(1)]);
+            }
+            frames
+        });
+        let [one, other] = shown.collect::<Vec<_>>().try_into().unwrap();
+        assert!(one == other, "{pair:?}");
+        let seeds = |seeds: &[u64]| seeds.iter().map(|seed| first_frame(*seed)).collect::<Vec<_>>();
+        match pair[0] {
+            Seeding::Continue { .. } => {
+                let mut twin =
+                    Player::new(&PoolConfig { seeding: Seeding::Continue { seed: Some(50) }, ..config(2) }, 1);
+                twin.pool.reset(ResetRequest::All, &mut twin.blocks).unwrap();
+                assert!(one[2..4] == [twin.frame(0), twin.frame(1)], "the generator of the seed continues");
+            }
+            Seeding::Range { .. } => assert_ne!(one[2], one[3], "environments draw independently"),
+            Seeding::List(_) => assert!(one == seeds(&[50, 51, 5, 6, 7, 5, 6, 7, 5, 6]), "the list starts again"),
+        }
+    }
+}
+
+#[test]
+fn the_number_of_threads_is_limited() {
+    assert!(matches!(Threads::new(MAX_THREADS + 1), Err(PoolError::ThreadCount { given }) if given == MAX_THREADS + 1));
+    assert!(matches!(Threads::new(usize::MAX), Err(PoolError::ThreadCount { .. })));
 }
 
 #[test]
@@ -250,7 +308,12 @@ fn without_frames_nothing_else_changes() {
 
 #[test]
 fn wrong_configurations_are_refused() {
-    let refused = |config: PoolConfig| Pool::new(&config, &Threads::new(1).unwrap()).err().unwrap();
+    let refused = |config: PoolConfig| {
+        let error = Pool::new(&config, &Threads::new(1).unwrap()).err().unwrap();
+        assert_eq!(config.validate().unwrap_err().to_string(), error.to_string());
+        error
+    };
+    assert!(config(2).validate().is_ok());
     let with =
         |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
@@ -260,16 +323,18 @@ fn wrong_configurations_are_refused() {
         assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
     }
     assert!(matches!(refused(PoolConfig { seeding: Seeding::List(vec![]), ..config(1) }), PoolError::NoSeeds));
-    let empty = Seeding::Range { start: 5, end: 5, seed: None };
+    let empty = Seeding::Range { start: 5, end: 5, step: 1, seed: None };
     assert!(matches!(refused(PoolConfig { seeding: empty, ..config(1) }), PoolError::SeedRange { .. }));
+    let still = Seeding::Range { start: 4, end: 12, step: 0, seed: None };
+    assert!(matches!(refused(PoolConfig { seeding: still, ..config(1) }), PoolError::SeedStep));
     let two = ResetOptions::Each(vec![Map::new(); 2]);
     assert!(matches!(refused(PoolConfig { options: two, ..config(3) }), PoolError::OptionsCount { .. }));
     assert!(with(json!({"arena_sise": 5})).contains("`arena_sise`; it has max_steps, agent_scale"));
     assert!(with(json!({"allowed_commands": 3})).contains("`allowed_commands` must be an integer, 4 to 9, got 3"));
     assert!(with(json!({"visual_feedback": 1})).contains("`visual_feedback` must be true or false, got 1"));
     let one_of_two = ResetOptions::Each(vec![Map::new(), options(json!({"agent_speed": "fast"}))]);
-    let text = refused(PoolConfig { options: one_of_two, ..config(2) }).to_string();
-    assert!(text.contains("environment 1") && text.contains("agent_speed"), "{text}");
+    let text = refused(PoolConfig { options: one_of_two, first_env: 4, total_envs: 6, ..config(2) }).to_string();
+    assert!(text.contains("environment 5") && text.contains("agent_speed"), "{text}");
 }
 
 #[test]

@@ -212,6 +212,11 @@ fn verify_counts_and_exits_by_differences() {
         "{}",
         text(&other.stdout)
     );
+    let mut truncated: Json = serde_json::from_str(&recorded).unwrap();
+    truncated["episodes"][5]["steps"].as_array_mut().unwrap().pop();
+    let truncated = verify(&[&write("truncated.json.gz", &truncated)]);
+    assert_eq!(truncated.status.code(), Some(1));
+    assert!(text(&truncated.stdout).contains("not replayed: the trace is truncated: episode 5 must end with `done`"));
     trace["env"] = "Chess-v0".into();
     let unknown = verify(&[&files[0], &write("unknown.json.gz", &trace)]);
     assert_eq!(unknown.status.code(), Some(1));

@@ -72,7 +72,7 @@ fn a_snapshot_contains_the_options() {
 
 #[test]
 fn a_snapshot_contains_the_position_in_the_seeds() {
-    let seeding = Seeding::Range { start: 0, end: 100_000, seed: Some(1) };
+    let seeding = Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) };
     let with_range = PoolConfig { seeding, ..config("MortarMayhem-v0", 0) };
     let (mut original, mut blocks) = pool(&with_range);
     let snapshot = original.snapshot(0).unwrap();

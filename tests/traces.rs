@@ -167,6 +167,35 @@ fn difference(expected: &[u8], found: &[u8]) -> Option<([usize; 3], u8, u8)> {
 }
 
 #[test]
+fn a_trace_without_its_last_steps_is_an_error() {
+    for (id, views) in [("MortarMayhem-v0", false), ("Endless-MortarMayhem-v0", false), ("MysteryPath-v0", true)] {
+        for file in if views { common::traces_with_views(id) } else { common::traces(id) } {
+            let truncated = |change: fn(&mut Trace)| {
+                let mut trace = Trace::open(&file).unwrap();
+                change(&mut trace);
+                trace.check_complete()
+            };
+            let last = Trace::open(&file).unwrap().episodes.len() - 1;
+            for change in [
+                |trace: &mut Trace| drop(trace.episodes.last_mut().unwrap().steps.pop()),
+                |trace: &mut Trace| trace.episodes.last_mut().unwrap().steps.truncate(1),
+                |trace: &mut Trace| trace.episodes.last_mut().unwrap().steps.clear(),
+            ] {
+                let error = truncated(change).unwrap_err();
+                assert!(matches!(error, TraceError::Truncated { episode, .. } if episode == last), "{error}");
+            }
+            assert!(matches!(truncated(|trace| trace.episodes.clear()), Err(TraceError::Empty)));
+            // A recording with another limit states it.
+            let limited = truncated(|trace| {
+                trace.max_steps = Some(10);
+                trace.episodes.iter_mut().for_each(|episode| episode.steps.truncate(10));
+            });
+            assert!(limited.is_ok(), "{limited:?}");
+        }
+    }
+}
+
+#[test]
 fn a_trace_of_an_unknown_environment_is_an_error() {
     let mut trace = Trace::open(&common::traces("MortarMayhem-v0")[0]).unwrap();
     trace.env = "NoSuchThing-v0".to_owned();

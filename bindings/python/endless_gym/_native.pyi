@@ -11,9 +11,11 @@ __version__: str
 # Names of the autoreset modes: those of Gymnasium's `AutoresetMode` in lower case.
 AUTORESET_MODES: tuple[str, ...]
 DEFAULT_ENV_ID: str
-# Most environments in a group, and most groups.
+# Most environments in a group, groups, threads, and batches of a group that a trainer may hold.
 MAX_ENVS: int
 MAX_GROUPS: int
+MAX_THREADS: int
+MAX_BATCHES_HELD: int
 
 class EngineLost(ConnectionError):
     """The engine has ended, or has been replaced by another engine."""
@@ -27,25 +29,26 @@ Reset = int | tuple[Sequence[int], Sequence[int]]
 Arrays = tuple[NDArray[Any], ...]
 SingleArrays = tuple[NDArray[np.uint8], NDArray[np.float32] | None, NDArray[np.float64] | None]
 
-class Pool:
+class PoolConfig:
     def __init__(
         self,
         id: str,
         num_envs: int,
         *,
-        group: int,
         first_env: int,
         total_envs: int,
-        threads: Threads,
         options: str,
         autoreset: str,
         seed: int | None,
-        seed_range: tuple[int, int] | None,
+        seed_range: tuple[int, int, int] | None,
         seed_list: Sequence[int] | None,
         frames: tuple[bool, bool, bool, int] | None,
         features: bool,
         final_observation: bool,
     ) -> None: ...
+
+class Pool:
+    def __init__(self, config: PoolConfig, group: int, threads: Threads) -> None: ...
     def sections(self) -> list[str]: ...
     def reset(self, request: Reset | None = None, options: str | None = None) -> Arrays: ...
     def step(self, actions: Any) -> Arrays: ...

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 #: Largest unsigned 64-bit integer: the largest seed, and the largest count that the engine can read.
 MAX_U64 = 2**64 - 1
+#: Largest end of a range of seeds.
+MAX_I64 = 2**63 - 1
 
 
 def integer(name: str, given: Any, low: int = 0, high: int = MAX_U64) -> int:
@@ -25,6 +27,19 @@ def integer(name: str, given: Any, low: int = 0, high: int = MAX_U64) -> int:
     if not low <= number <= high:
         raise ValueError(f"{name} must be {low} to {high}, got {number}")
     return number
+
+
+def mapping(name: str, given: Any) -> dict[str, Any]:
+    """The argument as a dict; empty for `None`.
+
+    Raises:
+        TypeError: It is not a mapping.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{name} must be a mapping, got {given!r}")
+    return dict(given)
 
 
 def timeout(given: float) -> float:
@@ -47,18 +62,24 @@ def timeout(given: float) -> float:
 
 def seed_source(
     seed: int | None, seeds: range | Sequence[int] | None
-) -> tuple[int | None, tuple[int, int] | None, list[int] | None]:
-    """The arguments `seed` and `seeds` as a seed, the bounds of a range, and a list; the last two exclude each other.
+) -> tuple[int | None, tuple[int, int, int] | None, list[int] | None]:
+    """The arguments `seed` and `seeds` as a seed, start, stop and positive step of a range, and a list.
+
+    The last two exclude each other.
 
     Raises:
         TypeError: A seed is not an integer.
-        ValueError: A seed is out of range, or the range has a step other than 1.
+        ValueError: A seed is out of range, or there are none in `seeds`.
     """
     seed = None if seed is None else integer("seed", seed)
     if seeds is None:
         return seed, None, None
     if not isinstance(seeds, range):
-        return seed, None, [integer("seeds", each) for each in seeds]
-    if seeds.step != 1:
-        raise ValueError(f"seeds must be a range with step 1, got {seeds}")
-    return seed, (integer("start of seeds", seeds.start), integer("stop of seeds", seeds.stop)), None
+        seeds = [integer("seeds", each) for each in seeds]
+    if not seeds:
+        raise ValueError(f"seeds must have at least one seed, got {seeds}")
+    if isinstance(seeds, list):
+        return seed, None, seeds
+    # The order does not matter, since seeds are drawn from the range.
+    first, last = sorted((seeds[0], seeds[-1]))
+    return seed, (integer("seeds", first), integer("seeds", last, 0, MAX_I64 - 1) + 1, abs(seeds.step)), None

@@ -31,7 +31,7 @@ class Backend:
         """Step a group; `receive` returns its arrays. The actions are copied."""
         raise NotImplementedError
 
-    def send_reset(self, group: int, seed: int | None) -> None:
+    def send_reset(self, group: int, request: _native.Reset | None) -> None:
         """Reset a group; `receive` returns its arrays."""
         raise NotImplementedError
 
@@ -79,8 +79,8 @@ class InProcess(Backend):
         self._pool(group).send(actions)
         self._sent[group] = None
 
-    def send_reset(self, group: int, seed: int | None) -> None:
-        self._pool(group).send_reset(seed)
+    def send_reset(self, group: int, request: _native.Reset | None) -> None:
+        self._pool(group).send_reset(request)
         self._sent[group] = None
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
@@ -128,8 +128,8 @@ class Remote(Backend):
     def send(self, actions: Any, group: int) -> None:
         self._connected().send(group, actions)
 
-    def send_reset(self, group: int, seed: int | None) -> None:
-        self._connected().reset(group, seed)
+    def send_reset(self, group: int, request: _native.Reset | None) -> None:
+        self._connected().reset(group, request)
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
         return self._connected().receive(group, self._timeout)

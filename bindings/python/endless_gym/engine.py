@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -12,11 +13,12 @@ from itertools import count
 from typing import Any
 
 from endless_gym import _native
-from endless_gym.arguments import integer, seed_source
+from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
+from endless_gym.configuration import AutoresetMode, Options, checked_arguments
 from endless_gym.program import program
-from endless_gym.specs import Frames, json_text, spec
-from endless_gym.vector import AutoresetMode, EndlessVectorEnv, Options, autoreset_mode, connect, contents
+from endless_gym.specs import Frames, json_text
+from endless_gym.vector import EndlessVectorEnv, connect
 
 _numbers = count()
 
@@ -28,16 +30,26 @@ _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11)
 class EngineProcess:
     """A child process that serves environments. `end` stops it, and it stops when this process ends."""
 
-    def __init__(self, arguments: list[str]) -> None:
+    def __init__(self, arguments: list[str], long_arguments: Sequence[str] = ()) -> None:
+        """Start the process.
+
+        Args:
+            arguments: Arguments of `endless serve`.
+            long_arguments: Further ones, which the process reads from a file: a command line has a limited length.
+        """
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
-        self._process = subprocess.Popen(
-            [*program(), "serve", "--child", "--service", self.service, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-            **_OWN_GROUP,
-        )
+        with tempfile.TemporaryFile() as file:
+            file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
+            file.flush()
+            self._process = subprocess.Popen(
+                [*program(), "serve", "--child", "--service", self.service, *arguments, f"@/dev/fd/{file.fileno()}"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=self._errors,
+                pass_fds=[file.fileno()],
+                **_OWN_GROUP,
+            )
 
     @property
     def pid(self) -> int:
@@ -68,6 +80,10 @@ class EngineProcess:
             self._process.kill()
             self._process.wait()
         self._errors.close()
+        if self._process.returncode:
+            # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
+            with contextlib.suppress(OSError, RuntimeError):
+                _native.running_engines()
 
 
 def serve(
@@ -110,36 +126,35 @@ def serve(
 
     Raises:
         TypeError: A number is not an integer.
-        ValueError: A number is negative, or the timeout is not finite.
+        ValueError: An argument is out of its range.
         RuntimeError: The engine cannot start; the message says why.
     """
-    described, mode = spec(id), autoreset_mode(autoreset)
-    frames, features = contents(observation, frames)
+    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
     timeout = checked_timeout(timeout)
-    seed, seed_range, seed_list = seed_source(seed, seeds)
     arguments: dict[str, Any] = {
-        "--env": described.id,
-        "--num-envs": integer("num_envs", num_envs, 1, _native.MAX_ENVS),
-        "--threads": integer("num_threads", num_threads or 0),
-        "--groups": integer("groups", groups, 1, _native.MAX_GROUPS),
-        "--batches-held": integer("batches_held", batches_held),
-        "--autoreset": mode.name.lower(),
+        "--env": given.described.id,
+        "--num-envs": given.num_envs,
+        "--threads": given.num_threads,
+        "--groups": given.groups,
+        "--batches-held": integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD),
+        "--autoreset": given.autoreset.name.lower(),
     }
-    if seed is not None:
-        arguments["--seed"] = seed
-    if seed_range is not None:
-        arguments["--seed-range"] = f"{seed_range[0]}..{seed_range[1]}"
-    if seed_list is not None:
-        arguments["--seed-list"] = ",".join(map(str, seed_list))
+    if given.seed is not None and given.seed_list is None:
+        arguments["--seed"] = given.seed
+    if given.seed_range is not None:
+        start, stop, step = given.seed_range
+        arguments["--seed-range"] = f"{start}..{stop}:{step}"
     command = [f"{name}={value}" for name, value in arguments.items()]
+    command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
+    command += ["--features"] if given.features else []
+    command += given.frames.command() if given.frames else ["--no-frames"]
     if options is None or isinstance(options, Mapping):
-        command += [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
+        long = [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
     else:
-        command += [f"--env-options={json_text(dict(each))}" for each in options]
-    command += ["--final-observation"] if mode is AutoresetMode.SAME_STEP else []
-    command += ["--features"] if features else []
-    command += frames.command() if frames else ["--no-frames"]
-    engine = EngineProcess(command)
+        long = [f"--env-options={json_text(dict(each))}" for each in options]
+    if given.seed_list is not None:
+        long.append(f"--seed-list={','.join(map(str, given.seed_list))}")
+    engine = EngineProcess(command, long)
     try:
         return engine.connect(timeout, copy)
     except BaseException:

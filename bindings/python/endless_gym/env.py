@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.arguments import integer
+from endless_gym.arguments import integer, mapping
 from endless_gym.specs import options_text, spec
 
 Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
@@ -58,7 +58,7 @@ class Env(gymnasium.Env[Any, Any]):
         if self.has_ground_truth_info:
             self.ground_truth_space = self._spec.ground_truth_space()
         self._truth_dtype = np.int64 if self._spec.id in _INTEGER_GROUND_TRUTH else np.float64
-        self._options = dict(options or {})
+        self._options = mapping("options", options)
         self._native = _native.Single(self._spec.id, options_text(self._options))
         self._seed: int | None = None
         self._window: _Window | None = None
@@ -86,7 +86,7 @@ class Env(gymnasium.Env[Any, Any]):
         """
         seed = None if seed is None else integer("seed", seed)
         super().reset(seed=seed)
-        given = {**self._options, **(options or {})}
+        given = {**self._options, **mapping("options", options)}
         arrays = self._native.reset(seed, options_text(given))
         self.reset_params = {**self._spec.reset_parameters, **given}
         self._seed = seed

@@ -95,17 +95,16 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         """Step all environments.
 
         Args:
-            actions: Integers, (num_envs,) or (num_envs, branches).
+            actions: Integers, (num_envs,) for Discrete and (num_envs, branches) for MultiDiscrete.
 
         Returns:
             The arrays that the class describes, `observations`, `rewards`, `terminals` and `truncations`, and the infos.
 
         Raises:
             TypeError: The actions are not integers.
-            ValueError: The number of actions is wrong, or one is out of its range. No environment was stepped.
+            ValueError: The actions have another shape, or one is out of its range. No environment was stepped.
             RuntimeError: The environments have not been reset.
         """
-        actions = np.reshape(actions, (self.num_agents, *(self.single_action_space.shape or ())))
         observations, rewards, terminated, truncated, info = self.envs.step(actions)
         self._store_observations(observations)
         self.rewards[:] = rewards

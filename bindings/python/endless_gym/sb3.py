@@ -52,9 +52,13 @@ class EndlessVecEnv(VecEnv):
         """Wrap `envs`, made by `make_vec`, `serve` or `connect` with same-step auto-reset and one group.
 
         Raises:
-            ValueError: Another auto-reset mode, or several groups.
+            ValueError: Another auto-reset mode, several groups, or an engine without final observations.
         """
         check_adaptable(envs, gymnasium.vector.AutoresetMode.SAME_STEP, "Stable-Baselines3")
+        if not envs.has_final_observation:
+            raise ValueError(
+                "the engine must write final observations for Stable-Baselines3; start it with --final-observation"
+            )
         self.envs = envs
         self._actions: np.ndarray | None = None
         self.info: dict[str, Any] = {}
@@ -94,7 +98,7 @@ class EndlessVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Store integer `actions`, (num_envs,) or (num_envs, branches), for `step_wait`."""
+        """Store integer `actions`, (num_envs,) for Discrete and (num_envs, branches) for MultiDiscrete, for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -105,7 +109,7 @@ class EndlessVecEnv(VecEnv):
 
         Raises:
             TypeError: The actions are not integers.
-            ValueError: The number of actions is wrong, or one is out of its range. No environment was stepped.
+            ValueError: The actions have another shape, or one is out of its range. No environment was stepped.
             RuntimeError: The environments have not been reset.
             TimeoutError: A served engine did not answer in time.
             EngineLost: A served engine has ended.

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer
@@ -99,6 +100,10 @@ class Spec:
             return spaces.MultiDiscrete(list(self.branches))
         return spaces.Discrete(self.branches[0])
 
+    def batched_actions(self, actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Actions with a column for each branch, (n, branches), in the shape of a vector environment: (n,) for Discrete."""
+        return actions if self.multi_discrete else actions[:, 0]
+
     def observation_space(self, frames: Frames | None = Frames(), features: bool = False) -> gymnasium.Space[Any]:
         """The original's observation space, or with the feature observation instead of or beside the frames."""
         parts: dict[str, gymnasium.Space[Any]] = {}
@@ -148,8 +153,11 @@ def spec(id: str) -> Spec:
     """The specification of an id, with or without the prefix `EndlessGym/`.
 
     Raises:
+        TypeError: The id is not a string.
         ValueError: There is no such id; the message lists all ids.
     """
+    if not isinstance(id, str):
+        raise TypeError(f"id must be a string, got {id!r}")
     known = all_specs()
     name = id.removeprefix("EndlessGym/")
     if name not in known:

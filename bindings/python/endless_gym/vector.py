@@ -5,35 +5,23 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.arguments import MAX_U64, integer, seed_source
+from endless_gym.arguments import MAX_U64, integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.backends import Backend, InProcess, Remote
+from endless_gym.configuration import MODES, AutoresetMode, Options, checked_arguments, common_options
 from endless_gym.specs import Frames, Spec, options_text, spec
 
-try:
-    from gymnasium.vector import AutoresetMode as AutoresetMode
-    from gymnasium.vector import VectorEnv
-except ImportError as error:
-    raise ImportError(
-        f"vector environments need Gymnasium 1.1 or newer, and {gymnasium.__version__} is installed: "
-        "pip install 'gymnasium>=1.1'; `gymnasium.make` works with this version"
-    ) from error
-
-Options = Mapping[str, Any]
+Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
-
-#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
-OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
-
-_MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
 
 
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
@@ -47,7 +35,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
     (n, k) if the original has it; in steps that end episodes the original's final infos (`reward`, `length`, ...), and `episode`
     with the return `r`, the length `l` and the seconds since the environments were created `t`. With same-step auto-reset the
-    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended.
+    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was
+    started without `--final-observation`.
     """
 
     def __init__(
@@ -82,6 +71,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._final_observed = [
             (key, self._index[f"final_{name}"]) for name, key in names.items() if f"final_{name}" in self._index
         ]
+        #: Whether `info` has the last observation of an episode that ended, with same-step auto-reset.
+        self.has_final_observation = bool(self._final_observed)
         self._truth = self._index.get("ground_truth")
         self._steps = [self._index[name] for name in ("reward", "terminated", "truncated")]
         self._ends = [self._index[name] for name in ("episode_return", "episode_length", "info")]
@@ -98,14 +89,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def reset(  # type: ignore[override]
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: Seeds = None,
         options: Options | None = None,
         group: int | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`, or with item `i` of a list. `None`
+            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`. Or a list or an array with a seed or
+                `None` for each environment of a group, or of all groups. Later episodes follow from this seed alone. `None`
                 uses the seeds given at creation for the first reset, and continues the generators afterwards.
             options: Reset parameters until the next `reset`, which override those given at creation; and `reset_mask`, bool (n,),
                 the environments that start an episode. If the environments were created with one mapping each, only
@@ -127,7 +119,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """
         if group is not None:
             group = self._group(group)
-        given = dict(options or {})
+        given = mapping("options", options)
         mask = given.pop("reset_mask", None)
         text = None
         if given and self._options is None:
@@ -148,7 +140,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Play one step of every environment.
 
         Args:
-            actions: Integers, (n, branches) or (n,) for one branch.
+            actions: Integers in the shape of `action_space`, as an array or a list: (n,) for Discrete, (n, branches) for
+                MultiDiscrete.
 
         Returns:
             observation: (n, ...) with the shape and dtype of `observation_space`; uint8 (n, 84, 84, 3) by default, or a dict of
@@ -160,7 +153,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
         Raises:
             TypeError: The actions are not integers.
-            ValueError: The number of actions is wrong, or one is out of its range. No environment was stepped.
+            ValueError: The actions have another shape, or one is out of its range. No environment was stepped.
             RuntimeError: The environments have not been reset, or the last `send` or `send_reset` has not been received.
             TimeoutError: A served engine did not answer in time. `recv` can still return the result.
             EngineLost: A served engine has ended; see `reconnect`.
@@ -205,18 +198,19 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         step[4]["group"] = number
         return step
 
-    def send_reset(self, group: int = 0, *, seed: int | None = None) -> None:
+    def send_reset(self, group: int = 0, *, seed: Seeds = None) -> None:
         """Reset a group without waiting for the result; `recv` returns its first observations with rewards of 0.
 
         Args:
             group: The group to reset.
-            seed: Environment `i` of the group is seeded with `seed + group * num_envs + i`, as in `reset`.
+            seed: As for `reset`.
 
         Raises:
             ValueError: The seed is out of its range, or there is no such group.
             RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
-        self._backend.send_reset(self._group(group), None if seed is None else integer("seed", seed))
+        group = self._group(group)
+        self._backend.send_reset(group, self._request(seed, None, group))
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
         """The complete state of one environment, which `restore` accepts for any environment of the same id.
@@ -286,8 +280,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _group(self, given: int) -> int:
         return integer("group", given, 0, self.num_groups - 1)
 
-    def _request(self, seed: int | Sequence[int | None] | None, mask: Any, group: int) -> _native.Reset | None:
-        if mask is None and not isinstance(seed, Sequence):
+    def _request(self, seed: Seeds, mask: Any, group: int) -> _native.Reset | None:
+        if mask is None and not _has_items(seed):
             return None if seed is None else integer("seed", seed)
         if mask is None:
             chosen = self._all
@@ -301,17 +295,23 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
         return reset, [given or 0 for given in seeds]
 
-    def _seeds(self, seed: int | Sequence[int | None] | None, group: int) -> list[int | None]:
+    def _seeds(self, seed: Seeds, group: int) -> list[int | None]:
         """One seed for each environment of a group."""
         if seed is None:
             return [None] * self.num_envs
-        if not isinstance(seed, Sequence):
+        if not _has_items(seed):
             # Sums wrap, as in the engine.
             first = integer("seed", seed) + group * self.num_envs
             return [(first + env) & MAX_U64 for env in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must have {self.num_envs} items, one for each environment, got {len(seed)}")
-        return [None if given is None else integer("seed", given) for given in seed]
+        given: list[Any] = list(seed)
+        if len(given) == self.num_envs * self.num_groups:
+            given = given[group * self.num_envs :][: self.num_envs] if self.num_groups > 1 else given
+        elif len(given) != self.num_envs:
+            allowed = f"{self.num_envs} items, one for each environment"
+            if self.num_groups > 1:
+                allowed += f" of a group, or {self.num_envs * self.num_groups} for all groups"
+            raise ValueError(f"seed must have {allowed}, got {len(given)}")
+        return [None if each is None else integer("seed", each) for each in given]
 
     def _observation(self, arrays: _native.Arrays, places: list[tuple[str, int]]) -> Any:
         if len(places) == 1:
@@ -356,6 +356,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             final["ground_truth"] = np.where(ended[:, None], arrays[self._index["final_ground_truth"]], 0.0)
             final["_ground_truth"] = ended
         info["final_info"], info["_final_info"] = final, ended
+        if not self.has_final_observation:
+            return
         observations = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
             parts = {key: arrays[place][env] for key, place in self._final_observed}
@@ -385,8 +387,8 @@ def make_vec(
         num_threads: Threads that step environments; `None` or 0 for one per core.
         seed: Environment `i`, numbered over all groups, is seeded with `seed + i` at its first reset; later episodes continue its
             generator. `None` takes entropy from the operating system.
-        seeds: Seeds of the single episodes: a `range` to draw from, as the training in the paper does from `range(100_000)`, with
-            draws seeded by `seed`; or a list, used in order and repeated.
+        seeds: Seeds of the single episodes: a `range`, with any step, to draw from, as the training in the paper does from
+            `range(100_000)`, with draws seeded by `seed`; or a list, used in order and repeated.
         options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each
             environment of all groups.
         autoreset: Gymnasium's auto-reset mode: `next_step`, `same_step` or `disabled`.
@@ -400,41 +402,19 @@ def make_vec(
         TypeError: A number is not an integer.
         ValueError: An argument is out of its range.
     """
-    described, mode = spec(id), autoreset_mode(autoreset)
-    num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
-    groups = integer("groups", groups, 1, _native.MAX_GROUPS)
-    seed, seed_range, seed_list = seed_source(seed, seeds)
-    frames, features = contents(observation, frames)
-    # As in an engine, groups share threads, and environments are numbered over all groups.
-    threads = _native.Threads(integer("num_threads", num_threads or 0))
-    pools = [
-        _native.Pool(
-            described.id,
-            num_envs,
-            group=group,
-            threads=threads,
-            options=_pool_options(options, group * num_envs, num_envs, groups),
-            autoreset=mode.name.lower(),
-            first_env=group * num_envs,
-            total_envs=groups * num_envs,
-            seed=seed,
-            seed_range=seed_range,
-            seed_list=seed_list,
-            frames=frames.arguments() if frames else None,
-            features=features,
-            final_observation=True,
-        )
-        for group in range(groups)
-    ]
+    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    # As in an engine, groups share threads.
+    threads = _native.Threads(given.num_threads)
+    pools = [_native.Pool(config, group, threads) for group, config in enumerate(given.pools)]
     return EndlessVectorEnv(
         InProcess(pools),
-        described=described,
-        num_envs=num_envs,
-        frames=frames,
+        described=given.described,
+        num_envs=given.num_envs,
+        frames=given.frames,
         sections=pools[0].sections(),
-        autoreset=mode,
+        autoreset=given.autoreset,
         copy=copy,
-        options=_common_options(options),
+        options=common_options(options),
     )
 
 
@@ -461,7 +441,7 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
         num_envs=specification["num_envs"],
         frames=Frames.from_specification(specification["frames"]),
         sections=[section["name"] for section in specification["batch"]["sections"]],
-        autoreset=_MODES[specification["autoreset"]],
+        autoreset=MODES[specification["autoreset"]],
         copy=copy,
         options=options[0] if len(options) == 1 else None,
     )
@@ -474,37 +454,6 @@ def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **
     return make_vec(id, num_envs, **kwargs)
 
 
-def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
-    """Gymnasium's auto-reset mode, from the mode or its name."""
-    mode = given if isinstance(given, AutoresetMode) else _MODES.get(given)
-    if mode is None:
-        raise ValueError(f"autoreset must be one of {', '.join(_MODES)}, got {given!r}")
-    return mode
-
-
-def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
-    if observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
-    has_frames, has_features = OBSERVATIONS[observation]
-    if frames is not None and not has_frames:
-        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
-    return (frames or Frames()) if has_frames else None, has_features
-
-
-def _common_options(given: Options | Sequence[Options] | None) -> Options | None:
-    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
-    if given is None or isinstance(given, Mapping):
-        return given or {}
-    return given[0] if len(given) == 1 else None
-
-
-def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
-    """The reset parameters of the environments of one group, in the native module's format."""
-    if given is None or isinstance(given, Mapping):
-        return options_text(given)
-    if len(given) != groups * num_envs:
-        raise ValueError(
-            f"options must have one mapping for each of {groups * num_envs} environments, got {len(given)}"
-        )
-    return f"[{', '.join(options_text(each) for each in given[first : first + num_envs])}]"
+def _has_items(seed: Seeds) -> TypeGuard[Sequence[int | None]]:
+    """Whether there is a seed for each environment, instead of one for all."""
+    return isinstance(seed, Sequence) or (isinstance(seed, np.ndarray) and seed.ndim > 0)

@@ -4,39 +4,101 @@ use std::time::Duration;
 
 use endless_gym::batch::Frames;
 use endless_gym::batch::PixelFormat;
+use endless_gym::envs::ActionSpace;
 use endless_gym::pool::{Autoreset, ResetOptions, ResetRequest, Seeding, UnknownAutoreset};
 use endless_gym::service::timeout_from_seconds;
-use numpy::{Element, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{
+    Element, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
+};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::types::PyByteArray;
 use serde_json::{Map, Value as Json};
 
 use crate::errors;
 
-/// Copies the integers of an array-like into `to`, in C order. The engine checks their number and range.
-pub fn actions(given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
-    to.clear();
-    if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i64>>() {
-        append(&array, to, action)?;
-    } else if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i32>>() {
-        append(&array, to, Ok)?;
-    } else if let Ok(list) = given.extract::<Vec<i64>>() {
-        for number in list {
-            to.push(action(number)?);
+/// The shape that actions must have: that of the action space, with the environments as the first axis of a group's actions.
+pub struct ActionShape {
+    shape: Vec<usize>,
+    meaning: &'static str,
+}
+
+impl ActionShape {
+    /// The shape for one environment.
+    pub fn single(space: &ActionSpace) -> Self {
+        match space {
+            ActionSpace::Discrete(_) => ActionShape { shape: Vec::new(), meaning: "an integer" },
+            ActionSpace::MultiDiscrete(branches) => {
+                ActionShape { shape: vec![branches.len()], meaning: "an integer for each branch" }
+            }
         }
-    } else {
-        let module = given.py().import("numpy")?;
-        let array = module.call_method1("asarray", (given,))?;
-        let kind: String = array.getattr("dtype")?.getattr("kind")?.extract()?;
-        if !matches!(kind.as_str(), "i" | "u" | "b") {
-            let shown = given.repr()?.to_string();
-            let shown: String = shown.chars().take(80).collect();
-            return Err(PyTypeError::new_err(format!("actions must be integers, got {shown}")));
-        }
-        let array = array.call_method1("astype", ("int64",))?.cast_into::<numpy::PyArrayDyn<i64>>()?;
-        append(&array.readonly(), to, action)?;
     }
-    Ok(())
+
+    /// The shape for a group of environments.
+    pub fn group(space: &ActionSpace, num_envs: usize) -> Self {
+        match space {
+            ActionSpace::Discrete(_) => {
+                ActionShape { shape: vec![num_envs], meaning: "an integer for each environment" }
+            }
+            ActionSpace::MultiDiscrete(branches) => ActionShape {
+                shape: vec![num_envs, branches.len()],
+                meaning: "an integer for each branch of each environment",
+            },
+        }
+    }
+
+    /// Copies the integers of an array, or of a list of the same shape, into `to`, in C order. The engine checks their range.
+    pub fn copy(&self, given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
+        to.clear();
+        if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i64>>() {
+            self.check(array.shape())?;
+            return append(&array, to, action);
+        }
+        if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i32>>() {
+            self.check(array.shape())?;
+            return append(&array, to, Ok);
+        }
+        let no_integers = || {
+            let shown: String = given.repr()?.to_string().chars().take(80).collect();
+            Ok::<_, PyErr>(PyTypeError::new_err(format!("actions must be integers, got {shown}")))
+        };
+        // numpy takes it for a list of small integers.
+        if given.is_instance_of::<PyByteArray>() {
+            return Err(no_integers()?);
+        }
+        // It refuses lists whose items have different lengths.
+        let Ok(array) = given.py().import("numpy")?.call_method1("asarray", (given,)) else {
+            return Err(self.error("a list of items with different shapes"));
+        };
+        let array = array.cast_into::<PyUntypedArray>()?;
+        // The dtype of an empty list is float64.
+        if array.is_empty() {
+            self.check(array.shape())?;
+        }
+        if !matches!(array.dtype().kind(), b'i' | b'u') {
+            return Err(no_integers()?);
+        }
+        self.check(array.shape())?;
+        let array = array.call_method1("astype", ("int64",))?.cast_into::<PyArrayDyn<i64>>()?;
+        append(&array.readonly(), to, action)
+    }
+
+    fn check(&self, given: &[usize]) -> PyResult<()> {
+        if given == self.shape { Ok(()) } else { Err(self.error(&format!("the shape {}", shown(given)))) }
+    }
+
+    fn error(&self, given: &str) -> PyErr {
+        let (shape, meaning) = (shown(&self.shape), self.meaning);
+        PyValueError::new_err(format!("actions must have the shape {shape}, {meaning}, got {given}"))
+    }
+}
+
+/// A shape as Python shows it.
+fn shown(shape: &[usize]) -> String {
+    match shape {
+        [length] => format!("({length},)"),
+        shape => format!("({})", shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")),
+    }
 }
 
 /// Appends the numbers in C order, for any memory order of the array.
@@ -90,9 +152,9 @@ pub fn autoreset(name: &str) -> PyResult<Autoreset> {
 }
 
 /// The source of the episodes' seeds.
-pub fn seeding(seed: Option<u64>, range: Option<(u64, u64)>, list: Option<Vec<u64>>) -> Seeding {
+pub fn seeding(seed: Option<u64>, range: Option<(u64, u64, u64)>, list: Option<Vec<u64>>) -> Seeding {
     match (range, list) {
-        (Some((start, end)), _) => Seeding::Range { start, end, seed },
+        (Some((start, end, step)), _) => Seeding::Range { start, end, step, seed },
         (None, Some(list)) => Seeding::List(list),
         (None, None) => Seeding::Continue { seed },
     }

@@ -9,7 +9,7 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 
-use crate::arguments::{self, Reset};
+use crate::arguments::{self, ActionShape, Reset};
 use crate::arrays::{self, Owner};
 use crate::errors;
 
@@ -32,6 +32,7 @@ unsafe impl Owner for Lease {
 #[pyclass(module = "endless_gym._native")]
 pub struct Connection {
     trainer: Trainer,
+    action_shape: ActionShape,
     actions: Vec<i32>,
     process: u32,
 }
@@ -44,7 +45,9 @@ impl Connection {
         let config = ConnectConfig::new(service);
         let connect = |slice| Trainer::connect(&ConnectConfig { timeout: slice, ..config.clone() });
         let trainer = wait_for_engine(py, timeout, connect)?;
-        Ok(Connection { trainer, actions: Vec::new(), process: std::process::id() })
+        let specification = trainer.specification();
+        let action_shape = ActionShape::group(&specification.action_space, specification.num_envs);
+        Ok(Connection { trainer, action_shape, actions: Vec::new(), process: std::process::id() })
     }
 
     /// The engine's specification, as JSON text.
@@ -63,7 +66,7 @@ impl Connection {
 
     fn send(&mut self, group: usize, actions: &Bound<'_, PyAny>) -> PyResult<()> {
         self.check_process()?;
-        arguments::actions(actions, &mut self.actions)?;
+        self.action_shape.copy(actions, &mut self.actions)?;
         self.trainer.send(group, &self.actions).map_err(errors::service)
     }
 

@@ -48,6 +48,9 @@ pub fn service(error: ServiceError) -> PyErr {
         // The messages of a pool in this process.
         E::Rejected { reason: Rejection::NotReset, .. } => NOT_RESET.to_owned(),
         E::Rejected { message, .. } => message.clone(),
+        E::AnswerPending { group } => {
+            format!("group {group} has a pending answer; receive it with `recv` before the next request")
+        }
         E::NothingPending => E::NothingSent { group: 0 }.to_string(),
         error => error.to_string(),
     };

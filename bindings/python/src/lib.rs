@@ -41,9 +41,12 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("DEFAULT_ENV_ID", envs::DEFAULT_ENV_ID)?;
     module.add("MAX_ENVS", endless_gym::pool::MAX_ENVS)?;
     module.add("MAX_GROUPS", endless_gym::service::MAX_GROUPS)?;
+    module.add("MAX_THREADS", endless_gym::pool::MAX_THREADS)?;
+    module.add("MAX_BATCHES_HELD", endless_gym::service::MAX_BATCHES_HELD)?;
     module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
     module.add_class::<pool::Pool>()?;
+    module.add_class::<pool::PoolConfig>()?;
     module.add_class::<pool::Threads>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;

@@ -1,9 +1,8 @@
 //! Many environments in this process.
 
 use endless_gym::batch::{Block, SectionTable};
-use endless_gym::envs::ActionError;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
-use endless_gym::pool::{self as engine, PoolConfig, PoolError};
+use endless_gym::pool::{self as engine, PoolError};
 use endless_gym::service::ServiceError;
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
@@ -11,7 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use serde_json::{Map, Value as Json};
 
-use crate::arguments::{self, Reset};
+use crate::arguments::{self, ActionShape, Reset};
 use crate::buffers::Buffers;
 use crate::{arrays, errors};
 
@@ -27,6 +26,45 @@ impl Threads {
     }
 }
 
+/// The checked configuration of a pool, in this process or in an engine.
+#[pyclass(frozen, module = "endless_gym._native")]
+pub struct PoolConfig(engine::PoolConfig);
+
+#[pymethods]
+impl PoolConfig {
+    #[new]
+    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
+    #[allow(clippy::too_many_arguments)]
+    fn new(
+        id: &str,
+        num_envs: usize,
+        first_env: usize,
+        total_envs: usize,
+        options: &str,
+        autoreset: &str,
+        seed: Option<u64>,
+        seed_range: Option<(u64, u64, u64)>,
+        seed_list: Option<Vec<u64>>,
+        frames: Option<(bool, bool, bool, usize)>,
+        features: bool,
+        final_observation: bool,
+    ) -> PyResult<Self> {
+        let config = engine::PoolConfig {
+            options: arguments::pool_options(options)?,
+            autoreset: arguments::autoreset(autoreset)?,
+            seeding: arguments::seeding(seed, seed_range, seed_list),
+            frames: frames.map(arguments::frames),
+            features,
+            final_observation,
+            first_env,
+            total_envs,
+            ..engine::PoolConfig::new(id, num_envs)
+        };
+        config.validate().map_err(errors::pool)?;
+        Ok(PoolConfig(config))
+    }
+}
+
 /// A group of environments of one id that are stepped in lockstep, and the buffers of its batches.
 ///
 /// A buffer is not written to while arrays of it exist. A new one is allocated if arrays of all buffers exist.
@@ -38,6 +76,7 @@ pub struct Pool {
     buffers: Buffers,
     /// The message that `receive` has not answered yet.
     pending: Option<Message>,
+    action_shape: ActionShape,
     /// The actions of the last `step`, or of the pending one.
     actions: Vec<i32>,
     /// Memory for actions that are not checked yet.
@@ -56,37 +95,10 @@ enum Message {
 #[pymethods]
 impl Pool {
     #[new]
-    #[pyo3(signature = (id, num_envs, *, group, first_env, total_envs, threads, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
-    #[allow(clippy::too_many_arguments)]
-    fn new(
-        id: &str,
-        num_envs: usize,
-        group: usize,
-        first_env: usize,
-        total_envs: usize,
-        threads: &Threads,
-        options: &str,
-        autoreset: &str,
-        seed: Option<u64>,
-        seed_range: Option<(u64, u64)>,
-        seed_list: Option<Vec<u64>>,
-        frames: Option<(bool, bool, bool, usize)>,
-        features: bool,
-        final_observation: bool,
-    ) -> PyResult<Self> {
-        let config = PoolConfig {
-            options: arguments::pool_options(options)?,
-            autoreset: arguments::autoreset(autoreset)?,
-            seeding: arguments::seeding(seed, seed_range, seed_list),
-            frames: frames.map(arguments::frames),
-            features,
-            final_observation,
-            first_env,
-            total_envs,
-            ..PoolConfig::new(id, num_envs)
-        };
-        let pool = engine::Pool::new(&config, &threads.0).map_err(errors::pool)?;
+    fn new(config: &PoolConfig, group: usize, threads: &Threads) -> PyResult<Self> {
+        let pool = engine::Pool::new(&config.0, &threads.0).map_err(errors::pool)?;
         Ok(Pool {
+            action_shape: ActionShape::group(&pool.spec().action_space, config.0.num_envs),
             pool,
             group,
             buffers: Buffers::default(),
@@ -117,7 +129,7 @@ impl Pool {
 
     fn step<'py>(&mut self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
         self.check_process()?;
-        arguments::actions(actions, &mut self.unchecked)?;
+        self.action_shape.copy(actions, &mut self.unchecked)?;
         if self.pending.is_some() {
             self.check_message()?;
         }
@@ -128,7 +140,7 @@ impl Pool {
     /// Queues a step, which `receive` executes. The actions are copied.
     fn send(&mut self, actions: &Bound<'_, PyAny>) -> PyResult<()> {
         self.check_process()?;
-        arguments::actions(actions, &mut self.unchecked)?;
+        self.action_shape.copy(actions, &mut self.unchecked)?;
         self.check_message()?;
         std::mem::swap(&mut self.actions, &mut self.unchecked);
         self.pending = Some(Message::Step);
@@ -197,10 +209,8 @@ impl Pool {
 
     /// The checks of a step with the actions in `unchecked`, in the order in which a trainer makes them for an engine.
     fn check_message(&self) -> PyResult<()> {
-        match check_actions(&self.pool, &self.unchecked) {
-            Err(error @ PoolError::Action(ActionError::Count { .. })) => Err(errors::pool(error)),
-            checked => self.check_idle().and(checked.map_err(errors::pool)),
-        }
+        self.check_idle()?;
+        check_actions(&self.pool, &self.unchecked).map_err(errors::pool)
     }
 
     fn write_step<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {

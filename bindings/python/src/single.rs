@@ -2,13 +2,14 @@
 
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
-use endless_gym::envs::{FRAME_BYTES, SCREEN};
+use endless_gym::envs::{ActionSpace, FRAME_BYTES, SCREEN};
 use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-use crate::{arguments, errors};
+use crate::arguments::{self, ActionShape};
+use crate::errors;
 
 /// Frame, vector observation and ground truth; `None` for those that the environment does not have.
 type Arrays<'py> = (Bound<'py, PyAny>, Option<Bound<'py, PyAny>>, Option<Bound<'py, PyAny>>);
@@ -18,6 +19,7 @@ type Arrays<'py> = (Bound<'py, PyAny>, Option<Bound<'py, PyAny>>, Option<Bound<'
 pub struct Single {
     pool: Pool,
     blocks: Vec<Block>,
+    action_shape: ActionShape,
     action: Vec<i32>,
 }
 
@@ -33,7 +35,8 @@ impl Single {
         let threads = Threads::new(1).map_err(errors::pool)?;
         let pool = Pool::new(&config, &threads).map_err(errors::pool)?;
         let blocks = zeroed(pool.layout().blocks());
-        Ok(Single { pool, blocks, action: Vec::new() })
+        let action_shape = ActionShape::single(&pool.spec().action_space);
+        Ok(Single { pool, blocks, action_shape, action: Vec::new() })
     }
 
     fn reset<'py>(&mut self, py: Python<'py>, seed: Option<u64>, options: &str) -> PyResult<Arrays<'py>> {
@@ -50,11 +53,12 @@ impl Single {
         py: Python<'py>,
         action: &Bound<'py, PyAny>,
     ) -> PyResult<(Arrays<'py>, f64, bool, Option<(f64, i32, Vec<f64>)>)> {
-        if let Ok(action) = action.extract::<i64>() {
-            self.action.clear();
-            self.action.push(arguments::action(action)?);
-        } else {
-            arguments::actions(action, &mut self.action)?;
+        match (&self.pool.spec().action_space, action.extract::<i64>()) {
+            (ActionSpace::Discrete(_), Ok(action)) => {
+                self.action.clear();
+                self.action.push(arguments::action(action)?);
+            }
+            _ => self.action_shape.copy(action, &mut self.action)?,
         }
         self.pool.step(&self.action, &mut self.blocks).map_err(errors::pool)?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -141,3 +142,55 @@ def test_the_program_comes_along() -> None:
     assert subprocess.run(demo, capture_output=True, check=False).returncode == 0
     table = [sys.executable, "-m", "endless_gym", "--num-envs", "4", "--seconds", "0.01"]
     assert ID in subprocess.run(table, capture_output=True, text=True, check=True).stdout
+
+
+def test_a_killed_engine_leaves_nothing(segments: Callable[[], set[str]]) -> None:
+    before = segments()
+    envs = endless_gym.serve(ID, 4)
+    assert segments() > before
+    os.kill(envs._backend._engine.pid, signal.SIGKILL)
+    envs.close()
+    assert segments() <= before
+
+
+def test_a_running_engine_without_final_observations() -> None:
+    """As `endless serve --autoreset same-step` starts it."""
+    name = "without-final"
+    engine = subprocess.Popen(
+        [
+            *program(),
+            "serve",
+            "--child",
+            "--service",
+            name,
+            "--num-envs",
+            "4",
+            "--seed",
+            "1",
+            "--autoreset",
+            "same-step",
+        ],
+        stdin=subprocess.PIPE,
+    )
+    try:
+        with (
+            endless_gym.connect(name) as envs,
+            endless_gym.make_vec("Endless-MortarMayhem-v0", 4, seed=1, autoreset="same_step") as twin,
+        ):
+            assert not envs.has_final_observation
+            assert twin.has_final_observation
+            envs.reset()
+            twin.reset()
+            ends = 0
+            for _ in range(100):
+                (*step, info), (*wanted, whole) = (each.step(np.zeros((4, 2), np.int64)) for each in (envs, twin))
+                for given, expected in zip(step, wanted, strict=True):
+                    np.testing.assert_array_equal(given, expected)
+                assert info.keys() == whole.keys() - {"final_obs", "_final_obs"}
+                if "final_info" in info:
+                    np.testing.assert_array_equal(info["final_info"]["reward"], whole["final_info"]["reward"])
+                ends += int(step[2].sum())
+            assert ends > 4
+    finally:
+        engine.communicate()
+    assert engine.returncode == 0

@@ -220,7 +220,7 @@ def test_environments_may_have_options_of_their_own(where) -> None:
                 number = 2 * group + env
                 alone = endless_gym.Env("MortarMayhem-v0", options=each[number])
                 np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
-    with pytest.raises((ValueError, RuntimeError), match=r"2 sets, one for each, got 3|2 environments, got 3"):
+    with pytest.raises(ValueError, match=r"one mapping for each of 2 environments, got 3"):
         where("MortarMayhem-v0", 2, options=each[:3])
 
 
@@ -282,12 +282,12 @@ def test_mistakes_are_exceptions() -> None:
     with pytest.raises(RuntimeError, match="reset"):
         envs.step(np.zeros((2, 2), dtype=np.int64))
     envs.reset()
-    with pytest.raises(ValueError, match="2 environments"):
+    with pytest.raises(ValueError, match=r"the shape \(2, 2\), .*, got the shape \(3, 2\)"):
         envs.step(np.zeros((3, 2), dtype=np.int64))
     envs.close()
     with pytest.raises(RuntimeError, match="closed"):
         envs.step(np.zeros((2, 2), dtype=np.int64))
-    with pytest.raises(RuntimeError, match="arena_sise"):
+    with pytest.raises(ValueError, match="arena_sise"):
         endless_gym.serve(ID, 2, options={"arena_sise": 1})
     with pytest.raises(ConnectionError, match="nobody"):
         endless_gym.connect("nobody", timeout=0)
@@ -347,5 +347,5 @@ def test_frames_are_as_gymnasiums_wrappers_make_them(where, mode: AutoresetMode,
 def test_frames_that_cannot_be_are_refused(where) -> None:
     with pytest.raises(ValueError, match="has no frames"):
         where(ID, 2, observation="features", frames=endless_gym.Frames(stack=2))
-    with pytest.raises((ValueError, RuntimeError), match="frame stack must be 1 to 64, got 65"):
+    with pytest.raises(ValueError, match="frame stack must be 1 to 64, got 65"):
         where(ID, 2, frames=endless_gym.Frames(stack=65))

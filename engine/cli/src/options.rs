@@ -64,20 +64,21 @@ pub struct EnvironmentArgs {
     /// Seed: environment i, counted over all groups, is seeded with SEED + i [default: entropy of the operating system].
     #[arg(long)]
     seed: Option<u64>,
-    /// Draw the seed of each episode from START to END - 1, as the training in the paper does from 0..100000; `--seed` seeds the
-    /// draws [default: episodes continue the generator of their environment].
-    #[arg(long, value_name = "START..END", value_parser = seed_range)]
-    seed_range: Option<(u64, u64)>,
+    /// Draw the seed of each episode from START to END - 1, every STEP-th [default: every one], as the training in the paper does
+    /// from 0..100000; `--seed` seeds the draws [default: episodes continue the generator of their environment].
+    #[arg(long, value_name = "START..END[:STEP]", value_parser = seed_range)]
+    seed_range: Option<(u64, u64, u64)>,
     /// Seeds of the episodes, in turn, repeated from the start [default: as for `--seed-range`].
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
 }
 
-/// Parses `START..END`.
-fn seed_range(text: &str) -> Result<(u64, u64), String> {
-    let (start, end) = text.split_once("..").ok_or("expected START..END")?;
+/// Parses `START..END` or `START..END:STEP`.
+fn seed_range(text: &str) -> Result<(u64, u64, u64), String> {
+    let (start, end) = text.split_once("..").ok_or("expected START..END or START..END:STEP")?;
+    let (end, step) = end.split_once(':').unwrap_or((end, "1"));
     let number = |text: &str| text.parse::<u64>().map_err(|error| format!("`{text}`: {error}"));
-    Ok((number(start)?, number(end)?))
+    Ok((number(start)?, number(end)?, number(step)?))
 }
 
 impl EnvironmentArgs {
@@ -86,7 +87,7 @@ impl EnvironmentArgs {
         let mut arguments: Vec<String> = self.options.iter().map(|option| format!("--option={option}")).collect();
         arguments.extend(self.env_options.iter().map(|options| format!("--env-options={options}")));
         arguments.extend(self.seed.map(|seed| format!("--seed={seed}")));
-        arguments.extend(self.seed_range.map(|(start, end)| format!("--seed-range={start}..{end}")));
+        arguments.extend(self.seed_range.map(|(start, end, step)| format!("--seed-range={start}..{end}:{step}")));
         if !self.seed_list.is_empty() {
             let seeds: Vec<String> = self.seed_list.iter().map(u64::to_string).collect();
             arguments.push(format!("--seed-list={}", seeds.join(",")));
@@ -112,7 +113,7 @@ impl EnvironmentArgs {
         let each = each.collect::<Result<Vec<_>, _>>()?;
         let options = if each.is_empty() { ResetOptions::Shared(options) } else { ResetOptions::Each(each) };
         let seeding = match (self.seed_range, &self.seed_list[..]) {
-            (Some((start, end)), _) => Seeding::Range { start, end, seed: self.seed },
+            (Some((start, end, step)), _) => Seeding::Range { start, end, step, seed: self.seed },
             (None, []) => Seeding::Continue { seed: self.seed },
             (None, list) => Seeding::List(list.to_vec()),
         };
@@ -141,7 +142,7 @@ mod tests {
             #[command(flatten)]
             environment: EnvironmentArgs,
         }
-        let given = ["", "--option=-x=1", "--option=arena_size=6", "--seed=3", "--seed-range=0..9"];
+        let given = ["", "--option=-x=1", "--option=arena_size=6", "--seed=3", "--seed-range=0..9:2"];
         let parse = |arguments: &[String]| Arguments::try_parse_from(arguments).map(|parsed| parsed.environment);
         let given = parse(&given.map(str::to_owned)).unwrap();
         let passed = parse(&[vec![String::new()], given.arguments()].concat()).unwrap();

@@ -66,7 +66,7 @@ mod wait;
 pub use blackboard::running_engines;
 pub use connect::{ConnectConfig, timeout_from_seconds};
 pub use engine::{Engine, EngineSummary};
-pub use engine_config::{EngineConfig, MAX_GROUPS};
+pub use engine_config::{EngineConfig, MAX_BATCHES_HELD, MAX_GROUPS};
 pub use error::{Rejection, ServiceError};
 pub use lease::BatchLease;
 pub use namespace::{Namespace, ROOT_VARIABLE};

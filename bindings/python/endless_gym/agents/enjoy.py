@@ -98,7 +98,7 @@ class EpisodeRecorder:
                 {key: observation[key] for key in keys} if isinstance(observation, dict) else {single: observation}
             )
             action = self.agent.act(observed, memory, generator, self.greedy).action.cpu().numpy()
-            observation, rewards, terminated, truncated, _ = envs.step(action)
+            observation, rewards, terminated, truncated, _ = envs.step(env_spec.batched_actions(action))
             reward, length = reward + float(rewards[0]), length + 1
             done = bool(terminated[0] or truncated[0])
             self.rewards[-1], self.lengths[-1] = reward, length

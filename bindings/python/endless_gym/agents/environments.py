@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from endless_gym.agents.recovery import RecoverableEngine
 from endless_gym.agents.settings import TRAINING_SEEDS, Settings
 from endless_gym.engine import serve
 from endless_gym.specs import Spec, spec
@@ -65,8 +68,12 @@ class Environments:
             "autoreset": "same_step",
             "observation": wanted.observation,
         }
+        make, start = partial(make_vec, settings.env, **arguments), partial(serve, settings.env, **arguments)
+        self._engine: RecoverableEngine | None = None
         try:
-            self._envs: EndlessVectorEnv = (make_vec if in_process else serve)(settings.env, **arguments)
+            if not in_process:
+                self._engine = RecoverableEngine(settings.on_engine_failure, start, make)
+            self._envs: EndlessVectorEnv | RecoverableEngine = self._engine or make()
         except RuntimeError as error:  # The engine reports why it cannot start.
             raise ValueError(str(error)) from error
         # In this process a group is stepped in a worker thread; stepping releases the GIL.
@@ -80,7 +87,7 @@ class Environments:
 
     def send(self, actions: NDArray[np.int64], group: int) -> None:
         """Start a step of a group with actions int64 (n, branches), without waiting for the result."""
-        self._envs.send(actions, group)
+        self._envs.send(self.spec.batched_actions(actions), group)
         if self._thread is not None:
             self._results[group] = self._thread.submit(self._envs.recv, group)
 
@@ -95,6 +102,21 @@ class Environments:
             final.pop("ground_truth", None)
             episodes = [{key: float(value[env]) for key, value in final.items()} for env in np.flatnonzero(done)]
         return StepResult(observation, reward, done, info.get("ground_truth"), episodes)
+
+    def mark(self, report: Callable[[str], None]) -> None:
+        """Make the current state the one from which another engine goes on if the engine process fails.
+
+        Args:
+            report: Called with a line of text for each failure from now on.
+        """
+        if self._engine is not None:
+            self._engine.report = report
+            self._engine.mark()
+
+    @property
+    def failure(self) -> str | None:
+        """Why the engine was given up, and the environments continue in this process; None otherwise."""
+        return None if self._engine is None else self._engine.failure
 
     def snapshots(self) -> list[list[bytes]]:
         """Snapshots of all environments of each group, for `restore`."""

@@ -64,7 +64,9 @@ def evaluate(
             paths = [path_length(envs.ground_truth_view(env)) for env in range(num_envs)]
         while not all(results):
             output = agent.act(observation, memory, generator, greedy)
-            observation, _, terminated, truncated, info = envs.step(output.action.cpu().numpy())
+            observation, _, terminated, truncated, info = envs.step(
+                env_spec.batched_actions(output.action.cpu().numpy())
+            )
             done = terminated | truncated
             memory.reset(done)
             before = sum(map(bool, results))

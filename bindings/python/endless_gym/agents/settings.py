@@ -174,6 +174,10 @@ class Settings:
     """updates between two checkpoints; the last update always writes a checkpoint"""
     keep_checkpoints: bool = False
     """keep all checkpoints, for evaluation, instead of the last one only"""
+    on_engine_failure: Literal["restart", "save", "fail"] = "restart"
+    """what to do when the engine process ends or does not answer. restart: start another one, which continues exactly; after
+    three restarts without a completed update, as `save`. save: complete the update in this process, write a checkpoint and stop.
+    fail: stop at once"""
     time_limit: float = 0.0
     """minutes after which training stops with a checkpoint; 0 for no limit"""
     target_reward: float | None = None

@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 
+from endless_gym import EngineLost
 from endless_gym.agents import checkpoint, command
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
@@ -45,6 +46,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         ValueError: The settings are invalid, or do not fit the run to resume.
         FileExistsError: The folder already contains a run.
         FileNotFoundError: There is no run to resume.
+        EngineLost: The engine process failed, and was not replaced; see `Settings.on_engine_failure`.
     """
     settings, resumed = settings.validated(), None
     if settings.resume:
@@ -113,6 +115,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         clock = Clock((lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None)
         while update < ppo.updates and not stop.requested:
             start = time.perf_counter()
+            environments.mark(logger.print)
             segment, ended = collector.collect(clock)
             with clock.measure("learning"):
                 states = [memory.state for memory in collector.memories]
@@ -130,12 +133,18 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             reward, target = means.get("episode/reward"), settings.target_reward
             if reward is not None and target is not None and episodes.is_full() and reward >= target:
                 stop.requested = True
+            if environments.failure is not None:
+                stop.requested = True
             if watch is not None and watch(update, means):
                 stop.requested = True
             if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
                 save()
         logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
         logger.close()
+        if environments.failure is not None:
+            raise EngineLost(
+                f"{environments.failure}; the checkpoint is of update {update}; continue with: endless-train --resume {run}"
+            )
     return run
 
 

@@ -6,7 +6,8 @@ use super::autoreset::Autoreset;
 use super::error::PoolError;
 use super::seeding::{MAX_TOTAL_ENVS, Seeding};
 use crate::batch::limits::MAX_ENVS;
-use crate::batch::{Contents, Frames, MAX_STACK};
+use crate::batch::{Contents, Frames, MAX_STACK, batch_layout};
+use crate::envs::{self, ResetParameters};
 
 /// Reset parameters by the original's names, as a JSON object.
 pub type OptionMap = Map<String, Json>;
@@ -74,6 +75,24 @@ impl PoolConfig {
         }
     }
 
+    /// Checks everything, as [`Pool::new`](super::Pool::new) does, without making environments.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError`] if the id is unknown, or a reset parameter or a number is out of its range.
+    pub fn validate(&self) -> Result<(), PoolError> {
+        let spec = envs::spec(&self.id)?;
+        self.check()?;
+        batch_layout(spec, self.num_envs, self.contents())?;
+        let check = |given: &OptionMap| ResetParameters::new(spec.id, spec.parameters, given).map(drop);
+        match &self.options {
+            ResetOptions::Shared(given) => Ok(check(given)?),
+            ResetOptions::Each(each) => each.iter().enumerate().try_for_each(|(env, given)| {
+                check(given).map_err(|source| PoolError::ParametersOf { env: self.first_env + env, source })
+            }),
+        }
+    }
+
     /// Checks all but the id and the reset parameters.
     pub(super) fn check(&self) -> Result<(), PoolError> {
         if !(1..=MAX_ENVS).contains(&self.num_envs) {
@@ -89,11 +108,17 @@ impl PoolConfig {
             let PoolConfig { first_env, num_envs, total_envs, .. } = *self;
             return Err(PoolError::EnvNumbers { first_env, num_envs, total_envs });
         }
+        if let ResetOptions::Each(each) = &self.options
+            && each.len() != self.num_envs
+        {
+            return Err(PoolError::OptionsCount { given: each.len(), num_envs: self.num_envs });
+        }
         match &self.seeding {
             Seeding::List(seeds) if seeds.is_empty() => Err(PoolError::NoSeeds),
             Seeding::Range { start, end, .. } if start >= end || *end > i64::MAX as u64 => {
                 Err(PoolError::SeedRange { start: *start, end: *end })
             }
+            Seeding::Range { step: 0, .. } => Err(PoolError::SeedStep),
             _ => Ok(()),
         }
     }

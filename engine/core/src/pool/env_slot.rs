@@ -46,6 +46,9 @@ impl<E: Environment> EnvSlot<E> {
 
     /// Starts an episode with that seed, or with the next one of the environment's own.
     pub fn start_episode(&mut self, seed: Option<u64>) {
+        if let Some(seed) = seed {
+            self.seeds.restart(seed);
+        }
         if let Some(seed) = seed.or_else(|| self.seeds.next()) {
             self.random = Generator::from_seed(seed);
         }

@@ -10,6 +10,9 @@ use crate::envs::view::VIEW_BYTES;
 use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
 use crate::random::EntropyError;
 
+/// Maximum number of [`Threads`](super::Threads).
+pub const MAX_THREADS: usize = 1024;
+
 /// A pool that cannot be made, or a call that it cannot carry out.
 ///
 /// The call has changed no environment and no batch, except for [`PoolError::WrongFrame`].
@@ -27,7 +30,7 @@ pub enum PoolError {
     /// Reset parameters of one environment are not valid.
     #[error("options of environment {env}: {source}")]
     ParametersOf {
-        /// Number of the environment.
+        /// Number of the environment, counted over all pools.
         env: usize,
         /// What is wrong with its parameters.
         source: ParameterError,
@@ -77,6 +80,15 @@ pub enum PoolError {
         start: u64,
         /// The end of the range, excluded.
         end: u64,
+    },
+    /// The step of the range of seeds is 0.
+    #[error("the step of the range of seeds must be 1 or more, got 0")]
+    SeedStep,
+    /// Too many threads.
+    #[error("the number of threads must be 0, for one per core, to {MAX_THREADS}, got {given}")]
+    ThreadCount {
+        /// The number that was given.
+        given: usize,
     },
     /// The operating system refuses to start a thread.
     #[error("cannot start {count} threads: {source}")]

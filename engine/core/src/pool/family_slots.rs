@@ -84,7 +84,7 @@ pub(super) fn family_slots<E: Environment>(
     };
     let made: Vec<_> = match &config.options {
         ResetOptions::Shared(given) => vec![make(given)?; config.num_envs],
-        ResetOptions::Each(each) if each.len() == config.num_envs => {
+        ResetOptions::Each(each) => {
             let mut known = HashMap::new();
             each.iter()
                 .enumerate()
@@ -92,12 +92,9 @@ pub(super) fn family_slots<E: Environment>(
                     Entry::Occupied(entry) => Ok(Clone::clone(entry.get())),
                     Entry::Vacant(entry) => make(given)
                         .map(|made| Clone::clone(entry.insert(made)))
-                        .map_err(|source| PoolError::ParametersOf { env, source }),
+                        .map_err(|source| PoolError::ParametersOf { env: config.first_env + env, source }),
                 })
                 .collect::<Result<_, _>>()?
-        }
-        ResetOptions::Each(each) => {
-            return Err(PoolError::OptionsCount { given: each.len(), num_envs: config.num_envs });
         }
     };
     let list: Arc<[u64]> = match &config.seeding {

@@ -15,16 +15,22 @@ pub(super) const MAX_TOTAL_ENVS: usize = u32::MAX as usize;
 pub enum Seeding {
     /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as the original's does
     /// when it is reset without a seed.
+    ///
+    /// An environment that is reset with a seed `s` of its own continues from there, whatever the policy: with `Continue` its later
+    /// episodes continue the generator of `s`, with `Range` they draw with `SeedSequence(s, spawn_key=(0,))`, and with `List` they
+    /// start again with the environment's first item.
     Continue {
         /// The seed of environment 0; `None` seeds each environment from the operating system's entropy.
         seed: Option<u64>,
     },
-    /// Each episode draws its seed uniformly from `start..end`. The paper trains on `0..100000`.
+    /// Each episode draws its seed uniformly from `start`, `start + step`, ... below `end`. The paper trains on `0..100000`.
     Range {
         /// The lowest seed.
         start: u64,
         /// The end of the range, excluded: more than `start`, and at most 2^63 - 1.
         end: u64,
+        /// The difference between two seeds, 1 or more.
+        step: u64,
         /// Seed of the draws: environment `i` draws with `SeedSequence(seed, spawn_key=(i,))`. `None` takes the operating system's
         /// entropy.
         seed: Option<u64>,
@@ -81,13 +87,15 @@ pub(super) enum Seeds {
         first: Option<u64>,
     },
     Range {
-        start: i64,
-        end: i64,
+        start: u64,
+        step: u64,
+        count: i64,
         draws: Generator,
     },
-    /// Both indices are below the length of the list.
+    /// The indices are below the length of the list.
     List {
         seeds: std::sync::Arc<[u64]>,
+        first: usize,
         next: usize,
         stride: usize,
     },
@@ -104,9 +112,10 @@ impl Seeds {
     ) -> Self {
         match seeding {
             Seeding::Continue { seed } => Seeds::Continue { first: seed.map(|seed| seed.wrapping_add(env as u64)) },
-            Seeding::Range { start, end, seed } => Seeds::Range {
-                start: *start as i64,
-                end: *end as i64,
+            Seeding::Range { start, end, step, seed } => Seeds::Range {
+                start: *start,
+                step: *step,
+                count: (end - start).div_ceil(*step) as i64,
                 draws: match seed {
                     Some(seed) => {
                         Generator::from_seed_sequence(&SeedSequence::new(*seed).with_spawn_key(&[env as u32]))
@@ -114,7 +123,10 @@ impl Seeds {
                     None => unseeded.seeds(env),
                 },
             },
-            Seeding::List(_) => Seeds::List { seeds: list.clone(), next: env % list.len(), stride: total % list.len() },
+            Seeding::List(_) => {
+                let first = env % list.len();
+                Seeds::List { seeds: list.clone(), first, next: first, stride: total % list.len() }
+            }
         }
     }
 
@@ -122,12 +134,23 @@ impl Seeds {
     pub(super) fn next(&mut self) -> Option<u64> {
         match self {
             Seeds::Continue { first } => first.take(),
-            Seeds::Range { start, end, draws } => Some(draws.integers(*start, *end) as u64),
-            Seeds::List { seeds, next, stride } => {
+            Seeds::Range { start, step, count, draws } => Some(*start + *step * draws.integers(0, *count) as u64),
+            Seeds::List { seeds, next, stride, .. } => {
                 let seed = seeds[*next];
                 *next = (*next + *stride) % seeds.len();
                 Some(seed)
             }
+        }
+    }
+
+    /// Starts again from a seed that was given to a reset, so that all later episodes follow from it alone.
+    pub(super) fn restart(&mut self, seed: u64) {
+        match self {
+            Seeds::Continue { first } => *first = None,
+            Seeds::Range { draws, .. } => {
+                *draws = Generator::from_seed_sequence(&SeedSequence::new(seed).with_spawn_key(&[0]));
+            }
+            Seeds::List { first, next, .. } => *next = *first,
         }
     }
 

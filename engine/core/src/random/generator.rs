@@ -9,6 +9,10 @@ use serde::{Deserialize, Serialize};
 use super::entropy::{EntropyError, entropy};
 use super::seed_sequence::SeedSequence;
 
+/// Maximum number of draws that rejection sampling repeats, after which it takes a biased one. numpy has no such limit. Less than
+/// half of the draws are rejected, so that no seed reaches it; a state from outside could.
+const MAX_REDRAWS: u32 = 1024;
+
 /// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
 ///
 /// ```
@@ -129,7 +133,10 @@ impl Generator {
         // The threshold is below the count, so that most draws need no division.
         if (product as u32) < count {
             let threshold = count.wrapping_neg() % count;
-            while (product as u32) < threshold {
+            for _ in 0..MAX_REDRAWS {
+                if (product as u32) >= threshold {
+                    break;
+                }
                 product = u64::from(count) * u64::from(self.next_u32());
             }
         }
@@ -142,7 +149,10 @@ impl Generator {
         let mut product = u128::from(count) * u128::from(self.bits.next_u64());
         if (product as u64) < count {
             let threshold = count.wrapping_neg() % count;
-            while (product as u64) < threshold {
+            for _ in 0..MAX_REDRAWS {
+                if (product as u64) >= threshold {
+                    break;
+                }
                 product = u128::from(count) * u128::from(self.bits.next_u64());
             }
         }
@@ -191,5 +201,20 @@ impl fmt::Debug for Generator {
             .field("stream", &self.bits.stream())
             .field("kept", &self.kept)
             .finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rejection_sampling_ends_on_any_state() {
+        // With an even increment, which `from_state` and deserialising do not let through, all draws are 0 and rejected.
+        let stuck: Pcg64 = serde_json::from_str(r#"{"state":0,"increment":0}"#).unwrap();
+        for high in [49, 1 << 33, i64::MAX - 1] {
+            let mut generator = Generator { bits: stuck.clone(), kept: None };
+            assert_eq!(generator.integers(0, high), 0);
+        }
     }
 }

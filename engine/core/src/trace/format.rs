@@ -20,6 +20,10 @@ pub struct Trace {
     pub options: Map<String, Json>,
     /// The episodes in the order in which they were played.
     pub episodes: Vec<Episode>,
+    /// Number of steps after which the recording of an episode stops if it has not ended; by default 700, and 200 in a trace with
+    /// ground-truth views, as the reference traces were recorded.
+    #[serde(default)]
+    pub max_steps: Option<usize>,
 }
 
 /// One recorded episode.
@@ -93,10 +97,33 @@ impl Trace {
     ///
     /// # Errors
     ///
-    /// [`TraceError::Open`] or [`TraceError::Format`].
+    /// [`TraceError::Open`], [`TraceError::Format`], [`TraceError::Empty`] or [`TraceError::Truncated`].
     pub fn open(path: &Path) -> Result<Self, TraceError> {
         let file = File::open(path).map_err(TraceError::Open)?;
-        serde_json::from_reader(BufReader::new(GzDecoder::new(file))).map_err(TraceError::Format)
+        let trace: Self = serde_json::from_reader(BufReader::new(GzDecoder::new(file))).map_err(TraceError::Format)?;
+        trace.check_complete()?;
+        Ok(trace)
+    }
+
+    /// Checks that no episode lacks its last steps: each has ended, or has as many steps as are recorded of an episode at most.
+    ///
+    /// # Errors
+    ///
+    /// [`TraceError::Empty`] or [`TraceError::Truncated`].
+    pub fn check_complete(&self) -> Result<(), TraceError> {
+        if self.episodes.is_empty() {
+            return Err(TraceError::Empty);
+        }
+        let steps = || self.episodes.iter().flat_map(|episode| &episode.steps);
+        let usual = if steps().any(|step| step.render_crc.is_some()) { 200 } else { 700 };
+        let max_steps = self.max_steps.unwrap_or(usual);
+        let complete = |steps: &[Step]| steps.last().is_some_and(|last| last.done) || steps.len() == max_steps;
+        match self.episodes.iter().position(|episode| !complete(&episode.steps)) {
+            None => Ok(()),
+            Some(episode) => {
+                Err(TraceError::Truncated { episode, steps: self.episodes[episode].steps.len(), max_steps })
+            }
+        }
     }
 }
 
@@ -109,6 +136,22 @@ pub enum TraceError {
     /// The file's content is not a trace.
     #[error("the file must be a trace (gzipped JSON): {0}")]
     Format(serde_json::Error),
+    /// There are no episodes.
+    #[error("the trace must have at least one episode, got none")]
+    Empty,
+    /// The last steps of an episode are missing.
+    #[error(
+        "the trace is truncated: episode {episode} must end with `done` or have {max_steps} steps, got {steps} steps without an end \
+         (a recording with another limit states it as `max_steps`)"
+    )]
+    Truncated {
+        /// Episode of the trace, from 0.
+        episode: usize,
+        /// Number of its steps.
+        steps: usize,
+        /// Number of steps after which a recording stops.
+        max_steps: usize,
+    },
     /// The environment does not exist, or the recorded reset parameters or actions are not valid.
     #[error(transparent)]
     Pool(#[from] PoolError),

@@ -9,6 +9,9 @@ use crate::envs::parameters::ResetParameters;
 /// one leaves.
 pub const MAX_SPOTLIGHTS: usize = 1000;
 
+/// Largest number of coins at a time.
+pub const MAX_COINS: usize = 100;
+
 /// Largest radius of a spotlight in pixels: more than the screen's diagonal.
 pub const MAX_SPOT_RADIUS: i32 = 256;
 

@@ -4,7 +4,7 @@
 //! for every use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
 
 use super::features::FEATURES;
-use super::parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
+use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use crate::envs::action_space::ActionSpace;
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
@@ -120,7 +120,7 @@ const SEARING_SPOTLIGHTS: &[Parameter] = &[
     HIDE_CHESSBOARD,
     LIGHT_DIM_OFF_DURATION,
     LIGHT_THRESHOLD,
-    Parameter::list("num_coins", &[1], 0, 100, "Number of coins. A list to draw from."),
+    Parameter::list("num_coins", &[1], 0, MAX_COINS as i64, "Number of coins. A list to draw from."),
     COIN_SCALE,
     COINS_VISIBLE,
     Parameter::bool(

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::circle::Circle;
 use super::config::MAX_COORDINATE;
-use super::parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
+use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
 use super::spotlight::Spotlight;
 use crate::envs::character::Character;
 use crate::envs::screen::SCREEN;
@@ -123,6 +123,7 @@ impl State {
                 .lit
                 .iter()
                 .all(|circle| near(circle.centre()) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius.into()))
+            && self.coins.len() <= MAX_COINS
             && self.coins.iter().copied().chain(self.exit.map(|exit| exit.location)).all(near)
             && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
             && self.coins_collected < u32::MAX / 2

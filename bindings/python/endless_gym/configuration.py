@@ -1,0 +1,132 @@
+"""The arguments of `make_vec` and `serve`, and their checks: the same errors in this process and for an engine process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+
+from endless_gym import _native
+from endless_gym.arguments import integer, mapping, seed_source
+from endless_gym.specs import Frames, Spec, options_text, spec
+
+try:
+    from gymnasium.vector import AutoresetMode as AutoresetMode
+except ImportError as error:
+    raise ImportError(
+        f"vector environments need Gymnasium 1.1 or newer, and {gymnasium.__version__} is installed: "
+        "pip install 'gymnasium>=1.1'; `gymnasium.make` works with this version"
+    ) from error
+
+Options = Mapping[str, Any]
+
+#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
+OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
+
+#: The auto-reset modes by their names.
+MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """The checked arguments that `make_vec` and `serve` share."""
+
+    described: Spec
+    num_envs: int
+    num_threads: int
+    groups: int
+    seed: int | None
+    seed_range: tuple[int, int, int] | None
+    seed_list: list[int] | None
+    autoreset: AutoresetMode
+    frames: Frames | None
+    features: bool
+    #: The configuration of each group, which the engine has checked.
+    pools: list[_native.PoolConfig]
+
+
+def checked_arguments(
+    id: str,
+    num_envs: int,
+    num_threads: int | None,
+    groups: int,
+    seed: int | None,
+    seeds: range | Sequence[int] | None,
+    options: Options | Sequence[Options] | None,
+    autoreset: str | AutoresetMode,
+    observation: str,
+    frames: Frames | None,
+) -> Arguments:
+    """Check arguments of `make_vec`.
+
+    Raises:
+        TypeError: A number is not an integer.
+        ValueError: An argument is out of its range.
+    """
+    described, mode = spec(id), autoreset_mode(autoreset)
+    num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
+    groups = integer("groups", groups, 1, _native.MAX_GROUPS)
+    threads = integer("num_threads", num_threads or 0, 0, _native.MAX_THREADS)
+    seed, seed_range, seed_list = seed_source(seed, seeds)
+    frames, features = contents(observation, frames)
+    pools = [
+        _native.PoolConfig(
+            described.id,
+            num_envs,
+            options=_pool_options(options, group * num_envs, num_envs, groups),
+            autoreset=mode.name.lower(),
+            # Environments are numbered over all groups.
+            first_env=group * num_envs,
+            total_envs=groups * num_envs,
+            seed=seed,
+            seed_range=seed_range,
+            seed_list=seed_list,
+            frames=frames.arguments() if frames else None,
+            features=features,
+            final_observation=True,
+        )
+        for group in range(groups)
+    ]
+    return Arguments(described, num_envs, threads, groups, seed, seed_range, seed_list, mode, frames, features, pools)
+
+
+def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
+    """Gymnasium's auto-reset mode, from the mode or its name."""
+    mode = given if isinstance(given, AutoresetMode) else MODES.get(given) if isinstance(given, str) else None
+    if mode is None:
+        raise ValueError(f"autoreset must be one of {', '.join(MODES)}, got {given!r}")
+    return mode
+
+
+def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
+    if not isinstance(observation, str) or observation not in OBSERVATIONS:
+        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
+    if frames is not None and not isinstance(frames, Frames):
+        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
+    has_frames, has_features = OBSERVATIONS[observation]
+    if frames is not None and not has_frames:
+        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
+    return (frames or Frames()) if has_frames else None, has_features
+
+
+def common_options(given: Options | Sequence[Options] | None) -> Options | None:
+    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
+    if given is None or isinstance(given, Mapping):
+        return given or {}
+    return given[0] if len(given) == 1 else None
+
+
+def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
+    """The reset parameters of the environments of one group, in the native module's format."""
+    if given is None or isinstance(given, Mapping):
+        return options_text(given)
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise TypeError(f"options must be a mapping, or a sequence of mappings, got {given!r}")
+    if len(given) != groups * num_envs:
+        raise ValueError(
+            f"options must have one mapping for each of {groups * num_envs} environments, got {len(given)}"
+        )
+    return f"[{', '.join(options_text(mapping('options', each)) for each in given[first : first + num_envs])}]"

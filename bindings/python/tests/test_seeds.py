@@ -1,0 +1,155 @@
+"""Which seeds the episodes have: in this process and in an engine process, and in the original under Gymnasium."""
+
+import json
+import os
+import pickle
+import subprocess
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import endless_gym
+
+ID = "Endless-MortarMayhem-v0"
+WHERE = [endless_gym.make_vec, endless_gym.serve]
+GROUPS, NUM_ENVS = 2, 2
+STEPS = 120
+
+
+def short_episodes(id: str) -> dict[str, object]:
+    """Reset parameters with which random actions end several episodes."""
+    if id.startswith("MortarMayhem"):
+        return {"command_count": [2]}
+    return {} if id == ID else {"max_steps": 40}
+
+
+@pytest.mark.parametrize("id", endless_gym.all_specs())
+def test_episodes_after_a_reset_are_the_originals(id: str, original_python: str, tmp_path: Path) -> None:
+    """Gymnasium's vector environment seeds at the reset, and then resets without a seed."""
+    options = short_episodes(id)
+    space = endless_gym.make_vec(id, GROUPS * NUM_ENVS).action_space
+    space.seed(3)
+    actions = np.array([space.sample() for _ in range(STEPS)])
+    np.save(tmp_path / "actions.npy", actions)
+    arguments = [id, "41", tmp_path / "actions.npy", json.dumps(options), tmp_path / "out.pickle"]
+    program = Path(__file__).parent / "original_vector.py"
+    environment = os.environ | {"PYTHONPATH": str(program.parent)}
+    subprocess.run([original_python, program, *arguments], check=True, capture_output=True, env=environment)
+    expected = pickle.loads((tmp_path / "out.pickle").read_bytes())
+
+    def frames(observation: object) -> list[int]:
+        shown = observation["visual_observation"] if isinstance(observation, dict) else observation
+        return [zlib.crc32(frame.tobytes()) for frame in shown]
+
+    for where in WHERE:
+        ends = 0
+        with where(id, NUM_ENVS, groups=GROUPS, seed=0, options=options, autoreset="same_step") as envs:
+            for group in range(GROUPS):
+                own = slice(group * NUM_ENVS, (group + 1) * NUM_ENVS)
+                assert frames(envs.reset(seed=41, group=group)[0]) == expected[0][0][own]
+                for step, (action, wanted) in enumerate(zip(actions, expected[1:], strict=True)):
+                    envs.send(action[own], group)
+                    observation, reward, terminated, *_ = envs.recv(group)
+                    place = f"{where.__name__}, group {group}, step {step}"
+                    assert terminated.tolist() == wanted[2][own], place
+                    assert reward.tolist() == wanted[1][own], place
+                    assert frames(observation) == wanted[0][own], place
+                    ends += int(terminated.sum())
+        assert ends >= 2 * GROUPS * NUM_ENVS
+
+
+def episodes(envs: endless_gym.EndlessVectorEnv, group: int = 0, number: int = 4) -> list[list[bytes]]:
+    """The first frames of the next episodes of each environment of a group, which start in the same step as others end."""
+    firsts: list[list[bytes]] = [[] for _ in range(envs.num_envs)]
+    while min(map(len, firsts)) < number:
+        envs.send(np.zeros((envs.num_envs, 2), np.int64), group)
+        observation, _, terminated, *_ = envs.recv(group)
+        for env in np.flatnonzero(terminated):
+            # The character of the last episode is not shown in the first frame.
+            firsts[env].append(observation[env].tobytes())
+    return [each[:number] for each in firsts]
+
+
+@pytest.mark.parametrize("seeds", [None, range(100_000), range(0, 90_000, 3), [5, 6, 7, 8, 9]])
+def test_episodes_depend_on_the_seed_of_the_reset_alone(seeds) -> None:
+    """In every place, for every policy, whatever the seed of creation and whatever was played before."""
+    played = []
+    for where in WHERE:
+        for seed in (0, 1):
+            with where(ID, NUM_ENVS, groups=GROUPS, seed=seed, seeds=seeds, autoreset="same_step") as envs:
+                every = [40 + env for env in range(GROUPS * NUM_ENVS)]
+                envs.reset()
+                for group in range(GROUPS):
+                    episodes(envs, group, 1 + seed)
+                shown = []
+                # The same seeds, given in all ways.
+                for given in (40, every, np.array(every)):
+                    envs.reset(seed=given)
+                    shown.append([episodes(envs, group) for group in range(GROUPS)])
+                for group in range(GROUPS):
+                    own = every[group * NUM_ENVS :][:NUM_ENVS]
+                    expected = shown[0][group]
+                    for given in (40, own, np.array(own, np.uint32)):
+                        envs.reset(seed=given, group=group)
+                        assert episodes(envs, group) == expected
+                        envs.send_reset(group, seed=given)
+                        envs.recv(group)
+                        assert episodes(envs, group) == expected
+                    for env in range(NUM_ENVS):
+                        mask = np.arange(NUM_ENVS) == env
+                        envs.reset(seed=own, options={"reset_mask": mask}, group=group)
+                    for env in range(NUM_ENVS):
+                        mask = np.arange(NUM_ENVS) == env
+                        envs.reset(seed=np.array(own), options={"reset_mask": mask}, group=group)
+                        assert episodes(envs, group)[env] == expected[env]
+                assert shown[0] == shown[1] == shown[2]
+                played.append(shown[0])
+    assert all(each == played[0] for each in played)
+
+
+def test_they_are_those_of_gymnasiums_vector_environment() -> None:
+    sync = SyncVectorEnv([lambda: endless_gym.Env(ID)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    with endless_gym.make_vec(ID, 3, seed=0, autoreset="same_step") as envs:
+        for seed in (7, [3, 1, 2]):
+            np.testing.assert_array_equal(envs.reset(seed=seed)[0], sync.reset(seed=seed)[0])
+            for _ in range(150):
+                actions = np.zeros((3, 2), np.int64)
+                np.testing.assert_array_equal(envs.step(actions)[0], sync.step(actions)[0])
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_seeds_may_be_an_array(where) -> None:
+    with where(ID, 4) as envs:
+        expected = envs.reset(seed=0)[0].copy()
+        np.testing.assert_array_equal(envs.reset(seed=np.arange(4))[0], expected)
+        np.testing.assert_array_equal(envs.reset(seed=np.int64(0))[0], expected)
+        with pytest.raises(ValueError, match=r"^seed must have 4 items, one for each environment, got 3$"):
+            envs.reset(seed=np.arange(3))
+        with pytest.raises(TypeError, match=r"^seed must be an integer, got "):
+            envs.reset(seed=np.zeros((4, 1), int))
+        with pytest.raises(TypeError, match=r"^seed must be an integer, got "):
+            envs.reset(seed=np.zeros(4))
+        with pytest.raises(ValueError, match=r"^seed must be 0 to \d+, got -1$"):
+            envs.reset(seed=np.array([0, 1, -1, 2]))
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_a_range_keeps_its_step(where) -> None:
+    wanted = {endless_gym.Env(ID).reset(seed=seed)[0].tobytes() for seed in (0, 3, 6, 9)}
+    for seeds in (range(0, 10, 3), range(9, -1, -3)):
+        with where(ID, 64, seeds=seeds, seed=1) as envs:
+            assert {frame.tobytes() for frame in envs.reset()[0]} == wanted
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_many_seeds(where) -> None:
+    """More than fit one argument of a command."""
+    seeds = [(number * 7_919) % 2**64 + 10**15 for number in range(100_000)]
+    with where(ID, 3, seeds=seeds) as envs:
+        for episode in range(2):
+            for env, frame in enumerate(envs.reset()[0]):
+                expected, _ = endless_gym.Env(ID).reset(seed=seeds[3 * episode + env])
+                np.testing.assert_array_equal(frame, expected)
