@@ -4,7 +4,7 @@ use thiserror::Error;
 
 use super::drawn_scene::WrongFrame;
 use super::seeding::MAX_TOTAL_ENVS;
-use crate::batch::limits::MAX_ENVS;
+use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 use crate::batch::{BLOCK_BYTES, LayoutError, MAX_STACK};
 use crate::envs::view::VIEW_BYTES;
 use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
@@ -77,6 +77,12 @@ pub enum PoolError {
         start: u64,
         /// The end of the range, excluded.
         end: u64,
+    },
+    /// The number of threads is out of range.
+    #[error("threads must be 0 (one for each core) to {MAX_THREADS}, got {given}")]
+    ThreadCount {
+        /// The number that was given.
+        given: usize,
     },
     /// The operating system refuses to start a thread.
     #[error("cannot start {count} threads: {source}")]

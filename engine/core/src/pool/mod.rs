@@ -19,7 +19,7 @@ mod seeding;
 mod snapshot;
 mod threads;
 
-pub use crate::batch::limits::MAX_ENVS;
+pub use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 pub use autoreset::{Autoreset, UnknownAutoreset};
 pub use config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 pub use drawn_scene::WrongFrame;

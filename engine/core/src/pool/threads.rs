@@ -5,6 +5,8 @@
 mod workers;
 
 use super::error::PoolError;
+#[cfg(feature = "threads")]
+use crate::batch::limits::MAX_THREADS;
 
 /// Threads that step environments: the calling thread and workers. Several pools may share them; they then take turns.
 ///
@@ -17,13 +19,20 @@ pub struct Threads {
 
 #[cfg(feature = "threads")]
 impl Threads {
-    /// `count` threads, the calling one included; 0 means one for each core.
+    /// `count` threads, the calling one included, at most [`MAX_THREADS`]; 0 means one for each core.
     ///
     /// # Errors
     ///
-    /// If the operating system cannot start them.
+    /// If there are too many, or if the operating system cannot start them.
     pub fn new(count: usize) -> Result<Self, PoolError> {
-        let count = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
+        if count > MAX_THREADS {
+            return Err(PoolError::ThreadCount { given: count });
+        }
+        let count = if count == 0 {
+            std::thread::available_parallelism().map_or(1, usize::from).min(MAX_THREADS)
+        } else {
+            count
+        };
         let workers = (count > 1).then(|| workers::Workers::new(count - 1)).transpose();
         let workers = workers.map_err(|source| PoolError::Threads { count, source })?;
         Ok(Threads { workers: workers.map(std::sync::Arc::new) })
