@@ -78,15 +78,33 @@ fn main() -> ExitCode {
     }
 }
 
-/// Runs the test that needs a mount namespace of its own where the system permits it, and otherwise says that it was not run.
+/// Runs the tests that need a mount namespace of their own or the rights of root where the system permits them, and otherwise says
+/// that they were not run.
 fn mount_namespaces() -> Result<(), String> {
-    const NAME: &str = "too_little_shared_memory_is_an_error_and_not_a_signal";
+    const IN_NAMESPACES: [(&str, &str); 4] = [
+        ("service", "too_little_shared_memory_is_an_error_and_not_a_signal"),
+        ("service_faults", "inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing"),
+        ("service_faults", "inside_small_shared_memory_observers_get_what_is_left"),
+        ("service_faults", "two_directories_of_one_path_share_nothing"),
+    ];
+    const AS_ROOT: [(&str, &str); 1] = [("service_faults", "as_root_a_segment_of_another_user_is_reported_or_avoided")];
     let mut probe = Command::new("unshare");
     probe.args(["--mount", "--map-root-user", "mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]).stderr(Stdio::null());
-    if probe.status().is_ok_and(|status| status.success()) {
-        return run(&[&["test", "--locked", "--test", "service", "--", "--ignored", "--exact", NAME]], &[]);
+    let permitted = probe.status().is_ok_and(|status| status.success());
+    let user = Command::new("id").arg("-u").output().map_err(|error| format!("`id -u`: {error}"))?;
+    let is_root = user.stdout.trim_ascii() == b"0";
+    for (permitted, reason, tests) in [
+        (permitted, "this system refuses mount namespaces", &IN_NAMESPACES[..]),
+        (is_root, "this user is not root", &AS_ROOT[..]),
+    ] {
+        for (program, name) in tests {
+            if permitted {
+                run(&[&["test", "--locked", "--test", program, "--", "--ignored", "--exact", name]], &[])?;
+            } else {
+                println!("==> not run: {name}, since {reason}");
+            }
+        }
     }
-    println!("==> not run: {NAME}, since this system refuses mount namespaces");
     Ok(())
 }
 
