@@ -114,19 +114,18 @@ impl Engine {
     ///
     /// [`ServiceError::InvalidName`], [`ServiceError::OutOfRange`] or [`ServiceError::Pool`] for an invalid configuration,
     /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is
-    /// running, [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory, [`ServiceError::DescriptorLimit`] if
-    /// there are not enough file descriptors, [`ServiceError::Version`] if an engine
-    /// of another version has the name, [`ServiceError::EngineUnreachable`] if its files are removed while it starts,
-    /// [`ServiceError::NamespaceLocked`] if another process holds the namespace's lock for too
-    /// long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
+    /// running, [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] if there is not enough shared memory or
+    /// there are too few file descriptors, [`ServiceError::Version`] if an engine of another version has the name,
+    /// [`ServiceError::ForeignSegment`] if another user has taken the namespace's segments, [`ServiceError::EngineUnreachable`] if
+    /// the engine's files are removed while it starts, [`ServiceError::NamespaceLocked`] if another process holds the namespace's
+    /// lock for too long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
-        let node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
+        let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
         blackboard::refuse_second_engine(&node, &config.service, &node.lock()?)?;
         let pools = config.pools()?;
         let pools = || pools.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<Vec<_>, _>>();
         let mut attempt = 1;
-        let mut node = node;
         loop {
             match Self::start(config, node, pools()?) {
                 // Something has removed the engine's files.
@@ -321,4 +320,32 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
         batches_held: config.batches_held,
         observers: config.observers,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::pool::{PoolConfig, Threads};
+
+    use super::*;
+    use crate::namespace::Namespace;
+
+    #[test]
+    fn an_engine_that_cannot_be_found_is_noticed() {
+        let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
+        let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
+        let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+        let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
+        let check = || {
+            let lock = engine.node.lock().unwrap();
+            Engine::check_published(&engine.node, engine.specification(), &lock)
+        };
+        check().unwrap();
+        let services = namespace.root().join("services");
+        std::fs::rename(&services, namespace.root().join("elsewhere")).unwrap();
+        assert!(matches!(check(), Err(ServiceError::EngineUnreachable { .. })));
+        std::fs::rename(namespace.root().join("elsewhere"), &services).unwrap();
+        check().unwrap();
+        drop(engine);
+        std::fs::remove_dir_all(namespace.root()).unwrap();
+    }
 }

@@ -63,11 +63,12 @@ impl Identity {
         &self.prefix
     }
 
-    /// Fails if the root directory or the file was removed or replaced since this process joined.
+    /// Fails if the root directory or the file was removed or replaced since this process joined. A file that cannot be read, such
+    /// as for lack of a descriptor, counts as the same.
     pub(crate) fn check(&self) -> Result<(), ServiceError> {
         match read(&self.root) {
             Ok(Some(found)) if found == *self => Ok(()),
-            Err(e) if e.kind() != io::ErrorKind::NotFound => Err(self.unusable(&e)),
+            Err(e) if !matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(()),
             _ => Err(ServiceError::RootRemoved { path: self.root.clone() }),
         }
     }

@@ -58,9 +58,9 @@ impl NamespaceNode {
     }
 
     fn join_locked(namespace: &Namespace, patience: Duration, lock: &NamespaceLock) -> Result<Self, ServiceError> {
-        let (identity, config) = own_identity(namespace, lock)?;
         memory::check_free(memory::NODE_BYTES)?;
         descriptors::reserve(descriptors::NODE)?;
+        let (identity, config) = own_identity(namespace, lock)?;
         cleanup::remove_counter(&config, lock)?;
         let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled).create();
         cleanup::remove_counter(&config, lock)?;
@@ -171,7 +171,9 @@ impl NamespaceNode {
             return false;
         };
         let number = |node: &UniqueNodeId| fs::read(self.context_file(node)).ok();
-        pid != std::process::id() && number(&node) == number(self.id()) && !process::runs(pid)
+        pid != std::process::id()
+            && number(&node).is_some_and(|number_of| Some(number_of) == number(self.id()))
+            && !process::runs(pid)
     }
 
     /// The file with the number by which iceoryx2 identifies the process of a node.
@@ -221,12 +223,16 @@ impl Drop for NamespaceNode {
 /// The identity of the namespace and iceoryx2's configuration. A namespace whose prefix another user has used gets another one,
 /// unless processes use it.
 fn own_identity(namespace: &Namespace, lock: &NamespaceLock) -> Result<(Identity, Config), ServiceError> {
+    let mut renewed = false;
     loop {
         let identity = Identity::read_or_create(namespace, lock)?;
         let config = namespace.config(identity.prefix())?;
         let Some((path, owner)) = cleanup::foreign_segment(&config) else { return Ok((identity, config)) };
         match identity.try_exclusive(lock) {
-            Some(all) if cleanup::remove_orphans(&config, lock, &all) => identity.remove(lock, &all),
+            Some(all) if !renewed && cleanup::remove_orphans(&config, lock, &all) => {
+                identity.remove(lock, &all);
+                renewed = true;
+            }
             _ => return Err(ServiceError::ForeignSegment { path, owner, root: namespace.root().to_owned() }),
         }
     }
