@@ -40,8 +40,8 @@ pub mod pool {
 /// Engines that serve environments in shared memory, their trainers and observers.
 pub mod service {
     pub use endless_gym_service::{
-        BatchLease, ConnectConfig, Engine, EngineConfig, EngineSummary, MAX_BATCHES_HELD, MAX_GROUPS, Namespace,
-        Observer, ROOT_VARIABLE, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
+        BatchLease, ConnectConfig, Engine, EngineConfig, EngineSummary, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS,
+        Namespace, Observer, ROOT_VARIABLE, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
         timeout_from_seconds,
     };
 }

@@ -293,8 +293,6 @@ fn deaths_at_any_moment_are_survived() {
         play(&mut trainer, 0, 3);
         play(&mut trainer, 1, 3);
     }
-    // Incomplete nodes are recognised by their age.
-    std::thread::sleep(Duration::from_secs(11));
     assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
     assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
 }

@@ -77,7 +77,11 @@ fn node(namespace: &Namespace) -> Node<ipc::Service> {
     std::fs::set_permissions(namespace.root(), std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
     let mut config = Config::default();
     config.global.set_root_path(&Path::new(namespace.root().to_str().unwrap().as_bytes()).unwrap());
-    config.global.prefix = FileName::new(namespace.prefix().as_bytes()).unwrap();
+    let file = namespace.root().join("prefix");
+    if !file.exists() {
+        std::fs::write(&file, format!("{}Alien_", namespace.prefix())).unwrap();
+    }
+    config.global.prefix = FileName::new(&std::fs::read(file).unwrap()).unwrap();
     NodeBuilder::new().config(&config).create().unwrap()
 }
 

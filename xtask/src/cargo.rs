@@ -14,6 +14,11 @@ pub fn run(arguments: &[&str]) -> Result<(), String> {
     execute(with_original(arguments)?.env("PROPTEST_RNG_SEED", PROPERTY_SEED).env("RUSTDOCFLAGS", "--deny warnings"))
 }
 
+/// Runs one test that is ignored where the machine does not permit it.
+pub fn ignored_test(program: &str, name: &str) -> Result<(), String> {
+    run(&["test", "--locked", "--test", program, "--", "--ignored", "--exact", name])
+}
+
 /// Compares `steps` steps of each environment with the original, from new seeds; optimised, since it is long.
 pub fn live(steps: u64) -> Result<(), String> {
     original::python()?;

@@ -24,7 +24,7 @@ pub fn for_package() -> Option<Interpreter> {
 
 /// One CPython of each minor version, in their order.
 pub fn all() -> Vec<Interpreter> {
-    let mut found = find();
+    let mut found: Vec<Interpreter> = find().collect();
     found.sort_by_key(|python| python.minor);
     found.dedup_by_key(|python| python.minor);
     found

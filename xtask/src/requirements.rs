@@ -20,6 +20,7 @@ pub enum Requirement {
     Valgrind,
     Wasm,
     MountNamespaces,
+    Root,
     SharedMemory,
     Disk,
 }
@@ -33,6 +34,7 @@ impl Requirement {
             Requirement::Valgrind => "valgrind",
             Requirement::Wasm => "Rust's standard library for wasm32-unknown-unknown",
             Requirement::MountNamespaces => "mount namespaces",
+            Requirement::Root => "the rights of root",
             Requirement::SharedMemory => "shared memory",
             Requirement::Disk => "disk space",
         }
@@ -56,6 +58,7 @@ impl Requirement {
                 "permit `unshare --mount --map-root-user` (util-linux): sysctl kernel.unprivileged_userns_clone=1, or in a container \
                  --cap-add SYS_ADMIN"
             }
+            Requirement::Root => "run it as root: sudo --preserve-env env \"PATH=$PATH\" cargo xtask test",
             Requirement::SharedMemory => "mount -o remount,size=2G /dev/shm, or in a container --shm-size=2g",
             Requirement::Disk => "free the space, or set CARGO_TARGET_DIR to a larger file system",
         }
@@ -79,6 +82,8 @@ impl Requirement {
             Requirement::Valgrind => first_line("valgrind", &["--version"]),
             Requirement::Wasm => wasm::Toolchain::find().map(|found| found.to_string()).ok_or("not found".to_owned()),
             Requirement::MountNamespaces => mount_namespaces(),
+            Requirement::Root if rustix::process::geteuid().is_root() => Ok("user root".to_owned()),
+            Requirement::Root => Err(format!("user {}", rustix::process::geteuid().as_raw())),
             Requirement::SharedMemory => free(Path::new("/dev/shm"), SHARED_MEMORY),
             Requirement::Disk => {
                 let target = venv::target()?;

@@ -128,12 +128,21 @@ pub const STAGES: &[Stage] = &[
     },
     Stage { name: "wasm", run: wasm::build, needs: &[Linker, Wasm], compiles: true, ..STAGE },
     Stage {
-        name: "too little shared memory",
+        name: "shared memory of other sizes",
         run: || {
-            let test = "too_little_shared_memory_is_an_error_and_not_a_signal";
-            cargo::run(&["test", "--locked", "--test", "service", "--", "--ignored", "--exact", test])
+            cargo::ignored_test("service", "too_little_shared_memory_is_an_error_and_not_a_signal")?;
+            cargo::ignored_test("service_faults", "inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing")?;
+            cargo::ignored_test("service_faults", "inside_small_shared_memory_observers_get_what_is_left")?;
+            cargo::ignored_test("service_faults", "two_directories_of_one_path_share_nothing")
         },
         needs: &[MountNamespaces],
+        after: &["rust build"],
+        ..STAGE
+    },
+    Stage {
+        name: "segments of another user",
+        run: || cargo::ignored_test("service_faults", "as_root_a_segment_of_another_user_is_reported_or_avoided"),
+        needs: &[Root],
         after: &["rust build"],
         ..STAGE
     },

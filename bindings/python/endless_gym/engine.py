@@ -38,12 +38,13 @@ class EngineProcess:
             long_arguments: Further ones, which the process reads from a file: a command line has a limited length.
         """
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
+        self._owner = os.getpid()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         with tempfile.TemporaryFile() as file:
             file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
             file.flush()
             self._process = subprocess.Popen(
-                [*program(), "serve", "--child", "--service", self.service, *arguments, f"@/dev/fd/{file.fileno()}"],
+                [*program(), "serve", f"--child={os.getpid()}", "--service", self.service, *arguments, f"@/dev/fd/{file.fileno()}"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._errors,
@@ -71,9 +72,16 @@ class EngineProcess:
             time.sleep(0.01)
 
     def end(self) -> None:
-        """Stops the process and waits for its end."""
+        """Stops the process and waits for its end. Does nothing in a process that was forked from the one that started it."""
+        if self._owner != os.getpid():
+            return
         if self._process.stdin is not None:
-            self._process.stdin.close()
+            # Closing it is not enough: processes that were forked from this one keep it open.
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.write(b"\n")
+                self._process.stdin.flush()
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
         try:
             self._process.wait(10)
         except subprocess.TimeoutExpired:

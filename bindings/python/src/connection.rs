@@ -160,10 +160,13 @@ fn wait_for_engine<T: Send>(
         let left = timeout.saturating_sub(start.elapsed());
         match py.detach(|| connect(left.min(SIGNAL_INTERVAL))) {
             Ok(connected) => return Ok(connected),
-            // The engine is not running yet, or it was replaced during the call.
-            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
-                if left > SIGNAL_INTERVAL =>
-            {
+            // The engine is not running yet, or it was replaced during the call, or another process has locked the namespace.
+            Err(
+                ServiceError::UnknownEngine { .. }
+                | ServiceError::EngineUnreachable { .. }
+                | ServiceError::EngineRestarted { .. }
+                | ServiceError::NamespaceLocked { .. },
+            ) if left > SIGNAL_INTERVAL => {
                 py.check_signals()?;
             }
             Err(error) => return Err(errors::service(error)),

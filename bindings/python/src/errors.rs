@@ -56,11 +56,14 @@ pub fn service(error: ServiceError) -> PyErr {
     };
     match error {
         E::Pool(error) => pool(error),
-        E::EngineLost { .. } | E::EngineRestarted { .. } | E::SpecificationChanged { .. } => EngineLost::new_err(text),
-        E::TooManyBatchesHeld { .. } => TooManyBatchesHeld::new_err(text),
-        E::UnknownEngine { .. } | E::TrainerExists { .. } | E::TooManyObservers { .. } => {
-            PyConnectionError::new_err(text)
+        E::EngineLost { .. } | E::EngineRestarted { .. } | E::SpecificationChanged { .. } | E::RootRemoved { .. } => {
+            EngineLost::new_err(text)
         }
+        E::TooManyBatchesHeld { .. } => TooManyBatchesHeld::new_err(text),
+        E::UnknownEngine { .. }
+        | E::EngineUnreachable { .. }
+        | E::TrainerExists { .. }
+        | E::TooManyObservers { .. } => PyConnectionError::new_err(text),
         E::Rejected { reason: Rejection::NotReset, .. } => PyRuntimeError::new_err(text),
         E::TimedOut { .. } | E::NamespaceLocked { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
@@ -71,7 +74,7 @@ pub fn service(error: ServiceError) -> PyErr {
         | E::OptionsTooLong { .. }
         | E::SnapshotTooLong { .. }
         | E::Rejected { .. } => PyValueError::new_err(text),
-        E::Root { .. } => PyOSError::new_err(text),
+        E::Root { .. } | E::ForeignSegment { .. } | E::DescriptorLimit { .. } => PyOSError::new_err(text),
         _ => PyRuntimeError::new_err(text),
     }
 }

@@ -194,3 +194,100 @@ def test_a_running_engine_without_final_observations() -> None:
     finally:
         engine.communicate()
     assert engine.returncode == 0
+
+
+#: Starts an engine or connects to one, forks a worker that lives on, and prints its process id.
+FORKING = """
+import os, sys, time, endless_gym
+envs = endless_gym.connect("forking") if sys.argv[1] == "connect" else endless_gym.serve("Endless-MortarMayhem-v0", 4)
+envs.reset()
+worker = os.fork()
+if worker == 0:
+    time.sleep(60)
+    os._exit(0)
+print(worker, flush=True)
+if sys.argv[1] == "close":
+    start = time.monotonic()
+    envs.close()
+    print(time.monotonic() - start, flush=True)
+time.sleep(60)
+"""
+
+
+def forking(how: str) -> tuple[subprocess.Popen, int]:
+    process = subprocess.Popen([sys.executable, "-c", FORKING, how], stdout=subprocess.PIPE, text=True)
+    return process, int(process.stdout.readline())
+
+
+def test_an_engine_closes_at_once_while_a_forked_worker_lives() -> None:
+    process, worker = forking("close")
+    try:
+        assert float(process.stdout.readline()) < 3
+        assert endless_gym.running_engines() == []
+    finally:
+        process.kill()
+        os.kill(worker, signal.SIGKILL)
+        process.wait()
+
+
+def test_an_engine_ends_with_its_parent_while_a_forked_worker_lives() -> None:
+    process, worker = forking("serve")
+    try:
+        assert len(endless_gym.running_engines()) == 1
+        process.kill()
+        process.wait()
+        end = time.monotonic() + 3
+        while endless_gym.running_engines() and time.monotonic() < end:
+            time.sleep(0.02)
+        assert endless_gym.running_engines() == []
+    finally:
+        os.kill(worker, signal.SIGKILL)
+
+
+def test_a_dead_trainer_is_replaced_while_its_forked_worker_lives() -> None:
+    command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=forking"]
+    engine = subprocess.Popen(command, stdin=subprocess.PIPE)
+    process, worker = forking("connect")
+    try:
+        process.kill()
+        process.wait()
+        with endless_gym.connect("forking", timeout=5) as envs:
+            envs.reset()
+            envs.step(ACTIONS)
+    finally:
+        os.kill(worker, signal.SIGKILL)
+        engine.stdin.close()
+        assert engine.wait() == 0
+
+
+def test_a_dead_trainer_is_replaced_by_another_fork_of_the_same_process() -> None:
+    program_text = """
+import os, signal, endless_gym
+print(endless_gym.running_engines(), flush=True)
+read, write = os.pipe()
+first = os.fork()
+if first == 0:
+    envs = endless_gym.connect("family")
+    envs.reset()
+    os.write(write, b"x")
+    signal.pause()
+os.read(read, 1)
+os.kill(first, signal.SIGKILL)
+os.waitpid(first, 0)
+second = os.fork()
+if second == 0:
+    with endless_gym.connect("family", timeout=5) as envs:
+        envs.reset()
+        print("connected", flush=True)
+    os._exit(0)
+os.waitpid(second, 0)
+"""
+    command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=family"]
+    engine = subprocess.Popen(command, stdin=subprocess.PIPE)
+    try:
+        endless_gym.connect("family").close()
+        family = subprocess.run([sys.executable, "-c", program_text], stdout=subprocess.PIPE, text=True, timeout=60)
+        assert family.stdout.splitlines() == ["['family']", "connected"]
+    finally:
+        engine.stdin.close()
+        assert engine.wait() == 0

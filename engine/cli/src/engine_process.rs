@@ -1,7 +1,7 @@
 //! An engine in a child process.
 
 use std::ffi::OsString;
-use std::io::{self, Read};
+use std::io::{self, Read, Write};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStderr, Command, Stdio};
 use std::sync::OnceLock;
@@ -50,7 +50,8 @@ impl EngineProcess {
             .and_then(|command| command.split_first())
             .ok_or("the command that starts an engine is empty")?;
         let mut command = Command::new(program);
-        command.args(first).args(["serve", "--child", "--service", &service]).args(arguments);
+        let child = format!("--child={}", std::process::id());
+        command.args(first).args(["serve", &child, "--service", &service]).args(arguments);
         Self::spawn(command, ConnectConfig::new(&service))
     }
 
@@ -77,7 +78,11 @@ impl EngineProcess {
         let start = Instant::now();
         loop {
             match Trainer::connect(&self.config) {
-                Err(ServiceError::UnknownEngine { .. }) => {}
+                Err(
+                    ServiceError::UnknownEngine { .. }
+                    | ServiceError::EngineUnreachable { .. }
+                    | ServiceError::NamespaceLocked { .. },
+                ) => {}
                 connected => return Ok(connected?),
             }
             if let Some(status) = self.child.try_wait()? {
@@ -103,7 +108,10 @@ impl EngineProcess {
 
 impl Drop for EngineProcess {
     fn drop(&mut self) {
-        drop(self.child.stdin.take());
+        if let Some(mut stdin) = self.child.stdin.take() {
+            // Closing it is not enough if another process has inherited it. An error means that the engine has ended.
+            let _ = stdin.write_all(b"\n");
+        }
         let start = Instant::now();
         while let Ok(None) = self.child.try_wait() {
             if start.elapsed() >= END_TIMEOUT {

@@ -2,11 +2,11 @@
 
 use endless_gym_core::envs::DEFAULT_ENV_ID;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Threads};
-use endless_gym_service::{Engine, EngineConfig};
+use endless_gym_service::{Engine, EngineConfig, ServiceError};
 
 use super::failure::Failure;
 use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
-use super::output::{grouped, print};
+use super::output::{grouped, print, print_error};
 use super::stop;
 
 /// Arguments of `endless serve`.
@@ -43,16 +43,18 @@ pub struct Args {
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
-    /// Print nothing, and stop when standard input closes: for an engine that is a child process.
-    #[arg(long, hide = true)]
-    child: bool,
+    /// Print nothing, and stop when standard input closes or gives a byte: for an engine that is a child process. With the id of the
+    /// parent process, also stop when that process ends.
+    #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
+    #[expect(clippy::option_option, reason = "clap's form of an option with an optional value")]
+    child: Option<Option<u32>>,
 }
 
 /// Runs `endless serve`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let stop = stop::on_signal()?;
-    if args.child {
-        stop::on_closed_input(stop);
+    if let Some(parent) = args.child {
+        stop::with_parent(stop, parent);
     }
     let pool = PoolConfig {
         autoreset: args.autoreset,
@@ -61,12 +63,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         features: args.features,
         ..args.environment.configure(&args.id, args.num_envs)?
     };
-    let mut engine = Engine::new(&EngineConfig {
+    let config = EngineConfig {
         groups: args.groups,
         batches_held: args.batches_held,
         ..EngineConfig::new(&args.service, pool, Threads::new(args.threads)?)
-    })?;
-    if !args.child {
+    };
+    let mut engine = Engine::new(&config)?;
+    if args.child.is_none() {
         let (groups, num_envs) = (args.groups, args.num_envs);
         let groups = if groups == 1 { "1 group".to_owned() } else { format!("{groups} groups") };
         print(format_args!(
@@ -74,8 +77,18 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             args.id, args.service
         ))?;
     }
-    let summary = engine.run(stop)?;
-    if !args.child {
+    let summary = loop {
+        match engine.run(stop) {
+            // The episodes are lost with the connection, but a trainer can reconnect without help.
+            Err(error @ ServiceError::RootRemoved { .. }) => {
+                print_error(&error);
+                drop(engine);
+                engine = Engine::new(&config)?;
+            }
+            finished => break finished?,
+        }
+    };
+    if args.child.is_none() {
         let (steps, batches) = (grouped(summary.env_steps as f64), grouped(summary.batches as f64));
         print(format_args!("{steps} steps in {batches} batches"))?;
     }

@@ -1,9 +1,15 @@
 //! Stop flags of commands.
 
+use std::io::Read;
+use std::os::unix::process::parent_id;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use super::failure::Failure;
+
+/// How often a child process looks whether its parent is running.
+const PARENT_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The flag of the running command. A process has one set of signal handlers, so all commands of a process share it.
 static STOP: AtomicBool = AtomicBool::new(false);
@@ -18,12 +24,21 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     Ok(&STOP)
 }
 
-/// Sets the flag at the end of standard input, which a parent process that dies closes.
-pub fn on_closed_input(stop: &'static AtomicBool) {
+/// Sets the flag when the parent process asks for it or ends: with a byte on standard input, at its end, or when `parent` is no
+/// longer this process's parent. The end of standard input alone would not do: children that the parent has forked keep it open.
+pub fn with_parent(stop: &'static AtomicBool, parent: Option<u32>) {
     std::thread::spawn(move || {
-        let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+        let _ = std::io::stdin().read(&mut [0]);
         stop.store(true, Ordering::Relaxed);
     });
+    if let Some(parent) = parent {
+        std::thread::spawn(move || {
+            while parent_id() == parent {
+                std::thread::sleep(PARENT_INTERVAL);
+            }
+            stop.store(true, Ordering::Relaxed);
+        });
+    }
 }
 
 #[cfg(test)]

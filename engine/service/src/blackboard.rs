@@ -21,9 +21,8 @@ use iceoryx2::service::builder::blackboard::{BlackboardCreateError, BlackboardOp
 use iceoryx2::service::port_factory::blackboard;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern;
 
-use crate::cleanup;
 use crate::error::{PACKAGE_VERSION, ServiceError};
-use crate::lock::NamespaceLock;
+use crate::lock::{LOCK_TIMEOUT, NamespaceLock};
 use crate::namespace::{Ipc, Namespace, check_name};
 use crate::node::NamespaceNode;
 use crate::ports::{self, SPECIFICATION_PREFIX, ServiceNames};
@@ -72,7 +71,7 @@ pub(crate) struct PublishedSpecification {
 impl Drop for PublishedSpecification {
     fn drop(&mut self) {
         // Closing the board removes the service by its name, which must not be a successor's by then.
-        let lock = NamespaceLock::acquire(&self.root);
+        let lock = NamespaceLock::acquire_within(&self.root, LOCK_TIMEOUT);
         if let Err(e) = &lock {
             tracing::warn!(error = %e, "the specification is removed without the lock");
         }
@@ -80,19 +79,20 @@ impl Drop for PublishedSpecification {
     }
 }
 
-/// Publishes the specification and thereby takes the engine's name.
+/// Publishes the specification and thereby takes the engine's name. Returns the lock as well, without which no other process can
+/// find the engine yet.
 pub(crate) fn publish(
     node: &NamespaceNode,
     specification: &ServiceSpecification,
-) -> Result<PublishedSpecification, ServiceError> {
+) -> Result<(NamespaceLock, PublishedSpecification), ServiceError> {
     let failed = ServiceError::middleware("cannot publish the specification");
     let text = serde_json::to_vec(specification).map_err(|e| failed(e.to_string()))?;
     let name = ServiceNames::specification(&specification.service)?;
     let mut blocked_since = None;
     loop {
-        let lock = NamespaceLock::acquire(node.root())?;
+        let lock = node.lock()?;
         if let Some(published) = create(node, &name, &text)? {
-            return Ok(published);
+            return Ok((lock, published));
         }
         refuse_second_engine(node, &specification.service, &lock)?;
         // No engine that holds the name is running, and none can take it while this process holds the lock.
@@ -101,14 +101,13 @@ pub(crate) fn publish(
             return Err(ServiceError::EngineExists { service: specification.service.clone(), pid: None });
         }
         if waited >= REMOVAL_TIMEOUT {
-            cleanup::remove_incomplete_services(node.config(), &lock);
             // SAFETY: no other process uses the service. Its engine is dead, as checked above, and readers and other engines open
             // it only while they hold the lock, which this process holds from before the check until after the removal.
             let removed = unsafe { node.force_remove_service(&name, MessagingPatternKind::Blackboard) };
             removed.map_err(|e| failed(e.to_string()))?;
         }
+        node.clean(&lock);
         drop(lock);
-        node.remove_dead_nodes();
         std::thread::sleep(RETRY_INTERVAL);
     }
 }
@@ -190,7 +189,7 @@ fn writer_node(board: &Board) -> Option<UniqueNodeId> {
 /// Reads the specification of the running engine of that name; `None` if there is none.
 pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<ServiceSpecification>, ServiceError> {
     check_name(service)?;
-    read_locked(node, service, &NamespaceLock::acquire(node.root())?)
+    read_locked(node, service, &node.lock()?)
 }
 
 /// Like [`read`], for a caller that holds the lock.
@@ -230,12 +229,26 @@ pub(crate) fn read_locked(
 /// [`ServiceError::Root`] if the namespace's directory cannot be used, and [`ServiceError::Middleware`] if iceoryx2 cannot
 /// register this process or list the services.
 pub fn running_engines(namespace: &Namespace) -> Result<Vec<String>, ServiceError> {
-    list(&NamespaceNode::join(namespace)?)
+    list(&NamespaceNode::join(namespace, Duration::ZERO)?)
 }
 
 /// Names of the running engines, sorted.
 pub(crate) fn list(node: &NamespaceNode) -> Result<Vec<String>, ServiceError> {
-    // Without the lock: listing opens no service.
+    let mut names = published_names(node)?;
+    if !names.is_empty() {
+        let _lock = node.lock()?;
+        names.retain(|name| match open(node, name) {
+            Ok(board) => board.as_ref().and_then(writer_node).is_some_and(|engine| node.is_alive(engine)),
+            // Such as an engine of another version.
+            Err(_) => true,
+        });
+    }
+    Ok(names)
+}
+
+/// Names of the specifications that a running process uses, sorted: also of those of dead engines that another process reads.
+/// Needs no lock, because it opens no service.
+fn published_names(node: &NamespaceNode) -> Result<Vec<String>, ServiceError> {
     let mut names = Vec::new();
     let listed = Ipc::list(node.config(), |service| {
         let name = service.static_details.name().as_str();
@@ -267,14 +280,15 @@ mod tests {
         let config = EngineConfig::new("model", pool, Threads::new(1).unwrap());
         let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
         let specification = ServiceSpecification { service: "gym".to_owned(), ..engine.specification().clone() };
-        let node = NamespaceNode::join(&namespace).unwrap();
-        let lock = NamespaceLock::acquire(node.root()).unwrap();
+        let node = NamespaceNode::join(&namespace, Duration::ZERO).unwrap();
+        let lock = node.lock().unwrap();
         std::thread::scope(|scope| {
             let publication = scope.spawn(|| publish(&node, &specification));
             std::thread::sleep(Duration::from_millis(200));
-            assert_eq!(list(&node).unwrap(), ["model"]);
+            assert_eq!(published_names(&node).unwrap(), ["model"]);
             drop(lock);
-            let published = publication.join().unwrap().unwrap();
+            let (lock, published) = publication.join().unwrap().unwrap();
+            drop(lock);
             assert_eq!(list(&node).unwrap(), ["gym", "model"]);
             drop(published);
         });

@@ -6,106 +6,142 @@
 //! - **unsized segments**: created, but not resized yet. iceoryx2 waits without a timeout for the size, so they are removed
 //!   first;
 //! - **incomplete nodes and services**: a node without details, or a service whose static configuration is not finished;
-//! - **orphans**: segments and sockets that no record names. They are recognised once a namespace has no nodes.
+//! - **orphans**: segments and sockets that no record names. They are recognised once a namespace has no nodes;
+//! - **the node counter**: a segment that iceoryx2 needs while it creates a node, and leaves behind.
 //!
-//! In addition, the shared counter that numbers the nodes remains after a regular end.
+//! A living process may be in the same state for any time, for it may be stopped. Nodes are created under the namespace's lock,
+//! services and ports under the creation lock ([`crate::identity`]); the functions take the locks that prove that no process which
+//! lives is creating what they remove.
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
 use std::fs::{self, Metadata};
+use std::io::ErrorKind;
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, SemanticString};
+use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
 
+use crate::error::ServiceError;
+use crate::identity::ExclusiveCreation;
 use crate::lock::NamespaceLock;
 use crate::namespace::Ipc;
 
 const SEGMENTS: &str = "/dev/shm";
 
-/// Age from which an unsized segment counts as abandoned. Creating and resizing one takes microseconds.
-const UNSIZED_SEGMENT_AGE: Duration = Duration::from_millis(500);
-
-/// Age from which an incomplete service counts as abandoned. Creating one takes milliseconds.
-const INCOMPLETE_SERVICE_AGE: Duration = Duration::from_secs(1);
-
-/// Age from which an incomplete node or an orphan counts as abandoned. Creating a node takes milliseconds.
-const INCOMPLETE_NODE_AGE: Duration = Duration::from_secs(10);
-
-/// Removes unsized segments. Waits until the younger ones reach [`UNSIZED_SEGMENT_AGE`]: on return, no process that was dead
-/// before the call has an unsized segment.
-pub(crate) fn remove_unsized_segments(config: &Config) {
-    let prefix = config.global.prefix.as_bytes();
-    for segment in entries(Path::new(SEGMENTS)).into_iter().filter(|path| is_named(path, prefix)) {
-        let is_unsized = || metadata(&segment).filter(|data| data.len() == 0);
-        let Some(data) = is_unsized() else { continue };
-        std::thread::sleep(UNSIZED_SEGMENT_AGE.saturating_sub(age(&data)));
-        if is_unsized().is_some() {
-            remove(&segment);
-        }
-    }
+/// Whether the namespace has an unsized segment.
+pub(crate) fn has_unsized_segments(config: &Config) -> bool {
+    unsized_segments(config).next().is_some()
 }
 
-/// Removes incomplete services, which block their names. The lock keeps an engine from creating a service of the same
-/// name between the check and the removal.
-pub(crate) fn remove_incomplete_services(config: &Config, _lock: &NamespaceLock) {
+/// Removes unsized segments.
+pub(crate) fn remove_unsized_segments(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) {
+    unsized_segments(config).for_each(|segment| remove(&segment));
+}
+
+fn unsized_segments(config: &Config) -> impl Iterator<Item = PathBuf> {
+    segments(config).filter(|path| metadata(path).is_some_and(|data| data.len() == 0))
+}
+
+fn segments(config: &Config) -> impl Iterator<Item = PathBuf> {
+    let prefix = config.global.prefix;
+    entries(Path::new(SEGMENTS)).into_iter().filter(move |path| is_named(path, prefix.as_bytes()))
+}
+
+/// A segment of the namespace that belongs to another user, and that user.
+pub(crate) fn foreign_segment(config: &Config) -> Option<(PathBuf, u32)> {
+    let user = rustix::process::getuid().as_raw();
+    segments(config).find_map(|path| {
+        let owner = metadata(&path)?.uid();
+        (owner != user).then_some((path, owner))
+    })
+}
+
+/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and creates it anew: a node's id also
+/// contains its process id and its start time. All users may write to the counter, and one that a process left which died in
+/// between is unusable, so it exists only while a node is created.
+pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(), ServiceError> {
+    for path in segments(config).filter(|path| path.as_os_str().as_bytes().ends_with(b".global_mgmt")) {
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != ErrorKind::NotFound => {
+                let failed = ServiceError::middleware("cannot remove the counter of nodes");
+                return Err(failed(format!("{}: {e}", path.display())));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Removes incomplete services, which block their names.
+pub(crate) fn remove_incomplete_services(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) {
     for path in entries(&directory(&config.global.service_dir())) {
         // iceoryx2 makes a static configuration read-only when it is finished.
-        if metadata(&path)
-            .is_some_and(|data| data.permissions().mode() & 0o200 != 0 && age(&data) >= INCOMPLETE_SERVICE_AGE)
-        {
+        if metadata(&path).is_some_and(|data| data.permissions().mode() & 0o200 != 0) {
             remove(&path);
         }
     }
 }
 
 /// Removes incomplete nodes.
-pub(crate) fn remove_incomplete_nodes(config: &Config) {
-    let mut dead = HashSet::new();
+pub(crate) fn remove_incomplete_nodes(config: &Config, _lock: &NamespaceLock) {
     let mut complete = HashSet::new();
     let listed = Node::<Ipc>::list(config, |state| {
-        let number = state.node_id().value().to_string();
-        match &state {
-            NodeState::Dead(view) if view.details().is_none() => dead.insert(number),
+        let is_complete = match &state {
+            NodeState::Dead(view) => view.details().is_some(),
             NodeState::Undefined(_) => false,
-            NodeState::Alive(_) | NodeState::Dead(_) | NodeState::Inaccessible(_) => complete.insert(number),
+            NodeState::Alive(_) | NodeState::Inaccessible(_) => true,
         };
+        if is_complete {
+            complete.insert(state.node_id().value().to_string());
+        }
         CallbackProgression::Continue
     });
     if listed.is_err() {
         return;
     }
     for path in entries(&directory(&config.global.node_dir())) {
-        let Some(number) = node_number(&path, config.global.prefix.as_bytes()) else { continue };
-        if dead.contains(&number) || (!complete.contains(&number) && is_old(&path)) {
+        let number = node_number(&path, config.global.prefix.as_bytes());
+        if number.is_some_and(|number| !complete.contains(&number)) {
             remove(&path);
         }
     }
 }
 
-/// Removes the node counter and all orphans if the namespace has no nodes, neither running nor dead.
-///
-/// The counter may restart at zero: a node's id also contains its process id and its start time. Orphans are recognised by their
-/// age, so that the resources of a node that joins in the meantime are kept. The lock keeps an engine from creating a service
-/// between the check and the removal.
-pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock) {
+/// Removes everything if the namespace has no nodes, neither running nor dead. Returns whether it had none.
+pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) -> bool {
     let mut is_empty = true;
     let listed = Node::<Ipc>::list(config, |_| {
         is_empty = false;
         CallbackProgression::Stop
     });
     if listed.is_err() || !is_empty {
-        return;
+        return false;
     }
+    let root = directory(config.global.root_path());
+    let (services, nodes) = (directory(&config.global.service_dir()), directory(&config.global.node_dir()));
     let prefix = config.global.prefix.as_bytes();
-    let directories =
-        [PathBuf::from(SEGMENTS), directory(config.global.root_path()), directory(&config.global.service_dir())];
-    for path in directories.iter().flat_map(|directory| entries(directory)).filter(|path| is_named(path, prefix)) {
-        if path.as_os_str().as_bytes().ends_with(b".global_mgmt") || is_old(&path) {
-            remove(&path);
+    let files = [&root, &services].into_iter().flat_map(|directory| entries(directory));
+    files.filter(|path| is_named(path, prefix)).chain(segments(config)).for_each(|path| remove(&path));
+    // They stay if they are not empty.
+    let _ = (fs::remove_dir(services), fs::remove_dir(nodes));
+    true
+}
+
+/// Sets the times of all files in the namespace's directory to now.
+pub(crate) fn refresh(config: &Config) {
+    let now = Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
+    let now = Timestamps { last_access: now, last_modification: now };
+    let (services, nodes) = (directory(&config.global.service_dir()), directory(&config.global.node_dir()));
+    let of_nodes = entries(&nodes).into_iter().flat_map(|path| entries(&path));
+    let all =
+        [directory(config.global.root_path()), services, nodes.clone()].into_iter().flat_map(|path| entries(&path));
+    for path in all.chain(of_nodes) {
+        if let Err(e) = utimensat(CWD, &path, &now, AtFlags::SYMLINK_NOFOLLOW) {
+            tracing::debug!(error = %e, path = %path.display(), "cannot set the times of a file");
         }
     }
 }
@@ -134,15 +170,6 @@ fn metadata(path: &Path) -> Option<Metadata> {
     fs::symlink_metadata(path).ok()
 }
 
-/// Time since the last modification; zero if the clock was set back since then.
-fn age(data: &Metadata) -> Duration {
-    data.modified().ok().and_then(|at| at.elapsed().ok()).unwrap_or_default()
-}
-
-fn is_old(path: &Path) -> bool {
-    metadata(path).is_some_and(|data| age(&data) >= INCOMPLETE_NODE_AGE)
-}
-
 fn remove(path: &Path) {
     tracing::debug!(path = %path.display(), "removing a resource of a dead process");
     // An error means that another process has removed it.
@@ -152,27 +179,27 @@ fn remove(path: &Path) {
 #[cfg(test)]
 mod tests {
     use std::fs::{File, Permissions};
-    use std::time::{Instant, SystemTime};
-
-    use iceoryx2::prelude::FileName;
+    use std::time::SystemTime;
 
     use super::*;
+    use crate::identity::Identity;
+    use crate::namespace::Namespace;
 
     /// A namespace in a directory of its own, without nodes.
-    fn empty_namespace(name: &str) -> (PathBuf, Config) {
-        let root = PathBuf::from(format!("/tmp/endless-sweep-{name}-{}", std::process::id()));
-        let mut config = Config::default();
-        config.global.set_root_path(&iceoryx2::prelude::Path::new(root.as_os_str().as_bytes()).unwrap());
-        config.global.prefix = FileName::new(format!("e{name}{}_", std::process::id()).as_bytes()).unwrap();
-        fs::create_dir_all(root.join("services")).unwrap();
-        fs::create_dir_all(root.join("nodes")).unwrap();
-        (root, config)
+    fn empty_namespace(name: &str) -> (Namespace, Config, Identity, NamespaceLock) {
+        let namespace = Namespace::at(format!("/tmp/endless-sweep-{name}-{}", std::process::id()));
+        namespace.prepare().unwrap();
+        let lock = NamespaceLock::acquire(namespace.root()).unwrap();
+        let identity = Identity::read_or_create(&namespace, &lock).unwrap();
+        let config = namespace.config(identity.prefix()).unwrap();
+        fs::create_dir(namespace.root().join("services")).unwrap();
+        fs::create_dir(namespace.root().join("nodes")).unwrap();
+        (namespace, config, identity, lock)
     }
 
-    fn file(directory: &Path, config: &Config, name: &str, mode: u32, seconds: u64) -> PathBuf {
+    fn file(directory: &Path, config: &Config, name: &str, mode: u32) -> PathBuf {
         let path = directory.join(format!("{}{name}", config.global.prefix));
-        let file = File::create(&path).unwrap();
-        file.set_modified(SystemTime::now() - Duration::from_secs(seconds)).unwrap();
+        File::create(&path).unwrap();
         fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
         path
     }
@@ -187,36 +214,35 @@ mod tests {
         assert_eq!(number("notes.txt"), None);
     }
 
+    /// Files of age zero: what is removed does not depend on the clock.
     #[test]
-    fn incomplete_resources_are_removed_when_they_are_old() {
-        let (root, config) = empty_namespace("stub");
-        let services = root.join("services");
-        let [finished, begun, stuck] =
-            [("a", 0o400, 60), ("b", 0o600, 0), ("c", 0o600, 60)].map(|(n, m, s)| file(&services, &config, n, m, s));
-        let nodes = root.join("nodes");
-        let [young, old] = [("1", 1), ("2", 60)].map(|(n, s)| file(&nodes, &config, n, 0o600, s));
-        let lock = NamespaceLock::acquire(&root).unwrap();
-        remove_incomplete_services(&config, &lock);
-        remove_incomplete_nodes(&config);
-        assert!(finished.exists() && begun.exists() && !stuck.exists());
-        assert!(young.exists() && !old.exists());
-        remove_orphans(&config, &lock);
-        assert!(!finished.exists() && begun.exists(), "old resources of an empty namespace are orphans");
-        fs::remove_dir_all(&root).unwrap();
-    }
-
-    #[test]
-    fn unsized_segments_are_removed_when_they_are_old() {
-        let (root, config) = empty_namespace("size");
+    fn incomplete_resources_are_removed_under_the_locks_that_prove_it() {
+        let (namespace, config, identity, lock) = empty_namespace("stub");
+        let [services, nodes] = ["services", "nodes"].map(|name| namespace.root().join(name));
+        let [finished, begun] = [("a", 0o400), ("b", 0o600)].map(|(name, mode)| file(&services, &config, name, mode));
+        let node = file(&nodes, &config, "1.node_monitor_context", 0o200);
+        fs::create_dir(nodes.join("1")).unwrap();
         let segments = Path::new(SEGMENTS);
-        let [old, young, sized] = ["old", "young", "sized"].map(|name| file(segments, &config, name, 0o600, 0));
-        File::options().write(true).open(&old).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        let [empty, sized, counter] =
+            ["empty", "sized", ".global_mgmt"].map(|name| file(segments, &config, name, 0o200));
         fs::write(&sized, "x").unwrap();
-        let start = Instant::now();
-        remove_unsized_segments(&config);
-        assert!(!old.exists() && !young.exists() && sized.exists());
-        assert!(start.elapsed() >= UNSIZED_SEGMENT_AGE / 2);
-        fs::remove_file(sized).unwrap();
-        fs::remove_dir_all(&root).unwrap();
+
+        let creating = identity.creating().unwrap();
+        assert!(identity.try_exclusive(&lock).is_none() && has_unsized_segments(&config));
+        drop(creating);
+        let all = identity.try_exclusive(&lock).unwrap();
+        File::options().write(true).open(&begun).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        refresh(&config);
+        assert!(metadata(&begun).unwrap().modified().unwrap() > SystemTime::UNIX_EPOCH);
+        remove_counter(&config, &lock).unwrap();
+        assert!(empty.exists() && !counter.exists());
+        remove_unsized_segments(&config, &lock, &all);
+        assert!(!empty.exists() && sized.exists());
+        remove_incomplete_services(&config, &lock, &all);
+        remove_incomplete_nodes(&config, &lock);
+        assert!(finished.exists() && !begun.exists() && !node.exists() && !nodes.join("1").exists());
+        assert!(remove_orphans(&config, &lock, &all));
+        assert!(!finished.exists() && !sized.exists() && !services.exists() && !nodes.exists());
+        fs::remove_dir_all(namespace.root()).unwrap();
     }
 }

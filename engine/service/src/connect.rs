@@ -5,12 +5,16 @@ use std::time::{Duration, Instant};
 
 use crate::blackboard;
 use crate::error::ServiceError;
+use crate::memory;
 use crate::namespace::Namespace;
 use crate::node::NamespaceNode;
 use crate::specification::ServiceSpecification;
 
 /// How often a process looks for an engine that is not running yet.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
+
+/// How long a process at least waits for an engine that is starting or ending.
+const TRANSITION_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The engine to which a trainer or an observer connects.
 #[derive(Clone, Debug)]
@@ -59,28 +63,41 @@ pub(crate) fn connect_to_engine<T>(
     connect: impl Fn(&Arc<NamespaceNode>, &ServiceSpecification) -> Result<T, ServiceError>,
 ) -> Result<(Arc<NamespaceNode>, T, ServiceSpecification), ServiceError> {
     let start = Instant::now();
-    let node = Arc::new(NamespaceNode::join(&config.namespace)?);
+    let node = Arc::new(NamespaceNode::join(&config.namespace, config.timeout)?);
     loop {
-        let result = match blackboard::read(&node, &config.service)? {
-            None => Err(ServiceError::UnknownEngine {
-                service: config.service.clone(),
-                root: config.namespace.root().to_owned(),
-                running: blackboard::list(&node)?,
-            }),
-            Some(specification) => connect(&node, &specification).map(|ports| (ports, specification)),
+        let result = find(&node, config).and_then(|specification| {
+            memory::check_free(memory::MARGIN)?;
+            connect(&node, &specification).map(|ports| (ports, specification))
+        });
+        let patience = match &result {
+            // The engine is not running yet, or it was replaced while this process connected.
+            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. }) => config.timeout,
+            Err(ServiceError::EngineUnreachable { .. }) => config.timeout.max(TRANSITION_TIMEOUT),
+            _ => Duration::ZERO,
         };
         match result {
             Ok((ports, specification)) => return Ok((node, ports, specification)),
-            // The engine is not running yet, or it was replaced while this process connected.
-            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. })
-                if start.elapsed() < config.timeout =>
-            {
+            Err(_) if start.elapsed() < patience => {
                 node.remove_dead_nodes();
                 std::thread::sleep(RETRY_INTERVAL);
             }
             Err(e) => return Err(e),
         }
     }
+}
+
+/// The specification of the engine.
+fn find(node: &NamespaceNode, config: &ConnectConfig) -> Result<ServiceSpecification, ServiceError> {
+    let service = config.service.clone();
+    if let Some(specification) = blackboard::read(node, &service)? {
+        return Ok(specification);
+    }
+    let running = blackboard::list(node)?;
+    if running.contains(&service) {
+        // It has started since it was looked for, or it is ending.
+        return Err(ServiceError::EngineUnreachable { service });
+    }
+    Err(ServiceError::UnknownEngine { service, root: config.namespace.root().to_owned(), running })
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
 use crate::connect::{ConnectConfig, connect_to_engine};
+use crate::descriptors;
 use crate::error::ServiceError;
 use crate::lease::ResponsePort;
 use crate::namespace::Ipc;
@@ -18,8 +19,8 @@ use crate::specification::ServiceSpecification;
 /// Chunks of a request publisher: one that the engine reads, one in its queue, one being written.
 const REQUEST_CHUNKS: usize = 3;
 
-/// How long a trainer waits for the removal of a dead trainer's ports.
-const REMOVAL_TIMEOUT: Duration = Duration::from_secs(1);
+/// How long a trainer waits for the removal of a dead trainer's ports, which is the engine's work if it cannot do it itself.
+const REMOVAL_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// How often it looks.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
@@ -44,11 +45,13 @@ impl EngineConnection {
                 let names = ServiceNames::new(&specification.service, specification.incarnation);
                 let services = EngineServices { node, names, mode: OpenMode::Open };
                 let groups = 0..specification.groups;
+                descriptors::reserve(descriptors::of_trainer(specification.groups))?;
                 // The owner of the first publisher is the trainer, so the publishers come first.
                 let requests: Vec<_> = groups
                     .clone()
                     .map(|group| request_publisher(&services, group, specification))
                     .collect::<Result<_, _>>()?;
+                let _creating = node.creating()?;
                 let responses: Vec<_> = groups
                     .map(|group| ResponsePort::open(&services, node, group, specification).map(Arc::new))
                     .collect::<Result<_, _>>()?;
@@ -73,15 +76,17 @@ fn request_publisher(
     group: usize,
     specification: &ServiceSpecification,
 ) -> Result<RequestPublisher, ServiceError> {
-    let service = services.requests(group)?;
     let start = Instant::now();
     loop {
+        let creating = services.node.creating()?;
+        let service = services.requests(group)?;
         match ports::publisher(&service, specification.action.blocks(), REQUEST_CHUNKS) {
             Ok((publisher, _)) => return Ok(publisher),
             Err(PortError::Other(e)) => return Err(e),
             Err(PortError::LimitReached) => {}
         }
-        // The port of a dead trainer exists until a process removes it.
+        // The port of a dead trainer exists until a process removes it. While this process creates ports, it cannot.
+        drop(creating);
         let owner = ports::publisher_node(&service);
         let is_alive = owner.is_some_and(|owner| services.node.is_alive(owner));
         if is_alive || start.elapsed() >= REMOVAL_TIMEOUT {

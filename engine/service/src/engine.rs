@@ -9,6 +9,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
 use crate::blackboard::{self, PublishedSpecification};
+use crate::descriptors;
 use crate::engine_config::EngineConfig;
 use crate::error::{PACKAGE_VERSION, ServiceError};
 use crate::group::{Group, Outcome, RequestSample, chunk_blocks};
@@ -26,6 +27,18 @@ const IDLE_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// How often an idle engine looks for dead processes.
 const CLEANUP_INTERVAL: Duration = Duration::from_millis(500);
+
+/// How often an engine checks that it can still be found.
+const CHECK_INTERVAL: Duration = Duration::from_millis(500);
+
+/// How often an engine refreshes the times of the namespace's files.
+const REFRESH_INTERVAL: Duration = Duration::from_secs(3600);
+
+/// How long an engine that starts waits for the namespace's lock.
+const START_PATIENCE: Duration = Duration::from_secs(30);
+
+/// How often an engine tries to start whose files are removed meanwhile.
+const START_ATTEMPTS: usize = 3;
 
 /// What an engine has done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -101,21 +114,44 @@ impl Engine {
     ///
     /// [`ServiceError::InvalidName`], [`ServiceError::OutOfRange`] or [`ServiceError::Pool`] for an invalid configuration,
     /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is
-    /// running, [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory, [`ServiceError::Version`] if an engine
-    /// of another version has the name, [`ServiceError::NamespaceLocked`] if another process holds the namespace's lock for too
-    /// long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
+    /// running, [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] if there is not enough shared memory or
+    /// there are too few file descriptors, [`ServiceError::Version`] if an engine of another version has the name,
+    /// [`ServiceError::ForeignSegment`] if another user has taken the namespace's segments, [`ServiceError::EngineUnreachable`] if
+    /// the engine's files are removed while it starts, [`ServiceError::NamespaceLocked`] if another process holds the namespace's
+    /// lock for too long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
-        let node = NamespaceNode::join(&config.namespace)?;
-        blackboard::refuse_second_engine(&node, &config.service, &NamespaceLock::acquire(node.root())?)?;
-        let pools: Vec<Pool> =
-            config.pools()?.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<_, _>>()?;
+        let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
+        blackboard::refuse_second_engine(&node, &config.service, &node.lock()?)?;
+        let pools = config.pools()?;
+        let pools = || pools.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<Vec<_>, _>>();
+        let mut attempt = 1;
+        loop {
+            match Self::start(config, node, pools()?) {
+                // Something has removed the engine's files.
+                Err(ServiceError::EngineUnreachable { .. } | ServiceError::EngineRestarted { .. })
+                    if attempt < START_ATTEMPTS => {}
+                Err(ServiceError::EngineRestarted { service }) => {
+                    return Err(ServiceError::EngineUnreachable { service });
+                }
+                started => return started,
+            }
+            attempt += 1;
+            tracing::warn!(engine = config.service, "the engine cannot be found; starting it again");
+            node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
+        }
+    }
+
+    /// Creates the engine's services and publishes them.
+    fn start(config: &EngineConfig, node: NamespaceNode, pools: Vec<Pool>) -> Result<Self, ServiceError> {
         let specification = specify(config, &pools[0])?;
         let limits = specification.lease_limits();
         let blocks = chunk_blocks(&specification.batch);
         PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
+        descriptors::reserve(descriptors::of_engine(config.groups, config.observers))?;
         let names = ServiceNames::new(&config.service, specification.incarnation);
         let services = EngineServices { node: &node, names, mode: OpenMode::Create };
+        let creating = node.creating()?;
         let to_engine = ports::listener(&services.events("to_engine", config.groups)?)?;
         let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?)?;
         let groups = pools
@@ -123,10 +159,35 @@ impl Engine {
             .enumerate()
             .map(|(group, pool)| Group::new(&services, group, pool, limits))
             .collect::<Result<_, _>>()?;
+        drop(creating);
         // Last: a process that finds the specification expects all other services.
-        let published = blackboard::publish(&node, &specification)?;
+        let (lock, published) = blackboard::publish(&node, &specification)?;
+        let found = Self::check_published(&node, &specification, &lock);
+        drop(lock);
+        found?;
         let summary = EngineSummary::default();
         Ok(Engine { groups, to_trainer, to_engine, specification, summary, _published: published, node })
+    }
+
+    /// Fails unless a trainer could find the engine and all of its services.
+    fn check_published(
+        node: &NamespaceNode,
+        specification: &ServiceSpecification,
+        lock: &NamespaceLock,
+    ) -> Result<(), ServiceError> {
+        let ServiceSpecification { service, incarnation, groups, .. } = specification;
+        let found = blackboard::read_locked(node, service, lock)?;
+        if found.is_none_or(|found| found.incarnation != *incarnation) {
+            return Err(ServiceError::EngineUnreachable { service: service.clone() });
+        }
+        let services = EngineServices { node, names: ServiceNames::new(service, *incarnation), mode: OpenMode::Open };
+        services.events("to_engine", *groups)?;
+        services.events("to_trainer", *groups)?;
+        for group in 0..*groups {
+            services.requests(group)?;
+            services.responses(group, specification.lease_limits())?;
+        }
+        Ok(())
     }
 
     /// The specification that trainers and observers read.
@@ -138,12 +199,22 @@ impl Engine {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
+    /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, so that no trainer finds the engine
+    /// any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
     /// are no errors: its requests are rejected.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
+        let (mut last_check, mut last_refresh) = (Instant::now(), Instant::now());
         let mut next = 0;
         while !stop.load(Ordering::Relaxed) {
+            if last_check.elapsed() >= CHECK_INTERVAL {
+                self.node.check_root()?;
+                last_check = Instant::now();
+                if last_refresh.elapsed() >= REFRESH_INTERVAL {
+                    self.node.refresh_files();
+                    last_refresh = last_check;
+                }
+            }
             let Engine { groups, to_engine, .. } = self;
             // Round robin: the group after the last one is polled first, so that no group starves.
             let request = wait(to_engine, IDLE_TIMEOUT, last_request, || {
@@ -249,4 +320,32 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
         batches_held: config.batches_held,
         observers: config.observers,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::pool::{PoolConfig, Threads};
+
+    use super::*;
+    use crate::namespace::Namespace;
+
+    #[test]
+    fn an_engine_that_cannot_be_found_is_noticed() {
+        let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
+        let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
+        let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+        let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
+        let check = || {
+            let lock = engine.node.lock().unwrap();
+            Engine::check_published(&engine.node, engine.specification(), &lock)
+        };
+        check().unwrap();
+        let services = namespace.root().join("services");
+        std::fs::rename(&services, namespace.root().join("elsewhere")).unwrap();
+        assert!(matches!(check(), Err(ServiceError::EngineUnreachable { .. })));
+        std::fs::rename(namespace.root().join("elsewhere"), &services).unwrap();
+        check().unwrap();
+        drop(engine);
+        std::fs::remove_dir_all(namespace.root()).unwrap();
+    }
 }

@@ -8,6 +8,8 @@ use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::PoolError;
 use thiserror::Error;
 
+use crate::process::LockHolder;
+
 /// Version of this package, for messages about versions that differ.
 pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -30,17 +32,49 @@ pub enum ServiceError {
         /// Why it cannot be used.
         reason: String,
     },
+    /// The namespace's directory, or the file in it that identifies the namespace, was removed or replaced while this process used
+    /// it.
+    #[error(
+        "root directory {} was removed or replaced while it was in use, so engines and trainers no longer find each other there; \
+         reconnect, or start the engine again; set ENDLESS_GYM_ROOT to a directory that nothing cleans up",
+        path.display()
+    )]
+    RootRemoved {
+        /// The namespace's root directory.
+        path: PathBuf,
+    },
+    /// Another user has created a shared memory segment with the names of this namespace.
+    #[error(
+        "{} belongs to user {owner}, and segments of the namespace {} must belong to user {}, who runs this process; end the \
+         engines and trainers of this namespace and try again, or set ENDLESS_GYM_ROOT to another directory",
+        path.display(), root.display(), rustix::process::getuid().as_raw()
+    )]
+    ForeignSegment {
+        /// The segment.
+        path: PathBuf,
+        /// The user to whom it belongs.
+        owner: u32,
+        /// The namespace's root directory.
+        root: PathBuf,
+    },
     /// Another process held the namespace's lock for too long.
     #[error(
-        "root directory {} has been locked for {waited:?} by another process that starts, ends or looks for an engine; try again, \
-         or end a process that is stopped",
-        path.display()
+        "root directory {} has been locked for {waited:?} by {}",
+        path.display(), LockHolder::text(*holder)
     )]
     NamespaceLocked {
         /// The namespace's root directory.
         path: PathBuf,
         /// How long this process waited for the lock.
         waited: Duration,
+        /// The process that holds the lock, if it can be found.
+        holder: Option<LockHolder>,
+    },
+    /// There is an engine of that name, and it cannot be used: it is starting or ending, or parts of it were removed.
+    #[error("engine `{service}` is running and cannot be reached; try again, and restart it if the error stays")]
+    EngineUnreachable {
+        /// The engine's name.
+        service: String,
     },
     /// No engine of that name is running.
     #[error(
@@ -132,9 +166,9 @@ pub enum ServiceError {
         /// The timeout that was given, in seconds.
         given: f64,
     },
-    /// There is not enough free shared memory for the batches.
+    /// There is not enough free shared memory.
     #[error(
-        "batches need {} MB of shared memory, and {path} has {} MB free; use fewer environments or groups, or enlarge it \
+        "{} MB of shared memory are needed, and {path} has {} MB free; use fewer environments or groups, or enlarge it \
          (`docker run --shm-size`, `mount -o remount,size=... /dev/shm`)",
         megabytes(*needed), available / 1_000_000
     )]
@@ -145,6 +179,17 @@ pub enum ServiceError {
         available: u64,
         /// The file system.
         path: &'static str,
+    },
+    /// The process may not open enough file descriptors.
+    #[error(
+        "{needed} file descriptors are needed, and the limit of this process is {limit}; raise it with `ulimit -n {needed}`, or use \
+         fewer groups or observers"
+    )]
+    DescriptorLimit {
+        /// Descriptors that are needed, with those that are open.
+        needed: u64,
+        /// The limit (`RLIMIT_NOFILE`).
+        limit: u64,
     },
     /// The engine has no group of that number.
     #[error("group must be 0 to {} in engine `{service}`, got group {given}", groups.saturating_sub(1))]

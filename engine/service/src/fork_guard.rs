@@ -14,13 +14,16 @@ impl<T> ForkGuard<T> {
         ForkGuard { value: Some(value), process: std::process::id() }
     }
 
-    /// Drops the value now, if this process created it. Returns whether it did. The value must not be used afterwards.
-    pub(crate) fn drop_now(&mut self) -> bool {
-        let is_owner = self.process == std::process::id();
-        if is_owner {
+    /// Whether this process created the value.
+    pub(crate) fn is_owner(&self) -> bool {
+        self.process == std::process::id()
+    }
+
+    /// Drops the value now, if this process created it. The value must not be used afterwards.
+    pub(crate) fn drop_now(&mut self) {
+        if self.is_owner() {
             self.value = None;
         }
-        is_owner
     }
 }
 
@@ -37,7 +40,7 @@ impl<T> Deref for ForkGuard<T> {
 
 impl<T> Drop for ForkGuard<T> {
     fn drop(&mut self) {
-        if self.process != std::process::id() {
+        if !self.is_owner() {
             std::mem::forget(self.value.take());
         }
     }
@@ -56,7 +59,8 @@ mod tests {
         assert_eq!(Rc::strong_count(&value), 1);
         drop(ForkGuard { value: Some(Rc::clone(&value)), process: 0 });
         assert_eq!(Rc::strong_count(&value), 2);
-        let mut inherited = ForkGuard { value: Some(()), process: 0 };
-        assert!(!inherited.drop_now() && ForkGuard::new(()).drop_now());
+        let mut inherited = ForkGuard { value: Some(Rc::clone(&value)), process: 0 };
+        inherited.drop_now();
+        assert!(!inherited.is_owner() && inherited.value.is_some());
     }
 }

@@ -12,10 +12,6 @@ use crate::message::{PayloadBlock, RequestHeader, RequestKind};
 use crate::namespace::Ipc;
 use crate::ports::{self, EngineServices, LeaseLimits, PortError, RequestSubscriber, ResponsePublisher};
 
-/// Chunks of a group that are prefaulted at the start: the engine writes one while the trainer reads the other. More are used
-/// when a trainer or an observer holds more batches; [`Engine::new`](crate::Engine::new) checks that there is room for them.
-const CHUNKS_AT_START: usize = 2;
-
 /// A request in shared memory.
 pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
 
@@ -54,7 +50,8 @@ impl Group {
             .create()
             .map_err(|e| ServiceError::middleware("cannot create a subscriber")(e.to_string()))?;
         let service = services.responses(number, limits)?;
-        let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), CHUNKS_AT_START);
+        // An observer reserves its chunks when it connects.
+        let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), limits.trainer_chunks());
         let (responses, memory) = publisher.map_err(|e| match e {
             PortError::Other(e) => e,
             PortError::LimitReached => {

@@ -38,18 +38,34 @@
 //! | a trainer dies | the engine removes its resources when idle, or the next trainer does when it connects |
 //! | an engine dies or ends | the liveness check of its trainer and its observers reports it; a trainer may reconnect to a new engine |
 //! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
+//! | an observer holds batches | it has reserved their memory in the engine's segment when it connected, or was refused; engine and trainer have reserved theirs when the engine started |
 //! | a request names another incarnation | the engine ignores it |
 //! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |
+//!
+//! # Faults of the surroundings
+//!
+//! | situation | behaviour |
+//! | --- | --- |
+//! | `/dev/shm` is full, or too few file descriptors may be opened | [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] before iceoryx2 creates anything; the soft limit of descriptors is raised if the hard limit permits it |
+//! | a process dies while it creates something | the next process that has the locks removes it, whatever its age; while another process creates something, or is stopped at it, nothing incomplete is removed |
+//! | a process is stopped while it holds the namespace's lock | the others wait: an engine 30 s to start, a trainer or observer as long as its timeout and at least 5 s; after a second they log who holds it, and [`ServiceError::NamespaceLocked`] names it |
+//! | two directories have the same path (containers that share `/dev/shm` and not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
+//! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts anew in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
+//! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix, otherwise [`ServiceError::ForeignSegment`]; no segment that stays is accessible to other users |
+//! | a process forks | liveness is that of the process that connected; a child that it forked neither keeps it alive nor releases what it holds |
+//! | an engine's files are removed while it starts | it checks after publishing that it can be found, starts again up to twice, and then ends with [`ServiceError::EngineUnreachable`] |
 
 mod blackboard;
 mod cleanup;
 mod connect;
 mod connection;
+mod descriptors;
 mod engine;
 mod engine_config;
 mod error;
 mod fork_guard;
 mod group;
+mod identity;
 mod lease;
 mod lock;
 mod memory;
@@ -59,6 +75,8 @@ mod node;
 mod observer;
 mod pending;
 mod ports;
+mod process;
+mod reservation;
 mod specification;
 mod trainer;
 mod wait;
@@ -71,5 +89,6 @@ pub use error::{Rejection, ServiceError};
 pub use lease::BatchLease;
 pub use namespace::{Namespace, ROOT_VARIABLE};
 pub use observer::Observer;
+pub use process::LockHolder;
 pub use specification::ServiceSpecification;
 pub use trainer::Trainer;

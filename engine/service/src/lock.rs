@@ -1,25 +1,35 @@
-//! The lock of a namespace, which serialises everything that creates or removes a specification service.
+//! The lock of a namespace, which serialises everything that creates or removes a node or a specification service.
 //!
 //! iceoryx2 removes a service by its name. A process that has decided to remove the service of a dead engine could therefore
 //! remove that of a successor which has taken the name in the meantime. The lock covers decision and removal:
 //!
+//! - join the namespace: read or create its identity, and create a node;
 //! - publish a specification, and remove what a dead engine left under its name;
-//! - close the specification service of an engine that ends;
+//! - close the specification service of an engine that ends, and leave the namespace;
 //! - remove the resources of dead nodes and orphans, which is skipped if the lock is not free;
 //! - read a specification, because the last process that closes a service removes it.
 //!
 //! Readers exclude each other too: with a shared lock, many waiting trainers could starve an engine that starts. The lock is an
 //! advisory `flock` on the namespace's directory: it leaves no file behind, and the kernel releases it when its holder dies.
+//!
+//! It is held for milliseconds. A holder that is stopped (SIGSTOP, a debugger, a frozen container) may be in the middle of a
+//! removal, so its lock is never broken: the others wait for as long as their caller does, continue within a millisecond when it
+//! is free, and name the holder in a warning after a second and in their error.
 
-use std::fs::{File, TryLockError};
+use std::fs::{self, File, TryLockError};
+use std::io::ErrorKind;
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crate::error::ServiceError;
+use crate::process::{self, LockHolder};
 
-/// How long a process waits for the lock before it reports an error. The longest regular holder waits half a second for a service
-/// whose creation was interrupted.
-const LOCK_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long a process waits for the lock at least before it reports an error.
+pub(crate) const LOCK_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long a process waits before it warns.
+const WARNING_AFTER: Duration = Duration::from_secs(1);
 
 const RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
@@ -35,25 +45,43 @@ impl NamespaceLock {
         Some(NamespaceLock(directory))
     }
 
-    /// Waits for the lock of the namespace at `root`.
+    /// Waits for the lock of the namespace at `root` up to [`LOCK_TIMEOUT`].
+    #[cfg(test)]
     pub(crate) fn acquire(root: &Path) -> Result<Self, ServiceError> {
         Self::acquire_within(root, LOCK_TIMEOUT)
     }
 
     /// Waits for the lock of the namespace at `root` up to `timeout`.
     pub(crate) fn acquire_within(root: &Path, timeout: Duration) -> Result<Self, ServiceError> {
-        let unusable = |e: std::io::Error| ServiceError::Root { path: root.to_owned(), reason: e.to_string() };
+        let unusable = |e: std::io::Error| match e.kind() {
+            ErrorKind::NotFound => ServiceError::RootRemoved { path: root.to_owned() },
+            _ => ServiceError::Root { path: root.to_owned(), reason: e.to_string() },
+        };
         let directory = File::open(root).map_err(unusable)?;
-        let start = Instant::now();
+        let (start, mut warned) = (Instant::now(), false);
         loop {
             match directory.try_lock() {
-                Ok(()) => return Ok(NamespaceLock(directory)),
+                Ok(()) => break,
                 Err(TryLockError::Error(e)) => return Err(unusable(e)),
                 Err(TryLockError::WouldBlock) if start.elapsed() >= timeout => {
-                    return Err(ServiceError::NamespaceLocked { path: root.to_owned(), waited: timeout });
+                    let holder = holder(&directory);
+                    return Err(ServiceError::NamespaceLocked { path: root.to_owned(), waited: timeout, holder });
                 }
-                Err(TryLockError::WouldBlock) => std::thread::sleep(RETRY_INTERVAL),
+                Err(TryLockError::WouldBlock) => {
+                    if !warned && start.elapsed() >= WARNING_AFTER {
+                        warned = true;
+                        tracing::warn!(root = %root.display(), "waiting for {}", LockHolder::text(holder(&directory)));
+                    }
+                    std::thread::sleep(RETRY_INTERVAL);
+                }
             }
+        }
+        // The directory may have been removed or replaced in the meantime.
+        let (locked, named) = (directory.metadata().map_err(unusable)?, fs::metadata(root).map_err(unusable)?);
+        if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
+            Ok(NamespaceLock(directory))
+        } else {
+            Err(ServiceError::RootRemoved { path: root.to_owned() })
         }
     }
 }
@@ -65,19 +93,40 @@ impl Drop for NamespaceLock {
     }
 }
 
+/// The process that holds the lock on `directory`, from `/proc/locks`; `None` if it cannot be found, such as one that died after it
+/// forked a child, which then shares the lock.
+fn holder(directory: &File) -> Option<LockHolder> {
+    let data = directory.metadata().ok()?;
+    let (major, minor) = (rustix::fs::major(data.dev()), rustix::fs::minor(data.dev()));
+    let inode = format!("{major:02x}:{minor:02x}:{}", data.ino());
+    let locks = fs::read_to_string("/proc/locks").ok()?;
+    let pid = locks.lines().find_map(|line| {
+        // `1: FLOCK ADVISORY WRITE 1234 fe:00:5678 0 EOF`; a waiter has `->` in the second place.
+        let words: Vec<&str> = line.split_whitespace().collect();
+        (words.get(1) == Some(&"FLOCK") && words.get(5) == Some(&&*inode)).then(|| words[4].parse().ok()).flatten()
+    })?;
+    Some(LockHolder { pid, stopped: matches!(process::state(pid)?, 'T' | 't') })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn one_holder_excludes_all_others() {
+    fn one_holder_excludes_all_others_and_is_named() {
         let root = std::env::temp_dir().join(format!("endless-lock-{}", std::process::id()));
         std::fs::create_dir_all(&root).unwrap();
         let lock = NamespaceLock::acquire(&root).unwrap();
         assert!(NamespaceLock::try_acquire(&root).is_none());
+        let refused = NamespaceLock::acquire_within(&root, Duration::ZERO).map(drop).unwrap_err();
+        let own = LockHolder { pid: std::process::id(), stopped: false };
+        assert!(
+            matches!(&refused, ServiceError::NamespaceLocked { holder: Some(holder), .. } if *holder == own),
+            "{refused}"
+        );
         drop(lock);
         assert!(NamespaceLock::try_acquire(&root).is_some());
         std::fs::remove_dir(&root).unwrap();
-        assert!(matches!(NamespaceLock::acquire(&root), Err(ServiceError::Root { .. })));
+        assert!(matches!(NamespaceLock::acquire(&root), Err(ServiceError::RootRemoved { .. })));
     }
 }

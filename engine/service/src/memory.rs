@@ -13,10 +13,19 @@ use crate::error::ServiceError;
 use crate::message::PayloadBlock;
 use endless_gym_core::batch::BLOCK_BYTES;
 
-const PATH: &str = "/dev/shm";
+pub(crate) const PATH: &str = "/dev/shm";
 
 /// Bytes reserved for iceoryx2's own segments and for headers.
-const MARGIN: u64 = 1 << 20;
+pub(crate) const MARGIN: u64 = 1 << 20;
+
+/// Bytes that must be free for a process to join a namespace.
+pub(crate) const NODE_BYTES: u64 = 64 << 10;
+
+/// Fails if `/dev/shm` has fewer than `needed` bytes free. iceoryx2 writes to a new segment without allocating it first, which
+/// raises SIGBUS if there is no memory.
+pub(crate) fn check_free(needed: u64) -> Result<(), ServiceError> {
+    available().map_or(Ok(()), |available| check(needed, available))
+}
 
 /// The addresses of the chunks that have been prefaulted.
 #[derive(Debug, Default)]
@@ -25,10 +34,7 @@ pub(crate) struct PrefaultedChunks(Vec<usize>);
 impl PrefaultedChunks {
     /// Fails if `/dev/shm` has no room for `chunks` chunks of `blocks` blocks.
     pub(crate) fn check_available(blocks: usize, chunks: usize) -> Result<(), ServiceError> {
-        match available() {
-            Some(available) => check(needed(blocks, chunks), available),
-            None => Ok(()),
-        }
+        check_free(needed(blocks, chunks))
     }
 
     /// Prefaults a chunk unless it has been prefaulted before.
@@ -43,13 +49,14 @@ impl PrefaultedChunks {
                 self.0.push(address);
                 Ok(())
             }
-            Err(_) => Err(ServiceError::SharedMemoryTooSmall {
-                needed: needed(chunk.len(), 1),
-                available: available().unwrap_or(0),
-                path: PATH,
-            }),
+            Err(_) => Err(too_small(needed(chunk.len(), 1))),
         }
     }
+}
+
+/// The error if `needed` bytes cannot be had.
+pub(crate) fn too_small(needed: u64) -> ServiceError {
+    ServiceError::SharedMemoryTooSmall { needed, available: available().unwrap_or(0), path: PATH }
 }
 
 fn needed(blocks: usize, chunks: usize) -> u64 {

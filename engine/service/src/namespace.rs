@@ -23,10 +23,11 @@ const MAX_SERVICE_NAME: usize = 64;
 /// Maximum length of the root in bytes. The path of a Unix socket has at most 107 bytes: the root, a separator, the prefix (at
 /// most [`MAX_PREFIX`] bytes) and 49 bytes of the socket's own name.
 const MAX_ROOT: usize = 107 - 1 - MAX_PREFIX - 49;
-const MAX_PREFIX: usize = 16;
+/// Length in bytes of the prefix of all sockets and segments: [`Namespace::prefix`], random characters, `_`.
+pub(crate) const MAX_PREFIX: usize = 16;
 
 /// A root directory for sockets and small files, and a prefix for shared memory segments. Engines, trainers and observers find
-/// each other only within the same namespace.
+/// each other only within the same namespace: the same directory, by whatever path, not only the same path.
 ///
 /// The default root is `/tmp/endless-gym-<uid>`, or the directory in the environment variable `ENDLESS_GYM_ROOT`. It belongs to
 /// one user and is not writable by others. It does not depend on the login session, because engines outlive logins.
@@ -55,11 +56,10 @@ impl Default for Namespace {
 
 impl Namespace {
     /// The namespace with the root directory `root`, an absolute path of at most 41 bytes. The directory is created when it is
-    /// first used. The prefix is derived from the path, so that no two root directories share segments: a process removes
-    /// abandoned segments of its prefix.
+    /// first used.
     pub fn at(root: impl Into<PathBuf>) -> Self {
         let root = root.into();
-        let prefix = format!("endless{:08x}_", crc32fast::hash(root.as_os_str().as_bytes()));
+        let prefix = format!("eg{:08x}", crc32fast::hash(root.as_os_str().as_bytes()));
         Namespace { root, prefix }
     }
 
@@ -68,14 +68,20 @@ impl Namespace {
         &self.root
     }
 
-    /// The prefix of the names of all shared memory segments in `/dev/shm`.
+    /// How the names of all shared memory segments in `/dev/shm` begin. It is derived from the path. Five random characters
+    /// follow, which the first process that joins draws and the last one that leaves discards: two directories of the same path,
+    /// in two containers that share `/dev/shm`, never share a segment.
     pub fn prefix(&self) -> &str {
         &self.prefix
     }
 
-    /// Creates the root directory if it is missing, fails if other users can write to it, and returns iceoryx2's configuration.
-    pub(crate) fn prepare(&self) -> Result<Config, ServiceError> {
-        let unusable = |reason: String| ServiceError::Root { path: self.root.clone(), reason };
+    fn unusable(&self, reason: String) -> ServiceError {
+        ServiceError::Root { path: self.root.clone(), reason }
+    }
+
+    /// Creates the root directory if it is missing, and fails if other users can write to it.
+    pub(crate) fn prepare(&self) -> Result<(), ServiceError> {
+        let unusable = |reason: String| self.unusable(reason);
         if !self.root.is_absolute() {
             return Err(unusable("it must be an absolute path".to_owned()));
         }
@@ -96,13 +102,31 @@ impl Namespace {
                 "it must belong to user {user}, who runs this process, and belongs to user {owner}"
             )));
         }
-        if metadata.permissions().mode() & 0o022 != 0 {
-            return Err(unusable("other users must not have write permission; remove it with `chmod 700`".to_owned()));
+        let mode = metadata.permissions().mode();
+        // A directory with the sticky bit, such as `/tmp`, is shared on purpose.
+        if mode & 0o022 != 0 && mode & 0o1000 != 0 {
+            let own = self.root.join(format!("endless-gym-{user}"));
+            return Err(unusable(format!(
+                "it is shared with other users; use a directory in it, such as {}",
+                own.display()
+            )));
         }
+        if mode & 0o022 != 0 {
+            let root = self.root.display();
+            return Err(unusable(format!(
+                "other users must not have write permission; remove it with `chmod go-w {root}`"
+            )));
+        }
+        Ok(())
+    }
+
+    /// iceoryx2's configuration with this prefix.
+    pub(crate) fn config(&self, prefix: &str) -> Result<Config, ServiceError> {
+        let unusable = |reason: String| self.unusable(reason);
         let mut config = Config::default();
         let root = IceoryxPath::new(self.root.as_os_str().as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;
         config.global.set_root_path(&root);
-        config.global.prefix = FileName::new(self.prefix.as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;
+        config.global.prefix = FileName::new(prefix.as_bytes()).map_err(|e| unusable(format!("{e:?}")))?;
         config.global.creation_timeout = Duration::from_millis(500);
         // `NamespaceNode` cleans up, under the namespace's lock.
         config.global.node.cleanup_dead_nodes_on_creation = false;
@@ -134,7 +158,7 @@ mod tests {
     fn the_prefix_is_derived_from_the_root() {
         assert_eq!(Namespace::at("/tmp/a"), Namespace::at("/tmp/a"));
         assert_ne!(Namespace::at("/tmp/a").prefix(), Namespace::at("/tmp/b").prefix());
-        assert!(Namespace::at("/tmp/a").prefix().len() <= MAX_PREFIX);
+        assert!(Namespace::at("/tmp/a").prefix().len() + 6 == MAX_PREFIX);
     }
 
     #[test]
@@ -142,7 +166,14 @@ mod tests {
         assert!(reason(&Namespace::at("somewhere")).contains("absolute"));
         assert!(reason(&Namespace::at(format!("/tmp/{}", "a".repeat(MAX_ROOT)))).contains("at most"));
         assert!(reason(&Namespace::at("/dev/null")).contains("/dev/null"));
-        assert!(reason(&Namespace::at("/tmp")).contains("/tmp"));
+        let shared = reason(&Namespace::at("/tmp"));
+        assert!(shared.contains("/tmp") && !shared.contains("chmod"), "{shared}");
+        let open = std::env::temp_dir().join(format!("endless-open-{}", std::process::id()));
+        fs::create_dir(&open).unwrap();
+        fs::set_permissions(&open, fs::Permissions::from_mode(0o777)).unwrap();
+        let advice = reason(&Namespace::at(&open));
+        fs::remove_dir(&open).unwrap();
+        assert!(advice.contains(&format!("chmod go-w {}", open.display())), "{advice}");
     }
 
     #[test]

@@ -4,10 +4,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::connect::{ConnectConfig, connect_to_engine};
+use crate::descriptors;
 use crate::error::ServiceError;
 use crate::lease::{BatchLease, Response, ResponsePort};
 use crate::node::NamespaceNode;
 use crate::ports::{EngineServices, OpenMode, ServiceNames};
+use crate::reservation;
 use crate::specification::ServiceSpecification;
 use crate::wait::LIVENESS_INTERVAL;
 
@@ -17,7 +19,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(1);
 /// Reads the batches of one group while a trainer steps it.
 ///
 /// The engine does not wait for observers. An observer sees the newest batch and misses those before it that it did not receive
-/// in time.
+/// in time. Before it connects, the shared memory for the batches that it may hold is reserved, so that what it holds is never
+/// missing to the engine.
 ///
 /// ```no_run
 /// use std::time::Duration;
@@ -45,6 +48,7 @@ impl Observer {
     ///
     /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::NoSuchGroup`] if it
     /// has no such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts,
+    /// [`ServiceError::SharedMemoryTooSmall`] if there is no room for the batches that the observer may hold,
     /// [`ServiceError::EngineRestarted`] if the engine ended while this process connected, [`ServiceError::Version`],
     /// [`ServiceError::IncompatibleTypes`] or [`ServiceError::Specification`] for an engine of another version,
     /// [`ServiceError::InvalidName`] or [`ServiceError::Root`] for an invalid configuration, [`ServiceError::NamespaceLocked`] if
@@ -57,6 +61,10 @@ impl Observer {
             }
             let names = ServiceNames::new(&service, specification.incarnation);
             let services = EngineServices { node, names, mode: OpenMode::Open };
+            descriptors::reserve(descriptors::of_trainer(1))?;
+            // One observer at a time, so that each counts those before it.
+            let _lock = node.lock()?;
+            reservation::reserve_for_observer(&services, group, specification)?;
             ResponsePort::open(&services, node, group, specification)
         })?;
         Ok(Observer { port: Arc::new(port), specification: Arc::new(specification), node })
@@ -82,7 +90,7 @@ impl Observer {
     /// # Errors
     ///
     /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] within half a second after the
-    /// engine's process has ended, and the errors of [`newest`](Observer::newest).
+    /// engine's process has ended, [`ServiceError::RootRemoved`] if the namespace's directory was removed, and the errors of [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
         let mut last_check = start;
@@ -96,6 +104,7 @@ impl Observer {
             }
             let service = || self.specification.service.clone();
             if is_lost {
+                self.node.check_root()?;
                 return Err(ServiceError::EngineLost { service: service(), pid: self.specification.engine_pid });
             }
             if is_over {

@@ -69,6 +69,11 @@ impl LeaseLimits {
     pub(crate) fn trainer_chunks(self) -> usize {
         self.batches_held + 2
     }
+
+    /// Chunks in use by one observer: those that it holds, and one in its queue.
+    pub(crate) fn observer_chunks(self) -> usize {
+        self.batches_held + 1
+    }
 }
 
 /// Whether services are created or opened.

@@ -15,7 +15,6 @@ use crate::connection::EngineConnection;
 use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
 use crate::lease::{BatchLease, Response};
-use crate::lock::NamespaceLock;
 use crate::message::{RequestHeader, RequestKind};
 use crate::pending::{PendingRequests, Request};
 use crate::ports;
@@ -404,8 +403,11 @@ impl Trainer {
     /// it is [`ServiceError::EngineLost`].
     fn lost(&self) -> ServiceError {
         let (service, node) = (self.config.service.clone(), &*self.connection.node);
-        let successor = NamespaceLock::acquire_within(node.root(), SUCCESSOR_TIMEOUT)
-            .and_then(|lock| blackboard::read_locked(node, &service, &lock));
+        if let Err(removed) = node.check_root() {
+            return removed;
+        }
+        let successor =
+            node.lock_within(SUCCESSOR_TIMEOUT).and_then(|lock| blackboard::read_locked(node, &service, &lock));
         match successor {
             Ok(Some(other)) if other.incarnation != self.specification.incarnation => {
                 ServiceError::EngineRestarted { service }

@@ -4,14 +4,11 @@ use thiserror::Error;
 
 use super::drawn_scene::WrongFrame;
 use super::seeding::MAX_TOTAL_ENVS;
-use crate::batch::limits::MAX_ENVS;
+use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 use crate::batch::{BLOCK_BYTES, LayoutError, MAX_STACK};
 use crate::envs::view::VIEW_BYTES;
 use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
 use crate::random::EntropyError;
-
-/// Maximum number of [`Threads`](super::Threads).
-pub const MAX_THREADS: usize = 1024;
 
 /// A pool that cannot be made, or a call that it cannot carry out.
 ///
@@ -84,8 +81,8 @@ pub enum PoolError {
     /// The step of the range of seeds is 0.
     #[error("the step of the range of seeds must be 1 or more, got 0")]
     SeedStep,
-    /// Too many threads.
-    #[error("the number of threads must be 0, for one per core, to {MAX_THREADS}, got {given}")]
+    /// The number of threads is out of range.
+    #[error("threads must be 0 (one for each core) to {MAX_THREADS}, got {given}")]
     ThreadCount {
         /// The number that was given.
         given: usize,

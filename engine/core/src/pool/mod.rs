@@ -19,11 +19,11 @@ mod seeding;
 mod snapshot;
 mod threads;
 
-pub use crate::batch::limits::MAX_ENVS;
+pub use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 pub use autoreset::{Autoreset, UnknownAutoreset};
 pub use config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 pub use drawn_scene::WrongFrame;
-pub use error::{MAX_THREADS, PoolError};
+pub use error::PoolError;
 pub use pool::Pool;
 pub use seeding::Seeding;
 pub use snapshot::{SNAPSHOT_VERSION, SnapshotError};

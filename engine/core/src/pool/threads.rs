@@ -4,9 +4,9 @@
 #[allow(unsafe_code)] // The crate's only module with unsafe code: see its SAFETY comment.
 mod workers;
 
-#[cfg(feature = "threads")]
-use super::error::MAX_THREADS;
 use super::error::PoolError;
+#[cfg(feature = "threads")]
+use crate::batch::limits::MAX_THREADS;
 
 /// Threads that step environments: the calling thread and workers. Several pools may share them; they then take turns.
 ///
@@ -19,16 +19,20 @@ pub struct Threads {
 
 #[cfg(feature = "threads")]
 impl Threads {
-    /// `count` threads, the calling one included, to [`MAX_THREADS`](super::MAX_THREADS); 0 means one for each core.
+    /// `count` threads, the calling one included, at most [`MAX_THREADS`]; 0 means one for each core.
     ///
     /// # Errors
     ///
-    /// If they are too many, or the operating system cannot start them.
+    /// If there are too many, or if the operating system cannot start them.
     pub fn new(count: usize) -> Result<Self, PoolError> {
         if count > MAX_THREADS {
             return Err(PoolError::ThreadCount { given: count });
         }
-        let count = if count == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { count };
+        let count = if count == 0 {
+            std::thread::available_parallelism().map_or(1, usize::from).min(MAX_THREADS)
+        } else {
+            count
+        };
         let workers = (count > 1).then(|| workers::Workers::new(count - 1)).transpose();
         let workers = workers.map_err(|source| PoolError::Threads { count, source })?;
         Ok(Threads { workers: workers.map(std::sync::Arc::new) })
