@@ -31,8 +31,8 @@ pub mod envs {
 /// Many environments in this process, stepped in lockstep.
 pub mod pool {
     pub use endless_gym_core::pool::{
-        Autoreset, MAX_ENVS, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, SNAPSHOT_VERSION,
-        Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
+        Autoreset, MAX_ENVS, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, ResumeError,
+        SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }
@@ -40,8 +40,10 @@ pub mod pool {
 /// Engines that serve environments in shared memory, their trainers and observers.
 pub mod service {
     pub use endless_gym_service::{
-        BatchLease, ConnectConfig, Engine, EngineConfig, EngineSummary, MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE,
-        Rejection, ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
+        BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
+        EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
+        MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification,
+        Trainer, running_engines, timeout_from_seconds,
     };
 }
 

@@ -50,7 +50,9 @@ class EngineProcess:
         while True:
             if (status := self._process.poll()) is not None:
                 self._errors.seek(0)
-                message = self._errors.read().decode(errors="replace").strip().removeprefix("endless: ")
+                # Logs may come before the message.
+                text = f"\n{self._errors.read().decode(errors='replace')}"
+                message = text.rpartition("\nendless: ")[2].strip()
                 raise RuntimeError(message or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
                 return connect(self.service, timeout=timeout, copy=copy, engine=self)
@@ -83,6 +85,9 @@ def serve(
     observation: str = "rgb",
     frames: Frames | None = None,
     batches_held: int = 4,
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: float | None = None,
+    resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
 ) -> EndlessVectorEnv:
@@ -105,12 +110,18 @@ def serve(
         observation: As for `make_vec`.
         frames: As for `make_vec`.
         batches_held: Batches of a group whose arrays may be referenced at a time, 1 to 16.
+        checkpoint: File to which the engine saves all environments when it is closed or ended by a signal, and when
+            `EndlessVectorEnv.checkpoint` is called.
+        checkpoint_every: Seconds after which it also saves while it runs.
+        resume: Continue from `checkpoint` if it exists; `EndlessVectorEnv.adopt` returns the observations. Otherwise a file that
+            exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
 
     Raises:
         TypeError: A number is not an integer.
-        ValueError: A number is negative, or the timeout is not finite.
+        ValueError: A number is negative, or the timeout is not finite; or `checkpoint_every` or `resume` is given without
+            `checkpoint`.
         RuntimeError: The engine cannot start; the message says why.
     """
     described, mode = spec(id), autoreset_mode(autoreset)
@@ -131,6 +142,13 @@ def serve(
         arguments["--seed-range"] = f"{seed_range[0]}..{seed_range[1]}"
     if seed_list is not None:
         arguments["--seed-list"] = ",".join(map(str, seed_list))
+    if checkpoint is None and (checkpoint_every is not None or resume):
+        raise ValueError("checkpoint must name a file if checkpoint_every or resume is given")
+    if checkpoint is not None:
+        arguments["--checkpoint"] = os.fspath(checkpoint)
+    if checkpoint_every is not None:
+        # In whole nanoseconds, as the program reads durations.
+        arguments["--every"] = f"{round(checked_timeout(checkpoint_every) * 1e9)}ns"
     command = [f"{name}={value}" for name, value in arguments.items()]
     if options is None or isinstance(options, Mapping):
         command += [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
@@ -138,6 +156,7 @@ def serve(
         command += [f"--env-options={json_text(dict(each))}" for each in options]
     command += ["--final-observation"] if mode is AutoresetMode.SAME_STEP else []
     command += ["--features"] if features else []
+    command += ["--resume"] if resume else []
     command += frames.command() if frames else ["--no-frames"]
     engine = EngineProcess(command)
     try:

@@ -29,6 +29,12 @@ pub fn print(text: impl std::fmt::Display) -> Result<(), Failure> {
     check(writeln!(stdout, "{text}").and_then(|()| stdout.flush()))
 }
 
+/// Clears the terminal, if standard output is one.
+pub fn clear() -> Result<(), Failure> {
+    let mut stdout = io::stdout().lock();
+    if stdout.is_terminal() { check(write!(stdout, "\x1b[H\x1b[2J")) } else { Ok(()) }
+}
+
 /// Prints one JSON document to standard output.
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     print(serde_json::to_string_pretty(value)?)

@@ -2,20 +2,42 @@
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use super::failure::Failure;
 
 /// The flag of the running command. A process has one set of signal handlers, so all commands of a process share it.
 static STOP: AtomicBool = AtomicBool::new(false);
 
-/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets. Each call clears it.
+/// How often a command that waits looks at its flag.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// Exit status of a process that a second signal ended, as of one that SIGINT killed.
+const INTERRUPTED: i32 = 130;
+
+/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets. Each call clears it. A signal while it is set ends the process at once: what
+/// runs does not look at the flag, or takes too long for the user.
 pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     // A second call of `set_handler` is an error.
     static HANDLER: OnceLock<Result<(), String>> = OnceLock::new();
-    let set = || ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed)).map_err(|error| error.to_string());
+    let stop = || {
+        if STOP.swap(true, Ordering::Relaxed) {
+            std::process::exit(INTERRUPTED);
+        }
+    };
+    let set = || ctrlc::set_handler(stop).map_err(|error| error.to_string());
     HANDLER.get_or_init(set).clone()?;
     STOP.store(false, Ordering::Relaxed);
     Ok(&STOP)
+}
+
+/// Waits up to `time` for the flag, and returns whether it is set.
+pub fn wait(stop: &AtomicBool, time: Duration) -> bool {
+    let start = Instant::now();
+    while !stop.load(Ordering::Relaxed) && start.elapsed() < time {
+        std::thread::sleep(POLL_INTERVAL.min(time));
+    }
+    stop.load(Ordering::Relaxed)
 }
 
 /// Sets the flag at the end of standard input, which a parent process that dies closes.

@@ -14,6 +14,7 @@ use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
 use crate::lock::NamespaceLock;
 use crate::namespace::{Ipc, Namespace};
+use crate::status_file;
 
 /// This process's node in a namespace. Must be dropped after all ports that were created with it.
 pub(crate) struct NamespaceNode {
@@ -27,6 +28,7 @@ impl NamespaceNode {
         set_log_level_from_env_or(LogLevel::Error);
         let config = namespace.prepare()?;
         cleanup::remove_unsized_segments(&config);
+        status_file::remove_abandoned(namespace.prefix());
         let node = NodeBuilder::new()
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
@@ -46,8 +48,9 @@ impl NamespaceNode {
         &self.root
     }
 
-    /// Removes the resources of processes that have died. Does nothing while another process holds the namespace's lock.
-    pub(crate) fn remove_dead_nodes(&self) {
+    /// Removes the resources of processes that have died, and returns the number of these processes. Does nothing while another
+    /// process holds the namespace's lock.
+    pub(crate) fn remove_dead_nodes(&self) -> usize {
         let mut dead = Vec::new();
         let listed = Node::<Ipc>::list(self.config(), |state| {
             if let NodeState::Dead(node) = state {
@@ -59,16 +62,23 @@ impl NamespaceNode {
             tracing::debug!(error = %e, "cannot list the nodes");
         }
         if dead.is_empty() {
-            return;
+            return 0;
         }
         // Before iceoryx2 opens the dead nodes' segments: it would wait forever for one without a size.
         cleanup::remove_unsized_segments(self.config());
-        let Some(_lock) = NamespaceLock::try_acquire(&self.root) else { return };
+        let Some(_lock) = NamespaceLock::try_acquire(&self.root) else { return 0 };
+        let mut removed = 0;
         for node in dead.into_iter().filter(|node| node.details().is_some()) {
-            if let Err(e) = node.try_remove_stale_resources() {
-                tracing::debug!(error = %e, "cannot remove a dead node");
+            let process = node.details().as_ref().map(|details| details.process_id().value());
+            match node.try_remove_stale_resources() {
+                Ok(_) => {
+                    tracing::info!(process, "removed the resources of a process that has died");
+                    removed += 1;
+                }
+                Err(e) => tracing::debug!(error = %e, "cannot remove a dead node"),
             }
         }
+        removed
     }
 
     /// Whether the process that owns a node is running. `false` is certain; a node whose state cannot be read counts as running.
