@@ -252,9 +252,14 @@ fn a_closed_pipe_is_no_failure() {
 #[test]
 fn every_command_explains_itself() {
     let room = Room::new("help");
-    for (command, part) in
-        [("list", "--json"), ("demo", "--seconds"), ("serve", "--service"), ("bench", "--rounds"), ("verify", "FILES")]
-    {
+    for (command, part) in [
+        ("list", "--json"),
+        ("demo", "--seconds"),
+        ("serve", "--checkpoint"),
+        ("status", "--watch"),
+        ("bench", "--rounds"),
+        ("verify", "FILES"),
+    ] {
         let help = room.run(&[command, "--help"]);
         assert!(help.status.success() && text(&help.stdout).contains(part), "{command}");
     }

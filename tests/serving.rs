@@ -356,8 +356,9 @@ fn logs_follow_the_option_and_the_variable() {
         command.env_remove("ENDLESS_GYM_LOG").stdout(Stdio::null()).stderr(Stdio::piped());
         variable.map(|value| command.env("ENDLESS_GYM_LOG", value));
         let mut engine = Served(command.spawn().unwrap());
-        room.connect("endless").reset(0, ResetRequest::All).unwrap();
-        std::thread::sleep(Duration::from_millis(300));
+        let mut trainer = room.connect("endless");
+        trainer.reset(0, ResetRequest::All).unwrap();
+        trainer.receive(0, SECONDS).unwrap();
         signal(&engine.0, Signal::INT);
         wait(&mut engine.0);
         let mut output = String::new();

@@ -5,7 +5,7 @@ Both have the same interface, and raise the same exceptions with the same messag
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,13 @@ from endless_gym import _native
 class GroupReconnection(NamedTuple):
     """What `reconnect` found out about a group."""
 
-    #: Batches that the group has returned in the engine that is connected now; `None` if its status cannot be read. An engine that
-    #: resumed from a checkpoint counts on from there.
+    #: Batches that the group has returned in the engine that is connected now, counted on from the checkpoint that it resumed from;
+    #: `None` if its status cannot be read.
     step: int | None
     #: Batches that it had returned in the engine that ended; `None` if the engine is the same, or if its status cannot be read.
     lost_step: int | None
-    #: What became of the last request: `none` if there was none, `pending` if `recv` can return its result, `played` or `not_played`
-    #: if it was executed once or never, and `unknown` if the engine ended while it executed it.
+    #: What became of the last request: `none` if there was none, `pending` if `recv` can return its result, `played` if it was
+    #: executed once, `not_played` if never, and `unknown` if the engine ended while it executed it.
     last_request: _native.LastRequest
 
 

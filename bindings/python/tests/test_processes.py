@@ -212,9 +212,8 @@ def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     twin.close()
     with pytest.raises(ValueError, match="checkpoint must name a file"):
         endless_gym.serve(ID, resume=True)
-    with endless_gym.serve(ID) as envs:
-        with pytest.raises(RuntimeError, match="no checkpoint file"):
-            envs.checkpoint()
+    with endless_gym.serve(ID) as envs, pytest.raises(RuntimeError, match="no checkpoint file"):
+        envs.checkpoint()
 
 
 def test_events_are_logged_by_python(caplog: pytest.LogCaptureFixture) -> None:
