@@ -16,8 +16,8 @@ from endless_gym import _native
 class GroupReconnection(NamedTuple):
     """What `reconnect` found out about a group."""
 
-    #: Batches that the group has returned in the engine that is connected now, counted on from the checkpoint that it resumed from;
-    #: `None` if its status cannot be read.
+    #: Batches that the group has returned in the engine that is connected now, counted on from the checkpoint that it resumed
+    #: from; `None` if its status cannot be read.
     step: int | None
     #: Batches that it had returned in the engine that ended; `None` if the engine is the same, or if its status cannot be read.
     lost_step: int | None

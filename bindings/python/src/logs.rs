@@ -1,7 +1,7 @@
 //! Logs of the native module through Python's `logging`, under the logger `endless_gym`.
 //!
-//! Events may come from any thread, while another one holds the interpreter's lock and waits for it. They are therefore kept, and handed
-//! to Python by the next call that holds the lock.
+//! Events may come from any thread, while another one holds the interpreter's lock and waits for it. They are therefore kept, and
+//! handed to Python by the next call that holds the lock.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};

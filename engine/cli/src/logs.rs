@@ -22,7 +22,10 @@ pub fn start(given: Option<&str>) -> Result<(), Failure> {
         (None, None) => ("--log", DEFAULT),
     };
     let filter = EnvFilter::try_new(text).map_err(|error| {
-        format!("{name} must be off, error, warn, info, debug, trace or a filter such as `endless_gym_service=debug`, got `{text}`: {error}")
+        format!(
+            "{name} must be off, error, warn, info, debug, trace or a filter such as `endless_gym_service=debug`, got `{text}`: \
+             {error}"
+        )
     })?;
     let subscriber = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).with_ansi(false);
     // An error means that the process has a subscriber, such as that of the Python package.

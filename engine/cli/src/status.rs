@@ -100,7 +100,8 @@ fn env_steps(status: &EngineStatus) -> u64 {
 }
 
 fn sum(status: &EngineStatus, field: fn(&GroupStatus) -> u64) -> u64 {
-    status.groups.iter().map(field).sum()
+    // Saturating: the numbers come from another process.
+    status.groups.iter().map(field).fold(0, u64::saturating_add)
 }
 
 fn show(args: &Args, readings: &[Reading]) -> Result<(), Failure> {

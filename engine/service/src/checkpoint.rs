@@ -1,7 +1,7 @@
 //! The file from which an engine continues the environments of an earlier one.
 //!
-//! A checkpoint is `EGYC`, the format's version (u32), the CRC-32 of what follows (u32), both little-endian, and then the content in
-//! [postcard](https://postcard.jamesmunns.com)'s encoding: what the environments are, as JSON text, and for each group its step and
+//! A checkpoint is `EGYC`, the format's version (u32), the CRC-32 of what follows (u32), both little-endian, and then the content
+//! in [postcard](https://postcard.jamesmunns.com)'s encoding: what the environments are, as JSON text, and for each group its step and
 //! its environments' states.
 
 use std::fs::{self, File};

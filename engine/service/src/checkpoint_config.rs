@@ -67,8 +67,8 @@ pub enum CheckpointError {
     },
     /// The checkpoint was saved by a version of this crate with another format.
     #[error(
-        "checkpoint {} must be of version {CHECKPOINT_VERSION}, got version {given}; resume with the version of endless-gym that saved \
-         it",
+        "checkpoint {} must be of version {CHECKPOINT_VERSION}, got version {given}; resume with the version of endless-gym that \
+         saved it",
         path.display()
     )]
     Version {

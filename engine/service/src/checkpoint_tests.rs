@@ -42,7 +42,9 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
     #[test]
-    fn an_altered_checkpoint_is_never_accepted(changes in prop::collection::vec((any::<prop::sample::Index>(), 1..=255u8), 1..4)) {
+    fn an_altered_checkpoint_is_never_accepted(
+        changes in prop::collection::vec((any::<prop::sample::Index>(), 1..=255u8), 1..4),
+    ) {
         let (head, original) = checkpoint("altered");
         let mut bytes = original.clone();
         for (at, change) in changes {
@@ -54,7 +56,11 @@ proptest! {
 
     /// With a checksum that matches, so that the decoder sees the content.
     #[test]
-    fn a_forged_checkpoint_is_no_panic(changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..9), length in any::<prop::sample::Index>(), cut: bool) {
+    fn a_forged_checkpoint_is_no_panic(
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..9),
+        length in any::<prop::sample::Index>(),
+        cut: bool,
+    ) {
         let (head, mut bytes) = checkpoint("forged");
         for (at, value) in changes {
             *at.get_mut(&mut bytes[PREAMBLE..]) = value;

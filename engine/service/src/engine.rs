@@ -94,7 +94,8 @@ impl Engine {
     /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is
     /// running, [`ServiceError::SharedMemoryTooSmall`] if there is not enough shared memory, [`ServiceError::Version`] if an engine
     /// of another version has the name, [`ServiceError::NamespaceLocked`] if another process holds the namespace's lock for too
-    /// long, [`ServiceError::Checkpoint`] for a checkpoint that exists, cannot be written, or cannot be resumed from, and [`ServiceError::Middleware`] for other errors of iceoryx2.
+    /// long, [`ServiceError::Checkpoint`] for a checkpoint that exists, cannot be written, or cannot be resumed from, and
+    /// [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
         let node = NamespaceNode::join(&config.namespace)?;
@@ -142,8 +143,8 @@ impl Engine {
     /// # Errors
     ///
     /// [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
-    /// are no errors: its requests are rejected. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; an earlier one
-    /// that cannot is logged, and tried again later.
+    /// are no errors: its requests are rejected. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; an earlier
+    /// one that cannot is logged, and tried again later.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
         let mut next = 0;

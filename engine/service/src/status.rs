@@ -167,3 +167,28 @@ pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize
     }
     EngineActivity::NotTaken { process: engine.process }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn record<R: bytemuck::Pod + std::fmt::Debug>() -> impl Strategy<Value = R> {
+        prop::collection::vec(any::<u8>(), size_of::<R>()).prop_map(|bytes| bytemuck::pod_read_unaligned(&bytes))
+    }
+
+    proptest! {
+        #[test]
+        fn any_records_are_a_status(
+            engine in record::<EngineRecord>(),
+            groups in prop::collection::vec(record::<GroupRecord>(), 0..4),
+            now: u64,
+        ) {
+            let status = EngineStatus::new(&engine, &groups, now);
+            prop_assert_eq!(status.groups.len(), groups.len());
+            prop_assert!(!status.service.chars().any(char::is_control));
+            serde_json::to_string(&status).unwrap();
+        }
+    }
+}

@@ -1,7 +1,7 @@
 //! The file in shared memory that holds an engine's status.
 //!
-//! The engine maps the file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a writer does can
-//! harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence lock).
+//! The engine maps the file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a writer
+//! does can harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence lock).
 //!
 //! The engine holds an `flock` on the file from before it has its name until its process ends. A file without that lock belongs to
 //! a dead engine and may be removed, independent of process ids, which another container would not see.

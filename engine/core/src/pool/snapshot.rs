@@ -122,8 +122,10 @@ pub enum SnapshotError {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SavedEnv {
     /// The environment's snapshot.
+    #[serde(with = "serde_bytes")]
     pub snapshot: Vec<u8>,
     /// The frames of a stacked observation but the newest, oldest first, in the pool's format.
+    #[serde(with = "serde_bytes")]
     pub earlier_frames: Vec<u8>,
 }
 

@@ -70,15 +70,15 @@ impl Trainer {
         self.transfer(group, request, timeout, write).map(|_| ())
     }
 
-    /// Saves all environments of the engine to its checkpoint file, and returns the step of each group that was saved. The file is on
-    /// the disk when this returns. Groups whose answers are pending are saved before or after their step, as their number says.
+    /// Saves all environments of the engine to its checkpoint file, and returns the step of each group that was saved. The file is
+    /// on the disk when this returns. Groups whose answers are pending are saved before or after their step, as their number says.
     ///
     /// After [`ServiceError::TimedOut`], the same call continues to wait.
     ///
     /// # Errors
     ///
-    /// [`ServiceError::AnswerPending`] if group 0 has a pending batch, [`ServiceError::Rejected`] if the engine has no checkpoint file
-    /// or cannot write it, or if no group was reset, and the errors of [`receive`](Trainer::receive).
+    /// [`ServiceError::AnswerPending`] if group 0 has a pending batch, [`ServiceError::Rejected`] if the engine has no checkpoint
+    /// file or cannot write it, or if no group was reset, and the errors of [`receive`](Trainer::receive).
     pub fn checkpoint(&mut self, timeout: Duration) -> Result<Vec<u64>, ServiceError> {
         let steps = self.transfer(0, Request::new(RequestKind::Checkpoint), timeout, |_| Ok(0))?;
         Ok(steps.chunks_exact(size_of::<u64>()).map(bytemuck::pod_read_unaligned).collect())
