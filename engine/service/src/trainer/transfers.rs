@@ -43,7 +43,7 @@ impl Trainer {
     }
 
     /// Restores an environment from a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of no
-    /// environment ([`ResetRequest::Each`]) then returns its observation.
+    /// environment ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each)) then returns its observation.
     ///
     /// After [`ServiceError::TimedOut`], the engine may still restore the environment, but not after a later request.
     ///
