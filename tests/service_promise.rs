@@ -6,7 +6,7 @@ mod service_support;
 use std::time::{Duration, Instant};
 
 use endless_gym::pool::ResetRequest;
-use endless_gym::service::{EngineActivity, EngineStatus, LastRequest, Rejection, ServiceError, Trainer};
+use endless_gym::service::{EngineActivity, EngineStatus, LastRequest, Observer, Rejection, ServiceError, Trainer};
 use rustix::process::{Pid, Signal, kill_process};
 use service_support::{Place, Running, play_role};
 
@@ -154,10 +154,11 @@ fn a_dead_engine_tells_what_became_of_the_last_request() {
     let (mut engine, last, lost_step) = replaced(&place, &mut trainer, 2);
     assert_eq!((last, lost_step), (LastRequest::Played, Some(1)));
 
-    // An answer that arrived before its death can still be received.
+    // An answer that arrived before its death can still be received. An observer receives it after the trainer.
     start(&mut trainer);
+    let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
     send(&mut trainer);
-    wait_until("the engine answers", || status(&place).groups[0].step == 2);
+    assert_eq!(observer.next(SECONDS).unwrap().step(), 2);
     engine.kill();
     assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), 2);
 }

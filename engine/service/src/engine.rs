@@ -239,13 +239,17 @@ impl Engine {
             Ok(Outcome::Snapshot { bytes }) => header.set_snapshot(*bytes),
             Err((reason, _)) => header.set_rejection(*reason, text),
         }
+        // Before the response, so that a trainer that has received it reads a status that includes it.
+        self.status.end(number, step, outcome.as_ref().ok());
         // A trainer that dies at this moment must not end the engine.
         let receivers = batch.send().unwrap_or_else(|e| {
             tracing::warn!(error = %e, group = number, "cannot deliver a response");
             0
         });
         ports::notify(&self.to_trainer, number);
-        self.status.end(number, step, receivers == 0, outcome.as_ref().ok());
+        if receivers == 0 && matches!(outcome, Ok(Outcome::Batch { .. })) {
+            self.status.update_group(number, |group| group.undelivered += 1);
+        }
         Ok(())
     }
 }

@@ -69,8 +69,8 @@ impl StatusWriter {
         is_new
     }
 
-    /// The request was answered: `outcome` is what the response holds, `None` for a rejection.
-    pub(crate) fn end(&mut self, group: usize, step: u64, undelivered: bool, outcome: Option<&Outcome>) {
+    /// The request was executed and is about to be answered: `outcome` is what the response holds, `None` for a rejection.
+    pub(crate) fn end(&mut self, group: usize, step: u64, outcome: Option<&Outcome>) {
         self.update_group(group, |record| {
             (record.step, record.answered, record.busy_since) = (step, record.taken, 0);
             match outcome {
@@ -81,7 +81,6 @@ impl StatusWriter {
                 record.batches += 1;
                 record.env_steps += *env_steps as u64;
                 record.episodes += *episodes as u64;
-                record.undelivered += u64::from(undelivered);
             }
         });
     }
