@@ -71,5 +71,20 @@ fn formats(criterion: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, step, threads, formats);
+/// How long a periodic checkpoint stalls an engine: copying the states of 1,024 environments.
+fn save(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("pool/save");
+    for spec in envs::specs() {
+        for stack in [1, 4] {
+            let frames = Some(Frames { stack, ..Frames::default() });
+            let config = PoolConfig { frames, ..config(spec, 1024) };
+            let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+            pool.reset(ResetRequest::All, &mut zeroed(pool.layout().blocks())).unwrap();
+            let name = format!("{}/stack_{stack}", spec.id);
+            group.bench_function(name, |bencher| bencher.iter(|| pool.save().unwrap()));
+        }
+    }
+}
+
+criterion_group!(benches, step, threads, formats, save);
 criterion_main!(benches);

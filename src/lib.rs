@@ -32,7 +32,7 @@ pub mod envs {
 pub mod pool {
     pub use endless_gym_core::pool::{
         Autoreset, MAX_ENVS, MAX_THREADS, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest,
-        SNAPSHOT_VERSION, Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
+        ResumeError, SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }
@@ -40,9 +40,10 @@ pub mod pool {
 /// Engines that serve environments in shared memory, their trainers and observers.
 pub mod service {
     pub use endless_gym_service::{
-        BatchLease, ConnectConfig, Engine, EngineConfig, EngineSummary, LockHolder, MAX_BATCHES_HELD, MAX_GROUPS,
-        Namespace, Observer, ROOT_VARIABLE, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
-        timeout_from_seconds,
+        BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
+        EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
+        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE, Reconnection, Rejection,
+        ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
     };
 }
 

@@ -1,92 +1,19 @@
 //! The `endless` program, as a user runs it: real processes, their output, exit status and what they leave behind.
 
 mod common;
+mod program_support;
 
 use std::fs::File;
 use std::io::Read;
-use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use endless_gym::service::{ConnectConfig, Namespace, Trainer};
-use rustix::process::{Pid, Signal, kill_process};
+use program_support::{Room, signal, text, wait};
+use rustix::process::Signal;
 use rustix::pty::OpenptFlags;
 use rustix::termios::Winsize;
 use serde_json::Value as Json;
-
-/// A directory of sockets for one test alone, and what is left of its segments.
-struct Room {
-    root: PathBuf,
-}
-
-impl Room {
-    fn new(name: &str) -> Self {
-        // At random, since another test run may have the same process ids in a container of its own.
-        let root = PathBuf::from(format!("/tmp/endless-{name}-{:016x}", rand::random::<u64>()));
-        std::fs::create_dir_all(&root).unwrap();
-        std::fs::set_permissions(&root, std::fs::Permissions::from_mode(0o700)).unwrap();
-        Room { root }
-    }
-
-    fn endless(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_endless"));
-        command.args(arguments).env("ENDLESS_GYM_ROOT", &self.root);
-        command
-    }
-
-    fn run(&self, arguments: &[&str]) -> Output {
-        self.endless(arguments).output().unwrap()
-    }
-
-    fn segments(&self) -> Vec<String> {
-        let prefix = Namespace::at(&self.root).prefix().to_owned();
-        let names = std::fs::read_dir("/dev/shm").unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
-        names.filter(|name| name.starts_with(&prefix)).collect()
-    }
-
-    fn wait_for_engine(&self) {
-        let start = Instant::now();
-        while endless_gym::service::running_engines(&Namespace::at(&self.root)).unwrap().is_empty() {
-            assert!(start.elapsed() < Duration::from_secs(20), "no engine starts");
-            std::thread::sleep(Duration::from_millis(50));
-        }
-    }
-
-    fn connect(&self, service: &str) -> Trainer {
-        let config = ConnectConfig {
-            namespace: Namespace::at(&self.root),
-            timeout: Duration::from_secs(10),
-            ..ConnectConfig::new(service)
-        };
-        Trainer::connect(&config).unwrap()
-    }
-}
-
-impl Drop for Room {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.root);
-    }
-}
-
-fn text(bytes: &[u8]) -> &str {
-    std::str::from_utf8(bytes).unwrap()
-}
-
-fn signal(child: &Child, signal: Signal) {
-    kill_process(Pid::from_child(child), signal).unwrap();
-}
-
-fn wait(child: &mut Child) -> std::process::ExitStatus {
-    let start = Instant::now();
-    loop {
-        if let Some(status) = child.try_wait().unwrap() {
-            return status;
-        }
-        assert!(start.elapsed() < Duration::from_secs(20), "the program does not end");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
 
 #[test]
 fn list_shows_environments_and_parameters() {
@@ -402,9 +329,14 @@ fn a_closed_pipe_is_no_failure() {
 #[test]
 fn every_command_explains_itself() {
     let room = Room::new("help");
-    for (command, part) in
-        [("list", "--json"), ("demo", "--seconds"), ("serve", "--service"), ("bench", "--rounds"), ("verify", "FILES")]
-    {
+    for (command, part) in [
+        ("list", "--json"),
+        ("demo", "--seconds"),
+        ("serve", "--checkpoint"),
+        ("status", "--watch"),
+        ("bench", "--rounds"),
+        ("verify", "FILES"),
+    ] {
         let help = room.run(&[command, "--help"]);
         assert!(help.status.success() && text(&help.stdout).contains(part), "{command}");
     }

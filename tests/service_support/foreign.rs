@@ -33,12 +33,14 @@ pub struct RequestHeader {
     pub seed: u64,
     pub env: u64,
     pub bytes: u64,
+    pub process: u32,
+    pub held: u32,
 }
 
 impl RequestHeader {
     pub fn reset_all(specification: &ServiceSpecification) -> Self {
         let (layout_version, incarnation) = (LAYOUT_VERSION, specification.incarnation);
-        RequestHeader { layout_version, kind: 2, incarnation, trainer: 42, request: 1, seed: 0, env: 0, bytes: 0 }
+        RequestHeader { layout_version, kind: 2, incarnation, trainer: 42, request: 1, ..RequestHeader::default() }
     }
 }
 
@@ -52,10 +54,9 @@ pub struct ResponseHeader {
     step: u64,
     trainer: u64,
     request: u64,
+    bytes: u64,
     status: u32,
-    text_length: u32,
-    text: [u8; 192],
-    snapshot: u64,
+    padding: u32,
 }
 
 #[derive(Clone, Copy, Debug, ZeroCopySend)]
@@ -94,10 +95,9 @@ impl Default for ResponseHeader {
             step: 0,
             trainer: 0,
             request: 0,
+            bytes: 0,
             status: 0,
-            text_length: 0,
-            text: [0; 192],
-            snapshot: 0,
+            padding: 0,
         }
     }
 }
@@ -142,8 +142,11 @@ impl Foreign {
             if let Some(answer) = self.subscriber.receive().unwrap() {
                 let header = answer.user_header();
                 assert_eq!((header.trainer, header.request), (42, 1));
-                let text = String::from_utf8_lossy(&header.text[..header.text_length as usize]).into_owned();
-                return Some((header.status, text));
+                if header.status == 0 {
+                    return Some((0, String::new()));
+                }
+                let payload: &[u8] = bytemuck::cast_slice(answer.payload());
+                return Some((header.status, String::from_utf8_lossy(&payload[..header.bytes as usize]).into_owned()));
             }
             std::thread::sleep(Duration::from_millis(1));
         }

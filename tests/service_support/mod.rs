@@ -164,6 +164,21 @@ pub fn play_role() {
                 trainer.send_with(group, |actions| actions.fill(0)).unwrap();
             }
         }
+        ["sender", service] => {
+            let timeout = Duration::from_secs(10);
+            let mut trainer = Trainer::connect(&ConnectConfig { timeout, ..ConnectConfig::new(service) }).unwrap();
+            trainer.reset(0, ResetRequest::All).unwrap();
+            loop {
+                // An engine that is stopped answers when it is killed or continued.
+                match trainer.receive(0, timeout) {
+                    Err(ServiceError::TimedOut { .. }) => {}
+                    received => {
+                        received.unwrap();
+                        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+                    }
+                }
+            }
+        }
         _ => panic!("unknown role {role}"),
     }
 }

@@ -1,7 +1,7 @@
 """Types of the native module, which the package wraps."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ class TooManyBatchesHeld(BufferError):
 # environment: 0 does not reset, 1 starts the next episode, 2 starts one with the seed.
 Reset = int | tuple[Sequence[int], Sequence[int]]
 Arrays = tuple[NDArray[Any], ...]
+LastRequest = Literal["none", "pending", "played", "not_played", "unknown"]
 SingleArrays = tuple[NDArray[np.uint8], NDArray[np.float32] | None, NDArray[np.float64] | None]
 
 class PoolConfig:
@@ -79,7 +80,8 @@ class Connection:
     def receive(self, group: int | None, timeout: float) -> tuple[int, Arrays]: ...
     def snapshot(self, group: int, env: int, timeout: float) -> bytes: ...
     def restore(self, group: int, env: int, snapshot: bytes, timeout: float) -> None: ...
-    def reconnect(self, timeout: float) -> None: ...
+    def checkpoint(self, timeout: float) -> list[int]: ...
+    def reconnect(self, timeout: float) -> tuple[bool, int, list[tuple[int | None, int | None, LastRequest]]]: ...
 
 def running_engines() -> list[str]: ...
 def segment_prefix() -> str: ...

@@ -5,12 +5,36 @@ Both have the same interface, and raise the same exceptions with the same messag
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
+
+
+class GroupReconnection(NamedTuple):
+    """What `reconnect` found out about a group."""
+
+    #: Batches that the group has returned in the engine that is connected now, counted on from the checkpoint that it resumed
+    #: from; `None` if its status cannot be read.
+    step: int | None
+    #: Batches that it had returned in the engine that ended; `None` if the engine is the same, or if its status cannot be read.
+    lost_step: int | None
+    #: What became of the last request: `none` if there was none, `pending` if `recv` can return its result, `played` if it was
+    #: executed once, `not_played` if never, and `unknown` if the engine ended while it executed it.
+    last_request: _native.LastRequest
+
+
+class Reconnection(NamedTuple):
+    """What `reconnect` found."""
+
+    #: Whether the engine is another run than before. Otherwise the connection and the results that were not received are kept.
+    restarted: bool
+    #: A number that identifies the run of the engine that is connected now.
+    incarnation: int
+    #: By group.
+    groups: list[GroupReconnection]
 
 
 class Backend:
@@ -51,7 +75,11 @@ class Backend:
         """The ground-truth view of one environment of group 0."""
         raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
 
-    def reconnect(self, timeout: float) -> None:
+    def checkpoint(self) -> list[int]:
+        """Save all environments to the engine's checkpoint file."""
+        raise RuntimeError("the environments are in this process; use `snapshot` to save them")
+
+    def reconnect(self, timeout: float) -> Reconnection:
         """Connect to an engine that replaces a lost one."""
         raise RuntimeError("the environments are in this process; there is no engine to reconnect to")
 
@@ -140,8 +168,12 @@ class Remote(Backend):
     def restore(self, group: int, env: int, snapshot: bytes) -> None:
         self._connected().restore(group, env, snapshot, self._timeout)
 
-    def reconnect(self, timeout: float) -> None:
-        self._connected().reconnect(timeout)
+    def checkpoint(self) -> list[int]:
+        return self._connected().checkpoint(self._timeout)
+
+    def reconnect(self, timeout: float) -> Reconnection:
+        restarted, incarnation, groups = self._connected().reconnect(timeout)
+        return Reconnection(restarted, incarnation, [GroupReconnection(*group) for group in groups])
 
     def close(self) -> None:
         self._connection = None

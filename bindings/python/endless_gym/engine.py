@@ -63,7 +63,9 @@ class EngineProcess:
         while True:
             if (status := self._process.poll()) is not None:
                 self._errors.seek(0)
-                message = self._errors.read().decode(errors="replace").strip().removeprefix("endless: ")
+                # Logs may come before the message.
+                text = f"\n{self._errors.read().decode(errors='replace')}"
+                message = text.rpartition("\nendless: ")[2].strip()
                 raise RuntimeError(message or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
                 return connect(self.service, timeout=timeout, copy=copy, engine=self)
@@ -107,6 +109,9 @@ def serve(
     observation: str = "rgb",
     frames: Frames | None = None,
     batches_held: int = 4,
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: float | None = None,
+    resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
 ) -> EndlessVectorEnv:
@@ -129,12 +134,17 @@ def serve(
         observation: As for `make_vec`.
         frames: As for `make_vec`.
         batches_held: Batches of a group whose arrays may be referenced at a time, 1 to 16.
+        checkpoint: File to which the engine saves all environments when it is closed or ended by a signal, and when
+            `EndlessVectorEnv.checkpoint` is called.
+        checkpoint_every: Seconds after which it also saves while it runs.
+        resume: Continue from `checkpoint` if it exists; `EndlessVectorEnv.adopt` returns the observations. Otherwise a file that
+            exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
 
     Raises:
         TypeError: A number is not an integer.
-        ValueError: An argument is out of its range.
+        ValueError: An argument is out of its range; or `checkpoint_every` or `resume` is given without `checkpoint`.
         RuntimeError: The engine cannot start; the message says why.
     """
     given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
@@ -152,6 +162,13 @@ def serve(
     if given.seed_range is not None:
         start, stop, step = given.seed_range
         arguments["--seed-range"] = f"{start}..{stop}:{step}"
+    if checkpoint is None and (checkpoint_every is not None or resume):
+        raise ValueError("checkpoint must name a file if checkpoint_every or resume is given")
+    if checkpoint is not None:
+        arguments["--checkpoint"] = os.fspath(checkpoint)
+    if checkpoint_every is not None:
+        # In whole nanoseconds, as the program reads durations.
+        arguments["--every"] = f"{round(checked_timeout(checkpoint_every) * 1e9)}ns"
     command = [f"{name}={value}" for name, value in arguments.items()]
     command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
     command += ["--features"] if given.features else []
@@ -162,6 +179,7 @@ def serve(
         long = [f"--env-options={json_text(dict(each))}" for each in options]
     if given.seed_list is not None:
         long.append(f"--seed-list={','.join(map(str, given.seed_list))}")
+    command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:
         return engine.connect(timeout, copy)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.arguments import MAX_U64, integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.backends import Backend, InProcess, Remote
+from endless_gym.backends import Backend, InProcess, Reconnection, Remote
 from endless_gym.configuration import MODES, AutoresetMode, Options, checked_arguments, common_options
 from endless_gym.specs import Frames, Spec, options_text, spec
 
@@ -251,18 +251,49 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """
         return self._backend.ground_truth_view(self._env(env))
 
-    def reconnect(self, timeout: float = 30.0) -> None:
-        """Connect to an engine that replaces an engine that has ended. Its environments must then be reset.
+    def adopt(self, group: int = 0) -> tuple[Any, dict[str, Any]]:
+        """The current observations and info of a group, without starting an episode.
+
+        The episodes of an engine that resumed from a checkpoint, or that another trainer left, go on from there.
+
+        Raises:
+            ValueError: There is no such group.
+            RuntimeError: The environments have no episodes yet, or the group's last `send` or `send_reset` has not been received.
+        """
+        return self.restore({}, group)
+
+    def checkpoint(self) -> list[int]:
+        """Save all environments of a served engine to its checkpoint file, and wait until it is on the disk.
+
+        Returns:
+            For each group the number of batches that it had returned; an engine that resumes counts on from there.
+
+        Raises:
+            RuntimeError: The engine has no checkpoint file or cannot write it, the environments are in this process or have no
+                episodes yet, or the last `send` or `send_reset` of group 0 has not been received.
+            TimeoutError: The engine did not answer in time.
+        """
+        return self._backend.checkpoint()
+
+    def reconnect(self, timeout: float = 30.0) -> Reconnection:
+        """Connect to an engine that replaces an engine that has ended. Its environments must then be reset, or
+        adopted (`adopt`) if the engine resumed from a checkpoint.
+
+        If the engine is running, the connection is kept, and so are results that were not received: nothing is played twice, and
+        `recv` returns what was sent.
 
         Args:
             timeout: Seconds to wait for the engine to start.
+
+        Returns:
+            Whether the engine is another run, and for each group its step and what became of the last request.
 
         Raises:
             ConnectionError: There is no such engine, or it already has a trainer.
             RuntimeError: The environments are in this process.
             ValueError: The timeout is negative or not finite.
         """
-        self._backend.reconnect(checked_timeout(timeout))
+        return self._backend.reconnect(checked_timeout(timeout))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Disconnect, and stop the engine if `serve` started it. Arrays remain valid."""

@@ -4,17 +4,22 @@ use std::time::{Duration, Instant};
 
 use endless_gym::batch::Block;
 
-use endless_gym::service::{self, BatchLease, ConnectConfig, Namespace, ServiceError, Trainer};
+use endless_gym::service::{
+    self, BatchLease, ConnectConfig, GroupReconnection, LastRequest, Namespace, ServiceError, Trainer,
+};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 
 use crate::arguments::{self, ActionShape, Reset};
 use crate::arrays::{self, Owner};
-use crate::errors;
+use crate::{errors, logs};
 
 /// Longest time between two runs of Python's signal handlers, among them that of Ctrl-C.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+
+/// The steps of a group in the engine that is connected and in the one that was lost, and what became of the last request.
+type GroupFound = (Option<u64>, Option<u64>, &'static str);
 
 /// The owner of the arrays of one batch in shared memory. The engine writes to the memory again once all arrays are gone.
 #[pyclass(frozen)]
@@ -42,9 +47,11 @@ impl Connection {
     /// Connects to the engine named `service`, and waits up to `timeout` seconds for it to start.
     #[new]
     fn new(py: Python<'_>, service: &str, timeout: f64) -> PyResult<Self> {
+        logs::start(py)?;
         let config = ConnectConfig::new(service);
         let connect = |slice| Trainer::connect(&ConnectConfig { timeout: slice, ..config.clone() });
         let trainer = wait_for_engine(py, timeout, connect)?;
+        logs::flush(py)?;
         let specification = trainer.specification();
         let action_shape = ActionShape::group(&specification.action_space, specification.num_envs);
         Ok(Connection { trainer, action_shape, actions: Vec::new(), process: std::process::id() })
@@ -104,11 +111,30 @@ impl Connection {
         self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
-    /// Connects to an engine of the same name that replaces a lost engine.
-    fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<()> {
+    /// Saves all environments of the engine to its checkpoint file. Returns the step of each group.
+    fn checkpoint(&mut self, py: Python<'_>, timeout: f64) -> PyResult<Vec<u64>> {
+        self.wait(py, timeout, Trainer::checkpoint)
+    }
+
+    /// Connects to an engine of the same name that replaces a lost engine. Returns whether the engine is another one, its
+    /// incarnation, and for each group `(step, lost_step, last_request)`.
+    fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<(bool, u64, Vec<GroupFound>)> {
         self.check_process()?;
+        logs::start(py)?;
         let trainer = &mut self.trainer;
-        wait_for_engine(py, timeout, |slice| trainer.reconnect(slice))
+        let found = wait_for_engine(py, timeout, |slice| trainer.reconnect(slice))?;
+        logs::flush(py)?;
+        let group = |group: GroupReconnection| {
+            let last = match group.last_request {
+                LastRequest::None => "none",
+                LastRequest::Pending => "pending",
+                LastRequest::Played => "played",
+                LastRequest::NotPlayed => "not_played",
+                LastRequest::Unknown => "unknown",
+            };
+            (group.step, group.lost_step, last)
+        };
+        Ok((found.restarted, found.incarnation, found.groups.into_iter().map(group).collect()))
     }
 }
 
@@ -126,11 +152,14 @@ impl Connection {
         loop {
             let slice = timeout.saturating_sub(start.elapsed()).min(SIGNAL_INTERVAL);
             match py.detach(|| answer(trainer, slice)) {
-                Ok(answer) => return Ok(answer),
-                Err(ServiceError::TimedOut { service, .. }) => {
+                Ok(answer) => {
+                    logs::flush(py)?;
+                    return Ok(answer);
+                }
+                Err(ServiceError::TimedOut { service, activity, .. }) => {
                     py.check_signals()?;
                     if start.elapsed() >= timeout {
-                        return Err(errors::service(ServiceError::TimedOut { service, waited: timeout }));
+                        return Err(errors::service(ServiceError::TimedOut { service, waited: timeout, activity }));
                     }
                 }
                 Err(error) => return Err(errors::service(error)),

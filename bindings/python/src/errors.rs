@@ -48,10 +48,14 @@ pub fn service(error: ServiceError) -> PyErr {
         // The messages of a pool in this process.
         E::Rejected { reason: Rejection::NotReset, .. } => NOT_RESET.to_owned(),
         E::Rejected { message, .. } => message.clone(),
+        // The names of Python's methods.
         E::AnswerPending { group } => {
-            format!("group {group} has a pending answer; receive it with `recv` before the next request")
+            format!("group {group} has a pending answer; call `recv` before the next request")
         }
-        E::NothingPending => E::NothingSent { group: 0 }.to_string(),
+        E::NothingSent { .. } | E::NothingPending => {
+            let group = if let E::NothingSent { group } = error { group } else { 0 };
+            format!("nothing was sent to group {group}; call `send`, `send_reset` or `reset` before `recv`")
+        }
         error => error.to_string(),
     };
     match error {
@@ -64,7 +68,7 @@ pub fn service(error: ServiceError) -> PyErr {
         | E::EngineUnreachable { .. }
         | E::TrainerExists { .. }
         | E::TooManyObservers { .. } => PyConnectionError::new_err(text),
-        E::Rejected { reason: Rejection::NotReset, .. } => PyRuntimeError::new_err(text),
+        E::Rejected { reason: Rejection::NotReset | Rejection::Checkpoint, .. } => PyRuntimeError::new_err(text),
         E::TimedOut { .. } | E::NamespaceLocked { .. } => PyTimeoutError::new_err(text),
         E::InvalidName { .. }
         | E::InvalidTimeout { .. }

@@ -9,6 +9,7 @@ mod connection;
 mod dlpack;
 mod ends;
 mod errors;
+mod logs;
 mod pool;
 mod single;
 

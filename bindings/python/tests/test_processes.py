@@ -1,11 +1,14 @@
 """Processes that die, are interrupted, or fork."""
 
+import logging
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -123,12 +126,41 @@ def test_reconnecting_to_an_engine_that_was_started_again() -> None:
     with pytest.raises(endless_gym.EngineLost):
         envs.step(ACTIONS)
     second = engine()
-    envs.reconnect()
+    found = envs.reconnect()
+    assert found.restarted and found.groups[0].step == 0 and found.groups[0].lost_step == 1
+    assert found.groups[0].last_request in ("played", "not_played")
     assert envs.reset(seed=1)[0].shape == (4, 84, 84, 3)
     envs.step(ACTIONS)
     envs.close()
     second.stdin.close()
     assert second.wait(10) == 0
+
+
+def test_an_interrupted_step_is_played_once() -> None:
+    with endless_gym.serve(ID, num_envs=4, seed=1) as envs, endless_gym.make_vec(ID, num_envs=4, seed=1) as twin:
+        envs.reset()
+        twin.reset()
+        engine = endless_gym_process(envs)
+        os.kill(engine, signal.SIGSTOP)
+        interrupt = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+        interrupt.start()
+        with pytest.raises(KeyboardInterrupt):
+            envs.step(ACTIONS)
+        interrupt.join()
+        found = envs.reconnect()
+        assert not found.restarted and found.groups[0] == (1, None, "pending")
+        with pytest.raises(RuntimeError, match="group 0 has a pending answer; call `recv`"):
+            envs.step(ACTIONS)
+        os.kill(engine, signal.SIGCONT)
+        np.testing.assert_array_equal(envs.recv()[0], twin.step(ACTIONS)[0])
+        assert envs.reconnect().groups[0] == (2, None, "played")
+        for _ in range(20):
+            np.testing.assert_array_equal(envs.step(ACTIONS)[0], twin.step(ACTIONS)[0])
+
+
+def endless_gym_process(envs: endless_gym.EndlessVectorEnv) -> int:
+    """The process id of the engine that `serve` started."""
+    return envs._backend._engine.pid
 
 
 def test_the_program_comes_along() -> None:
@@ -291,3 +323,55 @@ os.waitpid(second, 0)
     finally:
         engine.stdin.close()
         assert engine.wait() == 0
+
+
+def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
+    file = tmp_path / "state"
+    settings = {"num_envs": 4, "groups": 2, "seeds": range(50), "seed": 3, "autoreset": "same_step"}
+    twin = endless_gym.make_vec(ID, **settings)
+
+    def step(envs: endless_gym.EndlessVectorEnv) -> None:
+        for group in range(2):
+            for each in (envs, twin):
+                each.send(ACTIONS + 1, group)
+            received, expected = envs.recv(group), twin.recv(group)
+            for given, wanted in zip(received[:4], expected[:4], strict=True):
+                np.testing.assert_array_equal(given, wanted)
+
+    with endless_gym.serve(ID, **settings, checkpoint=file, checkpoint_every=3600.0) as envs:
+        for each in (envs, twin):
+            each.reset()
+        for _ in range(150):
+            step(envs)
+        assert envs.checkpoint() == [151, 151]
+        os.kill(endless_gym_process(envs), signal.SIGKILL)
+    with pytest.raises(RuntimeError, match="state exists; resume from it"):
+        endless_gym.serve(ID, **settings, checkpoint=file)
+    with endless_gym.serve(ID, **settings, checkpoint=file, resume=True) as envs:
+        with pytest.raises(RuntimeError, match="reset all of them first"):
+            envs.snapshot(0)
+        for group in range(2):
+            np.testing.assert_array_equal(envs.adopt(group)[0], twin.adopt(group)[0])
+        for _ in range(50):
+            step(envs)
+    with endless_gym.serve(ID, **settings, checkpoint=file, resume=True) as envs:
+        assert [group.step for group in envs.reconnect().groups] == [202, 202]
+        for group in range(2):
+            envs.adopt(group), twin.adopt(group)
+        step(envs)
+    twin.close()
+    with pytest.raises(ValueError, match="checkpoint must name a file"):
+        endless_gym.serve(ID, resume=True)
+    with endless_gym.serve(ID) as envs, pytest.raises(RuntimeError, match="no checkpoint file"):
+        envs.checkpoint()
+
+
+def test_events_are_logged_by_python(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger="endless_gym"), endless_gym.serve(ID) as envs:
+        envs.reset()
+    assert any("connected to an engine" in record.message for record in caplog.records), caplog.records
+    assert all(record.name == "endless_gym" for record in caplog.records)
+    caplog.clear()
+    with endless_gym.serve(ID) as envs:
+        envs.reset()
+    assert caplog.records == []

@@ -84,7 +84,7 @@ struct Measurement {
 
 /// Runs `endless bench`.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    options::seconds(args.seconds)?;
+    options::seconds("--seconds", args.seconds)?;
     let stop = stop::on_signal()?;
     let specs: Vec<&EnvSpec> = if args.id == "all" { envs::specs().collect() } else { vec![envs::spec(&args.id)?] };
     let cores = Threads::new(0)?.count();

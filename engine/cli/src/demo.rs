@@ -65,7 +65,7 @@ const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 /// Runs `endless demo`.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let spec = envs::spec(&args.id)?;
-    let seconds = options::seconds(args.seconds)?;
+    let seconds = options::seconds("--seconds", args.seconds)?;
     let stop = stop::on_signal()?;
     let num_envs = args.num_envs.unwrap_or(match (spec.family, args.policy) {
         (Family::SearingSpotlights(_), Policy::Expert) => 16,

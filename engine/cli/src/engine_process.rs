@@ -88,6 +88,8 @@ impl EngineProcess {
             if let Some(status) = self.child.try_wait()? {
                 let message = self.stderr.take().and_then(|reader| reader.join().ok()).unwrap_or_default();
                 let message = String::from_utf8_lossy(&message);
+                // Logs may come before the message.
+                let message = message.rsplit_once("\nendless: ").map_or(&*message, |(_, message)| message);
                 let message = message.trim().trim_start_matches("endless: ");
                 return Err(if message.is_empty() {
                     format!("the engine ended: {status}")

@@ -8,11 +8,14 @@ mod failure;
 mod film;
 mod frames;
 mod list;
+mod logs;
+mod metrics;
 mod options;
 mod output;
 mod picture;
 mod play;
 mod serve;
+mod status;
 mod stop;
 mod verify;
 
@@ -29,6 +32,10 @@ use failure::Failure;
 #[derive(Parser)]
 #[command(name = "endless", version, about, max_term_width = 110)]
 struct Cli {
+    /// What to log to standard error: off, error, warn, info, debug, trace, or a filter such as `endless_gym_service=debug`
+    /// [default: the environment variable ENDLESS_GYM_LOG, or warn].
+    #[arg(long, value_name = "LEVEL", global = true)]
+    log: Option<String>,
     #[command(subcommand)]
     command: Option<Command>,
 }
@@ -41,6 +48,8 @@ enum Command {
     Demo(demo::Args),
     /// Serve environments in shared memory until Ctrl-C.
     Serve(serve::Args),
+    /// Show what the running engines are doing, without disturbing them.
+    Status(status::Args),
     /// Measure steps per second, in process and through shared memory.
     ///
     /// Actions are random, and resets are included. Each round measures every method once. The median over the rounds is reported,
@@ -64,7 +73,10 @@ const FAILURE: u8 = 1;
 /// The status is 0 after success; 1 after an error, which is printed to standard error as one line, and if `verify` finds a
 /// difference; 2 if the arguments do not follow the usage. Output that cannot be written is an error, but a closed pipe is not.
 ///
-/// `demo`, `serve` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. Do not run two of them at the
+/// The first call of a process that has no subscriber of `tracing` yet installs one that logs to standard error.
+///
+/// `demo`, `serve` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
+/// stops the command, and a second one ends the process at once. Do not run two of them at the
 /// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
@@ -76,7 +88,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsStrin
         }
     };
     let result = match Cli::try_parse_from(arguments) {
-        Ok(cli) => run(cli.command.unwrap_or_else(|| Command::Demo(demo::Args::default()))),
+        Ok(cli) => run(cli),
         Err(usage) if usage.use_stderr() => {
             // Without standard error, the exit status is the only remaining way to report.
             let _ = usage.print();
@@ -95,11 +107,13 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsStrin
 }
 
 /// Runs one command. Returns false if `verify` found a difference.
-fn run(command: Command) -> Result<bool, Failure> {
-    match command {
+fn run(cli: Cli) -> Result<bool, Failure> {
+    logs::start(cli.log.as_deref())?;
+    match cli.command.unwrap_or_else(|| Command::Demo(demo::Args::default())) {
         Command::List(args) => list::run(&args)?,
         Command::Demo(args) => demo::run(&args)?,
         Command::Serve(args) => serve::run(&args)?,
+        Command::Status(args) => status::run(&args)?,
         Command::Bench(args) => bench::run(&args)?,
         Command::Frames(args) => frames::run(&args)?,
         Command::Verify(args) => return verify::run(&args),

@@ -121,11 +121,11 @@ impl EnvironmentArgs {
     }
 }
 
-/// The duration that `--seconds` gives.
-pub fn seconds(given: f64) -> Result<Duration, Failure> {
+/// The duration that the argument `name` gives in seconds.
+pub fn seconds(name: &str, given: f64) -> Result<Duration, Failure> {
     match Duration::try_from_secs_f64(given) {
         Ok(duration) if given > 0.0 => Ok(duration),
-        _ => Err(format!("--seconds must be finite and positive, got {given}").into()),
+        _ => Err(format!("{name} must be finite and positive, got {given}").into()),
     }
 }
 

@@ -1,6 +1,6 @@
 //! Standard output and standard error: tables and numbers for people, JSON for programs.
 
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, ErrorKind, IsTerminal, Write};
 
 use comfy_table::{ContentArrangement, LineStyle, Table, TableStyle};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -30,6 +30,12 @@ pub fn width() -> u16 {
 pub fn print(text: impl std::fmt::Display) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     check(writeln!(stdout, "{text}").and_then(|()| stdout.flush()))
+}
+
+/// Clears the terminal, if standard output is one.
+pub fn clear() -> Result<(), Failure> {
+    let mut stdout = io::stdout().lock();
+    if stdout.is_terminal() { check(write!(stdout, "\x1b[H\x1b[2J")) } else { Ok(()) }
 }
 
 /// Prints one JSON document to standard output.

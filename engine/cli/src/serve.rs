@@ -1,10 +1,15 @@
 //! `endless serve`.
 
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
 use endless_gym_core::envs::DEFAULT_ENV_ID;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Threads};
-use endless_gym_service::{Engine, EngineConfig, ServiceError};
+use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, Namespace, ServiceError};
 
 use super::failure::Failure;
+use super::metrics::Metrics;
 use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_value};
 use super::output::{grouped, print, print_error};
 use super::stop;
@@ -43,6 +48,18 @@ pub struct Args {
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
+    /// Save all environments to FILE when the engine stops, and when its trainer asks for it.
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Also save while the engine runs, at this interval, such as `30s`, `5m` or `1h 30m`.
+    #[arg(long, value_name = "DURATION", requires = "checkpoint", value_parser = humantime::parse_duration)]
+    every: Option<Duration>,
+    /// Continue from FILE, identically, if it exists. Without this, a FILE that exists is an error.
+    #[arg(long, requires = "checkpoint")]
+    resume: bool,
+    /// Serve metrics for Prometheus at http://ADDRESS/metrics, such as 127.0.0.1:9100; port 0 takes any free port.
+    #[arg(long, value_name = "ADDRESS")]
+    metrics: Option<SocketAddr>,
     /// Print nothing, and stop when standard input closes or gives a byte: for an engine that is a child process. With the id of the
     /// parent process, also stop when that process ends.
     #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
@@ -63,7 +80,14 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         features: args.features,
         ..args.environment.configure(&args.id, args.num_envs)?
     };
-    let config = EngineConfig {
+    let checkpoint = args.checkpoint.as_ref().map(|path| CheckpointConfig {
+        path: path.clone(),
+        every: args.every,
+        resume: args.resume,
+    });
+    let metrics = args.metrics.map(Metrics::bind).transpose()?;
+    let mut config = EngineConfig {
+        checkpoint,
         groups: args.groups,
         batches_held: args.batches_held,
         ..EngineConfig::new(&args.service, pool, Threads::new(args.threads)?)
@@ -76,6 +100,20 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             "serving {} as `{}`: {groups} of {num_envs} environments; stop with Ctrl-C",
             args.id, args.service
         ))?;
+        if let (Some(path), true) = (&args.checkpoint, args.resume) {
+            let steps: Vec<_> = engine.steps().iter().map(u64::to_string).collect();
+            let steps = steps.join(", ");
+            print(match steps.chars().all(|c| "0, ".contains(c)) {
+                true => format!("{} does not exist yet: the environments start anew", path.display()),
+                false => format!("resumed from {} after {steps} batches", path.display()),
+            })?;
+        }
+        if let Some(metrics) = &metrics {
+            print(format_args!("metrics at {}", metrics.url()))?;
+        }
+    }
+    if let Some(metrics) = metrics {
+        metrics.start(Namespace::default(), &args.service)?;
     }
     let summary = loop {
         match engine.run(stop) {
@@ -83,6 +121,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             Err(error @ ServiceError::RootRemoved { .. }) => {
                 print_error(&error);
                 drop(engine);
+                if let Some(checkpoint) = &mut config.checkpoint {
+                    checkpoint.resume = true;
+                }
                 engine = Engine::new(&config)?;
             }
             finished => break finished?,

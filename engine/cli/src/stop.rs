@@ -2,9 +2,9 @@
 
 use std::io::Read;
 use std::os::unix::process::parent_id;
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
 
 use super::failure::Failure;
 
@@ -14,14 +14,44 @@ const PARENT_INTERVAL: Duration = Duration::from_millis(200);
 /// The flag of the running command. A process has one set of signal handlers, so all commands of a process share it.
 static STOP: AtomicBool = AtomicBool::new(false);
 
-/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets. Each call clears it.
+/// When the first signal came since the flag was cleared.
+static FIRST_SIGNAL: Mutex<Option<Instant>> = Mutex::new(None);
+
+/// Signals within this time of the first count as one: a terminal that closes sends several.
+const SAME_SIGNAL: Duration = Duration::from_millis(200);
+
+/// How often a command that waits looks at its flag.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// Exit status of a process that a second signal ended, as of one that SIGINT killed.
+const INTERRUPTED: i32 = 130;
+
+/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets. Each call clears it. A second signal ends the process at once: what
+/// runs does not look at the flag, or takes too long for the user.
 pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     // A second call of `set_handler` is an error.
     static HANDLER: OnceLock<Result<(), String>> = OnceLock::new();
-    let set = || ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed)).map_err(|error| error.to_string());
+    let stop = || {
+        STOP.store(true, Ordering::Relaxed);
+        let mut first = FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner);
+        if first.get_or_insert_with(Instant::now).elapsed() >= SAME_SIGNAL {
+            std::process::exit(INTERRUPTED);
+        }
+    };
+    let set = || ctrlc::set_handler(stop).map_err(|error| error.to_string());
     HANDLER.get_or_init(set).clone()?;
+    *FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner) = None;
     STOP.store(false, Ordering::Relaxed);
     Ok(&STOP)
+}
+
+/// Waits up to `time` for the flag, and returns whether it is set.
+pub fn wait(stop: &AtomicBool, time: Duration) -> bool {
+    let start = Instant::now();
+    while !stop.load(Ordering::Relaxed) && start.elapsed() < time {
+        std::thread::sleep(POLL_INTERVAL.min(time));
+    }
+    stop.load(Ordering::Relaxed)
 }
 
 /// Sets the flag when the parent process asks for it or ends: with a byte on standard input, at its end, or when `parent` is no

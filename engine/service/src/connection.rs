@@ -15,6 +15,7 @@ use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
 use crate::ports::{self, EngineServices, OpenMode, PortError, RequestPublisher, ServiceNames};
 use crate::specification::ServiceSpecification;
+use crate::status_file::{self, StatusReader};
 
 /// Chunks of a request publisher: one that the engine reads, one in its queue, one being written.
 const REQUEST_CHUNKS: usize = 3;
@@ -34,6 +35,8 @@ pub(crate) struct EngineConnection {
     pub to_engine: Notifier<Ipc>,
     pub to_trainer: Listener<Ipc>,
     pub node: Arc<NamespaceNode>,
+    /// The engine's status, also after its end; `None` if it cannot be read.
+    pub status: Option<StatusReader>,
     engine: UniqueNodeId,
 }
 
@@ -61,7 +64,9 @@ impl EngineConnection {
             })?;
         // A valid specification has at least one group.
         let engine = responses[0].engine();
-        Ok((EngineConnection { requests, responses, to_engine, to_trainer, node, engine }, specification))
+        let status = status_file::path(node.prefix(), &specification.service, specification.incarnation);
+        let status = StatusReader::open(&status);
+        Ok((EngineConnection { requests, responses, to_engine, to_trainer, node, status, engine }, specification))
     }
 
     /// Whether the engine's process is running.

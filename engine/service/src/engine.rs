@@ -3,23 +3,28 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{LAYOUT_VERSION, action_layout};
+use endless_gym_core::batch::{Block, LAYOUT_VERSION, action_layout};
 use endless_gym_core::pool::{Pool, PoolError, ResetOptions};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
 use crate::blackboard::{self, PublishedSpecification};
+use crate::checkpoint::CheckpointHead;
+use crate::checkpoint_config::CheckpointError;
+use crate::checkpointer::Checkpointer;
 use crate::descriptors;
 use crate::engine_config::EngineConfig;
-use crate::error::{PACKAGE_VERSION, ServiceError};
-use crate::group::{Group, Outcome, RequestSample, chunk_blocks};
+use crate::engine_summary::EngineSummary;
+use crate::error::{PACKAGE_VERSION, Rejection, ServiceError};
+use crate::group::{Group, Outcome, Rejected, RequestSample, chunk_blocks};
 use crate::lock::NamespaceLock;
 use crate::memory::PrefaultedChunks;
-use crate::message::{ResponseHeader, copied};
+use crate::message::{RequestKind, ResponseHeader, copied};
 use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
 use crate::ports::{self, EngineServices, OpenMode, ServiceNames};
 use crate::specification::ServiceSpecification;
+use crate::status_writer::StatusWriter;
 use crate::wait::wait;
 
 /// How long an idle engine parks at most, which is also how long it takes to notice its stop flag.
@@ -39,21 +44,6 @@ const START_PATIENCE: Duration = Duration::from_secs(30);
 
 /// How often an engine tries to start whose files are removed meanwhile.
 const START_ATTEMPTS: usize = 3;
-
-/// What an engine has done.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct EngineSummary {
-    /// Batches sent, including those of resets.
-    pub batches: u64,
-    /// Steps, summed over the environments.
-    pub env_steps: u64,
-    /// Requests that were rejected.
-    pub rejected: u64,
-    /// Requests for an earlier incarnation, which were ignored.
-    pub dropped: u64,
-    /// Batches that no process received.
-    pub undelivered: u64,
-}
 
 /// Serves groups of environments to a trainer and to observers in other processes.
 ///
@@ -102,7 +92,8 @@ pub struct Engine {
     to_trainer: Notifier<Ipc>,
     to_engine: Listener<Ipc>,
     specification: ServiceSpecification,
-    summary: EngineSummary,
+    status: StatusWriter,
+    checkpointer: Option<Checkpointer>,
     node: NamespaceNode,
 }
 
@@ -118,7 +109,8 @@ impl Engine {
     /// there are too few file descriptors, [`ServiceError::Version`] if an engine of another version has the name,
     /// [`ServiceError::ForeignSegment`] if another user has taken the namespace's segments, [`ServiceError::EngineUnreachable`] if
     /// the engine's files are removed while it starts, [`ServiceError::NamespaceLocked`] if another process holds the namespace's
-    /// lock for too long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
+    /// lock for too long, [`ServiceError::Checkpoint`] for a checkpoint that exists, cannot be written, or cannot be resumed from,
+    /// and [`ServiceError::Middleware`] for other errors of iceoryx2.
     pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
         let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
@@ -145,6 +137,8 @@ impl Engine {
     /// Creates the engine's services and publishes them.
     fn start(config: &EngineConfig, node: NamespaceNode, pools: Vec<Pool>) -> Result<Self, ServiceError> {
         let specification = specify(config, &pools[0])?;
+        let head = CheckpointHead::new(config, &specification);
+        let checkpointer = config.checkpoint.as_ref().map(|config| Checkpointer::new(config, head)).transpose()?;
         let limits = specification.lease_limits();
         let blocks = chunk_blocks(&specification.batch);
         PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
@@ -154,19 +148,24 @@ impl Engine {
         let creating = node.creating()?;
         let to_engine = ports::listener(&services.events("to_engine", config.groups)?)?;
         let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?)?;
-        let groups = pools
+        let mut groups: Vec<_> = pools
             .into_iter()
             .enumerate()
             .map(|(group, pool)| Group::new(&services, group, pool, limits))
             .collect::<Result<_, _>>()?;
+        let mut status = StatusWriter::create(node.prefix(), &specification)?;
         drop(creating);
+        if let Some(checkpointer) = &checkpointer {
+            checkpointer.resume(&mut groups, &mut status)?;
+        }
         // Last: a process that finds the specification expects all other services.
         let (lock, published) = blackboard::publish(&node, &specification)?;
         let found = Self::check_published(&node, &specification, &lock);
         drop(lock);
         found?;
-        let summary = EngineSummary::default();
-        Ok(Engine { groups, to_trainer, to_engine, specification, summary, _published: published, node })
+        let (service, process) = (&*specification.service, specification.engine_pid);
+        tracing::info!(service, process, id = &*specification.id, groups = specification.groups, "engine started");
+        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, _published: published, node })
     }
 
     /// Fails unless a trainer could find the engine and all of its services.
@@ -195,13 +194,19 @@ impl Engine {
         &self.specification
     }
 
-    /// Serves requests until `stop` is set. Returns within a tenth of a second after that.
+    /// Batches that each group has returned, counted on from the checkpoint that the engine resumed from.
+    pub fn steps(&self) -> Vec<u64> {
+        (0..self.groups.len()).map(|group| self.status.step(group)).collect()
+    }
+
+    /// Serves requests until `stop` is set. Returns within a tenth of a second after that, or when the last checkpoint is saved.
     ///
     /// # Errors
     ///
     /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, so that no trainer finds the engine
     /// any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
-    /// are no errors: its requests are rejected.
+    /// are no errors: its requests are rejected. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; an earlier
+    /// one that cannot is logged, and tried again later.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
         let (mut last_check, mut last_refresh) = (Instant::now(), Instant::now());
@@ -234,13 +239,24 @@ impl Engine {
                     last_request = Instant::now();
                 }
                 None if last_cleanup.elapsed() >= CLEANUP_INTERVAL => {
-                    self.node.remove_dead_nodes();
+                    let removed = self.node.remove_dead_nodes() as u64;
+                    if removed > 0 {
+                        self.status.update_engine(|engine| engine.recoveries += removed);
+                    }
                     last_cleanup = Instant::now();
                 }
                 None => {}
             }
+            if let Some(checkpointer) = &mut self.checkpointer {
+                checkpointer.poll(&self.groups, &mut self.status);
+            }
         }
-        Ok(self.summary)
+        if let Some(checkpointer) = &mut self.checkpointer {
+            checkpointer.stop(&self.groups, &mut self.status)?;
+        }
+        let summary = self.status.summary();
+        tracing::info!(service = &*self.specification.service, batches = summary.batches, "engine stopped");
+        Ok(summary)
     }
 
     /// Executes a request and sends the response.
@@ -248,8 +264,11 @@ impl Engine {
         let request = copied(sample.user_header());
         if request.layout_version == LAYOUT_VERSION && request.incarnation != self.specification.incarnation {
             tracing::debug!(group = number, "dropped a request for an earlier incarnation");
-            self.summary.dropped += 1;
+            self.status.update_engine(|engine| engine.dropped += 1);
             return Ok(());
+        }
+        if self.status.begin(number, &request) {
+            tracing::info!(group = number, process = request.process, "a trainer sends its first request");
         }
         let group = &mut self.groups[number];
         let read = group.read(&self.specification.action, &request, bytemuck::cast_slice(sample.payload()));
@@ -263,33 +282,62 @@ impl Engine {
         // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
         // memory, and a recycled chunk holds an earlier response.
         let mut batch = unsafe { batch.assume_init() };
+        let read_kind = read.as_ref().ok().copied();
         let outcome =
             read.and_then(|kind| group.execute(kind, &request, bytemuck::cast_slice_mut(batch.payload_mut())));
-        let step = group.step + u64::from(matches!(outcome, Ok(Outcome::Batch { .. })));
+        let outcome = match read_kind {
+            Some(RequestKind::Checkpoint) => {
+                outcome.and_then(|_| self.save(bytemuck::cast_slice_mut(batch.payload_mut())))
+            }
+            _ => outcome,
+        };
+        if let (Ok(_), Some(checkpointer)) = (&outcome, &mut self.checkpointer)
+            && !matches!(read_kind, Some(RequestKind::Snapshot | RequestKind::Checkpoint))
+        {
+            checkpointer.mark_changed();
+        }
+        let step = self.status.step(number) + u64::from(matches!(outcome, Ok(Outcome::Batch { .. })));
+        let text = match &outcome {
+            Err((_, message)) => {
+                self.groups[number].write_rejection(bytemuck::cast_slice_mut(batch.payload_mut()), message)
+            }
+            Ok(_) => 0,
+        };
         let header = batch.user_header_mut();
         *header = ResponseHeader::answering(&request, number, self.specification.incarnation, step);
         match &outcome {
             Ok(Outcome::Batch { .. }) => {}
             Ok(Outcome::Snapshot { bytes }) => header.set_snapshot(*bytes),
-            Err((reason, message)) => header.set_rejection(*reason, message),
+            Err((reason, _)) => header.set_rejection(*reason, text),
         }
+        // Before the response, so that a trainer that has received it reads a status that includes it.
+        self.status.end(number, step, outcome.as_ref().ok());
         // A trainer that dies at this moment must not end the engine.
         let receivers = batch.send().unwrap_or_else(|e| {
             tracing::warn!(error = %e, group = number, "cannot deliver a response");
             0
         });
         ports::notify(&self.to_trainer, number);
-        group.step = step;
-        match outcome {
-            Ok(Outcome::Batch { env_steps }) => {
-                self.summary.undelivered += u64::from(receivers == 0);
-                self.summary.batches += 1;
-                self.summary.env_steps += env_steps as u64;
-            }
-            Ok(Outcome::Snapshot { .. }) => {}
-            Err(_) => self.summary.rejected += 1,
+        if receivers == 0 && matches!(outcome, Ok(Outcome::Batch { .. })) {
+            self.status.update_group(number, |group| group.undelivered += 1);
         }
         Ok(())
+    }
+}
+
+impl Engine {
+    /// Saves a checkpoint and writes the steps of the groups into the payload of the response.
+    fn save(&mut self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
+        let rejected = |e: CheckpointError| match e {
+            CheckpointError::NotReset => (Rejection::NotReset, e.to_string()),
+            e => (Rejection::Checkpoint, e.to_string()),
+        };
+        let checkpointer = self.checkpointer.as_mut().ok_or_else(|| rejected(CheckpointError::NoFile))?;
+        checkpointer.save(&self.groups, &mut self.status).map_err(rejected)?;
+        let steps = self.steps();
+        self.groups[0].forget_frames(payload);
+        bytemuck::cast_slice_mut(payload)[..steps.len()].copy_from_slice(&steps);
+        Ok(Outcome::Snapshot { bytes: size_of_val(&*steps) })
     }
 }
 

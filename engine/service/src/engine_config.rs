@@ -2,6 +2,7 @@
 
 use endless_gym_core::pool::{MAX_ENVS, PoolConfig, PoolError, ResetOptions, Threads};
 
+use crate::checkpoint_config::CheckpointConfig;
 use crate::error::ServiceError;
 use crate::namespace::{Namespace, check_name};
 
@@ -34,10 +35,12 @@ pub struct EngineConfig {
     pub batches_held: usize,
     /// Observers of a group that may be connected at a time, 0 to 16. They use memory only while they are connected.
     pub observers: usize,
+    /// The file to which the engine saves its environments, and from which it may continue; `None` for none.
+    pub checkpoint: Option<CheckpointConfig>,
 }
 
 impl EngineConfig {
-    /// One group in the default namespace, with `batches_held` and `observers` of 3.
+    /// One group in the default namespace, with `batches_held` and `observers` of 3, without a checkpoint.
     pub fn new(service: &str, pool: PoolConfig, threads: Threads) -> Self {
         EngineConfig {
             service: service.to_owned(),
@@ -47,6 +50,7 @@ impl EngineConfig {
             threads,
             batches_held: 3,
             observers: 3,
+            checkpoint: None,
         }
     }
 

@@ -8,6 +8,8 @@ use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::PoolError;
 use thiserror::Error;
 
+use crate::activity::EngineActivity;
+use crate::checkpoint_config::CheckpointError;
 use crate::process::LockHolder;
 
 /// Version of this package, for messages about versions that differ.
@@ -252,12 +254,14 @@ pub enum ServiceError {
         limit: usize,
     },
     /// No answer has arrived in time from an engine that is running.
-    #[error("no answer from engine `{service}` within {waited:?}; the engine is running, use a longer timeout")]
+    #[error("no answer from engine `{service}` within {waited:?}; {activity}")]
     TimedOut {
         /// The engine's name.
         service: String,
         /// How long the caller waited.
         waited: Duration,
+        /// What the engine is doing.
+        activity: EngineActivity,
     },
     /// The engine's process has ended.
     #[error("engine `{service}`{} has ended; start it again and reconnect", in_process(Some(*pid)))]
@@ -296,6 +300,9 @@ pub enum ServiceError {
     /// The environments could not be created.
     #[error(transparent)]
     Pool(#[from] PoolError),
+    /// The environments could not be saved, or not continued from a checkpoint.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
     /// An unexpected error of iceoryx2.
     #[error("{action}: {reason}")]
     Middleware {
@@ -336,10 +343,12 @@ pub enum Rejection {
     Options,
     /// A snapshot cannot be taken or restored.
     Snapshot,
+    /// The checkpoint cannot be saved.
+    Checkpoint,
 }
 
 impl Rejection {
-    const ALL: [Rejection; 7] = [
+    const ALL: [Rejection; 8] = [
         Rejection::Version,
         Rejection::Kind,
         Rejection::Payload,
@@ -347,6 +356,7 @@ impl Rejection {
         Rejection::Pool,
         Rejection::Options,
         Rejection::Snapshot,
+        Rejection::Checkpoint,
     ];
 
     /// The status in a response header. 0 is the status of a batch.

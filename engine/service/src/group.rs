@@ -1,14 +1,16 @@
 //! One group of an engine: its pool, its ports, and how it executes requests.
 
-use endless_gym_core::batch::{ActionLayout, ActionSection, Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for};
-use endless_gym_core::pool::{Pool, ResetRequest};
+use endless_gym_core::batch::{
+    ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for,
+};
+use endless_gym_core::pool::{Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError};
 use iceoryx2::port::ReceiveError;
 use iceoryx2::sample::Sample;
 use serde_json::{Map, Value as Json};
 
 use crate::error::{Rejection, ServiceError};
 use crate::memory::PrefaultedChunks;
-use crate::message::{PayloadBlock, RequestHeader, RequestKind};
+use crate::message::{PayloadBlock, RequestHeader, RequestKind, write_text};
 use crate::namespace::Ipc;
 use crate::ports::{self, EngineServices, LeaseLimits, PortError, RequestSubscriber, ResponsePublisher};
 
@@ -20,7 +22,7 @@ pub(crate) type Rejected = (Rejection, String);
 
 /// What the response to a request holds.
 pub(crate) enum Outcome {
-    Batch { env_steps: usize },
+    Batch { env_steps: usize, episodes: usize },
     Snapshot { bytes: usize },
 }
 
@@ -33,8 +35,6 @@ pub(crate) struct Group {
     request: RequestData,
     /// The trainer that last reset all environments.
     trainer: Option<u64>,
-    /// Batches returned so far.
-    pub step: u64,
 }
 
 impl Group {
@@ -58,7 +58,7 @@ impl Group {
                 ServiceError::middleware("cannot create a publisher")("it exists already".to_owned())
             }
         })?;
-        Ok(Group { pool, requests, responses, memory, request: RequestData::default(), trainer: None, step: 0 })
+        Ok(Group { pool, requests, responses, memory, request: RequestData::default(), trainer: None })
     }
 
     /// The next request, if there is one.
@@ -81,13 +81,17 @@ impl Group {
         payload: &[Block],
     ) -> Result<RequestKind, Rejected> {
         let kind = self.request.read(layout, header, payload)?;
-        let resets_all = match kind {
+        // A new trainer must not step the episodes of another one by mistake. It may adopt them, by a reset of no environment.
+        let is_allowed = match kind {
             RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore => false,
-            RequestKind::ResetEach => !self.request.reset.contains(&0),
-            RequestKind::ResetAll | RequestKind::ResetSeed => true,
+            RequestKind::ResetEach => {
+                let count = self.request.reset.iter().filter(|flag| **flag != 0).count();
+                count == 0 || count == self.request.reset.len()
+            }
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Checkpoint => true,
         };
-        if !resets_all && self.trainer != Some(header.trainer) {
-            let text = "this trainer must reset all environments of the group first";
+        if !is_allowed && self.trainer != Some(header.trainer) {
+            let text = "this trainer must reset all environments of the group first, or none to adopt their episodes";
             return Err((Rejection::NotReset, text.to_owned()));
         }
         Ok(kind)
@@ -114,10 +118,43 @@ impl Group {
             RequestKind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
             RequestKind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
             RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each { reset, seed }, options, batch),
+            // The engine executes it.
+            RequestKind::Checkpoint => return Ok(Outcome::Snapshot { bytes: 0 }),
         };
-        done.map_err(|e| (Rejection::Pool, e.to_string()))?;
+        done.map_err(|e| match e {
+            PoolError::NotReset => (Rejection::NotReset, e.to_string()),
+            e => (Rejection::Pool, e.to_string()),
+        })?;
         self.trainer = Some(header.trainer);
-        Ok(Outcome::Batch { env_steps: if kind == RequestKind::Step { self.pool.layout().num_envs() } else { 0 } })
+        let (env_steps, episodes) = match kind {
+            RequestKind::Step => {
+                let terminated = Batch::new(self.pool.layout(), batch).terminated();
+                (terminated.len(), terminated.iter().map(|flag| usize::from(*flag)).sum())
+            }
+            _ => (0, 0),
+        };
+        Ok(Outcome::Batch { env_steps, episodes })
+    }
+
+    /// The states of the environments; `None` before the first reset.
+    pub(crate) fn save(&self) -> Result<Option<Vec<SavedEnv>>, SnapshotError> {
+        self.pool.save()
+    }
+
+    /// Continues from these states.
+    pub(crate) fn resume(&mut self, saved: &[SavedEnv]) -> Result<(), ResumeError> {
+        self.pool.resume(saved)
+    }
+
+    /// Prepares `payload` for other content than a batch.
+    pub(crate) fn forget_frames(&self, payload: &mut [Block]) {
+        self.pool.layout().forget_frames(payload);
+    }
+
+    /// Writes the explanation of a rejection over the batch in `payload`, and returns its length in bytes.
+    pub(crate) fn write_rejection(&self, payload: &mut [Block], text: &str) -> usize {
+        self.forget_frames(payload);
+        write_text(payload, text)
     }
 
     /// Writes a snapshot of an environment over the batch in `payload`.
@@ -160,7 +197,7 @@ impl RequestData {
             return Err((Rejection::Version, text));
         }
         let Some(kind) = RequestKind::from_code(header.kind) else {
-            return Err((Rejection::Kind, format!("request kind must be 1 to 6, got {}", header.kind)));
+            return Err((Rejection::Kind, format!("request kind must be 1 to 7, got {}", header.kind)));
         };
         if payload.len() < layout.blocks() {
             let text = format!("payload must have {} blocks of 64 bytes, got {}", layout.blocks(), payload.len());
@@ -175,7 +212,7 @@ impl RequestData {
             RequestKind::Restore => {
                 copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes));
             }
-            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot => {}
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot | RequestKind::Checkpoint => {}
         }
         self.options = match kind {
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::ResetEach if header.bytes > 0 => {

@@ -42,6 +42,11 @@ impl Identity {
         }
     }
 
+    /// The namespace's identity, if any process uses the namespace. Creates nothing.
+    pub(crate) fn existing(namespace: &Namespace) -> Option<Self> {
+        read(namespace.root()).ok().flatten()
+    }
+
     /// Gives the namespace a new prefix.
     fn create(namespace: &Namespace, _lock: &NamespaceLock) -> io::Result<Self> {
         let path = namespace.root().join(FILE);

@@ -11,7 +11,7 @@ use iceoryx2::sample::Sample;
 
 use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
-use crate::message::{PayloadBlock, ResponseContent, ResponseHeader, copied};
+use crate::message::{PayloadBlock, ResponseContent, ResponseHeader, copied, read_text};
 use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
 use crate::ports::{self, EngineServices, ResponseSubscriber};
@@ -120,7 +120,8 @@ impl Response {
     /// Turns a rejection into an error.
     pub(crate) fn check_accepted(self) -> Result<Self, ServiceError> {
         match self.content {
-            ResponseContent::Rejection { reason, message } => {
+            ResponseContent::Rejection { reason, bytes } => {
+                let message = read_text(self.lease.blocks(), bytes);
                 let (service, group) = (self.lease.specification.service.clone(), self.lease.group);
                 Err(ServiceError::Rejected { service, group, reason, message })
             }

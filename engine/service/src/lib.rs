@@ -23,8 +23,8 @@
 //!
 //! | header | fields |
 //! | --- | --- |
-//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore), incarnation, trainer, request number, seed, environment, length of the options or snapshot |
-//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, text of a rejection, length of a snapshot |
+//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore, checkpoint), incarnation, trainer, request number, seed, environment, length of the options or snapshot, process id of the trainer, batches held |
+//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of a snapshot or of the text of a rejection |
 //!
 //! # Protocol
 //!
@@ -33,13 +33,15 @@
 //! | the engine receives a request | it sends exactly one response of the same group: a batch, a snapshot or a rejection; a rejected request changes no environment |
 //! | the trainer requests a snapshot or a restore | the response holds a snapshot or nothing in place of a batch; observers skip it, and may miss the batch before it |
 //! | a group has a pending answer | the trainer must receive it before its next request to this group; other groups are independent |
-//! | a new trainer connects | it must reset all environments of a group before it steps them |
+//! | a new trainer connects | it must reset all environments of a group before it steps them, or adopt their episodes by a reset of none ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each) with flags of 0), which returns the current batch |
+//! | the engine has a checkpoint file | it saves all environments periodically, when it stops, and when the trainer asks for it; a new engine continues from there identically |
 //! | a second trainer connects | it is refused, because `act` accepts one publisher |
 //! | a trainer dies | the engine removes its resources when idle, or the next trainer does when it connects |
 //! | an engine dies or ends | the liveness check of its trainer and its observers reports it; a trainer may reconnect to a new engine |
 //! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
 //! | an observer holds batches | it has reserved their memory in the engine's segment when it connected, or was refused; engine and trainer have reserved theirs when the engine started |
 //! | a request names another incarnation | the engine ignores it |
+//! | any process wants to know what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects nobody |
 //! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |
 //!
 //! # Faults of the surroundings
@@ -54,18 +56,45 @@
 //! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix, otherwise [`ServiceError::ForeignSegment`]; no segment that stays is accessible to other users |
 //! | a process forks | liveness is that of the process that connected; a child that it forked neither keeps it alive nor releases what it holds |
 //! | an engine's files are removed while it starts | it checks after publishing that it can be found, starts again up to twice, and then ends with [`ServiceError::EngineUnreachable`] |
+//!
+//! # How often a request is executed
+//!
+//! A request steps or resets a group, restores an environment, or takes a snapshot. The trainer numbers its requests, the engine
+//! numbers the batches of a group ([`BatchLease::step`]), and its status says which request it has taken, answered and executed.
+//! An engine executes each request that it takes once and sends one response; no message is repeated.
+//!
+//! | call | failure | the request was executed | what to do |
+//! | --- | --- | --- | --- |
+//! | `send`, `reset` | any error | never | |
+//! | `receive`, `snapshot`, `restore` | [`ServiceError::Rejected`] | never | |
+//! | | [`ServiceError::TimedOut`], a signal, an exception in Python | once, as long as the engine lives | call again; the answer stays pending |
+//! | | [`ServiceError::TooManyBatchesHeld`] | once | drop a lease, call again |
+//! | | [`ServiceError::EngineLost`], [`ServiceError::EngineRestarted`] | as [`reconnect`](Trainer::reconnect) says | reconnect |
+//! | `snapshot`, `restore` | another request follows a [`ServiceError::TimedOut`] | once, before that request | |
+//! | `reconnect` | the engine is the same | [`LastRequest::Pending`]: once | receive the pending answers, and go on |
+//! | | the engine is another run | [`LastRequest::Played`]: once; [`LastRequest::NotPlayed`]: never; [`LastRequest::Unknown`]: cannot be known | reset; or go on from the new engine's [`step`](GroupReconnection::step), if it resumed from a checkpoint |
+//! | drop of the trainer, its death | a request without an answer | once or never; the status's [`step`](GroupStatus::step) tells | the next trainer must reset or adopt the environments |
+//!
+//! The state of the environments ends with their engine. Whatever a dead engine executed after its last checkpoint is lost; the
+//! step number in which a resumed engine goes on says what to repeat.
 
+mod activity;
 mod blackboard;
+mod checkpoint;
+mod checkpoint_config;
+mod checkpointer;
 mod cleanup;
 mod connect;
 mod connection;
 mod descriptors;
 mod engine;
 mod engine_config;
+mod engine_summary;
 mod error;
 mod fork_guard;
 mod group;
 mod identity;
+mod inspect;
 mod lease;
 mod lock;
 mod memory;
@@ -76,19 +105,30 @@ mod observer;
 mod pending;
 mod ports;
 mod process;
+mod reconnection;
 mod reservation;
 mod specification;
+mod status;
+mod status_file;
+mod status_record;
+mod status_writer;
 mod trainer;
 mod wait;
 
+pub use activity::EngineActivity;
 pub use blackboard::running_engines;
+pub use checkpoint_config::{CHECKPOINT_VERSION, CheckpointConfig, CheckpointError};
 pub use connect::{ConnectConfig, timeout_from_seconds};
-pub use engine::{Engine, EngineSummary};
+pub use engine::Engine;
 pub use engine_config::{EngineConfig, MAX_BATCHES_HELD, MAX_GROUPS};
+pub use engine_summary::EngineSummary;
 pub use error::{Rejection, ServiceError};
+pub use inspect::EngineProcesses;
 pub use lease::BatchLease;
 pub use namespace::{Namespace, ROOT_VARIABLE};
 pub use observer::Observer;
 pub use process::LockHolder;
+pub use reconnection::{GroupReconnection, LastRequest, Reconnection};
 pub use specification::ServiceSpecification;
+pub use status::{EngineStatus, GroupStatus};
 pub use trainer::Trainer;

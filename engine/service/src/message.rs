@@ -43,21 +43,35 @@ pub(crate) enum RequestKind {
     Snapshot,
     /// Restore environment `env` from the payload's `snapshot`.
     Restore,
+    /// Save all groups to the engine's checkpoint file and return their steps.
+    Checkpoint,
 }
 
 impl RequestKind {
-    const ALL: [RequestKind; 6] = [
+    const ALL: [RequestKind; 7] = [
         RequestKind::Step,
         RequestKind::ResetAll,
         RequestKind::ResetSeed,
         RequestKind::ResetEach,
         RequestKind::Snapshot,
         RequestKind::Restore,
+        RequestKind::Checkpoint,
     ];
 
     /// The code in the header. 0 is not a code.
     pub(crate) fn code(self) -> u32 {
         self as u32 + 1
+    }
+
+    /// The kind in a word, for people.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            RequestKind::Step => "step",
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::ResetEach => "reset",
+            RequestKind::Snapshot => "snapshot",
+            RequestKind::Restore => "restore",
+            RequestKind::Checkpoint => "checkpoint",
+        }
     }
 
     /// The kind with that code.
@@ -67,7 +81,7 @@ impl RequestKind {
 
     /// Whether the response holds a batch and not a snapshot.
     pub(crate) fn returns_batch(self) -> bool {
-        !matches!(self, RequestKind::Snapshot | RequestKind::Restore)
+        !matches!(self, RequestKind::Snapshot | RequestKind::Restore | RequestKind::Checkpoint)
     }
 }
 
@@ -91,10 +105,11 @@ pub(crate) struct RequestHeader {
     pub env: u64,
     /// Length in bytes of the payload's `options` (JSON text of a reset; 0: keep the reset parameters) or `snapshot`.
     pub bytes: u64,
+    /// Process id of the trainer, for people.
+    pub process: u32,
+    /// Batches of the group that the trainer holds, for people.
+    pub held: u32,
 }
-
-/// Capacity in bytes of the text in a [`ResponseHeader`].
-const TEXT_BYTES: usize = 192;
 
 /// Status of a response that holds a batch.
 const BATCH: u32 = 0;
@@ -103,16 +118,17 @@ const BATCH: u32 = 0;
 const SNAPSHOT: u32 = u32::MAX;
 
 /// What a response holds.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseContent {
     Batch,
     /// A snapshot of that many bytes; 0 bytes in the response to a [`RequestKind::Restore`].
     Snapshot {
         bytes: usize,
     },
+    /// The explanation is that many bytes of text at the start of the payload.
     Rejection {
         reason: Rejection,
-        message: String,
+        bytes: usize,
     },
 }
 
@@ -129,12 +145,11 @@ pub(crate) struct ResponseHeader {
     /// The trainer and the number of the request that this message answers.
     pub trainer: u64,
     pub request: u64,
-    /// [`BATCH`], [`SNAPSHOT`] or the status of a [`Rejection`], whose payload is undefined.
+    /// Length in bytes of the snapshot, or of the text of a rejection.
+    bytes: u64,
+    /// [`BATCH`], [`SNAPSHOT`] or the status of a [`Rejection`].
     status: u32,
-    text_length: u32,
-    text: [u8; TEXT_BYTES],
-    /// Length of the snapshot in bytes.
-    snapshot: u64,
+    padding: u32,
 }
 
 impl Default for ResponseHeader {
@@ -146,10 +161,9 @@ impl Default for ResponseHeader {
             step: 0,
             trainer: 0,
             request: 0,
+            bytes: 0,
             status: BATCH,
-            text_length: 0,
-            text: [0; TEXT_BYTES],
-            snapshot: 0,
+            padding: 0,
         }
     }
 }
@@ -163,35 +177,47 @@ impl ResponseHeader {
 
     /// Turns the response into a snapshot of that many bytes.
     pub(crate) fn set_snapshot(&mut self, bytes: usize) {
-        (self.status, self.snapshot) = (SNAPSHOT, bytes as u64);
+        (self.status, self.bytes) = (SNAPSHOT, bytes as u64);
     }
 
-    /// Turns the response into a rejection. The message is cut at the capacity of the header.
-    pub(crate) fn set_rejection(&mut self, reason: Rejection, message: &str) {
-        let longest = message.len().min(TEXT_BYTES);
-        let end = (0..=longest).rev().find(|end| message.is_char_boundary(*end)).unwrap_or(0);
-        self.status = reason.status();
-        self.text_length = end as u32;
-        self.text[..end].copy_from_slice(&message.as_bytes()[..end]);
+    /// Turns the response into a rejection whose explanation has that many bytes.
+    pub(crate) fn set_rejection(&mut self, reason: Rejection, bytes: usize) {
+        (self.status, self.bytes) = (reason.status(), bytes as u64);
     }
 
-    /// What the response holds. Does not allocate for a batch.
+    /// What the response holds.
     pub(crate) fn content(&self) -> ResponseContent {
+        let bytes = usize::try_from(self.bytes).unwrap_or(usize::MAX);
         match self.status {
             BATCH => ResponseContent::Batch,
-            SNAPSHOT => ResponseContent::Snapshot { bytes: usize::try_from(self.snapshot).unwrap_or(usize::MAX) },
+            SNAPSHOT => ResponseContent::Snapshot { bytes },
             status => {
-                let text = self.text.get(..self.text_length as usize).unwrap_or_default();
-                let message = String::from_utf8_lossy(text).into_owned();
-                let reason = Rejection::from_status(status).unwrap_or(Rejection::Kind);
-                ResponseContent::Rejection { reason, message }
+                ResponseContent::Rejection { reason: Rejection::from_status(status).unwrap_or(Rejection::Kind), bytes }
             }
         }
     }
 }
 
+/// Writes the explanation of a rejection into the payload of a response, cut between characters if it does not fit, and returns its
+/// length in bytes.
+pub(crate) fn write_text(payload: &mut [Block], text: &str) -> usize {
+    let memory: &mut [u8] = bytemuck::cast_slice_mut(payload);
+    let longest = text.len().min(memory.len());
+    let end = (0..=longest).rev().find(|end| text.is_char_boundary(*end)).unwrap_or(0);
+    memory[..end].copy_from_slice(&text.as_bytes()[..end]);
+    end
+}
+
+/// The explanation of a rejection; empty if its length is beyond the payload.
+pub(crate) fn read_text(payload: &[Block], bytes: usize) -> String {
+    let memory: &[u8] = bytemuck::cast_slice(payload);
+    String::from_utf8_lossy(memory.get(..bytes).unwrap_or_default()).into_owned()
+}
+
 #[cfg(test)]
 mod tests {
+    use endless_gym_core::batch::zeroed;
+
     use super::*;
 
     #[test]
@@ -203,13 +229,18 @@ mod tests {
     }
 
     #[test]
-    fn the_message_of_a_rejection_is_cut_between_characters() {
-        let rejection = |message: &str| ResponseContent::Rejection { reason: Rejection::Pool, message: message.into() };
-        let mut header = ResponseHeader::default();
-        assert_eq!(header.content(), ResponseContent::Batch);
-        header.set_rejection(Rejection::Pool, &"ä".repeat(200));
-        assert_eq!(header.content(), rejection(&"ä".repeat(TEXT_BYTES / 2)));
-        header.text_length = u32::MAX;
-        assert_eq!(header.content(), rejection(""));
+    fn the_text_of_a_rejection_is_cut_between_characters_at_the_end_of_the_payload() {
+        let mut payload = zeroed(3);
+        for (given, kept) in [
+            ("ab", "ab"),
+            ("", ""),
+            (&"ä".repeat(200), &*"ä".repeat(96)),
+            (&format!("x{}", "ä".repeat(200)), &format!("x{}", "ä".repeat(95))),
+        ] {
+            let bytes = write_text(&mut payload, given);
+            assert_eq!(read_text(&payload, bytes), kept);
+        }
+        assert_eq!(read_text(&payload, 193), "");
+        assert_eq!(read_text(&payload, usize::MAX), "");
     }
 }

@@ -23,6 +23,7 @@ use crate::lock::{LOCK_TIMEOUT, NamespaceLock};
 use crate::memory;
 use crate::namespace::{Ipc, Namespace};
 use crate::process;
+use crate::status_file;
 
 /// How often a process tries to join a namespace whose directory is removed meanwhile.
 const JOIN_ATTEMPTS: usize = 5;
@@ -61,6 +62,7 @@ impl NamespaceNode {
         memory::check_free(memory::NODE_BYTES)?;
         descriptors::reserve(descriptors::NODE)?;
         let (identity, config) = own_identity(namespace, lock)?;
+        status_file::remove_abandoned(namespace.prefix());
         cleanup::remove_counter(&config, lock)?;
         let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled).create();
         cleanup::remove_counter(&config, lock)?;
@@ -81,6 +83,11 @@ impl NamespaceNode {
         let lock = NamespaceLock::acquire_within(&self.root, timeout)?;
         self.identity.check()?;
         Ok(lock)
+    }
+
+    /// The prefix of the names of the namespace's files in shared memory.
+    pub(crate) fn prefix(&self) -> &str {
+        self.identity.prefix()
     }
 
     /// The lock under which services and ports are created; see [`crate::identity`].
@@ -108,36 +115,43 @@ impl NamespaceNode {
         &self.root
     }
 
-    /// Removes the resources of processes that have died. Does nothing while another process holds the namespace's lock.
-    pub(crate) fn remove_dead_nodes(&self) {
+    /// Removes the resources of processes that have died, and returns the number of these processes. Does nothing while another
+    /// process holds the namespace's lock.
+    pub(crate) fn remove_dead_nodes(&self) -> usize {
         if !self.dead_nodes().is_empty()
             && self.check_root().is_ok()
             && let Some(lock) = NamespaceLock::try_acquire(&self.root)
         {
-            self.clean(&lock);
+            return self.clean(&lock);
         }
+        0
     }
 
-    /// Removes the resources of processes that have died, and those that they had not completed.
-    pub(crate) fn clean(&self, lock: &NamespaceLock) {
+    /// Removes the resources of processes that have died, and those that they had not completed. Returns the number of processes.
+    pub(crate) fn clean(&self, lock: &NamespaceLock) -> usize {
         let all = self.identity.try_exclusive(lock);
         // iceoryx2 waits forever for the size of an unsized segment.
         match &all {
             Some(all) => cleanup::remove_unsized_segments(self.config(), lock, all),
-            None if cleanup::has_unsized_segments(self.config()) => return,
+            None if cleanup::has_unsized_segments(self.config()) => return 0,
             None => {}
         }
-        for node in self.dead_nodes() {
-            if node.details().is_some()
-                && let Err(e) = node.try_remove_stale_resources()
-            {
-                tracing::debug!(error = %e, "cannot remove a dead node");
+        let mut removed = 0;
+        for node in self.dead_nodes().into_iter().filter(|node| node.details().is_some()) {
+            let process = node.details().as_ref().map(|details| details.process_id().value());
+            match node.try_remove_stale_resources() {
+                Ok(_) => {
+                    tracing::info!(process, "removed the resources of a process that has died");
+                    removed += 1;
+                }
+                Err(e) => tracing::debug!(error = %e, "cannot remove a dead node"),
             }
         }
         cleanup::remove_incomplete_nodes(self.config(), lock);
         if let Some(all) = &all {
             cleanup::remove_incomplete_services(self.config(), lock, all);
         }
+        removed
     }
 
     fn dead_nodes(&self) -> Vec<DeadNodeView<Ipc>> {

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use crate::activity::EngineActivity;
 use crate::connect::{ConnectConfig, connect_to_engine};
 use crate::descriptors;
 use crate::error::ServiceError;
@@ -108,7 +109,11 @@ impl Observer {
                 return Err(ServiceError::EngineLost { service: service(), pid: self.specification.engine_pid });
             }
             if is_over {
-                return Err(ServiceError::TimedOut { service: service(), waited: timeout });
+                return Err(ServiceError::TimedOut {
+                    service: service(),
+                    waited: timeout,
+                    activity: EngineActivity::Unknown,
+                });
             }
             if is_due {
                 last_check = Instant::now();

@@ -1,6 +1,7 @@
-//! The requests of a trainer that have not been answered yet.
+//! The requests of a trainer that have not been answered yet, and what is known of the last ones.
 
 use crate::message::RequestKind;
+use crate::reconnection::LastRequest;
 
 /// What is requested.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,13 +21,20 @@ impl Request {
     }
 }
 
-/// By group, the number and the content of the request that has not been answered yet.
+/// By group, the request that has not been answered yet, and the last request.
 #[derive(Clone, Debug)]
-pub(crate) struct PendingRequests(Vec<Option<(u64, Request)>>);
+pub(crate) struct PendingRequests(Vec<GroupRequests>);
+
+#[derive(Clone, Copy, Debug)]
+struct GroupRequests {
+    /// Number and content of the request that has not been answered yet.
+    pending: Option<(u64, Request)>,
+    last: LastRequest,
+}
 
 impl PendingRequests {
     pub(crate) fn new(groups: usize) -> Self {
-        PendingRequests(vec![None; groups])
+        PendingRequests(vec![GroupRequests { pending: None, last: LastRequest::None }; groups])
     }
 
     /// Number of groups.
@@ -36,27 +44,33 @@ impl PendingRequests {
 
     /// Replaces the pending request of a group.
     pub(crate) fn insert(&mut self, group: usize, number: u64, request: Request) {
-        self.0[group] = Some((number, request));
+        self.0[group] = GroupRequests { pending: Some((number, request)), last: LastRequest::Pending };
     }
 
-    /// Removes the pending request of a group.
-    pub(crate) fn remove(&mut self, group: usize) {
-        self.0[group] = None;
-    }
-
-    /// Removes all pending requests.
-    pub(crate) fn clear(&mut self) {
-        self.0.fill(None);
+    /// The pending request of a group was answered: it was executed, or rejected.
+    pub(crate) fn answered(&mut self, group: usize, executed: bool) {
+        let last = if executed { LastRequest::Played } else { LastRequest::NotPlayed };
+        self.0[group] = GroupRequests { pending: None, last };
     }
 
     /// Whether that request is pending in a group.
     pub(crate) fn has(&self, group: usize, request: Request) -> bool {
-        self.0[group].is_some_and(|(_, pending)| pending == request)
+        self.0[group].pending.is_some_and(|(_, pending)| pending == request)
+    }
+
+    /// The number of the request that is pending in a group.
+    pub(crate) fn any_number(&self, group: usize) -> Option<u64> {
+        self.0[group].pending.map(|(number, _)| number)
     }
 
     /// The number of the request that is pending in a group, if it returns a batch (`batch`) or does not (`!batch`).
     pub(crate) fn number(&self, group: usize, batch: bool) -> Option<u64> {
-        self.0[group].filter(|(_, pending)| pending.kind.returns_batch() == batch).map(|(number, _)| number)
+        self.0[group].pending.filter(|(_, pending)| pending.kind.returns_batch() == batch).map(|(number, _)| number)
+    }
+
+    /// What became of the last request to a group.
+    pub(crate) fn last(&self, group: usize) -> LastRequest {
+        self.0[group].last
     }
 
     /// Whether a group has a pending request that returns a batch.

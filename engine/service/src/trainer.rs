@@ -4,11 +4,12 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{ActionSection, Block, LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
+use endless_gym_core::batch::{ActionSection, Block, LAYOUT_VERSION, OPTIONS_BYTES};
 use endless_gym_core::envs::ActionError;
 use endless_gym_core::pool::ResetRequest;
 use serde_json::{Map, Value as Json};
 
+use crate::activity::EngineActivity;
 use crate::blackboard;
 use crate::connect::ConnectConfig;
 use crate::connection::EngineConnection;
@@ -18,8 +19,12 @@ use crate::lease::{BatchLease, Response};
 use crate::message::{RequestHeader, RequestKind};
 use crate::pending::{PendingRequests, Request};
 use crate::ports;
+use crate::reconnection::{GroupReconnection, LastRequest, Reconnection};
 use crate::specification::ServiceSpecification;
+use crate::status;
 use crate::wait::{LIVENESS_INTERVAL, wait};
+
+mod transfers;
 
 /// How long a trainer whose engine has ended waits for the namespace's lock, to find out whether another engine has replaced it.
 const SUCCESSOR_TIMEOUT: Duration = Duration::from_millis(100);
@@ -72,6 +77,8 @@ impl Trainer {
     /// [`ServiceError::InvalidName`] or [`ServiceError::Root`] for an invalid configuration.
     pub fn connect(config: &ConnectConfig) -> Result<Self, ServiceError> {
         let (connection, specification) = EngineConnection::open(config)?;
+        let (service, process) = (&*specification.service, specification.engine_pid);
+        tracing::info!(service, process, "connected to an engine");
         Ok(Trainer {
             config: config.clone(),
             pending: PendingRequests::new(specification.groups),
@@ -86,24 +93,44 @@ impl Trainer {
     /// Connects to an engine of the same name that replaces a lost one. Waits for it up to `timeout`. It must serve the same
     /// environments in the same layout, and each group must be reset before it is stepped.
     ///
-    /// If the current engine is running, the connection is kept. In both cases pending answers are discarded.
+    /// If the current engine is running, the connection and the pending answers are kept: nothing is executed twice, and what was
+    /// sent can be received. The result says which of the two was the case, and for each group what became of the last request;
+    /// the crate's documentation has a table.
     ///
     /// # Errors
     ///
     /// [`ServiceError::SpecificationChanged`] if the new engine serves something else, and the errors of
     /// [`connect`](Trainer::connect).
-    pub fn reconnect(&mut self, timeout: Duration) -> Result<(), ServiceError> {
-        if !self.connection.is_engine_alive() {
+    pub fn reconnect(&mut self, timeout: Duration) -> Result<Reconnection, ServiceError> {
+        let restarted = !self.connection.is_engine_alive();
+        let mut last: Vec<_> = (0..self.pending.groups()).map(|group| (None, self.pending.last(group))).collect();
+        if restarted {
             let config = ConnectConfig { timeout, ..self.config.clone() };
             let (connection, specification) = EngineConnection::open(&config)?;
             if let Some(what) = self.specification.difference(&specification) {
                 return Err(ServiceError::SpecificationChanged { service: self.config.service.clone(), what });
             }
+            for (group, (lost_step, last)) in last.iter_mut().enumerate() {
+                let status = self.connection.status.as_ref().and_then(|status| status.group(group));
+                *lost_step = status.map(|status| status.step);
+                if let Some(number) = self.pending.any_number(group) {
+                    *last = LastRequest::of_dead_engine(status, self.id, number);
+                }
+            }
+            self.pending = PendingRequests::new(specification.groups);
             self.specification = Arc::new(specification);
             self.connection = ForkGuard::new(connection);
+            let (service, process) = (&*self.specification.service, self.specification.engine_pid);
+            tracing::info!(service, process, "reconnected to another engine");
         }
-        self.pending.clear();
-        Ok(())
+        let step = |group| self.connection.status.as_ref().and_then(|status| status.group(group)).map(|now| now.step);
+        let groups = last.into_iter().enumerate();
+        let groups = groups.map(|(group, (lost_step, last_request))| GroupReconnection {
+            step: step(group),
+            lost_step,
+            last_request,
+        });
+        Ok(Reconnection { restarted, incarnation: self.specification.incarnation, groups: groups.collect() })
     }
 
     /// The engine's specification.
@@ -233,81 +260,6 @@ impl Trainer {
         self.receive_batch(0..self.pending.groups(), timeout)
     }
 
-    /// Takes a snapshot of an environment: its whole state, for [`restore`](Trainer::restore) or
-    /// [`Pool::restore`](endless_gym_core::pool::Pool::restore). This trainer must have reset the group before.
-    ///
-    /// After [`ServiceError::TimedOut`], the same call continues to wait, and any other request replaces it.
-    ///
-    /// # Errors
-    ///
-    /// [`ServiceError::AnswerPending`] if the group has a pending batch, [`ServiceError::Rejected`] if there is no such
-    /// environment or the group was not reset, and the errors of [`receive`](Trainer::receive).
-    ///
-    /// ```no_run
-    /// # use std::time::Duration;
-    /// # use endless_gym_core::pool::ResetRequest;
-    /// # use endless_gym_service::{ConnectConfig, Trainer};
-    /// # let timeout = Duration::from_secs(10);
-    /// # let mut trainer = Trainer::connect(&ConnectConfig::new("endless"))?;
-    /// trainer.reset(0, ResetRequest::All)?;
-    /// trainer.receive(0, timeout)?;
-    /// let snapshot = trainer.snapshot(0, 3, timeout)?;
-    /// // Environment 5 continues where environment 3 was.
-    /// trainer.restore(0, 5, &snapshot, timeout)?;
-    /// // A reset of no environment returns the current observations.
-    /// let num_envs = trainer.specification().num_envs;
-    /// trainer.reset(0, ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] })?;
-    /// let lease = trainer.receive(0, timeout)?;
-    /// # Ok::<(), endless_gym_service::ServiceError>(())
-    /// ```
-    pub fn snapshot(&mut self, group: usize, env: usize, timeout: Duration) -> Result<Vec<u8>, ServiceError> {
-        self.transfer(group, Request { env, ..Request::new(RequestKind::Snapshot) }, timeout, |_| Ok(0))
-    }
-
-    /// Restores an environment from a snapshot; see [`Pool::restore`](endless_gym_core::pool::Pool::restore). A reset of no
-    /// environment ([`ResetRequest::Each`]) then returns its observation.
-    ///
-    /// After [`ServiceError::TimedOut`], the engine may still restore the environment, but not after a later request.
-    ///
-    /// # Errors
-    ///
-    /// [`ServiceError::SnapshotTooLong`], and the errors of [`snapshot`](Trainer::snapshot).
-    pub fn restore(
-        &mut self,
-        group: usize,
-        env: usize,
-        snapshot: &[u8],
-        timeout: Duration,
-    ) -> Result<(), ServiceError> {
-        let given = snapshot.len();
-        if given > SNAPSHOT_BYTES {
-            return Err(ServiceError::SnapshotTooLong { given });
-        }
-        let specification = Arc::clone(&self.specification);
-        let write = |message: &mut [Block]| {
-            specification.action.write::<u8>(message, ActionSection::Snapshot)[..given].copy_from_slice(snapshot);
-            Ok(given)
-        };
-        let request = Request { env, checksum: crc32fast::hash(snapshot), ..Request::new(RequestKind::Restore) };
-        self.transfer(group, request, timeout, write).map(|_| ())
-    }
-
-    /// Sends a request about a snapshot, unless the same request is pending, and waits for the answer.
-    fn transfer(
-        &mut self,
-        group: usize,
-        request: Request,
-        timeout: Duration,
-        write: impl FnOnce(&mut [Block]) -> Result<usize, ServiceError>,
-    ) -> Result<Vec<u8>, ServiceError> {
-        self.check_group(group)?;
-        if !self.pending.has(group, request) {
-            self.post(group, request, write)?;
-        }
-        let response = self.receive_response(group..group + 1, false, timeout)?;
-        response.to_snapshot().ok_or_else(|| self.incompatible())
-    }
-
     fn receive_batch(&mut self, groups: Range<usize>, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let response = self.receive_response(groups, true, timeout)?;
         response.into_batch().ok_or_else(|| self.incompatible())
@@ -337,16 +289,27 @@ impl Trainer {
                 Ok(None)
             })?;
             if let Some((group, response)) = received {
-                self.pending.remove(group);
-                return response.check_accepted();
+                let response = response.check_accepted();
+                self.pending.answered(group, response.is_ok());
+                return response;
             }
             if !connection.is_engine_alive() {
                 return Err(self.lost());
             }
             if start.elapsed() >= timeout {
-                return Err(ServiceError::TimedOut { service: self.config.service.clone(), waited: timeout });
+                let activity = self.activity(groups, batches);
+                let service = self.config.service.clone();
+                return Err(ServiceError::TimedOut { service, waited: timeout, activity });
             }
         }
+    }
+
+    /// What the engine does while this trainer waits for an answer from one of `groups`.
+    fn activity(&self, mut groups: Range<usize>, batches: bool) -> EngineActivity {
+        let waiting = groups.find_map(|group| self.pending.number(group, batches).map(|number| (group, number)));
+        waiting.map_or(EngineActivity::Unknown, |(group, number)| {
+            status::activity(self.connection.status.as_ref(), self.id, group, number)
+        })
     }
 
     fn check_group(&self, group: usize) -> Result<(), ServiceError> {
@@ -388,6 +351,8 @@ impl Trainer {
             seed: request.seed,
             env: request.env as u64,
             bytes,
+            process: std::process::id(),
+            held: (Arc::strong_count(&self.connection.responses[group]) - 1) as u32,
         };
         let receivers = message.send().map_err(|e| failed(e.to_string()))?;
         if receivers == 0 && !self.connection.is_engine_alive() {

@@ -38,4 +38,4 @@ pub(crate) use view::BatchMut;
 ///
 /// Version 4: the specification's key `epoch` became `incarnation`, the message headers have new type names, and a reset with a
 /// seed counts the environments of all groups.
-pub const LAYOUT_VERSION: u32 = 4;
+pub const LAYOUT_VERSION: u32 = 5;

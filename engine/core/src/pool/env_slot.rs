@@ -5,11 +5,12 @@ use std::sync::Arc;
 use super::autoreset::Autoreset;
 use super::config::OptionMap;
 use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame, draw_in_full};
-use super::frame_stack::FrameStack;
+use super::frame_stack::{FrameStack, StackedFrame};
 use super::seeding::Seeds;
 use crate::batch::BatchMut;
 use crate::envs::Environment;
 use crate::random::Generator;
+use crate::raster::PixelFormat;
 
 /// An environment with its generator, its seeds, and what is counted of its episode.
 pub(super) struct EnvSlot<E: Environment> {
@@ -59,9 +60,17 @@ impl<E: Environment> EnvSlot<E> {
         self.ended = false;
     }
 
-    /// The scenes of the observation's frames.
-    fn scenes(&self) -> impl Iterator<Item = E::Scene> {
-        self.frame_stack.scenes(|| self.env.scene())
+    /// The observation's frames.
+    fn frames(&self) -> impl Iterator<Item = StackedFrame<E::Scene>> {
+        self.frame_stack.frames(|| self.env.scene())
+    }
+
+    /// Writes a frame of the observation in full.
+    pub fn draw_stacked(&self, stacked: &StackedFrame<E::Scene>, format: PixelFormat, frame: &mut [u8]) {
+        match stacked {
+            StackedFrame::Scene(scene) => draw_in_full::<E>(self.env.shared(), scene, format, frame),
+            StackedFrame::Pixels(pixels) => frame.copy_from_slice(pixels),
+        }
     }
 
     /// Plays a step, or in next-step autoreset starts the next episode, and writes the environment's row without its frames.
@@ -130,14 +139,21 @@ impl<E: Environment> EnvSlot<E> {
             return drawn.update(assets, self.env.scene(), settings, frames);
         }
         let frames = frames.chunks_exact_mut(frames.len() / drawn.len());
-        let mut stacked = self.scenes().zip(drawn).zip(frames);
-        stacked.try_for_each(|((scene, drawn), frame)| drawn.update(assets, scene, settings, frame))
+        let mut stacked = self.frames().zip(drawn).zip(frames);
+        stacked.try_for_each(|((stacked, drawn), frame)| match stacked {
+            StackedFrame::Scene(scene) => drawn.update(assets, scene, settings, frame),
+            StackedFrame::Pixels(pixels) => {
+                frame.copy_from_slice(&pixels);
+                *drawn = DrawnScene::unknown();
+                Ok(())
+            }
+        })
     }
 
     fn write_final_observation(&self, draw: DrawSettings, out: &mut BatchMut<'_>, row: usize) {
         write_if_present(out.final_observation.row(row), |r| {
-            for (scene, frame) in self.scenes().zip(r.chunks_exact_mut(r.len() / self.frame_stack.length())) {
-                draw_in_full::<E>(self.env.shared(), &scene, draw.format, frame);
+            for (stacked, frame) in self.frames().zip(r.chunks_exact_mut(r.len() / self.frame_stack.length())) {
+                self.draw_stacked(&stacked, draw.format, frame);
             }
         });
         write_if_present(out.final_vector_observation.row(row), |r| self.env.vector_observation(r));

@@ -17,6 +17,7 @@ use super::snapshot::{Saved, SnapshotError};
 use super::threads::Threads;
 use crate::batch::BatchMut;
 use crate::envs::{EnvSpec, Environment, ParameterError, ResetParameters, view};
+use crate::raster::PixelFormat;
 
 /// The means for writing a batch.
 #[derive(Clone, Copy, Debug)]
@@ -54,6 +55,13 @@ pub(super) trait EnvSlots: Send + Sync {
 
     /// Replaces one environment's state by a snapshot's.
     fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError>;
+
+    /// The frames of one environment's observation but the newest, each of `frame_bytes` bytes; empty for an observation of one
+    /// frame.
+    fn earlier_frames(&self, env: usize, format: PixelFormat, frame_bytes: usize) -> Vec<u8>;
+
+    /// Replaces these frames.
+    fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError>;
 
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
@@ -227,6 +235,24 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
         slot.episode_return = saved.episode_return;
         slot.episode_length = saved.episode_length;
         slot.ended = saved.ended;
+        Ok(())
+    }
+
+    fn earlier_frames(&self, env: usize, format: PixelFormat, frame_bytes: usize) -> Vec<u8> {
+        let slot = &self.slots[env];
+        let mut frames = vec![0; (self.stack - 1) * frame_bytes];
+        for (stacked, frame) in slot.frame_stack.earlier().zip(frames.chunks_exact_mut(frame_bytes.max(1))) {
+            slot.draw_stacked(stacked, format, frame);
+        }
+        frames
+    }
+
+    fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError> {
+        let (given, expected) = (frames.len(), (self.stack - 1) * frame_bytes);
+        if given != expected {
+            return Err(SnapshotError::EarlierFrames { given, expected });
+        }
+        self.slots[env].frame_stack.set_earlier(frames.chunks_exact(frame_bytes.max(1)).map(Arc::from));
         Ok(())
     }
 

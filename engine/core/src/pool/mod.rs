@@ -26,5 +26,5 @@ pub use drawn_scene::WrongFrame;
 pub use error::PoolError;
 pub use pool::Pool;
 pub use seeding::Seeding;
-pub use snapshot::{SNAPSHOT_VERSION, SnapshotError};
+pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};
 pub use threads::Threads;

@@ -7,14 +7,14 @@ use super::drawn_scene::{DrawSettings, WrongFrame};
 use super::error::PoolError;
 use super::family_slots::{EnvSlots, WriteContext, family_slots};
 use super::seeding::Unseeded;
-use super::snapshot::SnapshotError;
+use super::snapshot::{ResumeError, SavedEnv, SnapshotError};
 use super::threads::Threads;
 use crate::batch::{BatchMut, Block, Layout, batch_layout};
 use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
-use crate::envs::{self, EnvSpec, Family};
+use crate::envs::{self, EnvSpec, Family, SCREEN};
 use crate::raster::PixelFormat;
 
 /// Environments of one id in lockstep.
@@ -230,6 +230,62 @@ impl Pool {
     pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
         self.check_env(env)?;
         if self.was_reset { self.slots.restore(env, snapshot) } else { Err(SnapshotError::NotReset) }
+    }
+
+    /// The state of all environments, from which [`resume`](Pool::resume) continues identically; `None` before their first reset.
+    ///
+    /// # Errors
+    ///
+    /// [`SnapshotError::Content`] if a state cannot be encoded.
+    ///
+    /// ```
+    /// # use endless_gym_core::batch::zeroed;
+    /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    /// let config = PoolConfig::new("MysteryPath-v0", 2);
+    /// let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+    /// let mut blocks = zeroed(pool.layout().blocks());
+    /// pool.reset(ResetRequest::Seed(3), &mut blocks)?;
+    /// let saved = pool.save()?.expect("the environments have been reset");
+    ///
+    /// let mut successor = Pool::new(&config, &Threads::new(1)?)?;
+    /// successor.resume(&saved)?;
+    /// successor.step(&[1, 0, 2, 2], &mut blocks)?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn save(&self) -> Result<Option<Vec<SavedEnv>>, SnapshotError> {
+        if !self.was_reset {
+            return Ok(None);
+        }
+        let save = |env| {
+            let snapshot = self.slots.snapshot(env)?;
+            Ok(SavedEnv { snapshot, earlier_frames: self.slots.earlier_frames(env, self.format, self.frame_bytes()) })
+        };
+        (0..self.layout.num_envs()).map(save).collect::<Result<_, _>>().map(Some)
+    }
+
+    /// Continues from what [`save`](Pool::save) returned in a pool of the same configuration, except that its seeds may differ.
+    ///
+    /// # Errors
+    ///
+    /// [`ResumeError`] if the number of environments differs, or if a state is not valid. Environments before it have changed then.
+    pub fn resume(&mut self, saved: &[SavedEnv]) -> Result<(), ResumeError> {
+        let num_envs = self.layout.num_envs();
+        if saved.len() != num_envs {
+            return Err(ResumeError::Count { given: saved.len(), num_envs });
+        }
+        let frame_bytes = self.frame_bytes();
+        for (env, SavedEnv { snapshot, earlier_frames }) in saved.iter().enumerate() {
+            let failed = |source| ResumeError::Environment { env, source };
+            self.slots.restore(env, snapshot).map_err(failed)?;
+            self.slots.restore_earlier_frames(env, earlier_frames, frame_bytes).map_err(failed)?;
+        }
+        self.was_reset = true;
+        Ok(())
+    }
+
+    /// Bytes of one frame.
+    fn frame_bytes(&self) -> usize {
+        self.format.shape(SCREEN, SCREEN).iter().product()
     }
 
     fn check_env(&self, env: usize) -> Result<(), SnapshotError> {

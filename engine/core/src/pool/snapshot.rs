@@ -102,10 +102,50 @@ pub enum SnapshotError {
         /// The pool's environment id.
         expected: &'static str,
     },
+    /// The earlier frames of a stacked observation, which a checkpoint stores beside the snapshot, have a wrong length.
+    #[error("the earlier frames must have {expected} bytes, got {given}")]
+    EarlierFrames {
+        /// Bytes that were given.
+        given: usize,
+        /// Bytes that the pool's observation needs.
+        expected: usize,
+    },
     /// The snapshot's reset parameters are not valid.
     #[error("the snapshot's reset parameters: {0}")]
     Parameters(#[from] ParameterError),
     /// The snapshot's state is not a possible one of its environment.
     #[error("the snapshot's content is not valid: {0}")]
     State(#[from] InvalidState),
+}
+
+/// The state of one environment of a pool, as [`Pool::save`](super::Pool::save) returns it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SavedEnv {
+    /// The environment's snapshot.
+    #[serde(with = "serde_bytes")]
+    pub snapshot: Vec<u8>,
+    /// The frames of a stacked observation but the newest, oldest first, in the pool's format.
+    #[serde(with = "serde_bytes")]
+    pub earlier_frames: Vec<u8>,
+}
+
+/// A pool cannot continue from a saved state.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum ResumeError {
+    /// The number of environments differs.
+    #[error("the saved state must have {num_envs} environments, got {given}")]
+    Count {
+        /// Saved environments.
+        given: usize,
+        /// Environments of the pool.
+        num_envs: usize,
+    },
+    /// The state of an environment is not valid.
+    #[error("environment {env}: {source}")]
+    Environment {
+        /// Number of the environment in its pool.
+        env: usize,
+        /// What is wrong.
+        source: SnapshotError,
+    },
 }

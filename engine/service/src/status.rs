@@ -1,0 +1,196 @@
+//! What an engine is doing, as other processes see it.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::activity::EngineActivity;
+use crate::identity::Identity;
+use crate::namespace::Namespace;
+use crate::status_file::{self, StatusReader};
+use crate::status_record::{EngineRecord, GroupRecord, now, unpadded};
+
+/// The status of an engine, read from shared memory. Reading it affects neither the engine nor its trainer.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EngineStatus {
+    /// The engine's name.
+    pub service: String,
+    /// Environment id.
+    pub id: String,
+    /// Process id of the engine.
+    pub process: u32,
+    /// Random number that identifies this run of the engine.
+    pub incarnation: u64,
+    /// Environments in each group.
+    pub num_envs: u32,
+    /// Time since the engine started.
+    #[serde(rename = "uptime_seconds", serialize_with = "seconds")]
+    pub uptime: Duration,
+    /// Requests for an earlier incarnation, which were ignored.
+    pub dropped: u64,
+    /// Dead processes whose resources the engine removed.
+    pub recoveries: u64,
+    /// Checkpoints saved.
+    pub checkpoints: u64,
+    /// Time since the last checkpoint; `None` before the first.
+    #[serde(rename = "seconds_since_checkpoint", serialize_with = "optional_seconds")]
+    pub last_checkpoint: Option<Duration>,
+    /// By group.
+    pub groups: Vec<GroupStatus>,
+}
+
+/// The status of one group of an engine.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct GroupStatus {
+    /// Batches that the group has returned, as [`BatchLease::step`](crate::BatchLease::step).
+    pub step: u64,
+    /// Batches that this run of the engine has sent, including those of resets.
+    pub batches: u64,
+    /// Steps, summed over the environments.
+    pub env_steps: u64,
+    /// Episodes that have ended.
+    pub episodes: u64,
+    /// Requests that were rejected.
+    pub rejected: u64,
+    /// Batches that no process received.
+    pub undelivered: u64,
+    /// Number of trainers that sent requests, one after the other.
+    pub trainers: u64,
+    /// Process id of the last trainer; `None` before its first request.
+    pub trainer_process: Option<u32>,
+    /// Batches that the trainer held when it sent its last request.
+    pub held: u32,
+    /// Number of the last request that the engine has taken, and of the last that it has answered.
+    pub last_taken: u64,
+    /// See [`last_taken`](GroupStatus::last_taken).
+    pub last_answered: u64,
+    /// Kind of the last request: `step`, `reset`, `snapshot`, `restore` or `checkpoint`; `None` before the first.
+    pub kind: Option<&'static str>,
+    /// How long the engine has been executing the current request; `None` if there is none.
+    #[serde(rename = "busy_seconds", serialize_with = "optional_seconds")]
+    pub busy: Option<Duration>,
+    /// Time since the last request; `None` before the first.
+    #[serde(rename = "seconds_since_request", serialize_with = "optional_seconds")]
+    pub last_request: Option<Duration>,
+}
+
+fn seconds<S: serde::Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64(duration.as_secs_f64())
+}
+
+#[allow(clippy::ref_option)] // The signature that serde requires.
+fn optional_seconds<S: serde::Serializer>(duration: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+    duration.map(|duration| duration.as_secs_f64()).serialize(serializer)
+}
+
+impl EngineStatus {
+    /// The status of all running engines of a namespace, sorted by name.
+    ///
+    /// Creates and removes nothing, also where the namespace's directory does not exist. Engines of another version are left out.
+    pub fn all(namespace: &Namespace) -> Vec<Self> {
+        let Some(identity) = Identity::existing(namespace) else { return Vec::new() };
+        let readers = status_file::paths(identity.prefix()).into_iter().filter_map(|path| StatusReader::open(&path));
+        let running = readers.filter(StatusReader::is_engine_alive);
+        let mut found: Vec<_> = running.filter_map(|reader| EngineStatus::read(&reader)).collect();
+        found.sort_by(|a, b| a.service.cmp(&b.service));
+        found
+    }
+
+    /// The status of the running engine of that name.
+    pub fn of(namespace: &Namespace, service: &str) -> Option<Self> {
+        EngineStatus::all(namespace).into_iter().find(|status| status.service == service)
+    }
+
+    fn read(reader: &StatusReader) -> Option<Self> {
+        let engine = reader.engine()?;
+        let now = now();
+        let groups: Option<Vec<_>> = (0..engine.groups as usize).map(|group| reader.group(group)).collect();
+        Some(EngineStatus::new(&engine, &groups?, now))
+    }
+
+    fn new(engine: &EngineRecord, groups: &[GroupRecord], now: u64) -> Self {
+        EngineStatus {
+            service: unpadded(&engine.service),
+            id: unpadded(&engine.id),
+            process: engine.process,
+            incarnation: engine.incarnation,
+            num_envs: engine.num_envs,
+            uptime: since(engine.started, now).unwrap_or_default(),
+            dropped: engine.dropped,
+            recoveries: engine.recoveries,
+            checkpoints: engine.checkpoints,
+            last_checkpoint: since(engine.last_checkpoint, now),
+            groups: groups.iter().map(|group| GroupStatus::new(group, now)).collect(),
+        }
+    }
+}
+
+impl GroupStatus {
+    fn new(group: &GroupRecord, now: u64) -> Self {
+        let had_request = group.last_request != 0;
+        GroupStatus {
+            step: group.step,
+            batches: group.batches,
+            env_steps: group.env_steps,
+            episodes: group.episodes,
+            rejected: group.rejected,
+            undelivered: group.undelivered,
+            trainers: group.trainers,
+            trainer_process: had_request.then_some(group.trainer_process),
+            held: group.held,
+            last_taken: group.taken,
+            last_answered: group.answered,
+            kind: had_request.then(|| group.kind()),
+            busy: since(group.busy_since, now),
+            last_request: since(group.last_request, now),
+        }
+    }
+}
+
+/// The time since a moment; `None` for the moment 0.
+fn since(moment: u64, now: u64) -> Option<Duration> {
+    (moment != 0).then(|| Duration::from_nanos(now.saturating_sub(moment)))
+}
+
+/// What the engine does while a trainer waits for the answer to its request `number` to `group`.
+pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize, number: u64) -> EngineActivity {
+    let Some((status, engine)) = status.and_then(|status| Some((status, status.engine()?))) else {
+        return EngineActivity::Unknown;
+    };
+    let groups = std::iter::once(group).chain((0..engine.groups as usize).filter(|other| *other != group));
+    for other in groups {
+        let Some(record) = status.group(other) else { return EngineActivity::Unknown };
+        if let Some(since) = since(record.busy_since, now()) {
+            return EngineActivity::Busy { group: other, kind: record.kind(), since, process: engine.process };
+        }
+        if other == group && record.trainer == trainer && record.answered == number {
+            return EngineActivity::Answered;
+        }
+    }
+    EngineActivity::NotTaken { process: engine.process }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn record<R: bytemuck::Pod + std::fmt::Debug>() -> impl Strategy<Value = R> {
+        prop::collection::vec(any::<u8>(), size_of::<R>()).prop_map(|bytes| bytemuck::pod_read_unaligned(&bytes))
+    }
+
+    proptest! {
+        #[test]
+        fn any_records_are_a_status(
+            engine in record::<EngineRecord>(),
+            groups in prop::collection::vec(record::<GroupRecord>(), 0..4),
+            now: u64,
+        ) {
+            let status = EngineStatus::new(&engine, &groups, now);
+            prop_assert_eq!(status.groups.len(), groups.len());
+            prop_assert!(!status.service.chars().any(char::is_control));
+            serde_json::to_string(&status).unwrap();
+        }
+    }
+}
