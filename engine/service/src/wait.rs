@@ -23,6 +23,9 @@ const SPIN: Duration = Duration::from_micros(3);
 /// one. Waking a parked waiter takes up to half a millisecond on a virtual machine, during which the sender may park in turn.
 const YIELD: Duration = Duration::from_millis(3);
 
+/// Shortest timeout of a parked waiter. iceoryx2 passes whole microseconds to the kernel, which takes 0 for no timeout.
+const SHORTEST_PARK: Duration = Duration::from_micros(1);
+
 /// Calls `poll` until it returns a value or `timeout` has passed, and parks on `listener` between the calls. Spinning and
 /// yielding end a fixed time after `since`, the time of the last message, so that repeated calls without a message park at once.
 /// A signal ends the wait like the timeout.
@@ -44,11 +47,41 @@ pub(crate) fn wait<T>(
         match since.elapsed() {
             quiet if quiet < SPIN => std::hint::spin_loop(),
             quiet if quiet < YIELD => std::thread::yield_now(),
-            _ => match listener.timed_wait(|_| {}, timeout - waited) {
-                Ok(_) => {}
-                Err(ListenerWaitError::InterruptSignal) => return poll(),
-                Err(e) => return Err(ServiceError::middleware("cannot wait for a message")(e.to_string())),
-            },
+            _ => {
+                if !park(listener, timeout - waited)? {
+                    return poll();
+                }
+            }
         }
+    }
+}
+
+/// Parks until an event or the timeout. Returns `false` after a signal.
+fn park(listener: &Listener<Ipc>, timeout: Duration) -> Result<bool, ServiceError> {
+    match listener.timed_wait(|_| {}, timeout.max(SHORTEST_PARK)) {
+        Ok(_) => Ok(true),
+        Err(ListenerWaitError::InterruptSignal) => Ok(false),
+        Err(e) => Err(ServiceError::middleware("cannot wait for a message")(e.to_string())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::namespace::Namespace;
+    use crate::node::NamespaceNode;
+    use crate::ports::{self, EngineServices, OpenMode, ServiceNames};
+
+    #[test]
+    fn a_timeout_below_a_microsecond_is_not_forever() {
+        let root = format!("/tmp/endless-wait-{}", std::process::id());
+        let node = NamespaceNode::join(&Namespace::at(&root), Duration::ZERO).unwrap();
+        let services = EngineServices { node: &node, names: ServiceNames::new("wait", 1), mode: OpenMode::Create };
+        let listener = ports::listener(&services.events("to_engine", 1).unwrap()).unwrap();
+        assert!(park(&listener, Duration::from_nanos(1)).unwrap());
+        assert!(park(&listener, Duration::ZERO).unwrap());
+        drop(listener);
+        drop(node);
+        std::fs::remove_dir_all(root).unwrap();
     }
 }
