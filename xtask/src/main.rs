@@ -4,6 +4,7 @@ mod cargo;
 mod dist;
 mod docs;
 mod error_messages;
+mod faults;
 mod files;
 mod instructions;
 mod interpreters;
@@ -80,6 +81,20 @@ enum Task {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },
+    /// Kill, stop and starve engines, trainers and observers at random, and compare every byte.
+    #[command(disable_help_flag = true)]
+    Faults {
+        /// Arguments, such as `--minutes 10 --seed 1`; `--help` lists them.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// Play all environments with random options for an hour, and watch memory and descriptors.
+    #[command(disable_help_flag = true)]
+    Soak {
+        /// Arguments, such as `--minutes 10`; `--help` lists them.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
     /// Compare with the original from new seeds.
     Live {
         /// Steps to compare for each environment.
@@ -112,6 +127,8 @@ impl Task {
             Task::Wasm => wasm::build(),
             Task::Instructions { record } => instructions::run(*record),
             Task::Bench { arguments } => python::bench(arguments),
+            Task::Faults { arguments } => faults::run("faults", arguments),
+            Task::Soak { arguments } => faults::run("soak", arguments),
             Task::Live { steps } => cargo::live(*steps),
             Task::Properties { cases } => cargo::properties(*cases),
             Task::Original => original::python().map(|python| println!("{}", python.display())),

@@ -139,6 +139,11 @@ impl NamespaceNode {
         let mut removed = 0;
         for node in self.dead_nodes().into_iter().filter(|node| node.details().is_some()) {
             let process = node.details().as_ref().map(|details| details.process_id().value());
+            // iceoryx2 creates a node to tell others of the removal, which writes to shared memory.
+            if let Err(e) = memory::check_free(memory::NODE_BYTES) {
+                tracing::debug!(process, error = %e, "cannot remove the resources of a process that has died yet");
+                break;
+            }
             match node.try_remove_stale_resources() {
                 Ok(_) => {
                     tracing::info!(process, "removed the resources of a process that has died");

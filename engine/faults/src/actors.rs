@@ -1,0 +1,176 @@
+//! The processes of a round, and what they report.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::event::Event;
+
+/// Bytes of a process's standard error that are kept.
+const KEPT: usize = 4000;
+
+/// A process of a round. It is killed when this is dropped.
+pub struct Actor {
+    child: Child,
+    stdin: Option<ChildStdin>,
+    stderr: Arc<Mutex<String>>,
+}
+
+impl Actor {
+    /// Starts a process. What it reports goes to `events`, with its process id.
+    pub fn start(mut command: Command, events: &Sender<(u32, Event)>) -> Result<Self, String> {
+        let piped = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = piped.spawn().map_err(|error| format!("{command:?}: {error}"))?;
+        let (id, events) = (child.id(), events.clone());
+        if let Some(stdout) = child.stdout.take() {
+            std::thread::spawn(move || {
+                let lines = BufReader::new(stdout).lines().map_while(Result::ok);
+                // A killed process may leave a part of a line.
+                for event in lines.filter_map(|line| serde_json::from_str(&line).ok()) {
+                    if events.send((id, event)).is_err() {
+                        break;
+                    }
+                }
+            });
+        }
+        let stderr = Arc::new(Mutex::new(String::new()));
+        if let Some(mut pipe) = child.stderr.take() {
+            let kept = Arc::clone(&stderr);
+            std::thread::spawn(move || {
+                let mut bytes = [0; 1024];
+                while let Ok(count @ 1..) = pipe.read(&mut bytes) {
+                    let Ok(mut kept) = kept.lock() else { break };
+                    if kept.len() < KEPT {
+                        kept.push_str(&String::from_utf8_lossy(&bytes[..count]));
+                    }
+                }
+            });
+        }
+        let stdin = child.stdin.take();
+        Ok(Actor { child, stdin, stderr })
+    }
+
+    /// The process id.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Sends a signal.
+    pub fn signal(&self, signal: Signal) {
+        if let Some(pid) = i32::try_from(self.id()).ok().and_then(Pid::from_raw) {
+            let _ = kill_process(pid, signal);
+        }
+    }
+
+    /// Kills the process, which cannot clean up.
+    pub fn kill(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+
+    /// Asks it to end.
+    pub fn close_input(&mut self) {
+        drop(self.stdin.take());
+    }
+
+    /// Sends a line to its standard input.
+    pub fn order(&mut self, line: &str) {
+        if let Some(stdin) = &mut self.stdin {
+            let _ = writeln!(stdin, "{line}");
+        }
+    }
+
+    /// How it has ended, if it has.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().ok().flatten()
+    }
+
+    /// Waits for its end.
+    pub fn wait(&mut self, limit: Duration) -> Option<ExitStatus> {
+        let start = Instant::now();
+        loop {
+            let ended = self.ended();
+            if ended.is_some() || start.elapsed() >= limit {
+                return ended;
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    /// What it wrote to standard error, in one line.
+    pub fn complaint(&self) -> String {
+        // The pipe is read by another thread.
+        std::thread::sleep(Duration::from_millis(20));
+        let text = self.stderr.lock().map(|text| text.clone()).unwrap_or_default();
+        text.split_whitespace().collect::<Vec<_>>().join(" ")
+    }
+}
+
+impl Drop for Actor {
+    fn drop(&mut self) {
+        self.kill();
+    }
+}
+
+/// Whether a process crashed: it was ended by a signal that nobody sent, or by a panic.
+pub fn is_crash(status: ExitStatus) -> bool {
+    status.signal().is_some() || status.code() == Some(101)
+}
+
+/// This program.
+pub fn own_program() -> Result<PathBuf, String> {
+    std::env::current_exe().map_err(|error| format!("own program: {error}"))
+}
+
+/// The program `endless`, which is built into the same folder.
+pub fn engine_program() -> Result<PathBuf, String> {
+    let program = own_program()?.with_file_name("endless");
+    let missing = || format!("{} is missing; build it, or run `cargo xtask faults`", program.display());
+    program.is_file().then(|| program.clone()).ok_or_else(missing)
+}
+
+/// This program in a role with a JSON argument.
+pub fn role(name: &str, argument: &impl serde::Serialize) -> Result<Command, String> {
+    let mut command = Command::new(own_program()?);
+    command.args(["role", name]).arg(serde_json::to_string(argument).map_err(|error| error.to_string())?);
+    Ok(command)
+}
+
+/// The command under a limit of its descriptors.
+pub fn with_descriptors(command: &Command, limit: u64) -> Command {
+    let mut limited = Command::new("sh");
+    limited.args(["-c", &format!("ulimit -n {limit}; exec \"$0\" \"$@\"")]);
+    limited.arg(command.get_program()).args(command.get_args());
+    limited
+}
+
+/// The command with an empty /tmp of its own.
+pub fn with_own_tmp(command: &Command) -> Command {
+    let mut own = Command::new("unshare");
+    own.args(["--mount", "--map-root-user", "sh", "-c", "mount -t tmpfs tmpfs /tmp && exec \"$0\" \"$@\""]);
+    own.arg(command.get_program()).args(command.get_args());
+    own
+}
+
+/// The command with a /dev/shm of its own, of some megabytes.
+pub fn with_own_memory(command: &Command, megabytes: u64) -> Command {
+    let mut own = Command::new("unshare");
+    let script = format!("mount -t tmpfs -o size={megabytes}M tmpfs /dev/shm && exec \"$0\" \"$@\"");
+    own.args(["--mount", "--map-root-user", "sh", "-c", &script]);
+    own.arg(command.get_program()).args(command.get_args());
+    own
+}
+
+/// The command as the user nobody.
+pub fn as_nobody(command: &Command) -> Command {
+    let mut other = Command::new("setpriv");
+    other.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
+    other.arg(command.get_program()).args(command.get_args());
+    other
+}

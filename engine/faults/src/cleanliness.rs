@@ -1,0 +1,114 @@
+//! What a round leaves behind: processes, files in the namespace's directory, segments with its prefix.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant, SystemTime};
+
+use endless_gym_service::{Namespace, ROOT_VARIABLE, running_engines};
+use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
+
+/// Longer than the ages from which files count as abandoned.
+const ABANDONED: Duration = Duration::from_secs(60);
+
+/// How long removal may take.
+const LIMIT: Duration = Duration::from_secs(15);
+
+/// The files of a namespace: those in its directory and its segments.
+pub fn files(namespace: &Namespace) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    below(namespace.root(), &mut found);
+    let segments = fs::read_dir("/dev/shm").into_iter().flatten().flatten().map(|entry| entry.path());
+    found
+        .extend(segments.filter(|path| {
+            path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(namespace.prefix()))
+        }));
+    found
+}
+
+fn below(folder: &Path, found: &mut Vec<PathBuf>) {
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() => below(&entry.path(), found),
+            _ => found.push(entry.path()),
+        }
+    }
+}
+
+/// The processes of a namespace other than this one: those that have its directory in their environment.
+pub fn processes(namespace: &Namespace) -> Vec<u32> {
+    let variable = format!("{ROOT_VARIABLE}={}", namespace.root().display());
+    let ids = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let ids = ids.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+    ids.filter(|id| *id != std::process::id())
+        .filter(|id| {
+            let environment = fs::read(format!("/proc/{id}/environ")).unwrap_or_default();
+            environment.split(|byte| *byte == 0).any(|entry| entry == variable.as_bytes())
+        })
+        .collect()
+}
+
+/// What is left after all processes have ended and a process has listed the engines.
+///
+/// Files of processes that died while they started or ended are recognised by their age. Instead of waiting, they are made old.
+pub fn leftovers(namespace: &Namespace) -> Vec<String> {
+    let processes = processes(namespace).into_iter().map(|id| format!("process {id}"));
+    let mut left: Vec<String> = processes.collect();
+    let start = Instant::now();
+    loop {
+        if let Err(error) = running_engines(namespace) {
+            left.push(format!("engines cannot be listed: {error}"));
+        }
+        let files = files(namespace);
+        if files.is_empty() {
+            return left;
+        }
+        if start.elapsed() >= LIMIT || !left.is_empty() {
+            left.extend(files.iter().map(|path| path.display().to_string()));
+            return left;
+        }
+        set_age(namespace, -(ABANDONED.as_secs() as i64));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Moves the modification times of a namespace's files and directories to `seconds` from now.
+pub fn set_age(namespace: &Namespace, seconds: i64) {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let time = Timespec { tv_sec: now.as_secs() as i64 + seconds, tv_nsec: 0 };
+    let times = Timestamps { last_access: time, last_modification: time };
+    let files = files(namespace);
+    let folders = files.iter().filter_map(|path| path.parent()).filter(|folder| folder.starts_with(namespace.root()));
+    for path in files.iter().map(PathBuf::as_path).chain(folders) {
+        // Sockets cannot be opened, so the times are set by path.
+        let _ = utimensat(CWD, path, &times, AtFlags::SYMLINK_NOFOLLOW);
+    }
+}
+
+/// Removes everything, whatever it is.
+pub fn remove_all(namespace: &Namespace) {
+    for path in files(namespace) {
+        let _ = fs::remove_file(path);
+    }
+    let _ = fs::remove_dir_all(namespace.root());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_and_segments_are_found() {
+        let namespace = Namespace::at(format!("/tmp/endless-clean-{}", std::process::id()));
+        fs::create_dir_all(namespace.root().join("a")).unwrap();
+        let segment = PathBuf::from(format!("/dev/shm/{}x", namespace.prefix()));
+        let inner = namespace.root().join("a/b");
+        for path in [&segment, &inner] {
+            fs::write(path, "").unwrap();
+        }
+        assert_eq!(files(&namespace), [inner.clone(), segment]);
+        set_age(&namespace, -60);
+        assert!(fs::metadata(&inner).unwrap().modified().unwrap().elapsed().unwrap() >= Duration::from_secs(59));
+        remove_all(&namespace);
+        assert_eq!(files(&namespace), [] as [PathBuf; 0]);
+    }
+}

@@ -1,0 +1,52 @@
+//! What the processes of a round report, one JSON object a line, and the clock that they share.
+
+use std::io::Write;
+use std::time::Duration;
+
+use endless_gym_service::ServiceError;
+use rustix::time::{ClockId, clock_gettime};
+use serde::{Deserialize, Serialize};
+
+/// A line of a trainer, an observer or a visitor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Event {
+    /// A connection to a run of the engine.
+    Connected { at: Duration, incarnation: u64, engine: u32 },
+    /// A batch, which a trainer has compared with its twin.
+    Batch { at: Duration, incarnation: u64, group: usize, step: u64, checksum: u32 },
+    /// Bytes differ from the twin's, or changed while the batch was held.
+    Wrong { what: String },
+    /// A step was lost or doubled.
+    Miscounted { what: String },
+    /// A promise of the interface that was not kept.
+    Broken { what: String },
+    /// A call failed.
+    Error { during: String, kind: String, text: String, engine: Option<u32> },
+    /// A child process was forked.
+    Forked { child: u32 },
+    /// The regular end.
+    End,
+}
+
+impl Event {
+    /// The report of an error.
+    pub fn error(during: &str, error: &ServiceError, engine: Option<u32>) -> Self {
+        let kind = format!("{error:?}");
+        let kind = kind.split(|letter: char| !letter.is_alphanumeric()).next().unwrap_or_default().to_owned();
+        Event::Error { during: during.to_owned(), kind, text: error.to_string(), engine }
+    }
+
+    /// Writes the line. A process whose reader has ended ends too.
+    pub fn report(&self) {
+        let line = serde_json::to_string(self).unwrap_or_default() + "\n";
+        if std::io::stdout().lock().write_all(line.as_bytes()).is_err() {
+            std::process::exit(0);
+        }
+    }
+}
+
+/// The monotonic clock, which is the same in all processes.
+pub fn now() -> Duration {
+    let time = clock_gettime(ClockId::Monotonic);
+    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
+}

@@ -1,0 +1,219 @@
+//! How each fault is done.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::actors::{self, Actor};
+use crate::cleanliness;
+use crate::event::now;
+use crate::others::Habit;
+use crate::plan::{Fault, Role};
+use crate::scene::{LIMIT, Scene};
+
+/// How long a regular end may take.
+const END: Duration = Duration::from_secs(10);
+
+/// How long a process with few descriptors has to play or to end.
+const FEW_DESCRIPTORS: Duration = Duration::from_secs(6);
+
+const BALLAST: &str = "/dev/shm/ballast";
+
+impl Scene<'_> {
+    /// Does a fault. Returns the time at which it was over: from then on batches must come again.
+    pub fn apply(&mut self, fault: Fault) -> Result<Duration, String> {
+        let milliseconds = Duration::from_millis;
+        match fault {
+            Fault::Kill { role, down } => {
+                self.kill(role);
+                self.watch(milliseconds(down))?;
+                self.start(role)?;
+            }
+            Fault::KillStarting { role, moment } => {
+                self.kill(role);
+                self.start(role)?;
+                std::thread::sleep(Duration::from_micros(moment));
+                self.kill(role);
+                self.start(role)?;
+            }
+            Fault::KillEnding { role, moment } => {
+                if let Some(mut actor) = self.take(role) {
+                    actor.close_input();
+                    std::thread::sleep(Duration::from_micros(moment));
+                    actor.kill();
+                }
+                self.start(role)?;
+            }
+            Fault::Stop { role, time } => self.stop(role, milliseconds(time))?,
+            Fault::StopStarting { role, moment, time } => {
+                self.visitor(20)?;
+                self.kill(role);
+                self.start(role)?;
+                std::thread::sleep(Duration::from_micros(moment));
+                self.stop(role, milliseconds(time))?;
+            }
+            Fault::Restart { down } => {
+                self.end(Role::Engine, |engine| engine.signal(Signal::TERM))?;
+                self.watch(milliseconds(down))?;
+                self.start(Role::Engine)?;
+            }
+            Fault::Fork { is_killed } => return self.fork(is_killed),
+            Fault::Descriptors { role, limit } => self.few_descriptors(role, limit)?,
+            Fault::ClockJump { seconds } => {
+                cleanliness::set_age(&self.namespace, seconds);
+                self.visitor(5)?;
+                self.watch(milliseconds(200))?;
+                self.kill(Role::Trainer);
+                self.start(Role::Trainer)?;
+            }
+            Fault::RemoveRoot { then } => {
+                let _ = fs::remove_dir_all(self.namespace.root());
+                self.visitor(3)?;
+                self.watch(milliseconds(400))?;
+                self.kill(then);
+                self.start(then)?;
+            }
+            Fault::FillMemory { role, time } => {
+                fill();
+                self.kill(role);
+                self.start(role)?;
+                self.watch(milliseconds(time))?;
+                let _ = fs::remove_file(BALLAST);
+            }
+            Fault::HoardingObserver => {
+                let seed = self.plan.trainer_seed;
+                let hoarder = self.spawn(actors::role("observe", &Habit { seed, holds: 100, pause: 0 })?)?;
+                self.others.push(hoarder);
+                self.watch(milliseconds(1000))?;
+            }
+            Fault::OtherContainer => {
+                cleanliness::set_age(&self.namespace, -60);
+                let visit = actors::role("visit", &(self.plan.trainer_seed, 3))?;
+                self.wait_for(self.spawn(actors::with_own_tmp(&visit))?)?;
+                self.kill(Role::Trainer);
+                self.start(Role::Trainer)?;
+            }
+            Fault::OtherUser => {
+                let intruder = self.spawn(actors::as_nobody(&actors::role("intrude", &())?))?;
+                self.wait_for(intruder)?;
+                self.kill(Role::Trainer);
+                self.start(Role::Trainer)?;
+            }
+        }
+        Ok(now())
+    }
+
+    /// Starts a process that lists engines and tries to connect.
+    pub fn visitor(&mut self, times: usize) -> Result<(), String> {
+        let visitor = self.spawn(actors::role("visit", &(self.plan.trainer_seed, times))?)?;
+        self.others.push(visitor);
+        Ok(())
+    }
+
+    fn stop(&mut self, role: Role, time: Duration) -> Result<(), String> {
+        let Some(actor) = self.place(role) else { return Ok(()) };
+        actor.signal(Signal::STOP);
+        self.watch(time)?;
+        if let Some(actor) = self.place(role) {
+            actor.signal(Signal::CONT);
+        }
+        Ok(())
+    }
+
+    /// Ends the process of a role regularly.
+    pub fn end(&mut self, role: Role, ask: impl FnOnce(&mut Actor)) -> Result<(), String> {
+        let Some(mut actor) = self.take(role) else { return Ok(()) };
+        ask(&mut actor);
+        match actor.wait(END) {
+            Some(status) if status.success() => {}
+            Some(status) => {
+                let complaint = actor.complaint();
+                self.fail("unexpected end", format!("{role:?} was asked to end: {status}: {complaint}"));
+            }
+            None => self.fail("does not end", format!("{role:?} was asked to end, and has not within {END:?}")),
+        }
+        self.look()
+    }
+
+    /// Waits for a process that ends by itself.
+    fn wait_for(&mut self, mut actor: Actor) -> Result<(), String> {
+        match actor.wait(END) {
+            Some(status) if status.success() => {}
+            Some(status) => {
+                return Err(format!("a process that should end by itself failed: {status}: {}", actor.complaint()));
+            }
+            None => self.fail("does not end", format!("a visitor has not ended within {END:?}")),
+        }
+        self.look()
+    }
+
+    fn fork(&mut self, is_killed: bool) -> Result<Duration, String> {
+        self.forked = None;
+        if let Some(trainer) = &mut self.trainer {
+            trainer.order("fork");
+        }
+        let start = Instant::now();
+        while self.forked.is_none() && start.elapsed() < LIMIT {
+            self.watch(Duration::from_millis(2))?;
+        }
+        let Some(child) = self.forked.take() else { return Err("the trainer has not forked".to_owned()) };
+        if is_killed {
+            self.kill(Role::Trainer);
+        } else {
+            self.end(Role::Trainer, Actor::close_input)?;
+        }
+        self.start(Role::Trainer)?;
+        let over = now();
+        // The child is still running when the next trainer must play.
+        self.next_batch(over, LIMIT)?;
+        if let Some(child) = i32::try_from(child).ok().and_then(Pid::from_raw) {
+            let _ = kill_process(child, Signal::KILL);
+        }
+        Ok(over)
+    }
+
+    /// A process with too few descriptors plays or ends with an error; it must not take part without ever answering.
+    fn few_descriptors(&mut self, role: Role, limit: u64) -> Result<(), String> {
+        self.kill(role);
+        let command = self.command(role)?;
+        let mut actor = self.spawn(actors::with_descriptors(&command, limit))?;
+        let (start, since) = (Instant::now(), now());
+        self.limited.insert(actor.id());
+        if role == Role::Trainer {
+            self.add_trainer(actor.id());
+        }
+        let mut has_ended = false;
+        if role == Role::Engine {
+            let id = actor.id();
+            while !has_ended && start.elapsed() < FEW_DESCRIPTORS && !self.has_played(id, since) {
+                self.watch(Duration::from_millis(5))?;
+                has_ended = actor.ended().is_some();
+            }
+            if !has_ended && !self.has_played(id, since) {
+                self.fail("serves and never answers", format!("engine with {limit} descriptors"));
+            }
+            self.end_limited(id);
+        } else {
+            self.watch(Duration::from_millis(600))?;
+        }
+        if let Some(status) = actor.ended()
+            && actors::is_crash(status)
+        {
+            let complaint = actor.complaint();
+            self.fail("crash", format!("{role:?} with {limit} descriptors: {status}: {complaint}"));
+        }
+        actor.kill();
+        self.start(role)
+    }
+}
+
+/// Fills /dev/shm to the last page.
+fn fill() {
+    let Ok(mut file) = File::create(BALLAST) else { return };
+    for size in [1 << 20, 1 << 12] {
+        let bytes = vec![1; size];
+        while file.write_all(&bytes).is_ok() {}
+    }
+}

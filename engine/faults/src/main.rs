@@ -1,0 +1,82 @@
+//! Faults for real processes: an engine, its trainer, observers and visitors are killed, stopped and starved in a sequence that
+//! follows from a seed, and every byte that the trainer receives is compared with a pool in its own process.
+
+mod actors;
+mod checker;
+mod cleanliness;
+mod event;
+mod faults;
+mod options;
+mod others;
+mod plan;
+mod report;
+mod rights;
+mod round;
+mod run;
+mod scene;
+mod shape;
+mod soak;
+mod trainer;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Faults for real processes, and long runs.
+#[derive(Parser)]
+#[command(name = "endless-gym-faults", bin_name = "cargo xtask", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Task,
+}
+
+#[derive(Subcommand)]
+enum Task {
+    /// Kill, stop and starve processes, and check every byte.
+    Faults(run::Args),
+    /// Play all environments with random options for a long time, and watch memory and descriptors.
+    Soak(soak::Args),
+    /// Play one round, in the namespace of the environment, and print what it found as JSON.
+    #[command(hide = true)]
+    Round { seed: u64, number: u64 },
+    /// Take part in a round.
+    #[command(hide = true)]
+    Role { name: String, argument: String },
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Task::Faults(args) => run::run(&args),
+        Task::Soak(args) => soak::run(&args),
+        Task::Round { seed, number } => run::round(seed, number),
+        Task::Role { name, argument } => role(&name, &argument),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(message) => {
+            eprintln!("{message}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn role(name: &str, argument: &str) -> Result<(), String> {
+    let invalid = |error: serde_json::Error| error.to_string();
+    match name {
+        "train" => trainer::run(&serde_json::from_str(argument).map_err(invalid)?),
+        "observe" => {
+            others::observe(&serde_json::from_str(argument).map_err(invalid)?);
+            Ok(())
+        }
+        "visit" => {
+            let (seed, times) = serde_json::from_str(argument).map_err(invalid)?;
+            others::visit(seed, times);
+            Ok(())
+        }
+        "intrude" => {
+            others::intrude();
+            Ok(())
+        }
+        _ => Err(format!("unknown role {name}")),
+    }
+}

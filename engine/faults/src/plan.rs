@@ -1,0 +1,209 @@
+//! Which faults happen when. A plan follows from a seed and the number of its round alone, so that a printed pair repeats it.
+
+use std::fmt;
+
+use endless_gym_core::random::{Generator, SeedSequence};
+use serde::{Deserialize, Serialize};
+
+use crate::shape::Shape;
+
+/// One process of a round.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Role {
+    Engine,
+    Trainer,
+    Observer,
+}
+
+/// One fault. Times are in milliseconds, moments of a start or an end in microseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Fault {
+    /// SIGKILL; a successor starts after a time.
+    Kill { role: Role, down: u64 },
+    /// A successor of a killed process is killed itself while it starts.
+    KillStarting { role: Role, moment: u64 },
+    /// A process is asked to end and killed while it does.
+    KillEnding { role: Role, moment: u64 },
+    /// SIGSTOP and, later, SIGCONT.
+    Stop { role: Role, time: u64 },
+    /// The same while a successor of a killed process starts.
+    StopStarting { role: Role, moment: u64, time: u64 },
+    /// The engine ends regularly and is started again.
+    Restart { down: u64 },
+    /// A trainer with a forked child is killed or ends; the child lives on.
+    Fork { is_killed: bool },
+    /// A process is started anew with a limit of its descriptors.
+    Descriptors { role: Role, limit: u64 },
+    /// Modification times of all files move, as seen after a jump of the clock; then the trainer is replaced.
+    ClockJump { seconds: i64 },
+    /// The namespace's directory is removed; then the trainer or the engine is replaced.
+    RemoveRoot { then: Role },
+    /// /dev/shm is full for a time, in which a process is killed and started again.
+    FillMemory { role: Role, time: u64 },
+    /// An observer that keeps every batch.
+    HoardingObserver,
+    /// A process with another /tmp and the same /dev/shm lists engines when the segments are old.
+    OtherContainer,
+    /// A process of another user lists engines, connects, and removes what it can.
+    OtherUser,
+}
+
+/// What the machine must permit for a fault or a round.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Right {
+    MountNamespaces,
+    OtherUsers,
+}
+
+impl Fault {
+    /// The name under which faults are counted.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Fault::Kill { role: Role::Engine, .. } => "engine killed",
+            Fault::Kill { role: Role::Trainer, .. } => "trainer killed",
+            Fault::Kill { role: Role::Observer, .. } => "observer killed",
+            Fault::KillStarting { role: Role::Engine, .. } => "engine killed while it starts",
+            Fault::KillStarting { role: Role::Trainer, .. } => "trainer killed while it starts",
+            Fault::KillStarting { role: Role::Observer, .. } => "observer killed while it starts",
+            Fault::KillEnding { role: Role::Engine, .. } => "engine killed while it ends",
+            Fault::KillEnding { role: Role::Trainer, .. } => "trainer killed while it ends",
+            Fault::KillEnding { role: Role::Observer, .. } => "observer killed while it ends",
+            Fault::Stop { role: Role::Engine, .. } => "engine stopped",
+            Fault::Stop { role: Role::Trainer, .. } => "trainer stopped",
+            Fault::Stop { role: Role::Observer, .. } => "observer stopped",
+            Fault::StopStarting { role: Role::Engine, .. } => "engine stopped while it starts",
+            Fault::StopStarting { role: Role::Trainer, .. } => "trainer stopped while it starts",
+            Fault::StopStarting { role: Role::Observer, .. } => "observer stopped while it starts",
+            Fault::Restart { .. } => "engine restarted",
+            Fault::Fork { is_killed: true } => "forked trainer killed",
+            Fault::Fork { is_killed: false } => "forked trainer ended",
+            Fault::Descriptors { role: Role::Engine, .. } => "few descriptors, engine",
+            Fault::Descriptors { role: Role::Trainer, .. } => "few descriptors, trainer",
+            Fault::Descriptors { role: Role::Observer, .. } => "few descriptors, observer",
+            Fault::ClockJump { .. } => "clock jump",
+            Fault::RemoveRoot { .. } => "directory removed",
+            Fault::FillMemory { .. } => "full /dev/shm",
+            Fault::HoardingObserver => "hoarding observer",
+            Fault::OtherContainer => "container with its own /tmp",
+            Fault::OtherUser => "other user",
+        }
+    }
+
+    /// What it needs.
+    pub fn right(self) -> Option<Right> {
+        match self {
+            Fault::FillMemory { .. } | Fault::OtherContainer => Some(Right::MountNamespaces),
+            Fault::OtherUser => Some(Right::OtherUsers),
+            _ => None,
+        }
+    }
+}
+
+/// A fault and the time before it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Step {
+    pub pause: u64,
+    pub fault: Fault,
+}
+
+/// One round: an engine, a trainer, observers and visitors in a namespace of their own, and what happens to them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    pub shape: Shape,
+    /// The seed of the trainer's resets, actions and calls.
+    pub trainer_seed: u64,
+    /// Whether its resets change the reset parameters.
+    pub with_options: bool,
+    /// Mean time between a batch and the trainer's next request, in microseconds.
+    pub think: i64,
+    pub observers: usize,
+    /// Processes that list engines and try to connect all the time.
+    pub visitors: usize,
+    /// Size of the round's own /dev/shm in megabytes.
+    pub own_memory: Option<u64>,
+    pub steps: Vec<Step>,
+}
+
+/// A process takes about this long to start and connect, in microseconds.
+const START: i64 = 60_000;
+
+impl Plan {
+    /// Round `number` of a seed.
+    pub fn new(seed: u64, number: u64) -> Self {
+        let words = [seed as u32, (seed >> 32) as u32, number as u32, (number >> 32) as u32];
+        let draws = &mut Generator::from_seed_sequence(&SeedSequence::from_words(&words));
+        let own_memory = (draws.integers(0, 4) == 0).then(|| draws.integers(16, 65) as u64);
+        let shape = Shape::random(draws, 6);
+        let count = draws.integers(3, 8);
+        Plan {
+            shape,
+            trainer_seed: draws.integers(0, 1 << 40) as u64,
+            with_options: draws.integers(0, 2) == 0,
+            think: 300,
+            observers: draws.integers(0, 3) as usize,
+            visitors: draws.integers(0, 3) as usize,
+            own_memory,
+            steps: (0..count)
+                .map(|_| Step { pause: draws.integers(0, 300) as u64, fault: fault(draws, own_memory.is_some()) })
+                .collect(),
+        }
+    }
+
+    /// What the round as a whole needs.
+    pub fn right(&self) -> Option<Right> {
+        self.own_memory.map(|_| Right::MountNamespaces)
+    }
+}
+
+fn fault(draws: &mut Generator, owns_memory: bool) -> Fault {
+    let role = *draws.choice(&[Role::Engine, Role::Engine, Role::Trainer, Role::Trainer, Role::Observer]);
+    let mut below = |limit: i64| draws.integers(0, limit) as u64;
+    let (moment, time, down) = (below(START), below(1500), below(200));
+    if owns_memory && below(2) == 0 {
+        return if below(4) == 0 { Fault::HoardingObserver } else { Fault::FillMemory { role, time } };
+    }
+    match below(18) {
+        0..=2 => Fault::Kill { role, down },
+        3..=4 => Fault::KillStarting { role, moment },
+        5 => Fault::KillEnding { role, moment: moment / 4 },
+        6..=7 => Fault::Stop { role, time },
+        8..=9 => Fault::StopStarting { role, moment, time },
+        10 => Fault::Restart { down },
+        11 => Fault::Fork { is_killed: below(2) == 0 },
+        12 => Fault::Descriptors { role, limit: 4 + below(60) },
+        13 => Fault::ClockJump { seconds: if below(2) == 0 { -3600 } else { 3600 } },
+        14 => Fault::RemoveRoot { then: if below(2) == 0 { Role::Trainer } else { Role::Engine } },
+        15 => Fault::HoardingObserver,
+        16 => Fault::OtherContainer,
+        // In a user namespace there is no other user.
+        _ if owns_memory => Fault::Kill { role, down },
+        _ => Fault::OtherUser,
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{self:?}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn a_plan_follows_from_seed_and_round() {
+        assert_eq!(Plan::new(1, 5), Plan::new(1, 5));
+        assert_ne!(Plan::new(1, 5), Plan::new(1, 6));
+        assert_ne!(Plan::new(1, 5), Plan::new(2, 5));
+    }
+
+    #[test]
+    fn every_kind_of_fault_occurs() {
+        let kinds: BTreeSet<_> =
+            (0..400).flat_map(|round| Plan::new(1, round).steps).map(|step| step.fault.kind()).collect();
+        assert_eq!(kinds.len(), 27, "{kinds:?}");
+    }
+}

@@ -1,0 +1,132 @@
+//! What rounds found, and the summary of a run.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+/// Something that must not happen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Failure {
+    pub kind: String,
+    /// The fault that was being tried.
+    pub fault: String,
+    pub text: String,
+}
+
+/// What a round found.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Outcome {
+    /// The faults that were tried by kind, with the time in milliseconds from the end of the fault to the next correct batch.
+    pub faults: Vec<(String, Option<f64>)>,
+    pub failures: Vec<Failure>,
+    /// The errors that processes reported.
+    pub errors: BTreeMap<String, u64>,
+    /// Batches that a trainer compared with its twin.
+    pub batches: u64,
+    /// Batches of observers that were compared with a trainer's.
+    pub observed: u64,
+    /// Faults that the machine does not permit, by kind.
+    pub left_out: BTreeMap<String, u64>,
+}
+
+impl Outcome {
+    /// Adds a round's.
+    pub fn add(&mut self, other: Outcome) {
+        self.faults.extend(other.faults);
+        self.failures.extend(other.failures);
+        self.batches += other.batches;
+        self.observed += other.observed;
+        for (sums, counts) in [(&mut self.errors, other.errors), (&mut self.left_out, other.left_out)] {
+            for (kind, count) in counts {
+                *sums.entry(kind).or_default() += count;
+            }
+        }
+    }
+
+    /// The summary as JSON.
+    pub fn json(&self, seed: u64, rounds: u64) -> serde_json::Value {
+        serde_json::json!({
+            "seed": seed,
+            "rounds": rounds,
+            "faults": self.faults.len(),
+            "batches_compared": self.batches,
+            "observed_batches_compared": self.observed,
+            "recovery_ms": recovery(self.faults.iter().filter_map(|(_, time)| *time)),
+            "kinds": self.kinds().into_iter().map(|(kind, times)| {
+                (kind, serde_json::json!({"faults": times.len(), "recovery_ms": recovery(times.into_iter().flatten())}))
+            }).collect::<serde_json::Map<_, _>>(),
+            "failures": self.failures,
+            "errors": self.errors,
+            "left_out": self.left_out,
+        })
+    }
+
+    fn kinds(&self) -> BTreeMap<String, Vec<Option<f64>>> {
+        let mut kinds = BTreeMap::<_, Vec<_>>::new();
+        for (kind, time) in &self.faults {
+            kinds.entry(kind.clone()).or_default().push(*time);
+        }
+        kinds
+    }
+
+    /// Prints the summary.
+    pub fn print(&self) {
+        println!(
+            "\n{:34} {:>7} {:>9} {:>9} {:>9}  recovery in milliseconds",
+            "fault", "faults", "median", "p95", "max"
+        );
+        let all = ("all".to_owned(), self.faults.iter().map(|(_, time)| *time).collect());
+        for (kind, times) in self.kinds().into_iter().chain([all]) {
+            let count = times.len();
+            match recovery(times.into_iter().flatten()) {
+                Some(Recovery { median, p95, max }) => {
+                    println!("{kind:34} {count:>7} {median:>9.0} {p95:>9.0} {max:>9.0}");
+                }
+                None => println!("{kind:34} {count:>7}"),
+            }
+        }
+        println!("\nbatches compared: {} of trainers, {} of observers", self.batches, self.observed);
+        let errors: Vec<_> = self.errors.iter().map(|(kind, count)| format!("{kind} {count}")).collect();
+        println!("errors that were reported: {}", errors.join(", "));
+        for (kind, count) in &self.left_out {
+            println!("left out, since this machine does not permit it: {kind} ({count})");
+        }
+        let mut failures = BTreeMap::<_, u64>::new();
+        for failure in &self.failures {
+            *failures.entry((&failure.kind, &failure.fault)).or_default() += 1;
+        }
+        for ((kind, fault), count) in &failures {
+            println!("FAILED {count} times: {kind} after: {fault}");
+        }
+        println!("{} faults, {} failures", self.faults.len(), self.failures.len());
+    }
+}
+
+/// Times in milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Recovery {
+    pub median: f64,
+    pub p95: f64,
+    pub max: f64,
+}
+
+/// The quantiles of some times.
+pub fn recovery(times: impl Iterator<Item = f64>) -> Option<Recovery> {
+    let mut times: Vec<f64> = times.collect();
+    times.sort_by(f64::total_cmp);
+    let at =
+        |share: f64| times.get(((times.len() as f64 * share) as usize).min(times.len().saturating_sub(1))).copied();
+    Some(Recovery { median: at(0.5)?, p95: at(0.95)?, max: at(1.0)? })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_are_of_the_sorted_times() {
+        let times = (0..100).rev().map(f64::from);
+        assert_eq!(recovery(times), Some(Recovery { median: 50.0, p95: 95.0, max: 99.0 }));
+        assert_eq!(recovery([].into_iter()), None);
+    }
+}

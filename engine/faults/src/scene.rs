@@ -1,0 +1,309 @@
+//! A round's processes, and the rules by which what they report and how they end is judged.
+
+use std::collections::{HashMap, HashSet};
+use std::process::Command;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::{Duration, Instant};
+
+use endless_gym_service::{Namespace, ROOT_VARIABLE};
+
+use crate::actors::{self, Actor, is_crash};
+use crate::event::Event;
+use crate::others::Habit;
+use crate::plan::{Fault, Plan, Role};
+use crate::report::{Failure, Outcome};
+use crate::trainer::Work;
+
+/// How long the next correct batch may take. A machine may run other work.
+pub const LIMIT: Duration = Duration::from_secs(15);
+
+/// Failures of one kind that a round keeps.
+const KEPT: usize = 3;
+
+/// The processes of a round.
+pub struct Scene<'a> {
+    pub plan: &'a Plan,
+    pub namespace: Namespace,
+    pub outcome: Outcome,
+    /// The fault that is being tried.
+    pub current: Option<Fault>,
+    /// Processes that are to be started again if they end by themselves.
+    pub engine: Option<Actor>,
+    pub trainer: Option<Actor>,
+    pub observer: Option<Actor>,
+    /// Others, which end when they want.
+    pub others: Vec<Actor>,
+    /// Processes that were given few descriptors, so that their errors are expected.
+    pub limited: HashSet<u32>,
+    /// The last process that was forked.
+    pub forked: Option<u32>,
+    sender: Sender<(u32, Event)>,
+    events: Receiver<(u32, Event)>,
+    /// Engines that were ended on purpose.
+    ended_engines: HashSet<u32>,
+    /// All trainers so far and their numbers: reports of a killed process may still be in its pipe.
+    trainers: HashMap<u32, u64>,
+    /// The process of each incarnation.
+    engines: HashMap<u64, u32>,
+    /// Checksums by incarnation, group and step.
+    checksums: HashMap<(u64, usize, u64), (bool, u32)>,
+    /// The last batch of each incarnation's groups, and its trainer.
+    steps: HashMap<(u64, usize), (u32, u64)>,
+    /// The last correct batch: its time, its trainer and its engine.
+    last_batch: Option<(Duration, u32, u32)>,
+    started: u64,
+}
+
+impl<'a> Scene<'a> {
+    pub fn new(plan: &'a Plan, namespace: Namespace) -> Self {
+        let (sender, events) = channel();
+        Scene {
+            plan,
+            namespace,
+            outcome: Outcome::default(),
+            current: None,
+            engine: None,
+            trainer: None,
+            observer: None,
+            others: Vec::new(),
+            limited: HashSet::new(),
+            forked: None,
+            sender,
+            events,
+            ended_engines: HashSet::new(),
+            trainers: HashMap::new(),
+            engines: HashMap::new(),
+            checksums: HashMap::new(),
+            steps: HashMap::new(),
+            last_batch: None,
+            started: 0,
+        }
+    }
+
+    /// Notes something that must not happen.
+    pub fn fail(&mut self, kind: &str, text: String) {
+        let fault = self.current.map_or("no fault", Fault::kind).to_owned();
+        let same = |failure: &&Failure| failure.kind == kind && failure.fault == fault;
+        if self.outcome.failures.iter().filter(same).count() < KEPT {
+            self.outcome.failures.push(Failure { kind: kind.to_owned(), fault, text });
+        }
+    }
+
+    /// The command that starts a process in a role.
+    pub fn command(&mut self, role: Role) -> Result<Command, String> {
+        self.started += 1;
+        let seed = self.plan.trainer_seed.wrapping_add(self.started);
+        match role {
+            Role::Engine => {
+                let mut engine = Command::new(actors::engine_program()?);
+                engine.args(self.plan.shape.arguments());
+                Ok(engine)
+            }
+            Role::Trainer => {
+                let shape = self.plan.shape.clone();
+                actors::role(
+                    "train",
+                    &Work { shape, seed, with_options: self.plan.with_options, think: self.plan.think },
+                )
+            }
+            Role::Observer => actors::role("observe", &Habit { seed, holds: (seed % 3) as usize, pause: 20 }),
+        }
+    }
+
+    /// Starts any process of the round.
+    pub fn spawn(&self, mut command: Command) -> Result<Actor, String> {
+        command.env(ROOT_VARIABLE, self.namespace.root());
+        Actor::start(command, &self.sender)
+    }
+
+    /// Starts the process of a role, in place of the one that had it.
+    pub fn start(&mut self, role: Role) -> Result<(), String> {
+        let command = self.command(role)?;
+        let actor = self.spawn(command)?;
+        if role == Role::Trainer {
+            self.add_trainer(actor.id());
+        }
+        *self.place(role) = Some(actor);
+        Ok(())
+    }
+
+    /// The process of a role.
+    pub fn place(&mut self, role: Role) -> &mut Option<Actor> {
+        match role {
+            Role::Engine => &mut self.engine,
+            Role::Trainer => &mut self.trainer,
+            Role::Observer => &mut self.observer,
+        }
+    }
+
+    /// Takes the process of a role out of the round's watch, since it is going to end.
+    pub fn take(&mut self, role: Role) -> Option<Actor> {
+        let actor = self.place(role).take();
+        if let Some(engine) = actor.as_ref().filter(|_| role == Role::Engine) {
+            self.ended_engines.insert(engine.id());
+        }
+        actor
+    }
+
+    /// Kills the process of a role.
+    pub fn kill(&mut self, role: Role) {
+        if let Some(mut actor) = self.take(role) {
+            actor.kill();
+        }
+    }
+
+    /// Watches for a time.
+    pub fn watch(&mut self, time: Duration) -> Result<(), String> {
+        let start = Instant::now();
+        while start.elapsed() < time {
+            self.look()?;
+            std::thread::sleep(Duration::from_millis(1).min(time.saturating_sub(start.elapsed())));
+        }
+        Ok(())
+    }
+
+    /// Waits for a correct batch later than `since`, from the present engine to the present trainer. Returns its time.
+    pub fn next_batch(&mut self, since: Duration, limit: Duration) -> Result<Option<Duration>, String> {
+        let start = Instant::now();
+        loop {
+            self.look()?;
+            let present = (self.trainer.as_ref().map(Actor::id), self.engine.as_ref().map(Actor::id));
+            if let Some((at, trainer, engine)) = self.last_batch
+                && at > since
+                && present == (Some(trainer), Some(engine))
+            {
+                return Ok(Some(at));
+            }
+            if start.elapsed() >= limit {
+                return Ok(None);
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Reads what was reported, and starts again what has ended by itself.
+    pub fn look(&mut self) -> Result<(), String> {
+        while let Ok((process, event)) = self.events.try_recv() {
+            self.judge(process, event);
+        }
+        for role in [Role::Engine, Role::Trainer, Role::Observer] {
+            let Some(actor) = self.place(role) else { continue };
+            let (Some(status), id) = (actor.ended(), actor.id()) else { continue };
+            let complaint = actor.complaint();
+            let text = format!("{role:?} {id} ended by itself, {status}: {complaint}");
+            if is_crash(status) {
+                self.fail("crash", text);
+            } else if !self.is_excused(id, &complaint) {
+                self.fail("unexpected end", text);
+            }
+            drop(self.take(role));
+            // One that cannot start is not started in a tight loop.
+            std::thread::sleep(Duration::from_millis(50));
+            self.start(role)?;
+        }
+        Ok(())
+    }
+
+    fn is_short_of_memory(&self) -> bool {
+        self.plan.own_memory.is_some()
+    }
+
+    /// Whether a process may complain so in the present fault.
+    fn is_excused(&self, process: u32, complaint: &str) -> bool {
+        self.limited.contains(&process)
+            || (self.is_short_of_memory() && complaint.contains("/dev/shm"))
+            || (matches!(self.current, Some(Fault::StopStarting { .. } | Fault::Stop { .. }))
+                && complaint.contains("has been locked"))
+    }
+
+    fn judge(&mut self, process: u32, event: Event) {
+        match event {
+            Event::Connected { incarnation, engine, .. } => {
+                self.engines.insert(incarnation, engine);
+            }
+            Event::Batch { at, incarnation, group, step, checksum } => {
+                let is_trainer = self.trainers.contains_key(&process);
+                if is_trainer {
+                    self.count(process, incarnation, group, step);
+                    self.last_batch = self.engines.get(&incarnation).map(|engine| (at, process, *engine));
+                }
+                self.compare(is_trainer, (incarnation, group, step), checksum);
+            }
+            Event::Wrong { what } => self.fail("wrong bytes", what),
+            Event::Miscounted { what } => self.fail("lost or doubled step", what),
+            Event::Broken { what } => self.fail("broken promise", what),
+            Event::Forked { child } => self.forked = Some(child),
+            Event::End => {}
+            Event::Error { during, kind, text, engine } => {
+                *self.outcome.errors.entry(kind.clone()).or_default() += 1;
+                let is_lost = matches!(kind.as_str(), "EngineLost" | "EngineRestarted");
+                // An engine without its directory starts anew in the same process.
+                let is_removed = matches!(self.current, Some(Fault::RemoveRoot { .. }));
+                let has_crashed = self.engine.as_mut().is_some_and(|engine| engine.ended().is_some());
+                let is_running = engine.is_some_and(|engine| !self.ended_engines.contains(&engine)) && !has_crashed;
+                if is_lost && !is_removed && is_running {
+                    let text = format!("{during}: {text}, and engine {} was running", engine.unwrap_or_default());
+                    self.fail("false end of an engine", text);
+                }
+                let expected = match kind.as_str() {
+                    "EngineLost" | "EngineRestarted" | "UnknownEngine" | "TrainerExists" | "TimedOut" => true,
+                    "TooManyObservers" | "TooManyBatchesHeld" | "NoSuchGroup" => during == "observe",
+                    "RootRemoved" | "Root" => is_removed,
+                    "NamespaceLocked" => matches!(self.current, Some(Fault::Stop { .. } | Fault::StopStarting { .. })),
+                    _ => false,
+                };
+                if !expected && !self.is_excused(process, &text) {
+                    self.fail("unexpected error", format!("{during}: {kind}: {text}"));
+                }
+            }
+        }
+    }
+
+    /// A group's batches are numbered without gaps for one trainer. The first batch of another trainer's may come after one that
+    /// the trainer before it had requested and not reported.
+    fn count(&mut self, trainer: u32, incarnation: u64, group: usize, step: u64) {
+        self.outcome.batches += 1;
+        let last = self.steps.insert((incarnation, group), (trainer, step));
+        // Within a trainer's life the trainer itself counts.
+        let Some((other, last)) = last.filter(|(other, _)| *other != trainer) else { return };
+        // One for each trainer since then.
+        let unknown = self.trainers.get(&trainer).zip(self.trainers.get(&other)).map_or(0, |(new, old)| new - old);
+        if !(last + 1..=last + 1 + unknown).contains(&step) {
+            let text = format!("group {group}: the first batch of a new trainer is {step}, after {last}");
+            self.fail("lost or doubled step", text);
+        }
+    }
+
+    /// Compares a batch that an observer saw with the trainer's, which equals the twin's.
+    fn compare(&mut self, is_trainer: bool, batch: (u64, usize, u64), checksum: u32) {
+        match self.checksums.insert(batch, (is_trainer, checksum)) {
+            Some((_, other)) if other != checksum => {
+                let (_, group, step) = batch;
+                self.fail(
+                    "wrong bytes",
+                    format!("group {group}: an observer's batch {step} differs from the trainer's"),
+                );
+            }
+            Some((before, _)) if before != is_trainer => self.outcome.observed += 1,
+            _ => {}
+        }
+        if self.checksums.len() > 50_000 {
+            self.checksums.clear();
+        }
+    }
+
+    /// Whether the trainer has received a correct batch of that engine since then.
+    pub fn has_played(&self, engine: u32, since: Duration) -> bool {
+        self.last_batch.is_some_and(|(at, _, from)| at > since && from == engine)
+    }
+
+    /// Notes that a process is a trainer.
+    pub fn add_trainer(&mut self, process: u32) {
+        self.trainers.insert(process, self.trainers.len() as u64);
+    }
+
+    /// Notes that an engine is going to be ended on purpose.
+    pub fn end_limited(&mut self, engine: u32) {
+        self.ended_engines.insert(engine);
+    }
+}

@@ -1,0 +1,100 @@
+//! What an engine serves: the arguments of `endless serve`, and the pools that must play the same.
+
+use endless_gym_core::batch::Frames;
+use endless_gym_core::envs;
+use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, Seeding};
+use endless_gym_core::random::Generator;
+use endless_gym_core::raster::PixelFormat;
+use serde::{Deserialize, Serialize};
+
+use crate::options;
+
+/// The name of every round's engine.
+pub const SERVICE: &str = "gym";
+
+/// What an engine serves.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Shape {
+    pub id: String,
+    pub num_envs: usize,
+    pub groups: usize,
+    pub autoreset: Autoreset,
+    pub final_observation: bool,
+    pub features: bool,
+    pub frames: Option<Frames>,
+    pub options: OptionMap,
+    /// The engine's own seed. The trainer resets with seeds, after which it must not matter.
+    pub seed: Option<u64>,
+}
+
+impl Shape {
+    /// A random shape: any id and format, options within their limits, at most `most` environments in all groups.
+    pub fn random(draws: &mut Generator, most: i64) -> Self {
+        let specs: Vec<_> = envs::specs().map(|spec| spec.id).collect();
+        let id = *draws.choice(&specs);
+        Shape::random_of(draws, id, most)
+    }
+
+    /// A random shape of an id.
+    pub fn random_of(draws: &mut Generator, id: &str, most: i64) -> Self {
+        let groups = draws.integers(1, 4);
+        let autoreset =
+            *draws.choice(&[Autoreset::NextStep, Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled]);
+        let mut flag = || draws.integers(0, 3) == 0;
+        let format = PixelFormat { grayscale: flag(), channels_first: flag(), row_major: flag() };
+        let (final_observation, features, has_seed, is_stacked, has_options) = (flag(), flag(), flag(), flag(), flag());
+        let stack = if is_stacked { draws.integers(2, 5) as usize } else { 1 };
+        let options = if has_options { options::random(draws, id) } else { OptionMap::new() };
+        Shape {
+            id: id.to_owned(),
+            num_envs: draws.integers(1, (most / groups).max(1) + 1) as usize,
+            groups: groups as usize,
+            autoreset,
+            final_observation: final_observation && autoreset == Autoreset::SameStep,
+            features,
+            frames: (draws.integers(0, 12) != 0).then_some(Frames { format, stack }),
+            options,
+            seed: has_seed.then(|| draws.integers(0, 1000) as u64),
+        }
+    }
+
+    /// The arguments of `endless` that serve it.
+    pub fn arguments(&self) -> Vec<String> {
+        let mut arguments = vec!["serve".to_owned(), format!("--service={SERVICE}"), "--child".to_owned()];
+        arguments.push(format!("--env={}", self.id));
+        arguments.push(format!("--num-envs={}", self.num_envs));
+        arguments.push(format!("--groups={}", self.groups));
+        arguments.push("--threads=1".to_owned());
+        arguments.push(format!("--autoreset={}", self.autoreset.name()));
+        arguments.extend(self.options.iter().map(|(name, value)| format!("--option={name}={value}")));
+        arguments.extend(self.seed.map(|seed| format!("--seed={seed}")));
+        let mut flag = |is_set: bool, name: &str| arguments.extend(is_set.then(|| name.to_owned()));
+        flag(self.final_observation, "--final-observation");
+        flag(self.features, "--features");
+        match self.frames {
+            None => flag(true, "--no-frames"),
+            Some(Frames { format, stack }) => {
+                flag(format.grayscale, "--grayscale");
+                flag(format.channels_first, "--channels-first");
+                flag(format.row_major, "--row-major");
+                arguments.push(format!("--frame-stack={stack}"));
+            }
+        }
+        arguments
+    }
+
+    /// The pool that plays what the engine's group plays.
+    pub fn pool(&self, group: usize) -> PoolConfig {
+        PoolConfig {
+            options: ResetOptions::Shared(self.options.clone()),
+            autoreset: self.autoreset,
+            final_observation: self.final_observation,
+            seeding: Seeding::Continue { seed: self.seed },
+            frames: self.frames,
+            features: self.features,
+            first_env: group * self.num_envs,
+            total_envs: self.groups * self.num_envs,
+            ..PoolConfig::new(&self.id, self.num_envs)
+        }
+    }
+}

@@ -1,0 +1,256 @@
+//! A long run without faults: all ids with random options and formats, while memory, descriptors and segments are watched.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use endless_gym_core::envs;
+use endless_gym_core::random::Generator;
+use endless_gym_service::Namespace;
+use serde::Serialize;
+
+use crate::actors::Actor;
+use crate::cleanliness;
+use crate::plan::{Plan, Role};
+use crate::report::Outcome;
+use crate::round;
+use crate::run::{duration, new_namespace, random_seed, stop_on_signal};
+use crate::scene::Scene;
+use crate::shape::Shape;
+
+/// Growth that is no leak: the pictures of other options take other amounts of memory.
+const MEMORY: u64 = 16 << 20;
+const DESCRIPTORS: u64 = 4;
+const SEGMENTS: u64 = 8;
+
+/// Arguments of `soak`.
+#[derive(clap::Args)]
+pub struct Args {
+    /// How long to go on; each of the ten ids has a tenth of it.
+    #[arg(long, default_value_t = 60.0)]
+    minutes: f64,
+    /// The seed of options, formats and actions [default: random].
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Write the summary as JSON to a file.
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+/// What the processes take at one moment.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+struct Usage {
+    engine_memory: u64,
+    trainer_memory: u64,
+    engine_descriptors: u64,
+    trainer_descriptors: u64,
+    segments: u64,
+}
+
+impl Usage {
+    fn of(scene: &Scene<'_>) -> Self {
+        let id = |actor: &Option<Actor>| actor.as_ref().map_or(0, Actor::id);
+        let (engine, trainer) = (id(&scene.engine), id(&scene.trainer));
+        let segments = cleanliness::files(&scene.namespace);
+        Usage {
+            engine_memory: memory(engine),
+            trainer_memory: memory(trainer),
+            engine_descriptors: descriptors(engine),
+            trainer_descriptors: descriptors(trainer),
+            segments: segments.iter().filter(|path| path.starts_with("/dev/shm")).count() as u64,
+        }
+    }
+
+    /// What has grown from the first to the last third of a phase: even the lowest value of the last is above the highest of the first.
+    fn growth(usages: &[Usage]) -> Vec<String> {
+        type Counter = (&'static str, fn(&Usage) -> u64, u64);
+
+        let third = usages.len() / 3;
+        let (first, last) = (&usages[..third], &usages[usages.len() - third..]);
+        let counters: [Counter; 5] = [
+            ("memory of the engine", |usage| usage.engine_memory, MEMORY),
+            ("memory of the trainer", |usage| usage.trainer_memory, MEMORY),
+            ("descriptors of the engine", |usage| usage.engine_descriptors, DESCRIPTORS),
+            ("descriptors of the trainer", |usage| usage.trainer_descriptors, DESCRIPTORS),
+            ("segments", |usage| usage.segments, SEGMENTS),
+        ];
+        let grown = counters.into_iter().filter_map(|(name, counter, limit)| {
+            let (before, after) = (first.iter().map(counter).max()?, last.iter().map(counter).min()?);
+            (after > before + limit).then(|| format!("{name} from at most {before} to at least {after}"))
+        });
+        grown.collect()
+    }
+}
+
+/// Bytes of a process that are in memory.
+fn memory(process: u32) -> u64 {
+    let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok()).map_or(0, |kilobytes| kilobytes << 10)
+}
+
+fn descriptors(process: u32) -> u64 {
+    fs::read_dir(format!("/proc/{process}/fd")).map_or(0, |entries| entries.count() as u64)
+}
+
+/// One id's part of the run.
+#[derive(Debug, Serialize)]
+struct Phase {
+    id: String,
+    steps: u64,
+    first: Usage,
+    last: Usage,
+    outcome: Outcome,
+}
+
+/// Runs `soak`.
+pub fn run(args: &Args) -> Result<(), String> {
+    let time = duration(args.minutes)?;
+    let seed = args.seed.map_or_else(random_seed, Ok)?;
+    let stop = stop_on_signal()?;
+    println!("seed {seed}");
+    let ids: Vec<&str> = envs::specs().map(|spec| spec.id).collect();
+    let mut draws = Generator::from_seed(seed);
+    let start = Instant::now();
+    let mut phases: Vec<Phase> = Vec::new();
+    for (number, id) in ids.iter().enumerate() {
+        let end = time.mul_f64((number + 1) as f64 / ids.len() as f64);
+        let plan = Plan {
+            shape: Shape::random_of(&mut draws, id, 16),
+            trainer_seed: draws.integers(0, 1 << 40) as u64,
+            with_options: true,
+            think: 0,
+            observers: 1,
+            visitors: 1,
+            own_memory: None,
+            steps: Vec::new(),
+        };
+        let namespace = new_namespace()?;
+        let must_end = || start.elapsed() >= end || stop.load(std::sync::atomic::Ordering::Relaxed);
+        let phase = phase(&plan, namespace.clone(), &mut draws, start, must_end);
+        cleanliness::remove_all(&namespace);
+        let phase = phase?;
+        println!("{id}: {} steps, {} failures", phase.steps, phase.outcome.failures.len());
+        for failure in &phase.outcome.failures {
+            println!("    FAILED: {}: {}\n    {:?}", failure.kind, failure.text, plan.shape);
+        }
+        phases.push(phase);
+    }
+    summary(args, seed, start.elapsed(), &phases)
+}
+
+fn phase(
+    plan: &Plan,
+    namespace: Namespace,
+    draws: &mut Generator,
+    start: Instant,
+    must_end: impl Fn() -> bool,
+) -> Result<Phase, String> {
+    let mut scene = Scene::new(plan, namespace);
+    for role in [Role::Engine, Role::Trainer, Role::Observer] {
+        scene.start(role)?;
+    }
+    scene.visitor(usize::MAX)?;
+    let mut usages = Vec::new();
+    let mut minute = start.elapsed().as_secs() / 60;
+    let mut next_observer = Instant::now();
+    while !must_end() {
+        scene.watch(Duration::from_millis(500))?;
+        usages.push(Usage::of(&scene));
+        if Instant::now() >= next_observer {
+            // Observers come and go, regularly and not.
+            if draws.integers(0, 2) == 0 {
+                scene.kill(Role::Observer);
+            } else {
+                scene.end(Role::Observer, Actor::close_input)?;
+            }
+            scene.start(Role::Observer)?;
+            next_observer = Instant::now() + Duration::from_millis(draws.integers(500, 8000) as u64);
+        }
+        if start.elapsed().as_secs() / 60 > minute
+            && let Some(usage) = usages.last()
+        {
+            minute = start.elapsed().as_secs() / 60;
+            print_minute(minute, &scene, plan, *usage);
+        }
+    }
+    // The processes are still starting in the first third of a very short run, which is not judged.
+    if usages.len() >= 30 {
+        for grown in Usage::growth(&usages) {
+            scene.fail("growth", grown);
+        }
+    }
+    round::end(&mut scene)?;
+    for left in cleanliness::leftovers(&scene.namespace) {
+        scene.fail("left behind", left);
+    }
+    if scene.outcome.batches == 0 {
+        scene.fail("no batches", "the trainer has not played".to_owned());
+    }
+    Ok(Phase {
+        id: plan.shape.id.clone(),
+        steps: steps(&scene.outcome, plan),
+        first: usages.get(usages.len() / 10).copied().unwrap_or_default(),
+        last: usages.last().copied().unwrap_or_default(),
+        outcome: std::mem::take(&mut scene.outcome),
+    })
+}
+
+fn steps(outcome: &Outcome, plan: &Plan) -> u64 {
+    outcome.batches * plan.shape.num_envs as u64
+}
+
+fn print_minute(minute: u64, scene: &Scene<'_>, plan: &Plan, usage: Usage) {
+    let Usage { engine_memory, trainer_memory, engine_descriptors, trainer_descriptors, segments } = usage;
+    println!(
+        "minute {minute}: {}: {} steps, {} failures; memory of engine and trainer {:.1} and {:.1} MB, descriptors \
+         {engine_descriptors} and {trainer_descriptors}, segments {segments}",
+        plan.shape.id,
+        steps(&scene.outcome, plan),
+        scene.outcome.failures.len(),
+        engine_memory as f64 / 1e6,
+        trainer_memory as f64 / 1e6,
+    );
+}
+
+fn summary(args: &Args, seed: u64, time: Duration, phases: &[Phase]) -> Result<(), String> {
+    let steps: u64 = phases.iter().map(|phase| phase.steps).sum();
+    let observed: u64 = phases.iter().map(|phase| phase.outcome.observed).sum();
+    let failures: usize = phases.iter().map(|phase| phase.outcome.failures.len()).sum();
+    let mut kinds = BTreeMap::<_, u64>::new();
+    for failure in phases.iter().flat_map(|phase| &phase.outcome.failures) {
+        *kinds.entry(&failure.kind).or_default() += 1;
+    }
+    println!(
+        "\n{steps} steps compared in {:.1} minutes, {observed} batches of observers compared",
+        time.as_secs_f64() / 60.0
+    );
+    for (kind, count) in &kinds {
+        println!("FAILED {count} times: {kind}");
+    }
+    println!("{failures} failures");
+    if let Some(path) = &args.json {
+        let minutes = time.as_secs_f64() / 60.0;
+        let summary = serde_json::json!({
+            "seed": seed, "minutes": minutes, "steps": steps, "observed_batches_compared": observed, "failures": failures,
+            "phases": phases,
+        });
+        fs::write(path, format!("{summary:#}\n")).map_err(|error| format!("{}: {error}", path.display()))?;
+    }
+    if failures == 0 { Ok(()) } else { Err(format!("{failures} failures; seed {seed}")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steady_growth_is_found_and_fluctuation_is_not() {
+        let usages = |memory: fn(u64) -> u64| -> Vec<Usage> {
+            (0..90).map(|at| Usage { engine_memory: memory(at) << 20, ..Usage::default() }).collect()
+        };
+        assert_eq!(Usage::growth(&usages(|at| 100 + at)).len(), 1);
+        assert!(Usage::growth(&usages(|at| 100 + 50 * (at % 5))).is_empty());
+    }
+}

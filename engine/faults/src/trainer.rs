@@ -1,0 +1,309 @@
+//! The trainer: a process that plays at random, compares every batch with its twins, and goes on after every error.
+
+use std::collections::VecDeque;
+use std::io::BufRead;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use endless_gym_core::pool::PoolError;
+use endless_gym_core::random::Generator;
+use endless_gym_service::{BatchLease, ConnectConfig, GroupReconnection, LastRequest, ServiceError, Trainer};
+use serde::{Deserialize, Serialize};
+
+use crate::checker::{Request, Twin, checksum};
+use crate::event::{Event, now};
+use crate::shape::{SERVICE, Shape};
+
+/// How long one call waits.
+const PATIENCE: Duration = Duration::from_millis(400);
+
+/// The argument of the role.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Work {
+    pub shape: Shape,
+    pub seed: u64,
+    /// Whether resets change the reset parameters.
+    pub with_options: bool,
+    /// Mean time between a batch and the next request, in microseconds.
+    pub think: i64,
+}
+
+/// What the round asks of its trainer, over standard input.
+#[derive(Clone, Default)]
+struct Orders {
+    stop: Arc<AtomicBool>,
+    fork: Arc<AtomicBool>,
+}
+
+impl Orders {
+    fn read() -> Self {
+        let orders = Orders::default();
+        let reader = orders.clone();
+        std::thread::spawn(move || {
+            for line in std::io::stdin().lock().lines() {
+                if line.is_ok_and(|line| line == "fork") {
+                    reader.fork.store(true, Ordering::Relaxed);
+                }
+            }
+            reader.stop.store(true, Ordering::Relaxed);
+        });
+        orders
+    }
+
+    fn must_stop(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+}
+
+/// Plays until standard input ends.
+pub fn run(work: &Work) -> Result<(), String> {
+    let orders = Orders::read();
+    let mut draws = Generator::from_seed(work.seed);
+    let mut last: Option<(Trainer, Vec<Requested>)> = None;
+    while !orders.must_stop() {
+        let connected = match last.take() {
+            None => connect(),
+            Some((trainer, requested)) => reconnect(trainer, &requested),
+        };
+        let Some(mut connected) = connected else {
+            std::thread::sleep(Duration::from_millis(5));
+            continue;
+        };
+        let (incarnation, engine) = (connected.specification().incarnation, connected.specification().engine_pid);
+        Event::Connected { at: now(), incarnation, engine }.report();
+        let mut play = Play::new(work, &connected).map_err(|error| error.to_string())?;
+        while !orders.must_stop() {
+            if orders.fork.swap(false, Ordering::Relaxed) {
+                fork();
+            }
+            match play.exchange(&mut connected, &mut draws) {
+                Ok(true) => {}
+                Ok(false) => break,
+                Err(failed) => {
+                    let (during, error) = *failed;
+                    Event::error(during, &error, Some(engine)).report();
+                    if !matches!(error, ServiceError::TimedOut { .. }) {
+                        break;
+                    }
+                }
+            }
+            std::thread::sleep(Duration::from_micros(draws.integers(0, 2 * work.think + 1) as u64));
+        }
+        let requested =
+            play.groups.iter().map(|group| Requested { step: group.step, is_pending: group.pending.is_some() });
+        last = Some((connected, requested.collect()));
+    }
+    drop(last);
+    Event::End.report();
+    Ok(())
+}
+
+/// What a trainer knows of a group when its engine is lost.
+struct Requested {
+    /// The number of the last batch.
+    step: Option<u64>,
+    /// Whether it waits for another.
+    is_pending: bool,
+}
+
+fn connect() -> Option<Trainer> {
+    let config = ConnectConfig { timeout: PATIENCE, ..ConnectConfig::new(SERVICE) };
+    Trainer::connect(&config).inspect_err(|error| Event::error("connect", error, None).report()).ok()
+}
+
+/// Reconnects, and checks what it is told about its last requests. A trainer that cannot reconnect makes a new connection.
+fn reconnect(mut trainer: Trainer, requested: &[Requested]) -> Option<Trainer> {
+    for _ in 0..3 {
+        match trainer.reconnect(PATIENCE) {
+            Ok(found) => {
+                for (index, (before, group)) in requested.iter().zip(&found.groups).enumerate() {
+                    check_fate(index, before, group);
+                }
+                return Some(trainer);
+            }
+            Err(error) => Event::error("reconnect", &error, None).report(),
+        }
+    }
+    None
+}
+
+/// A lost engine must have returned the batches that the trainer received, and one more if it is said to have played the last
+/// request.
+fn check_fate(index: usize, before: &Requested, found: &GroupReconnection) {
+    let (Some(step), Some(lost)) = (before.step, found.lost_step) else { return };
+    let played = match found.last_request {
+        LastRequest::Unknown if before.is_pending => 0..=1,
+        LastRequest::Played if before.is_pending => 1..=1,
+        _ => 0..=0,
+    };
+    if !played.contains(&lost.saturating_sub(step)) || lost < step {
+        let what = format!(
+            "group {index}: batch {step} was received, pending: {}; the lost engine returned {lost}, and its last request is {:?}",
+            before.is_pending, found.last_request
+        );
+        Event::Miscounted { what }.report();
+    }
+}
+
+/// One connection's groups.
+struct Play<'a> {
+    work: &'a Work,
+    groups: Vec<Group>,
+    incarnation: u64,
+    held: VecDeque<(BatchLease, u32)>,
+}
+
+struct Group {
+    twin: Twin,
+    pending: Option<Request>,
+    was_reset: bool,
+    /// The number of the last batch.
+    step: Option<u64>,
+}
+
+/// The call that failed, and why.
+type Failed = Box<(&'static str, ServiceError)>;
+
+fn failed(during: &'static str) -> impl Fn(ServiceError) -> Failed {
+    move |error| Box::new((during, error))
+}
+
+impl<'a> Play<'a> {
+    fn new(work: &'a Work, trainer: &Trainer) -> Result<Self, PoolError> {
+        let twins = (0..work.shape.groups).map(|group| Twin::new(&work.shape, group));
+        let groups =
+            twins.map(|twin| Ok::<_, PoolError>(Group { twin: twin?, pending: None, was_reset: false, step: None }));
+        let groups: Vec<_> = groups.collect::<Result<_, _>>()?;
+        let specification = trainer.specification();
+        if let Some(what) = groups.first().and_then(|group| group.twin.difference(&work.shape, specification)) {
+            Event::Wrong { what }.report();
+        }
+        Ok(Play { work, groups, incarnation: specification.incarnation, held: VecDeque::new() })
+    }
+
+    /// Sends a request to the groups without a pending answer, and receives one batch. Returns false if the engine is another run.
+    fn exchange(&mut self, trainer: &mut Trainer, draws: &mut Generator) -> Result<bool, Failed> {
+        let (shape, space) = (&self.work.shape, trainer.specification().action_space.clone());
+        for (index, group) in self.groups.iter_mut().enumerate().filter(|(_, group)| group.pending.is_none()) {
+            if group.was_reset && draws.integers(0, 60) == 0 {
+                snapshot(&mut group.twin, trainer, index, draws.integers(0, shape.num_envs as i64) as usize)?;
+            }
+            let request = if group.was_reset {
+                Request::random(draws, shape, &space, self.work.with_options)
+            } else {
+                // An earlier trainer may have changed the options.
+                let options = self.work.with_options.then(|| shape.options.clone());
+                Request::Seed { seed: self.work.seed, options }
+            };
+            request.send(trainer, index).map_err(failed("send"))?;
+            group.pending = Some(request);
+        }
+        if draws.integers(0, 200) == 0 {
+            let found = trainer.reconnect(PATIENCE).map_err(failed("reconnect"))?;
+            if found.restarted {
+                // The engine was replaced at this moment.
+                return Ok(false);
+            }
+            for (index, group) in found.groups.iter().enumerate() {
+                // All groups wait for an answer.
+                if group.last_request != LastRequest::Pending {
+                    let what = format!("group {index}: a pending request is {:?} to reconnect()", group.last_request);
+                    Event::Broken { what }.report();
+                }
+            }
+        }
+        let lease = trainer.receive_any(PATIENCE).map_err(failed("receive"))?;
+        self.check(&lease, trainer)?;
+        self.hold(lease, draws);
+        Ok(true)
+    }
+
+    fn check(&mut self, lease: &BatchLease, trainer: &mut Trainer) -> Result<(), Failed> {
+        let (index, step) = (lease.group(), lease.step());
+        let Some(group) = self.groups.get_mut(index) else {
+            Event::Wrong { what: format!("a batch of group {index}, which does not exist") }.report();
+            return Ok(());
+        };
+        let Some(request) = group.pending.take() else {
+            Event::Miscounted { what: format!("group {index}: batch {step} answers no request") }.report();
+            return Ok(());
+        };
+        if let Some(last) = group.step.filter(|last| last + 1 != step) {
+            Event::Miscounted { what: format!("group {index}: batch {step} after batch {last}") }.report();
+        }
+        group.step = Some(step);
+        let compared = if !group.was_reset && step > 1 {
+            self.held.clear();
+            let take = |env| retry(|| trainer.snapshot(index, env, PATIENCE));
+            group.twin.adopt(&request, lease, take).map_err(failed("snapshot"))?
+        } else {
+            group.twin.compare(&request, lease)
+        };
+        group.was_reset = true;
+        match compared {
+            Ok(None) => {
+                let (incarnation, checksum) = (self.incarnation, checksum(lease));
+                Event::Batch { at: now(), incarnation, group: index, step, checksum }.report();
+            }
+            Ok(Some(difference)) => {
+                Event::Wrong { what: format!("group {index}, batch {step}, {request:?}: {difference}") }.report();
+                group.was_reset = false;
+            }
+            Err(error) => Event::Wrong { what: format!("the twin refuses what the engine played: {error}") }.report(),
+        }
+        Ok(())
+    }
+
+    /// Keeps some batches for a while: they must not change.
+    fn hold(&mut self, lease: BatchLease, draws: &mut Generator) {
+        if draws.integers(0, 4) == 0 {
+            let sum = checksum(&lease);
+            self.held.push_back((lease, sum));
+        }
+        // An engine accepts three held batches of a group; one of them is the next.
+        while self.held.len() > draws.integers(0, 3) as usize {
+            let Some((lease, sum)) = self.held.pop_front() else { return };
+            if checksum(&lease) != sum {
+                let (group, step) = (lease.group(), lease.step());
+                Event::Wrong { what: format!("group {group}: batch {step} changed while it was held") }.report();
+            }
+        }
+    }
+}
+
+/// Takes the snapshot of an environment, restores it, and compares it with the twin's.
+fn snapshot(twin: &mut Twin, trainer: &mut Trainer, group: usize, env: usize) -> Result<(), Failed> {
+    let taken = retry(|| trainer.snapshot(group, env, PATIENCE)).map_err(failed("snapshot"))?;
+    retry(|| trainer.restore(group, env, &taken, PATIENCE)).map_err(failed("restore"))?;
+    match twin.snapshot(env, &taken) {
+        Ok(true) => {}
+        found => Event::Wrong { what: format!("group {group}: the snapshot of environment {env} differs: {found:?}") }
+            .report(),
+    }
+    Ok(())
+}
+
+/// Repeats a call that continues to wait after a time-out; a stopped engine is continued some time.
+fn retry<T>(mut call: impl FnMut() -> Result<T, ServiceError>) -> Result<T, ServiceError> {
+    loop {
+        match call() {
+            Err(ServiceError::TimedOut { .. }) => {}
+            other => return other,
+        }
+    }
+}
+
+/// Starts a child as a data loader would: a fork that keeps all descriptors and memory, and does not execute a program.
+fn fork() {
+    // SAFETY: the child calls only `sleep` and `_exit`, which are async-signal-safe.
+    let child = unsafe {
+        let child = libc::fork();
+        if child == 0 {
+            libc::sleep(120);
+            libc::_exit(0);
+        }
+        child
+    };
+    Event::Forked { child: child.unsigned_abs() }.report();
+}
