@@ -94,7 +94,7 @@ enum Task {
     },
     /// Run the fuzz targets from new seeds, as property tests.
     Fuzz {
-        /// One of the targets: actions, layouts, options, snapshots, traces.
+        /// One of the targets: actions, checkpoints, layouts, options, snapshots, traces.
         target: Option<String>,
         /// How long; every target is run at least once.
         #[arg(long, default_value_t = 1)]

@@ -5,6 +5,7 @@
 //! `cargo-fuzz` hands them to libFuzzer.
 
 mod actions;
+mod checkpoints;
 mod layouts;
 mod options;
 mod playing;
@@ -18,8 +19,9 @@ pub use watchdog::BUDGET;
 pub type Target = fn(&[u8]);
 
 /// The targets by name.
-pub const TARGETS: [(&str, Target); 5] = [
+pub const TARGETS: [(&str, Target); 6] = [
     ("actions", actions::target),
+    ("checkpoints", checkpoints::target),
     ("layouts", layouts::target),
     ("options", options::target),
     ("snapshots", snapshots::target),

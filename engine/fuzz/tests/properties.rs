@@ -58,12 +58,17 @@ fn check(target: &str, cases: u32) {
 
 #[test]
 fn every_target_has_a_test() {
-    assert_eq!(TARGETS.map(|(name, _)| name), ["actions", "layouts", "options", "snapshots", "traces"]);
+    assert_eq!(TARGETS.map(|(name, _)| name), ["actions", "checkpoints", "layouts", "options", "snapshots", "traces"]);
 }
 
 #[test]
 fn actions() {
     check("actions", 150);
+}
+
+#[test]
+fn checkpoints() {
+    check("checkpoints", 100);
 }
 
 #[test]
