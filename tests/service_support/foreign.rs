@@ -137,6 +137,29 @@ impl Foreign {
         *message.user_header_mut() = header;
         fill(bytemuck::cast_slice_mut(message.payload_mut()));
         assert_eq!(message.send().unwrap(), 1);
+        self.answer()
+    }
+
+    /// Sends a request with any header, and changes header and payload by `words` until the engine has answered or for 20
+    /// milliseconds, which is long enough for it to read them several times.
+    pub fn ask_while_changing(&self, header: RequestHeader, mut words: impl FnMut() -> u64) {
+        let zero = vec![PayloadBlock::zeroed(); self.blocks];
+        let mut message = self.publisher.loan_slice_uninit(self.blocks).unwrap().write_from_slice(&zero);
+        *message.user_header_mut() = header;
+        let mut memory = SharedWords::of(message.user_header_mut());
+        let mut payload = SharedWords::of(message.payload_mut());
+        message.send().unwrap();
+        let start = Instant::now();
+        while start.elapsed() < Duration::from_millis(20) && self.subscriber.receive().unwrap().is_none() {
+            // The incarnation is kept: a request for another one is dropped.
+            memory.change([0, 2, 3, 4, 5, 6, 7, 8][words() as usize % 8], words());
+            for _ in 0..64 {
+                payload.change(words() as usize, words());
+            }
+        }
+    }
+
+    fn answer(&self) -> Option<(u32, String)> {
         let start = Instant::now();
         while start.elapsed() < Duration::from_secs(1) {
             if let Some(answer) = self.subscriber.receive().unwrap() {
@@ -151,6 +174,25 @@ impl Foreign {
             std::thread::sleep(Duration::from_millis(1));
         }
         None
+    }
+}
+
+/// Words in shared memory that another process reads at the same time.
+pub struct SharedWords {
+    first: *mut u64,
+    count: usize,
+}
+
+impl SharedWords {
+    fn of<T: ?Sized>(value: &mut T) -> Self {
+        SharedWords { count: size_of_val(value) / size_of::<u64>(), first: std::ptr::from_mut(value).cast() }
+    }
+
+    /// Writes one of the words.
+    pub fn change(&mut self, index: usize, word: u64) {
+        // SAFETY: a header or a payload is aligned to words, and mapped for writing as long as its publisher exists, which the tests
+        // guarantee.
+        unsafe { self.first.add(index % self.count).write_volatile(word) };
     }
 }
 
@@ -179,6 +221,9 @@ pub struct Engine {
 
 /// The headers in shared memory of a message that was sent.
 pub struct SentHeader {
+    /// All of the user header.
+    pub words: SharedWords,
+    pub payload: SharedWords,
     header: *mut ResponseHeader,
     /// The number of blocks of the payload in iceoryx2's header.
     length: *mut u64,
@@ -239,7 +284,9 @@ impl Engine {
         let header = message.user_header_mut();
         let incarnation = self.specification.incarnation;
         *header = ResponseHeader { incarnation, step, trainer: 42, request: 1, ..ResponseHeader::default() };
-        let header = SentHeader { header, length: number_of_elements(message.header(), zero.len()) };
+        let (words, header) = (SharedWords::of(header), std::ptr::from_mut(header));
+        let length = number_of_elements(message.header(), zero.len());
+        let header = SentHeader { words, payload: SharedWords::of(message.payload_mut()), header, length };
         assert_eq!(message.send().unwrap(), 1);
         header
     }
@@ -266,6 +313,13 @@ fn publish(node: &Node<ipc::Service>, service: &str, layout_version: u32, text: 
 pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u32) -> Box<dyn std::any::Any> {
     let node = node(namespace);
     let published = publish(&node, service, layout_version, b"not JSON");
+    Box::new((published, node))
+}
+
+/// Publishes any text as a specification.
+pub fn specification_text(namespace: &Namespace, service: &str, text: &[u8]) -> Box<dyn std::any::Any> {
+    let node = node(namespace);
+    let published = publish(&node, service, LAYOUT_VERSION, text);
     Box::new((published, node))
 }
 

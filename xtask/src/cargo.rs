@@ -1,9 +1,10 @@
 //! Runs of cargo.
 
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use crate::original;
-use crate::venv::execute;
+use crate::venv::{execute, target};
 
 /// A seed of the property tests: a failure in the tests is due to a change.
 const PROPERTY_SEED: &str = "20251122";
@@ -31,6 +32,32 @@ pub fn properties(cases: u32) -> Result<(), String> {
     original::python()?;
     let arguments = ["test", "--release", "--workspace", "--locked", "--lib", "--tests"];
     execute(with_original(&arguments)?.env("PROPTEST_CASES", cases.to_string()))
+}
+
+/// Runs the fuzz targets, or one of them, from new seeds for at least `minutes`; optimised, since it is long.
+pub fn fuzz(only: Option<&str>, minutes: u64) -> Result<(), String> {
+    let start = Instant::now();
+    let tests = ["test", "--release", "--locked", "--package", "endless-gym-fuzz", "--test", "properties", "--"];
+    loop {
+        let only = only.map(|target| ["--exact", target]).into_iter().flatten();
+        execute(command().args(tests).args(only).env("PROPTEST_CASES", "5000").env_remove("PROPTEST_RNG_SEED"))?;
+        if start.elapsed() >= Duration::from_secs(60 * minutes) {
+            return Ok(());
+        }
+    }
+}
+
+/// Checks the models of the worker threads under loom. The flags apply to all crates, hence a target directory of their own.
+pub fn loom() -> Result<(), String> {
+    let tests = ["test", "--locked", "--package", "endless-gym-core", "--lib", "loom_"];
+    execute(
+        command()
+            .args(tests)
+            .arg("--target-dir")
+            .arg(target()?.join("loom"))
+            .env("RUSTFLAGS", "--cfg loom --cfg crossbeam_loom")
+            .env("CARGO_PROFILE_TEST_OPT_LEVEL", "2"),
+    )
 }
 
 /// The cargo that runs this, so that toolchain and settings are the same.

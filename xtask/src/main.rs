@@ -107,6 +107,16 @@ enum Task {
         #[arg(default_value_t = 2000)]
         cases: u32,
     },
+    /// Run the fuzz targets from new seeds, as property tests.
+    Fuzz {
+        /// One of the targets: actions, checkpoints, layouts, options, snapshots, traces.
+        target: Option<String>,
+        /// How long; every target is run at least once.
+        #[arg(long, default_value_t = 1)]
+        minutes: u64,
+    },
+    /// Check the models of the worker threads under loom.
+    Loom,
     /// Set up the original in a virtual environment and print the path of its Python.
     Original,
 }
@@ -131,6 +141,8 @@ impl Task {
             Task::Soak { arguments } => faults::run("soak", arguments),
             Task::Live { steps } => cargo::live(*steps),
             Task::Properties { cases } => cargo::properties(*cases),
+            Task::Fuzz { target, minutes } => cargo::fuzz(target.as_deref(), *minutes),
+            Task::Loom => cargo::loom(),
             Task::Original => original::python().map(|python| println!("{}", python.display())),
         }
     }

@@ -126,6 +126,7 @@ pub const STAGES: &[Stage] = &[
         compiles: true,
         ..STAGE
     },
+    Stage { name: "loom", run: cargo::loom, needs: &[Linker, Disk], compiles: true, ..STAGE },
     Stage { name: "wasm", run: wasm::build, needs: &[Linker, Wasm], compiles: true, ..STAGE },
     Stage {
         name: "shared memory of other sizes",

@@ -11,6 +11,7 @@ use iceoryx2::sample::Sample;
 
 use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
+use crate::group::chunk_blocks;
 use crate::message::{PayloadBlock, ResponseContent, ResponseHeader, copied, read_text};
 use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
@@ -48,9 +49,10 @@ struct Payload {
 unsafe impl Send for Payload {}
 
 impl Payload {
-    fn new(payload: &[PayloadBlock]) -> Self {
+    /// At most `longest` blocks: a forged length may reach beyond the mapped memory.
+    fn new(payload: &[PayloadBlock], longest: usize) -> Self {
         let blocks: &[Block] = bytemuck::cast_slice(payload);
-        Payload { start: NonNull::from(blocks).cast(), blocks: blocks.len() }
+        Payload { start: NonNull::from(blocks).cast(), blocks: blocks.len().min(longest) }
     }
 }
 
@@ -181,7 +183,7 @@ impl ResponsePort {
             }
         };
         let header = copied(sample.user_header());
-        let payload = Payload::new(sample.payload());
+        let payload = Payload::new(sample.payload(), chunk_blocks(&specification.batch));
         if header.layout_version != LAYOUT_VERSION
             || header.group as usize != self.group
             || header.incarnation != specification.incarnation

@@ -76,6 +76,9 @@ impl Buffers {
 }
 
 #[cfg(test)]
+mod model_tests;
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::batch::{Contents, Frames, batch_layout, zeroed};

@@ -1,10 +1,10 @@
 //! The division of a batch among threads.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::PoisonError;
 
 use super::drawn_scene::{DrawnScene, WrongFrame};
 use super::env_slot::EnvSlot;
-use super::lock::lock;
+use super::sync::{Mutex, lock};
 use super::threads::Threads;
 use crate::batch::BatchMut;
 use crate::envs::Environment;

@@ -12,11 +12,11 @@ mod env_slot;
 mod error;
 mod family_slots;
 mod frame_stack;
-mod lock;
 #[expect(clippy::module_inception, reason = "the file of the type `Pool`")]
 mod pool;
 mod seeding;
 mod snapshot;
+mod sync;
 mod threads;
 
 pub use crate::batch::limits::{MAX_ENVS, MAX_THREADS};

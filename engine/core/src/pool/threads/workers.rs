@@ -6,18 +6,13 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
+use crossbeam_utils::CachePadded;
 use crossbeam_utils::sync::{Parker, Unparker};
-use crossbeam_utils::{Backoff, CachePadded};
 
-use crate::pool::lock::lock;
-
-/// A worker that was not called for this long parks. Most trainers call the next step sooner.
-const PARK_AFTER: Duration = Duration::from_millis(3);
+use crate::pool::sync::threads::{Arc, AtomicBool, AtomicU64, AtomicUsize, Backoff, Ordering, PARK_AFTER, thread};
+use crate::pool::sync::{Mutex, lock};
 
 /// Threads that wait for calls. They end when this is dropped.
 #[derive(Debug)]
@@ -177,10 +172,14 @@ impl Shared {
     }
 }
 
-#[cfg(test)]
+#[cfg(all(test, loom))]
+mod loom_tests;
+
+#[cfg(all(test, not(loom)))]
 mod tests {
     use std::collections::HashSet;
     use std::sync::Barrier;
+    use std::time::Duration;
 
     use super::*;
     use crate::pool::Threads;

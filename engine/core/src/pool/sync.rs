@@ -1,0 +1,50 @@
+//! What the threads of a step synchronise with: the standard library and crossbeam, or loom's models of them under `--cfg loom`.
+
+use std::sync::PoisonError;
+
+#[cfg(loom)]
+pub(super) use loom::sync::{Mutex, MutexGuard};
+#[cfg(not(loom))]
+pub(super) use std::sync::{Mutex, MutexGuard};
+
+/// Locks a mutex, also a poisoned one: no code under these locks can leave their data half written.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What worker threads use beside mutexes.
+#[cfg(all(feature = "threads", not(loom)))]
+pub(super) mod threads {
+    pub(in crate::pool) use std::sync::Arc;
+    pub(in crate::pool) use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+    pub(in crate::pool) use std::thread;
+
+    pub(in crate::pool) use crossbeam_utils::Backoff;
+
+    /// A worker that was not called for this long parks. Most trainers call the next step sooner.
+    pub(in crate::pool) const PARK_AFTER: std::time::Duration = std::time::Duration::from_millis(3);
+}
+
+/// The same under loom. `crossbeam_utils::sync::Parker` itself is modelled, by `--cfg crossbeam_loom`.
+#[cfg(all(feature = "threads", loom))]
+pub(super) mod threads {
+    pub(in crate::pool) use loom::sync::Arc;
+    pub(in crate::pool) use loom::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+    pub(in crate::pool) use loom::thread;
+
+    /// Workers park at once: a model has no time, and a worker that spins cannot miss a call.
+    pub(in crate::pool) const PARK_AFTER: std::time::Duration = std::time::Duration::ZERO;
+
+    /// Gives way to another thread. crossbeam's yields to the operating system, which loom does not see.
+    pub(in crate::pool) struct Backoff;
+
+    impl Backoff {
+        pub(in crate::pool) fn new() -> Self {
+            Backoff
+        }
+
+        pub(in crate::pool) fn snooze(&self) {
+            thread::yield_now();
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! The worker threads under loom: every interleaving up to a number of preemptions, and every value that an atomic load may
+//! return by the memory model. `cargo xtask loom` runs these models.
+//!
+//! A worker that sleeps through a call for good, or does not end after the pool of threads is dropped, is a deadlock, which loom
+//! reports. A write of a worker that is not visible when the call returns is a causality violation.
+
+use loom::cell::UnsafeCell;
+use loom::model::Builder;
+
+use super::*;
+use crate::batch::zeroed;
+use crate::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
+
+const ID: &str = "MysteryPath-Grid-v0";
+
+/// Pieces of work. A mutable access beside any other access, or without an order to it, fails the model.
+struct Pieces {
+    left: Mutex<Vec<usize>>,
+    done: Vec<UnsafeCell<usize>>,
+}
+
+// SAFETY: loom checks each access to the cells; a data race ends the model.
+unsafe impl Sync for Pieces {}
+
+impl Pieces {
+    fn new(count: usize) -> Self {
+        Pieces { left: Mutex::new((0..count).collect()), done: (0..count).map(|_| UnsafeCell::new(0)).collect() }
+    }
+
+    /// Does the pieces that nobody else has taken.
+    fn work(&self) {
+        while let Some(piece) = { lock(&self.left).pop() } {
+            // SAFETY: loom checks that no other access is possible at the same time.
+            self.done[piece].with_mut(|times| unsafe { *times += 1 });
+        }
+    }
+
+    /// Asserts that each piece has been done once.
+    fn check(&self) {
+        for times in &self.done {
+            // SAFETY: as above.
+            assert_eq!(times.with(|times| unsafe { *times }), 1);
+        }
+    }
+}
+
+fn model(preemptions: usize, model: impl Fn() + Sync + Send + 'static) {
+    let mut builder = Builder::new();
+    builder.preemption_bound.get_or_insert(preemptions);
+    builder.check(model);
+}
+
+#[test]
+fn loom_every_piece_is_done_once_and_seen_by_the_caller() {
+    model(3, || {
+        let workers = Workers::new(1).unwrap();
+        let pieces = Pieces::new(2);
+        workers.run(1, &|_| pieces.work());
+        pieces.check();
+    });
+}
+
+#[test]
+fn loom_a_second_call_wakes_parked_workers_and_is_not_joined_by_the_first_ones() {
+    model(3, || {
+        let workers = Workers::new(1).unwrap();
+        for _ in 0..2 {
+            // Freed after its call: a worker that joined late would use it.
+            let pieces = Pieces::new(2);
+            workers.run(1, &|_| pieces.work());
+            pieces.check();
+        }
+    });
+}
+
+#[test]
+fn loom_two_workers_share_the_pieces() {
+    model(2, || {
+        let workers = Workers::new(2).unwrap();
+        let pieces = Pieces::new(2);
+        workers.run(2, &|_| pieces.work());
+        pieces.check();
+    });
+}
+
+#[test]
+fn loom_a_worker_beyond_the_helpers_does_not_join() {
+    model(2, || {
+        let workers = Workers::new(2).unwrap();
+        let pieces = Pieces::new(2);
+        workers.run(1, &|number| {
+            assert!(number < 2);
+            pieces.work();
+        });
+        pieces.check();
+    });
+}
+
+#[test]
+fn loom_two_callers_take_turns() {
+    model(3, || {
+        let workers = Arc::new(Workers::new(1).unwrap());
+        let other = Arc::clone(&workers);
+        let call = |workers: &Workers| {
+            let pieces = Pieces::new(1);
+            workers.run(1, &|_| pieces.work());
+            pieces.check();
+        };
+        let thread = thread::spawn(move || call(&other));
+        call(&workers);
+        thread.join().unwrap();
+    });
+}
+
+/// The caller waits for the worker: if the call did not wake it, this is a deadlock.
+#[test]
+fn loom_a_call_wakes_a_parked_worker() {
+    model(3, || {
+        let workers = Workers::new(1).unwrap();
+        let came = AtomicBool::new(false);
+        workers.run(1, &|number| match number {
+            0 => {
+                while !came.load(Ordering::Acquire) {
+                    thread::yield_now();
+                }
+            }
+            _ => came.store(true, Ordering::Release),
+        });
+    });
+}
+
+#[test]
+fn loom_workers_end_without_a_call() {
+    model(3, || drop(Workers::new(2).unwrap()));
+}
+
+/// The division of a batch: the same batch as by the calling thread alone.
+#[test]
+fn loom_a_pool_steps_every_environment_once() {
+    fn play(threads: &Threads) -> Vec<u8> {
+        let config =
+            PoolConfig { frames: None, seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(ID, 64) };
+        let mut pool = Pool::new(&config, threads).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::All, &mut blocks).unwrap();
+        pool.step(&[1; 64], &mut blocks).unwrap();
+        // Two pools have different stamps.
+        pool.layout().forget_frames(&mut blocks);
+        bytemuck::cast_slice(&blocks).to_vec()
+    }
+    let expected = play(&Threads::new(1).unwrap());
+    model(1, move || assert!(play(&Threads::new(2).unwrap()) == expected));
+}

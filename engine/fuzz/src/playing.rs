@@ -1,0 +1,47 @@
+//! Pools that the targets play.
+
+use arbitrary::{Result, Unstructured};
+use endless_gym_core::batch::{Block, zeroed};
+use endless_gym_core::envs::view::VIEW_BYTES;
+use endless_gym_core::envs::{self, EnvSpec};
+use endless_gym_core::pool::{
+    Autoreset, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
+};
+
+/// Any of the ids.
+pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {
+    let specs: Vec<_> = envs::specs().collect();
+    input.choose(&specs).copied()
+}
+
+/// A pool with everything that a batch can contain, each frame drawn twice and compared.
+pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> std::result::Result<Pool, PoolError> {
+    let config = PoolConfig {
+        seeding: Seeding::Continue { seed: Some(3) },
+        options: ResetOptions::Shared(options),
+        autoreset,
+        final_observation: autoreset == Autoreset::SameStep,
+        features: true,
+        check_drawing: true,
+        ..PoolConfig::new(spec.id, 1)
+    };
+    Pool::new(&config, &Threads::new(1)?)
+}
+
+/// Resets a pool.
+pub(crate) fn reset(pool: &mut Pool) -> Vec<Block> {
+    let mut blocks = zeroed(pool.layout().blocks());
+    pool.reset(ResetRequest::All, &mut blocks).expect("a pool can be reset");
+    blocks
+}
+
+/// Plays `steps` actions that are drawn from `input`; zeros when it is exhausted.
+pub(crate) fn play(pool: &mut Pool, blocks: &mut [Block], input: &mut Unstructured<'_>, steps: usize) -> Result<()> {
+    let branches = pool.spec().action_space.branches().to_vec();
+    for _ in 0..steps {
+        let action = branches.iter().map(|count| input.int_in_range(0..=count - 1)).collect::<Result<Vec<i32>>>()?;
+        pool.step(&action, blocks).expect("an action in range is played");
+    }
+    pool.ground_truth_view(0, &mut [0; VIEW_BYTES]).expect("the environment exists");
+    Ok(())
+}

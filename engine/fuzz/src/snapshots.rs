@@ -1,0 +1,296 @@
+//! Snapshots with a valid checksum, in which any number may have any value.
+
+use arbitrary::Unstructured;
+use ciborium::Value;
+use endless_gym_core::batch::{Block, zeroed};
+use endless_gym_core::envs::view::VIEW_BYTES;
+use endless_gym_core::envs::{EnvSpec, Family, mortar_mayhem, mystery_path, searing_spotlights};
+use endless_gym_core::pool::{
+    Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads,
+};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value as Json};
+
+use crate::playing;
+use crate::watchdog::within_budget;
+
+/// Magic, version and checksum.
+const HEAD: usize = 12;
+
+/// Changes of one input.
+const MAX_CHANGES: usize = 12;
+
+/// The content of a snapshot, field for field as the pool encodes it.
+#[derive(Serialize, Deserialize)]
+struct Content<S> {
+    id: String,
+    options: String,
+    random: Pcg,
+    seeds: Seeds,
+    episode_return: f64,
+    episode_length: i32,
+    ended: bool,
+    state: S,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Pcg {
+    state: u128,
+    increment: u128,
+    kept: Option<u32>,
+}
+
+#[derive(Serialize, Deserialize)]
+enum Seeds {
+    Continue { first: Option<u64> },
+    Range { draws: Pcg },
+    List { next: usize },
+}
+
+/// Converts the content of one family's snapshots from and to a tree of values.
+#[derive(Clone, Copy)]
+struct Codec {
+    decode: fn(&[u8]) -> Value,
+    /// `None` if a value does not fit its type.
+    encode: fn(&Value) -> Option<Vec<u8>>,
+}
+
+impl Codec {
+    fn of<S: Serialize + DeserializeOwned>() -> Self {
+        Codec {
+            decode: |snapshot| {
+                Value::serialized(&postcard::from_bytes::<Content<S>>(&snapshot[HEAD..]).unwrap()).unwrap()
+            },
+            encode: |value| Some(postcard::to_stdvec(&value.deserialized::<Content<S>>().ok()?).unwrap()),
+        }
+    }
+
+    fn for_spec(spec: &EnvSpec) -> Self {
+        match spec.family {
+            Family::MortarMayhem(_) => Codec::of::<mortar_mayhem::State>(),
+            Family::MysteryPath(_) => Codec::of::<mystery_path::State>(),
+            Family::SearingSpotlights(_) => Codec::of::<searing_spotlights::State>(),
+        }
+    }
+}
+
+/// A pool of one environment, and snapshots of it.
+pub struct Game {
+    spec: &'static EnvSpec,
+    pool: Pool,
+    blocks: Vec<Block>,
+    random: SmallRng,
+    codec: Codec,
+    head: [u8; HEAD],
+}
+
+impl Game {
+    /// An environment that has been reset.
+    ///
+    /// # Panics
+    ///
+    /// If the options are not valid.
+    pub fn new(spec: &'static EnvSpec, seeding: Seeding, options: Map<String, Json>) -> Self {
+        let config = PoolConfig {
+            seeding,
+            options: ResetOptions::Shared(options),
+            autoreset: Autoreset::SameStep,
+            final_observation: true,
+            features: true,
+            ..PoolConfig::new(spec.id, 1)
+        };
+        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::All, &mut blocks).unwrap();
+        let random = SmallRng::seed_from_u64(1);
+        Game { spec, pool, blocks, random, codec: Codec::for_spec(spec), head: [0; HEAD] }
+    }
+
+    /// Plays random actions.
+    ///
+    /// # Panics
+    ///
+    /// If a step fails.
+    pub fn play(&mut self, steps: usize) {
+        for _ in 0..steps {
+            let branches = self.spec.action_space.branches();
+            let action: Vec<i32> = branches.iter().map(|n| self.random.random_range(0..*n)).collect();
+            self.pool.step(&action, &mut self.blocks).unwrap();
+        }
+    }
+
+    /// The decoded content of a snapshot.
+    ///
+    /// # Panics
+    ///
+    /// If the format differs from what this file says.
+    pub fn content(&mut self) -> Value {
+        let snapshot = self.pool.snapshot(0).unwrap();
+        self.head.copy_from_slice(&snapshot[..HEAD]);
+        let content = (self.codec.decode)(&snapshot);
+        assert_eq!((self.codec.encode)(&content).unwrap(), &snapshot[HEAD..], "the encoding of {}", self.spec.id);
+        content
+    }
+
+    /// Restores forged content; `None` if it cannot be encoded.
+    pub fn restore(&mut self, content: &Value) -> Option<Result<(), SnapshotError>> {
+        let content = (self.codec.encode)(content)?;
+        let mut snapshot = self.head.to_vec();
+        snapshot[8..].copy_from_slice(&crc32fast::hash(&content).to_le_bytes());
+        snapshot.extend(content);
+        Some(self.pool.restore(0, &snapshot))
+    }
+
+    /// Restores forged content and, if it is not refused, plays it.
+    pub fn try_to_play(&mut self, content: &Value) -> Outcome {
+        within_budget(content.clone(), || self.outcome(content))
+    }
+
+    fn outcome(&mut self, content: &Value) -> Outcome {
+        match self.restore(content) {
+            None => Outcome::NotEncodable,
+            Some(Err(_)) => Outcome::Refused,
+            Some(Ok(())) => {
+                self.play_on();
+                Outcome::Played
+            }
+        }
+    }
+
+    /// Plays a restored state: to the end of the episode or not, and in another episode.
+    fn play_on(&mut self) {
+        self.pool.observe(&mut self.blocks).unwrap();
+        self.pool.ground_truth_view(0, &mut [0; VIEW_BYTES]).unwrap();
+        self.play(40);
+        self.pool.ground_truth_view(0, &mut [0; VIEW_BYTES]).unwrap();
+        self.pool.snapshot(0).unwrap();
+        self.pool.reset(ResetRequest::All, &mut self.blocks).unwrap();
+        self.play(2);
+    }
+}
+
+/// What became of forged content.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// A value does not fit its type.
+    NotEncodable,
+    /// The pool refused it.
+    Refused,
+    /// It was played.
+    Played,
+}
+
+/// Where a value is in the tree: the index at each level.
+pub type Path = Vec<usize>;
+
+fn children(value: &mut Value) -> Vec<&mut Value> {
+    match value {
+        Value::Array(items) => items.iter_mut().collect(),
+        Value::Map(entries) => entries.iter_mut().map(|(_, value)| value).collect(),
+        _ => Vec::new(),
+    }
+}
+
+/// The value at `path`.
+///
+/// # Panics
+///
+/// If there is no value at `path`.
+pub fn at<'a>(value: &'a mut Value, path: &[usize]) -> &'a mut Value {
+    match path.split_first() {
+        Some((index, rest)) => at(children(value).swap_remove(*index), rest),
+        None => value,
+    }
+}
+
+/// The paths of all numbers and lists. Of a long list only the first and the last items are walked.
+pub fn paths(value: &mut Value) -> Vec<Path> {
+    let mut found = match value {
+        Value::Integer(_) | Value::Float(_) | Value::Bool(_) | Value::Null | Value::Array(_) | Value::Tag(..) => {
+            vec![Vec::new()]
+        }
+        _ => Vec::new(),
+    };
+    let is_list = value.is_array();
+    let children = children(value);
+    let count = children.len();
+    for (index, child) in children.into_iter().enumerate() {
+        if !is_list || index < 3 || index + 2 > count {
+            found.extend(paths(child).into_iter().map(|rest| [vec![index], rest].concat()));
+        }
+    }
+    found
+}
+
+/// Values to put in the place of any number or list.
+///
+/// # Panics
+///
+/// Never: the numbers are in range.
+pub fn extremes() -> Vec<Value> {
+    // About zero, at the limits of the types, and at limits of coordinates and counters.
+    let bounds = [1 << 8, 1 << 13, 1 << 15, 1 << 28, 1 << 31, 1 << 32, 1 << 62, 1 << 63, 1 << 64_i128];
+    let integers = bounds.into_iter().flat_map(|bound| [bound - 4, bound - 1, bound, -bound]).chain([-1, 0, 1, 2]);
+    let in_range = |value: &i128| (i128::from(i64::MIN)..=i128::from(u64::MAX)).contains(value);
+    let floats = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, f64::MAX, f64::MIN, -0.0, f64::MIN_POSITIVE, -1e9, 1e9];
+    let others = [Value::Bool(false), Value::Bool(true), Value::Null, Value::Array(Vec::new())];
+    let integers = integers.filter(in_range).map(|value| Value::Integer(value.try_into().unwrap()));
+    integers.chain(floats.into_iter().map(Value::Float)).chain(others).collect()
+}
+
+pub(crate) fn target(data: &[u8]) {
+    // Too short an input ends the game early.
+    let _ = forge(&mut Unstructured::new(data));
+}
+
+/// Gives changed bytes a checksum that matches.
+pub(crate) fn sealed(snapshot: &mut [u8]) {
+    if let Some((head, content)) = snapshot.split_at_mut_checked(HEAD) {
+        head[8..].copy_from_slice(&crc32fast::hash(content).to_le_bytes());
+    }
+}
+
+/// Plays a snapshot of which some numbers, or some bytes behind the checksum, are replaced.
+fn forge(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
+    let spec = playing::spec(input)?;
+    let seeding = match input.int_in_range(0..=2)? {
+        0 => Seeding::Continue { seed: Some(3) },
+        1 => Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
+        _ => Seeding::List(vec![5, 6, 7]),
+    };
+    let mut game = Game::new(spec, seeding, Map::new());
+    game.play(input.int_in_range(0..=60)?);
+    if input.arbitrary()? {
+        let mut snapshot = game.pool.snapshot(0).expect("the environment exists");
+        for _ in 0..input.int_in_range(1..=8)? {
+            let place = input.choose_index(snapshot.len())?;
+            snapshot[place] = input.arbitrary()?;
+        }
+        sealed(&mut snapshot);
+        if game.pool.restore(0, &snapshot).is_ok() {
+            game.play_on();
+        }
+        return Ok(());
+    }
+    let (mut content, extremes) = (game.content(), extremes());
+    for _ in 0..MAX_CHANGES {
+        if input.is_empty() {
+            break;
+        }
+        let mut forged = content.clone();
+        let paths = paths(&mut forged);
+        let path: &Path = input.choose(&paths)?;
+        *at(&mut forged, path) = match input.arbitrary::<Option<i64>>()? {
+            Some(number) => Value::from(number),
+            None => input.choose(&extremes)?.clone(),
+        };
+        // Forges further numbers of what can be played.
+        if game.try_to_play(&forged) == Outcome::Played {
+            content = forged;
+        }
+    }
+    Ok(())
+}

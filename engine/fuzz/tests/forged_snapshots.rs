@@ -1,0 +1,152 @@
+//! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot is
+//! refused or can be played; none panics, and none hangs.
+
+use ciborium::Value;
+use endless_gym_core::envs::{self, EnvSpec, Family, ParameterKind};
+use endless_gym_core::pool::{Seeding, SnapshotError};
+use endless_gym_fuzz::snapshots::{Game, Outcome, Path, at, extremes, paths};
+use proptest::prelude::*;
+use serde_json::{Map, Value as Json};
+
+/// Number of items of a forged list: more than any list has by play within a test.
+const MANY: usize = 100_000;
+
+#[test]
+fn every_list_can_be_long() {
+    for spec in envs::specs() {
+        let mut game = Game::new(spec, Seeding::Continue { seed: Some(3) }, Map::new());
+        game.play(45);
+        let mut content = game.content();
+        for path in paths(&mut content) {
+            let mut forged = content.clone();
+            let Value::Array(items) = at(&mut forged, &path) else { continue };
+            let Some(item) = items.last().cloned() else { continue };
+            items.resize(MANY, item);
+            game.try_to_play(&forged);
+        }
+        if matches!(spec.family, Family::SearingSpotlights(_)) {
+            for name in ["coins", "spotlights", "lit"] {
+                let mut forged = content.clone();
+                let Value::Array(items) = field(field(&mut forged, "state"), name) else { panic!("{name} is no list") };
+                let item = items.last().cloned().unwrap_or_else(|| panic!("{name} is empty"));
+                items.resize(MANY, item);
+                assert!(matches!(game.restore(&forged), Some(Err(SnapshotError::State(_)))), "{name}");
+            }
+        }
+    }
+}
+
+/// Each of the policies, whose place in the sequence of seeds a snapshot holds.
+fn seedings() -> [Seeding; 3] {
+    [
+        Seeding::Continue { seed: Some(3) },
+        Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) },
+        Seeding::List(vec![5, 6, 7]),
+    ]
+}
+
+/// Reset parameters with every flag set.
+fn all_flags(spec: &EnvSpec) -> Map<String, Json> {
+    let flags = spec.parameters.iter().filter(|parameter| matches!(parameter.kind, ParameterKind::Bool { .. }));
+    flags.map(|parameter| (parameter.name.to_owned(), Json::from(true))).collect()
+}
+
+#[test]
+fn every_number_can_be_extreme() {
+    for (spec, seeding) in envs::specs().zip(seedings().into_iter().cycle()) {
+        let (mut refused, mut played) = (0, 0);
+        // The second time with everything that a flag can turn on.
+        for (steps, options) in [(0, Map::new()), (45, all_flags(spec))] {
+            let mut game = Game::new(spec, seeding.clone(), options);
+            game.play(steps);
+            let mut content = game.content();
+            for path in paths(&mut content) {
+                for extreme in extremes() {
+                    let mut forged = content.clone();
+                    *at(&mut forged, &path) = extreme;
+                    match game.try_to_play(&forged) {
+                        Outcome::NotEncodable => {}
+                        Outcome::Refused => refused += 1,
+                        Outcome::Played => played += 1,
+                    }
+                }
+            }
+            assert_eq!(game.restore(&content), Some(Ok(())), "what was not forged is not refused");
+        }
+        assert!(refused > 100 && played > 100, "{}: {refused} refused, {played} played", spec.id);
+    }
+}
+
+fn field<'a>(value: &'a mut Value, name: &str) -> &'a mut Value {
+    let Value::Map(entries) = value else { panic!("no fields in {value:?}") };
+    entries.iter_mut().find(|(key, _)| key.as_text() == Some(name)).map(|(_, value)| value).unwrap()
+}
+
+#[test]
+fn an_even_increment_is_refused() {
+    // PCG64 with state 0 and increment 0 returns only zeros, which rejection sampling redraws forever.
+    let spec = envs::spec("MysteryPath-v0").unwrap();
+    let mut game = Game::new(spec, Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(3) }, Map::new());
+    let content = game.content();
+    for increment in [0, 2, u64::MAX - 1] {
+        let mut forged = content.clone();
+        *field(field(&mut forged, "random"), "increment") = Value::from(increment);
+        assert!(matches!(game.restore(&forged), Some(Err(SnapshotError::Content(_)))), "{increment}");
+        let mut forged = content.clone();
+        *field(field(field(field(&mut forged, "seeds"), "Range"), "draws"), "increment") = Value::from(increment);
+        assert!(matches!(game.restore(&forged), Some(Err(SnapshotError::Content(_)))), "seeds: {increment}");
+    }
+    assert_eq!(game.restore(&content), Some(Ok(())));
+}
+
+#[test]
+fn sums_of_the_episode_stay_in_range() {
+    let spec = envs::spec("Endless-SearingSpotlights-v0").unwrap();
+    let mut game = Game::new(spec, Seeding::Continue { seed: Some(3) }, Map::new());
+    let content = game.content();
+    for (name, value) in [
+        ("episode_length", Value::from(-1)),
+        ("episode_length", Value::from(i32::MIN)),
+        ("episode_return", Value::from(f64::NAN)),
+        ("episode_return", Value::from(f64::INFINITY)),
+    ] {
+        let mut forged = content.clone();
+        *field(&mut forged, name) = value;
+        assert!(matches!(game.restore(&forged), Some(Err(SnapshotError::State(_)))), "{name}");
+    }
+    // The largest length is not exceeded.
+    let mut forged = content.clone();
+    *field(&mut forged, "episode_length") = Value::from(i32::MAX - 1);
+    assert_eq!(game.restore(&forged), Some(Ok(())));
+    for _ in 0..3 {
+        game.play(1);
+        let mut content = game.content();
+        assert_eq!(*field(&mut content, "episode_length"), Value::from(i32::MAX));
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(endless_gym_fuzz::property_cases(300)))]
+
+    /// Several numbers at a time.
+    #[test]
+    fn numbers_can_be_extreme_together(
+        number in 0..10_usize,
+        steps in 0..60_usize,
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<prop::sample::Index>()), 2..5),
+    ) {
+        let mut game = Game::new(envs::specs().nth(number).unwrap(), Seeding::Continue { seed: Some(3) }, Map::new());
+        game.play(steps);
+        let (mut content, extremes) = (game.content(), extremes());
+        for (path, extreme) in changes {
+            let mut forged = content.clone();
+            let paths = paths(&mut forged);
+            let path: &Path = path.get(&paths);
+            *at(&mut forged, path) = extreme.get(&extremes).clone();
+            // Keeps what can be played, and forges further numbers of it.
+            if game.try_to_play(&forged) == Outcome::Played {
+                content = forged;
+            }
+        }
+    }
+}

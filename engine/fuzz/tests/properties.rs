@@ -1,0 +1,92 @@
+//! The fuzz targets without a fuzzer: each input of the corpus, changes of them, and arbitrary bytes.
+
+use std::path::Path;
+
+use endless_gym_fuzz::{TARGETS, property_cases, run};
+use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
+
+/// The recorded inputs of a target.
+fn corpus(target: &str) -> Vec<Vec<u8>> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(target);
+    let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
+    let mut files: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    assert!(!files.is_empty(), "no inputs in {}", folder.display());
+    files.iter().map(|file| std::fs::read(file).unwrap()).collect()
+}
+
+/// What replaces a part of an input: other bytes, numbers that a forger would try, punctuation of JSON.
+fn replacements() -> impl Strategy<Value = Vec<u8>> {
+    let words =
+        ["0", "-1", "64", "1e400", "18446744073709551615", "4294967296", "null", "[]", "{}", ",", "\"", "[", ""];
+    prop_oneof![
+        3 => prop::sample::select(words.to_vec()).prop_map(|word| word.as_bytes().to_vec()),
+        1 => prop::collection::vec(any::<u8>(), 1..8),
+        1 => any::<u32>().prop_map(|number| number.to_string().into_bytes()),
+    ]
+}
+
+/// Inputs of the corpus, of which parts are replaced.
+fn changed(corpus: Vec<Vec<u8>>) -> impl Strategy<Value = Vec<u8>> {
+    let change = (any::<prop::sample::Index>(), 0..6_usize, replacements());
+    (prop::sample::select(corpus), prop::collection::vec(change, 0..4)).prop_map(|(mut input, changes)| {
+        for (place, length, replacement) in changes {
+            let start = place.index(input.len() + 1);
+            let end = (start + length).min(input.len());
+            input.splice(start..end, replacement);
+        }
+        input
+    })
+}
+
+fn check(target: &str, cases: u32) {
+    let corpus = corpus(target);
+    corpus.iter().for_each(|input| run(target, input));
+    let inputs = prop_oneof![changed(corpus), prop::collection::vec(any::<u8>(), 0..400)];
+    let mut runner = TestRunner::new(ProptestConfig {
+        failure_persistence: None,
+        ..ProptestConfig::with_cases(property_cases(cases))
+    });
+    runner
+        .run(&inputs, |input| {
+            run(target, &input);
+            Ok(())
+        })
+        .unwrap_or_else(|error| panic!("{target}: {error}"));
+}
+
+#[test]
+fn every_target_has_a_test() {
+    assert_eq!(TARGETS.map(|(name, _)| name), ["actions", "checkpoints", "layouts", "options", "snapshots", "traces"]);
+}
+
+#[test]
+fn actions() {
+    check("actions", 150);
+}
+
+#[test]
+fn checkpoints() {
+    check("checkpoints", 100);
+}
+
+#[test]
+fn layouts() {
+    check("layouts", 2_000);
+}
+
+#[test]
+fn options() {
+    check("options", 150);
+}
+
+#[test]
+fn snapshots() {
+    check("snapshots", 150);
+}
+
+#[test]
+fn traces() {
+    check("traces", 300);
+}
