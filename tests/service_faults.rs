@@ -6,6 +6,7 @@
 mod service_support;
 
 use std::fs::{self, File, Permissions};
+use std::io::Write;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
@@ -111,6 +112,27 @@ fn inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing() {
     assert_eq!(segments(place.namespace().prefix()), [] as [PathBuf; 0]);
     // As soon as there is room, an engine starts.
     fs::remove_file(filler).unwrap();
+    let _engine = place.engine("gym", 2, 1);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
+}
+
+#[test]
+#[ignore = "needs permission to create mount namespaces (unshare --mount --map-root-user)"]
+fn inside_memory_that_dead_processes_fill_an_engine_starts() {
+    let name = "inside_memory_that_dead_processes_fill_an_engine_starts";
+    if !inside_namespace(name, "mount -t tmpfs -o size=8M tmpfs /dev/shm") {
+        return;
+    }
+    let place = Place::new();
+    let mut engine = place.engine("gym", 2, 1);
+    play(&mut place.trainer("gym").unwrap(), 0, 1);
+    engine.kill();
+    // A segment of the dead engine takes what is left.
+    let segment =
+        segments(place.namespace().prefix()).into_iter().find(|path| path.extension().unwrap() == "data").unwrap();
+    let mut file = fs::File::options().append(true).open(segment).unwrap();
+    file.write_all(&vec![1; 9 << 20]).unwrap_err();
+    drop(file);
     let _engine = place.engine("gym", 2, 1);
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }

@@ -19,8 +19,15 @@ pub fn ruff() -> Result<(), String> {
     let program = environment()?.join("bin/ruff");
     for arguments in [["format", "--check"].as_slice(), &["check"]] {
         execute(Command::new(&program).current_dir(package()).args(arguments))?;
-        let others =
-            ["--config", "bindings/python/pyproject.toml", "benches", "docs", "tests/reference", "xtask/pictures"];
+        let others = [
+            "--config",
+            "bindings/python/pyproject.toml",
+            "benches",
+            "docs",
+            "tests/reference",
+            "xtask/packages",
+            "xtask/pictures",
+        ];
         execute(Command::new(&program).current_dir(workspace()).args(arguments).args(others))?;
     }
     Ok(())

@@ -44,7 +44,15 @@ class EngineProcess:
             file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
             file.flush()
             self._process = subprocess.Popen(
-                [*program(), "serve", f"--child={os.getpid()}", "--service", self.service, *arguments, f"@/dev/fd/{file.fileno()}"],
+                [
+                    *program(),
+                    "serve",
+                    f"--child={os.getpid()}",
+                    "--service",
+                    self.service,
+                    *arguments,
+                    f"@/dev/fd/{file.fileno()}",
+                ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._errors,

@@ -121,14 +121,29 @@ pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock, _all: &Excl
     if listed.is_err() || !is_empty {
         return false;
     }
-    let root = directory(config.global.root_path());
-    let (services, nodes) = (directory(&config.global.service_dir()), directory(&config.global.node_dir()));
+    remove_files(config);
+    // They stay if they are not empty.
+    let _ =
+        (fs::remove_dir(directory(&config.global.service_dir())), fs::remove_dir(directory(&config.global.node_dir())));
+    true
+}
+
+/// Removes everything. The caller knows that no process uses the namespace.
+pub(crate) fn remove_all(config: &Config, _lock: &NamespaceLock) {
+    remove_files(config);
+    for directory in [directory(&config.global.service_dir()), directory(&config.global.node_dir())] {
+        if directory.exists() {
+            remove(&directory);
+        }
+    }
+}
+
+/// Removes the segments, the sockets and the services.
+fn remove_files(config: &Config) {
+    let (root, services) = (directory(config.global.root_path()), directory(&config.global.service_dir()));
     let prefix = config.global.prefix.as_bytes();
     let files = [&root, &services].into_iter().flat_map(|directory| entries(directory));
     files.filter(|path| is_named(path, prefix)).chain(segments(config)).for_each(|path| remove(&path));
-    // They stay if they are not empty.
-    let _ = (fs::remove_dir(services), fs::remove_dir(nodes));
-    true
 }
 
 /// Sets the times of all files in the namespace's directory to now.

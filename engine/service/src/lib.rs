@@ -50,6 +50,7 @@
 //! | --- | --- |
 //! | `/dev/shm` is full, or too few file descriptors may be opened | [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] before iceoryx2 creates anything; the soft limit of descriptors is raised if the hard limit permits it |
 //! | a process dies while it creates something | the next process that has the locks removes it, whatever its age; while another process creates something, or is stopped at it, nothing incomplete is removed |
+//! | dead processes fill `/dev/shm`, or their directory was removed | the next process that joins a namespace of the same path removes what no process uses, by the locks of the prefixes |
 //! | a process is stopped while it holds the namespace's lock | the others wait: an engine 30 s to start, a trainer or observer as long as its timeout and at least 5 s; after a second they log who holds it, and [`ServiceError::NamespaceLocked`] names it |
 //! | two directories have the same path (containers that share `/dev/shm` and not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
 //! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts anew in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
@@ -97,6 +98,7 @@ mod identity;
 mod inspect;
 mod lease;
 mod lock;
+mod members;
 mod memory;
 mod message;
 mod namespace;

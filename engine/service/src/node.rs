@@ -20,6 +20,7 @@ use crate::error::ServiceError;
 use crate::fork_guard::ForkGuard;
 use crate::identity::{CreationLock, Identity};
 use crate::lock::{LOCK_TIMEOUT, NamespaceLock};
+use crate::members::{self, Membership};
 use crate::memory;
 use crate::namespace::{Ipc, Namespace};
 use crate::process;
@@ -35,6 +36,7 @@ const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 pub(crate) struct NamespaceNode {
     node: ForkGuard<Node<Ipc>>,
     identity: Identity,
+    membership: Option<Membership>,
     root: PathBuf,
     /// How long this process waits for the namespace's lock.
     patience: Duration,
@@ -59,16 +61,27 @@ impl NamespaceNode {
     }
 
     fn join_locked(namespace: &Namespace, patience: Duration, lock: &NamespaceLock) -> Result<Self, ServiceError> {
-        memory::check_free(memory::NODE_BYTES)?;
+        if memory::check_free(memory::NODE_BYTES).is_err() {
+            // Dead processes may take it, and iceoryx2 cannot remove them without memory.
+            members::remove_abandoned(namespace, None);
+            if let Some(identity) =
+                Identity::existing(namespace).filter(|identity| !members::is_used(identity.prefix()))
+            {
+                cleanup::remove_all(&namespace.config(identity.prefix())?, lock);
+            }
+            memory::check_free(memory::NODE_BYTES)?;
+        }
         descriptors::reserve(descriptors::NODE)?;
         let (identity, config) = own_identity(namespace, lock)?;
-        status_file::remove_abandoned(namespace.prefix());
+        let membership = Membership::join(identity.prefix(), lock)?;
+        members::remove_abandoned(namespace, Some(identity.prefix()));
+        status_file::remove_abandoned(identity.prefix());
         cleanup::remove_counter(&config, lock)?;
         let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled).create();
         cleanup::remove_counter(&config, lock)?;
         let node = node.map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))?;
         let root = namespace.root().to_owned();
-        let node = NamespaceNode { node: ForkGuard::new(node), identity, root, patience };
+        let node = NamespaceNode { node: ForkGuard::new(node), identity, membership: Some(membership), root, patience };
         node.clean(lock);
         Ok(node)
     }
@@ -235,6 +248,11 @@ impl Drop for NamespaceNode {
             && cleanup::remove_orphans(&config, lock, &all)
         {
             self.identity.remove(lock, &all);
+        }
+        // Nobody will join under this prefix again.
+        if let Err(ServiceError::RootRemoved { .. }) = lock {
+            drop(self.membership.take());
+            members::remove_if_unused(self.identity.prefix());
         }
     }
 }
