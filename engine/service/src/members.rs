@@ -17,7 +17,7 @@ use crate::namespace::{MAX_PREFIX, Namespace};
 const SEGMENTS: &str = "/dev/shm";
 
 /// What follows the prefix in the name of the file.
-const SUFFIX: &str = "members";
+const SUFFIX: &str = ".members";
 
 /// A process's use of a prefix. Forked children share it.
 #[derive(Debug)]
