@@ -201,6 +201,13 @@ def test_kept_checkpoints_can_be_loaded(tmp_path: Path) -> None:
     assert output.action.shape == (3, 1)
 
 
+def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
+    file = train(small("none", tmp_path / "run", 1)) / "checkpoints" / "last.pt"
+    torch.save(torch.load(file) | {"version": 2}, file)
+    with pytest.raises(ValueError, match=r"last\.pt must be of version 1, got 2"):
+        checkpoint.load(file)
+
+
 def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
     """As after an interruption of the first update."""
     run = train(replace(small("gru", tmp_path / "run", 2), time_limit=1e-9, keep_checkpoints=True))

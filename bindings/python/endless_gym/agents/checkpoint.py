@@ -21,6 +21,9 @@ from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.settings import Settings, from_dict
 from endless_gym.specs import spec
 
+#: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
+CHECKPOINT_VERSION = 1
+
 #: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it.
 SETTINGS = "settings.json"
 FOLDER = "checkpoints"
@@ -61,7 +64,7 @@ def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
     folder = run / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     last, temporary = folder / LAST, folder / f"{LAST}.new"
-    torch.save(state, temporary)
+    torch.save({"version": CHECKPOINT_VERSION} | state, temporary)
     if keep:
         # A hard link: the same file under a second name.
         numbered = folder / f"update-{state['update']:06d}.pt"
@@ -86,6 +89,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
 
     Raises:
         FileNotFoundError: There is no such checkpoint.
+        ValueError: The checkpoint has another version.
     """
     file = Path(path)
     if file.is_dir():
@@ -96,6 +100,11 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         )
     # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
     state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
+    version = state.get("version")
+    if version != CHECKPOINT_VERSION:
+        raise ValueError(
+            f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; use the version of endless-gym that wrote it"
+        )
     settings = from_dict(state["settings"])
     agent = make_agent(settings, spec(settings.env), device)
     agent.load_state_dict(state["model"])
