@@ -103,7 +103,8 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     version = state.get("version")
     if version != CHECKPOINT_VERSION:
         raise ValueError(
-            f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; use the version of endless-gym that wrote it"
+            f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
+            "use the version of endless-gym that wrote it"
         )
     settings = from_dict(state["settings"])
     agent = make_agent(settings, spec(settings.env), device)
