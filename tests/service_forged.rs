@@ -4,8 +4,8 @@
 mod common;
 mod service_support;
 
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use common::property_cases;
 use endless_gym::batch::LAYOUT_VERSION;
@@ -139,9 +139,9 @@ fn batches_may_change_while_an_observer_reads_them() {
     let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
     let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
     let done = AtomicBool::new(false);
+    let (received, refused) = (AtomicU64::new(0), AtomicU64::new(0));
     std::thread::scope(|scope| {
-        let reader = scope.spawn(|| {
-            let (mut received, mut refused) = (0, 0);
+        scope.spawn(|| {
             while !done.load(Ordering::Relaxed) {
                 match observer.newest() {
                     Ok(None) => {}
@@ -150,16 +150,21 @@ fn batches_may_change_while_an_observer_reads_them() {
                         assert_eq!(lease.group(), 0);
                         assert_eq!(batch.reward().len(), 2);
                         std::hint::black_box(batch.observation().iter().map(|byte| u64::from(*byte)).sum::<u64>());
-                        received += 1;
+                        received.fetch_add(1, Ordering::Relaxed);
                     }
-                    Err(ServiceError::IncompatibleTypes { .. }) => refused += 1,
+                    Err(ServiceError::IncompatibleTypes { .. }) => drop(refused.fetch_add(1, Ordering::Relaxed)),
                     Err(error) => panic!("{error}"),
                 }
             }
-            (received, refused)
         });
         let mut random = SmallRng::seed_from_u64(1);
-        for step in 0..2_000 {
+        let start = Instant::now();
+        let both = || received.load(Ordering::Relaxed) > 0 && refused.load(Ordering::Relaxed) > 0;
+        for step in 0.. {
+            // What the reader meets depends on the scheduler.
+            if step >= 2_000 && (both() || start.elapsed() > Duration::from_secs(60)) {
+                break;
+            }
             let mut sent = foreign.send(step);
             for _ in 0..200 {
                 let word = if random.random() { u64::from(LAYOUT_VERSION) } else { random.random() };
@@ -168,8 +173,7 @@ fn batches_may_change_while_an_observer_reads_them() {
             }
         }
         done.store(true, Ordering::Relaxed);
-        let (received, refused) = reader.join().unwrap();
-        assert!(received > 0 && refused > 0, "{received} received, {refused} refused");
+        assert!(both(), "{received:?} received, {refused:?} refused");
     });
 }
 
