@@ -67,6 +67,8 @@ fn source_distribution(tools: &Path, folder: &Path) -> Result<PathBuf, String> {
     let mut tar = Command::new("tar");
     tar.args(["--extract", "--touch", "--strip-components=1", "--file"]).arg(only_file(folder, ".tar.gz")?);
     run("unpack the source distribution", tar.arg("--directory").arg(&unpacked))?;
+    // The archive lacks members of the workspace, which the lock file still lists. All other versions stay.
+    run("cargo update --workspace", cargo().args(["update", "--quiet", "--workspace"]).current_dir(&unpacked))?;
     Ok(unpacked)
 }
 
