@@ -150,10 +150,16 @@ pub fn with_descriptors(command: &Command, limit: u64) -> Command {
     limited
 }
 
-/// The command with an empty /tmp of its own.
-pub fn with_own_tmp(command: &Command) -> Command {
+/// The command with an empty directory of its own in the place of the namespace's.
+pub fn with_own_root(command: &Command) -> Command {
     let mut own = Command::new("unshare");
-    own.args(["--mount", "--map-root-user", "sh", "-c", "mount -t tmpfs tmpfs /tmp && exec \"$0\" \"$@\""]);
+    own.args([
+        "--mount",
+        "--map-root-user",
+        "sh",
+        "-c",
+        "mount -t tmpfs -o mode=700 tmpfs \"$ENDLESS_GYM_ROOT\" && exec \"$0\" \"$@\"",
+    ]);
     own.arg(command.get_program()).args(command.get_args());
     own
 }

@@ -91,7 +91,7 @@ impl Scene<'_> {
             Fault::OtherContainer => {
                 cleanliness::set_age(&self.namespace, -60);
                 let visit = actors::role("visit", &(self.plan.trainer_seed, 3))?;
-                self.wait_for(self.spawn(actors::with_own_tmp(&visit))?)?;
+                self.wait_for(self.spawn(actors::with_own_root(&visit))?)?;
                 self.kill(Role::Trainer);
                 self.start(Role::Trainer)?;
             }

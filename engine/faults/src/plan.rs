@@ -42,7 +42,7 @@ pub enum Fault {
     FillMemory { role: Role, time: u64 },
     /// An observer that keeps every batch.
     HoardingObserver,
-    /// A process with another /tmp and the same /dev/shm lists engines when the segments are old.
+    /// A process with another root directory of the same path, and the same /dev/shm, lists engines when the segments are old.
     OtherContainer,
     /// A process of another user lists engines, connects, and removes what it can.
     OtherUser,
@@ -84,7 +84,7 @@ impl Fault {
             Fault::RemoveRoot { .. } => "directory removed",
             Fault::FillMemory { .. } => "full /dev/shm",
             Fault::HoardingObserver => "hoarding observer",
-            Fault::OtherContainer => "container with its own /tmp",
+            Fault::OtherContainer => "container with its own root",
             Fault::OtherUser => "other user",
         }
     }
