@@ -137,7 +137,10 @@ fn difference(layout: &Layout, expected: &[Block], given: &[u8], only_numbers: b
     let is_frame = |section: &Section| matches!(section.name(), BatchSection::Observation | BatchSection::Features);
     layout.sections().iter().filter(|section| !(only_numbers && is_frame(section))).find_map(|section| {
         let row = section.bytes() / layout.num_envs();
-        let is_final = matches!(section.name(), BatchSection::FinalObservation | BatchSection::FinalVectorObservation);
+        let is_final = matches!(
+            section.name(),
+            BatchSection::FinalObservation | BatchSection::FinalVectorObservation | BatchSection::FinalFeatures
+        );
         (0..layout.num_envs()).find_map(|env| {
             let start = section.offset() + env * row;
             let (expected_row, given_row) = (expected.get(start..start + row)?, given.get(start..start + row)?);
