@@ -5,14 +5,6 @@ use std::process::Command;
 use crate::cargo;
 use crate::venv::{execute, target};
 
-/// The seed of the tests.
-const SEED: &str = "1";
-
-/// The faults of the tests.
-pub fn test() -> Result<(), String> {
-    run("faults", &["--minutes", "2", "--seed", SEED].map(str::to_owned))
-}
-
 /// Builds the program and the engine that it starts, and runs one of its commands.
 pub fn run(command: &str, arguments: &[String]) -> Result<(), String> {
     cargo::run(&["build", "--locked", "--package", "endless-gym", "--package", "endless-gym-faults", "--bins"])?;
