@@ -83,6 +83,10 @@ impl Room {
 
 impl Drop for Room {
     fn drop(&mut self) {
+        // Those of programs that were killed.
+        for segment in self.segments() {
+            let _ = std::fs::remove_file(std::path::Path::new("/dev/shm").join(segment));
+        }
         let _ = std::fs::remove_dir_all(&self.root);
     }
 }
