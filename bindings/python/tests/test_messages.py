@@ -92,9 +92,7 @@ def test_a_pending_answer_is_an_error_in_every_call() -> None:
                 assert inside == outside, name
                 if " " not in name or name.startswith(("reset", "restore")):
                     assert inside[0] is RuntimeError, name
-                    assert inside[1] == (
-                        "group 0 has a pending answer; call `recv` before the next request"
-                    ), name
+                    assert inside[1] == ("group 0 has a pending answer; call `recv` before the next request"), name
             # No refused call has replaced the message, and the other group answers.
             for envs in places:
                 envs.send(ACTIONS, 1)
