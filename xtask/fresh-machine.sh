@@ -54,13 +54,11 @@ step() {
 failed=0
 step 180 cargo run --release || failed=1
 step 2700 cargo xtask test "$@" || failed=1
-if [[ -e $checkout/xtask/src/dist.rs ]]; then
-    step 1800 cargo xtask dist || failed=1
-    wheels=("$checkout"/target/dist/*.whl)
-    step 60 python3 -m venv "$folder/venv" || failed=1
-    step 10 "$folder/venv/bin/python" -m pip install --quiet "${wheels[0]}" || failed=1
-    step 60 "$folder/venv/bin/python" -c 'import endless_gym; endless_gym.specs' || failed=1
-fi
+step 1800 cargo xtask dist || failed=1
+wheels=("$checkout"/target/dist/endless_gym-*.whl)
+step 60 python3 -m venv "$folder/venv" || failed=1
+step 10 "$folder/venv/bin/python" -m pip install --quiet "${wheels[0]}" || failed=1
+step 60 "$folder/venv/bin/python" -c 'import endless_gym; endless_gym.specs' || failed=1
 
 printf '\n%s\n' "${report[@]}"
 exit "$failed"
