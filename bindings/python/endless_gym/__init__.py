@@ -17,6 +17,7 @@ from endless_gym.env import Env
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
 from endless_gym.specs import Frames, all_specs, spec
+from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
     from endless_gym.engine import serve
@@ -29,6 +30,7 @@ __all__ = [
     "Env",
     "Frames",
     "TooManyBatchesHeld",
+    "WindowClosed",
     "__version__",
     "all_specs",
     "connect",

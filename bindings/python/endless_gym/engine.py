@@ -17,6 +17,7 @@ from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import AutoresetMode, Options, checked_arguments
 from endless_gym.program import program
+from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.specs import Frames, json_text
 from endless_gym.vector import EndlessVectorEnv, connect
 
@@ -65,8 +66,8 @@ class EngineProcess:
         """Process id."""
         return self._process.pid
 
-    def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
-        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer."""
+    def connect(self, timeout: float, **kwargs: Any) -> EndlessVectorEnv:
+        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer; `kwargs` are those of `connect`."""
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
@@ -76,7 +77,7 @@ class EngineProcess:
                 message = text.rpartition("\nendless: ")[2].strip()
                 raise RuntimeError(message or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
-                return connect(self.service, timeout=timeout, copy=copy, engine=self)
+                return connect(self.service, timeout=timeout, engine=self, **kwargs)
             if time.monotonic() >= end:
                 raise TimeoutError(f"the engine did not start within {timeout} seconds")
             time.sleep(0.01)
@@ -122,6 +123,8 @@ def serve(
     resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
 ) -> EndlessVectorEnv:
     """Start an engine in a child process, and connect to it. It stops when the environments are closed.
 
@@ -149,6 +152,8 @@ def serve(
             exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
 
     Raises:
         TypeError: A number is not an integer.
@@ -157,6 +162,7 @@ def serve(
     """
     given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
     timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
     arguments: dict[str, Any] = {
         "--env": given.described.id,
         "--num-envs": given.num_envs,
@@ -190,7 +196,7 @@ def serve(
     command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:
-        return engine.connect(timeout, copy)
+        return engine.connect(timeout, copy=copy, render_mode=render_mode, view=view)
     except BaseException:
         engine.end()
         raise

@@ -21,6 +21,9 @@ DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
 
 SCREEN = 84
 
+#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
+OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -163,6 +166,18 @@ def spec(id: str) -> Spec:
     if name not in known:
         raise ValueError(f"id must be one of {', '.join(known)}, got {id!r}")
     return known[name]
+
+
+def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
+    if not isinstance(observation, str) or observation not in OBSERVATIONS:
+        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
+    if frames is not None and not isinstance(frames, Frames):
+        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
+    has_frames, has_features = OBSERVATIONS[observation]
+    if frames is not None and not has_frames:
+        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
+    return (frames or Frames()) if has_frames else None, has_features
 
 
 def options_text(options: Mapping[str, Any] | None) -> str:

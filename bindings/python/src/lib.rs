@@ -11,6 +11,7 @@ mod ends;
 mod errors;
 mod logs;
 mod pool;
+mod renderer;
 mod single;
 
 use std::ffi::OsString;
@@ -49,6 +50,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<pool::Pool>()?;
     module.add_class::<pool::PoolConfig>()?;
     module.add_class::<pool::Threads>()?;
+    module.add_class::<renderer::Renderer>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;
