@@ -132,8 +132,8 @@ def serve(
     timeout: float = 30.0,
     copy: bool = False,
 ) -> EndlessVectorEnv:
-    """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to them,
-    and with this process.
+    """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to
+    them, and with this process.
 
     ```python
     with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
