@@ -16,7 +16,7 @@ from typing import IO, Any
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, Options, checked_arguments
+from endless_gym.configuration import AutoresetMode, AutoresetName, ObservationName, Options, checked_arguments
 from endless_gym.program import program
 from endless_gym.specs import Frames, json_text
 from endless_gym.vector import EndlessVectorEnv, connect
@@ -122,8 +122,8 @@ def serve(
     seed: int | None = None,
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    observation: str = "rgb",
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     batches_held: int = 4,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -131,6 +131,7 @@ def serve(
     resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
+    independent_episodes: bool = False,
 ) -> EndlessVectorEnv:
     """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to
     them, and with this process.
@@ -159,13 +160,26 @@ def serve(
             exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        independent_episodes: As for `make_vec`.
 
     Raises:
         TypeError: A number is not an integer.
         ValueError: An argument is out of its range; or `checkpoint_every` or `resume` is given without `checkpoint`.
         RuntimeError: The engine cannot start; the message says why.
     """
-    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+    )
     timeout = checked_timeout(timeout)
     arguments: dict[str, Any] = {
         "--env": given.described.id,
@@ -190,6 +204,7 @@ def serve(
     command = [f"{name}={value}" for name, value in arguments.items()]
     command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
     command += ["--features"] if given.features else []
+    command += ["--independent-episodes"] if given.independent_episodes else []
     command += given.frames.command() if given.frames else ["--no-frames"]
     if options is None or isinstance(options, Mapping):
         long = [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]

@@ -86,7 +86,9 @@ def test_an_engine_ends_with_the_adapter_around_it(library: str, name: str, auto
 
 @pytest.mark.parametrize("end", ["", "raise SystemExit(3)", "undefined_name"])
 def test_an_engine_ends_before_its_interpreter_does(end: str) -> None:
-    text = f"import endless_gym; envs = endless_gym.serve({ID!r}, 4); print(envs._backend._engine.pid, flush=True); {end}"
+    text = (
+        f"import endless_gym; envs = endless_gym.serve({ID!r}, 4); print(envs._backend._engine.pid, flush=True); {end}"
+    )
     ended = subprocess.run([sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=60)
     assert not Path(f"/proc/{int(ended.stdout)}").exists()
     assert endless_gym.running_engines() == []
