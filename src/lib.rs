@@ -22,8 +22,8 @@ pub mod batch {
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{
-        ActionError, ActionSpace, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family, InfoColumn,
-        InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
+        ActionBranch, ActionError, ActionSpace, Choice, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family,
+        InfoColumn, InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
         ParameterError, ParameterKind, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec, specs, view,
     };
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 
@@ -21,6 +21,10 @@ except ImportError as error:
     ) from error
 
 Options = Mapping[str, Any]
+
+#: The names of the auto-reset modes, and the kinds of observations.
+AutoresetName = Literal["next_step", "same_step", "disabled"]
+ObservationName = Literal["rgb", "features", "rgb+features"]
 
 #: Values of the argument `observation`, with whether the batch has frames and whether it has features.
 OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
@@ -43,6 +47,7 @@ class Arguments:
     autoreset: AutoresetMode
     frames: Frames | None
     features: bool
+    independent_episodes: bool
     #: The configuration of each group, which the engine has checked.
     pools: list[_native.PoolConfig]
 
@@ -55,9 +60,10 @@ def checked_arguments(
     seed: int | None,
     seeds: range | Sequence[int] | None,
     options: Options | Sequence[Options] | None,
-    autoreset: str | AutoresetMode,
-    observation: str,
+    autoreset: AutoresetName | AutoresetMode,
+    observation: ObservationName,
     frames: Frames | None,
+    independent_episodes: bool = False,
 ) -> Arguments:
     """Check arguments of `make_vec`.
 
@@ -86,13 +92,27 @@ def checked_arguments(
             frames=frames.arguments() if frames else None,
             features=features,
             final_observation=True,
+            independent_episodes=bool(independent_episodes),
         )
         for group in range(groups)
     ]
-    return Arguments(described, num_envs, threads, groups, seed, seed_range, seed_list, mode, frames, features, pools)
+    return Arguments(
+        described=described,
+        num_envs=num_envs,
+        num_threads=threads,
+        groups=groups,
+        seed=seed,
+        seed_range=seed_range,
+        seed_list=seed_list,
+        autoreset=mode,
+        frames=frames,
+        features=features,
+        independent_episodes=bool(independent_episodes),
+        pools=pools,
+    )
 
 
-def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
+def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
     """Gymnasium's auto-reset mode, from the mode or its name."""
     mode = given if isinstance(given, AutoresetMode) else MODES.get(given) if isinstance(given, str) else None
     if mode is None:
@@ -100,7 +120,7 @@ def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
     return mode
 
 
-def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
+def contents(observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
     """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
     if not isinstance(observation, str) or observation not in OBSERVATIONS:
         raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
-from endless_gym.specs import options_text, spec
+from endless_gym.meanings import documented, metadata
+from endless_gym.specs import all_specs, options_text, spec
 
 Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
 
@@ -23,17 +24,25 @@ _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 _VIEW = 336
 
 
+@documented(all_specs().values())
 class Env(gymnasium.Env[Any, Any]):
     """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 
     Observations are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB` return a dict
     of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+
+    As in the original, an episode shows what the one before has left: the first frames of Endless-MortarMayhem show the last
+    episode's character until the agent may move, so that `reset(seed=...)` alone does not decide them. An episode depends on its
+    seed and its options alone with `independent_episodes`.
+
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
         render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
             (336, 336, 3); both indexed `[row][column][channel]`. `human`: every step shows that view in a window (needs pygame).
         options: Reset parameters for every episode. Options of `reset` override them.
+        independent_episodes: Start every episode as in a new environment, and draw a seed for each episode that is given none.
 
     Raises:
         ValueError: The id or the render mode is unknown, or a reset parameter is unknown or out of its range.
@@ -44,13 +53,21 @@ class Env(gymnasium.Env[Any, Any]):
         "render_fps": 25,
     }
 
-    def __init__(self, id: str, render_mode: str | None = None, options: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        id: str,
+        render_mode: str | None = None,
+        options: dict[str, Any] | None = None,
+        *,
+        independent_episodes: bool = False,
+    ) -> None:
         self._spec = spec(id)
         if render_mode not in (None, *self.metadata["render_modes"]):
             known = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"render_mode must be None or one of {known}, got {render_mode!r}")
-        # The frame rate differs from id to id.
-        self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
+        # The frame rate and the meanings differ from id to id.
+        fps = {"render_fps": self._spec.render_fps}
+        self.metadata = {**type(self).metadata, **fps, **metadata(self._spec)}  # type: ignore[misc]
         self.render_mode = render_mode
         self.action_space = self._spec.action_space()
         self.observation_space = self._spec.observation_space()
@@ -59,7 +76,7 @@ class Env(gymnasium.Env[Any, Any]):
             self.ground_truth_space = self._spec.ground_truth_space()
         self._truth_dtype = np.int64 if self._spec.id in _INTEGER_GROUND_TRUTH else np.float64
         self._options = mapping("options", options)
-        self._native = _native.Single(self._spec.id, options_text(self._options))
+        self._native = _native.Single(self._spec.id, options_text(self._options), bool(independent_episodes))
         self._seed: int | None = None
         self._window: _Window | None = None
         self._is_shown = False

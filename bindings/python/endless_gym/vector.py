@@ -17,15 +17,27 @@ from endless_gym import _native
 from endless_gym.arguments import MAX_U64, integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.backends import Backend, InProcess, Reconnection, Remote
-from endless_gym.configuration import MODES, AutoresetMode, Options, checked_arguments, common_options
-from endless_gym.specs import Frames, Spec, options_text, spec
+from endless_gym.configuration import (
+    MODES,
+    AutoresetMode,
+    AutoresetName,
+    ObservationName,
+    Options,
+    checked_arguments,
+    common_options,
+)
+from endless_gym.meanings import documented, metadata
+from endless_gym.specs import Frames, Spec, all_specs, options_text, spec
 
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
+@documented(all_specs().values())
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
+
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
 
     `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
     of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. The arrays are read-only
@@ -58,9 +70,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.num_groups = backend.groups
         self.single_observation_space = described.observation_space(frames, "features" in sections)
         self.single_action_space = described.action_space()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
         self.metadata = {"autoreset_mode": autoreset, "render_fps": described.render_fps, "render_modes": []}
+        self.metadata.update(metadata(described))
         self._index = {name: place for place, name in enumerate(sections)}
         names = {
             "observation": "visual_observation",
@@ -404,11 +417,12 @@ def make_vec(
     seed: int | None = None,
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    observation: str = "rgb",
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
+    independent_episodes: bool = False,
 ) -> EndlessVectorEnv:
     """Create environments in this process.
 
@@ -428,12 +442,28 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
+        independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
+            alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
+            an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
+            the last one's background, and an episode continues the generator that the one before has drawn from.
 
     Raises:
         TypeError: A number is not an integer.
         ValueError: An argument is out of its range.
     """
-    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+    )
     # As in an engine, groups share threads.
     threads = _native.Threads(given.num_threads)
     pools = [_native.Pool(config, group, threads) for group, config in enumerate(given.pools)]

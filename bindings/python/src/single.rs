@@ -26,10 +26,12 @@ pub struct Single {
 #[pymethods]
 impl Single {
     #[new]
-    fn new(id: &str, options: &str) -> PyResult<Self> {
+    #[pyo3(signature = (id, options, independent_episodes=false))]
+    fn new(id: &str, options: &str, independent_episodes: bool) -> PyResult<Self> {
         let config = PoolConfig {
             options: ResetOptions::Shared(arguments::options(options)?),
             autoreset: Autoreset::Disabled,
+            independent_episodes,
             ..PoolConfig::new(id, 1)
         };
         let threads = Threads::new(1).map_err(errors::pool)?;

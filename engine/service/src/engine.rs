@@ -365,6 +365,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
             ResetOptions::Shared(options) => vec![options.clone()],
             ResetOptions::Each(each) => each.clone(),
         },
+        independent_episodes: config.pool.independent_episodes,
         autoreset: config.pool.autoreset,
         render_fps: spec.render_fps,
         batches_held: config.batches_held,

@@ -112,8 +112,11 @@ pub(super) fn family_slots<E: Environment>(
     let stack = config.frames.unwrap_or_default().stack;
     let slots = made.into_iter().enumerate().map(|(env, (options, assets))| {
         let number = config.first_env + env;
-        let seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
-        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack)
+        let mut seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        if config.independent_episodes {
+            seeds = seeds.independent(number, unseeded);
+        }
+        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack, config.independent_episodes)
     });
     Ok(FamilySlots { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
 }
