@@ -79,6 +79,12 @@ pub const STAGES: &[Stage] = &[
         needs: &[OriginalPython, Disk],
         ..STAGE
     },
+    Stage {
+        name: "libraries environment",
+        run: || python::libraries().map(drop),
+        after: &["python environment"],
+        ..STAGE
+    },
     Stage { name: "ruff", run: python::ruff, after: &["python environment"], ..QUICK },
     Stage { name: "mypy", run: python::mypy, after: &["python environment"], ..QUICK },
     Stage {
@@ -98,7 +104,7 @@ pub const STAGES: &[Stage] = &[
     Stage {
         name: "pytest slow",
         run: || python::pytest("slow and not original"),
-        after: &["wheel"],
+        after: &["wheel", "libraries environment"],
         needs: &[SharedMemory],
         ..STAGE
     },

@@ -17,11 +17,11 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 SUMMARY = re.compile(r"steps=(\d+) steps_per_second=(\d+) .*mean_return=(-?\d+\.\d+|none yet)")
 
 
-def run(script: str, cwd: Path, *arguments: str) -> tuple[str, re.Match[str]]:
+def run(script: str, cwd: Path, *arguments: str, python: str = sys.executable) -> tuple[str, re.Match[str]]:
     """Run the example with `arguments`, and return what it printed, and the last line's numbers."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     ran = subprocess.run(
-        [sys.executable, EXAMPLES / script, *arguments],
+        [python, EXAMPLES / script, *arguments],
         cwd=cwd,
         env=environment,
         capture_output=True,
@@ -92,3 +92,36 @@ def test_cleanrl_ppo(tmp_path, env_id):
     losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
     assert len(losses) == 2
     assert not any(math.isnan(loss) for loss in losses)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "observation", "runners", "lstm"),
+    [("Endless-MortarMayhem-v0", "rgb", 0, "--lstm"), ("MysteryPath-Grid-v0", "features", 1, "--no-lstm")],
+)
+def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, runners, lstm):
+    arguments = {
+        "--env-id": env_id,
+        "--options": "{}",
+        "--observation": observation,
+        "--num-env-runners": runners,
+        "--num-envs": 8,
+        "--num-steps": 16,
+        "--total-timesteps": 256,
+    }
+    flat = (str(part) for pair in arguments.items() for part in pair)
+    output, summary = run("rllib_ppo.py", tmp_path, *flat, lstm, python=libraries_python)
+    assert summary[1] == "256"
+    assert output.count("steps=") >= 2
+    if env_id.startswith("Endless"):
+        assert summary[3] != "none yet"
+
+
+@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
+def test_jax_service(tmp_path, libraries_python, segments, env_id):
+    sizes = ("--num-envs", "8", "--total-timesteps", "512")
+    output, summary = run("jax_service.py", tmp_path, "--env-id", env_id, *sizes, python=libraries_python)
+    assert summary[1] == "512"
+    assert "observation=(8, 84, 84, 3) uint8 shared=True" in output
+    if env_id.startswith("Endless"):
+        assert summary[3] != "none yet"
+    assert not segments()
