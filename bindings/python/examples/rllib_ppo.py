@@ -94,7 +94,7 @@ def make_config(args: argparse.Namespace) -> PPOConfig:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env-id", default="MortarMayhem-Grid-v0", help="environment id without dict observations")
+    parser.add_argument("--env-id", default="MortarMayhem-Grid-v0", help="environment id")
     parser.add_argument("--options", default='{"command_count": [1]}', help="reset parameters as JSON")
     parser.add_argument("--observation", choices=["features", "rgb"], default="features", help="what the agent sees")
     parser.add_argument("--lstm", action=argparse.BooleanOptionalAction, default=True, help="memory of the agent")
@@ -106,6 +106,8 @@ def main() -> None:
     parser.add_argument("--learning-rate", type=float, default=1e-3, help="learning rate of Adam")
     parser.add_argument("--seed", type=int, default=1, help="seed of the environments and the network")
     args = parser.parse_args()
+    if "MortarMayhemB" in args.env_id:
+        parser.error(f"{args.env_id} has dict observations, which the network here does not support; choose another id")
 
     ray.init(num_cpus=args.num_env_runners + 1, include_dashboard=False, log_to_driver=False)
     algorithm = make_config(args).build_algo()

@@ -46,6 +46,12 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The folder for the logs of Stable-Baselines3, in this process and its children; by default it makes new ones in /tmp."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
+@pytest.fixture(autouse=True, scope="session")
 def own_namespace() -> Iterator[Path]:
     """A namespace root of this test run, so that runs at the same time do not see each other's engines and segments."""
     # A short path, since it is part of the path of Unix sockets.

@@ -41,7 +41,23 @@ def test_every_example_has_a_test():
     assert {f"test_{path.stem}" for path in EXAMPLES.glob("*.py")} <= set(globals())
 
 
-@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MortarMayhemB-Grid-v0"])
+@pytest.mark.parametrize("script", ["cleanrl_ppo.py", "torchrl_rollout.py", "rllib_ppo.py"])
+def test_dict_observations_are_refused_with_a_message(script, tmp_path, libraries_python):
+    command = [libraries_python, EXAMPLES / script, "--env-id", "MortarMayhemB-v0"]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert ran.returncode
+    assert "MortarMayhemB-v0 has dict observations" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+def test_cleanrl_ppo_needs_steps_for_one_update(tmp_path):
+    command = [sys.executable, EXAMPLES / "cleanrl_ppo.py", "--total-timesteps", "100"]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert ran.returncode
+    assert "--total-timesteps must be at least num_envs * num_steps, 8192" in ran.stderr
+
+
+@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
 def test_sb3_recurrent_ppo(tmp_path, env_id):
     sizes = ("--num-envs", "8", "--num-steps", "32", "--total-timesteps", "512", "--hidden-size", "32")
     output, summary = run("sb3_recurrent_ppo.py", tmp_path, "--env-id", env_id, *sizes)
