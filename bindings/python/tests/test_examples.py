@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,17 @@ def test_every_example_has_a_test():
     assert {f"test_{path.stem}" for path in EXAMPLES.glob("*.py")} <= set(globals())
 
 
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_command_lines_are_right_as_written(tmp_path, path):
+    """Those of the docstring, with fewer steps: one of each kind of action space among them or the defaults."""
+    lines = re.findall(rf"^python {path.name} ?(.*)$", path.read_text(), re.M)
+    assert lines, "the docstring shows no command"
+    for line in lines:
+        few = ["--total-timesteps", "512", *(["--num-envs", "8"] if "num-steps" in path.read_text() else [])]
+        _, summary = run(path.name, tmp_path, *shlex.split(line), *few)
+        assert int(summary[1]) >= 512
+
+
 @pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MortarMayhemB-Grid-v0"])
 def test_sb3_recurrent_ppo(tmp_path, env_id):
     sizes = ("--num-envs", "8", "--num-steps", "32", "--total-timesteps", "512", "--hidden-size", "32")
@@ -70,6 +82,7 @@ def test_torchrl_rollout(tmp_path, env_id):
         ("Endless-MortarMayhem-v0", "Multiprocessing"),
         ("MysteryPath-Grid-v0", "PufferEnv"),
         ("MysteryPath-Grid-v0", "Serial"),
+        ("MysteryPath-Grid-v0", "Multiprocessing"),
     ],
 )
 def test_pufferlib_rollout(tmp_path, env_id, backend):
