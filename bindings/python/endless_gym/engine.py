@@ -137,6 +137,8 @@ def serve(
     them, and with this process.
 
     ```python
+    import endless_gym
+
     with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
         observation, info = envs.reset()
     ```

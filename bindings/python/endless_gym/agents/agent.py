@@ -1,11 +1,19 @@
 """The agent: an actor-critic of encoder, memory, body and heads.
 
 ```python
-memory = agent.initial_memory(num_envs)
-while playing:
-    output = agent.act(observation, memory)         # updates the memory
-    observation, done = step(output.action)
-    memory.reset(done)                              # where an episode has ended
+from endless_gym import make_vec, spec
+from endless_gym.agents.agent import make_agent
+from endless_gym.agents.settings import PRESETS
+
+settings = PRESETS["quick"]                          # with feature observations
+agent = make_agent(settings, spec(settings.env))
+with make_vec(settings.env, 8, observation="features", autoreset="same_step") as envs:
+    observation, info = envs.reset(seed=0)
+    memory = agent.initial_memory(envs.num_envs)
+    for _ in range(100):
+        output = agent.act(observation, memory)      # updates the memory
+        observation, reward, done, _, info = envs.step(output.action.numpy())
+        memory.reset(done)                           # where an episode has ended
 ```
 """
 
@@ -54,7 +62,8 @@ class AgentMemory:
 
     def reset(self, done: Tensor | NDArray[np.bool_]) -> None:
         """Mark the next observation as the first of an episode where `done`, bool (n,), is true."""
-        self.reset_mask = self.reset_mask | torch.as_tensor(done, device=self.reset_mask.device)
+        done = done if isinstance(done, Tensor) else unchecked_torch_view(done)
+        self.reset_mask = self.reset_mask | done.to(self.reset_mask.device)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything as tensors and numbers by name, for a checkpoint."""

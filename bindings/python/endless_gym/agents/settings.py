@@ -209,7 +209,7 @@ class Settings:
                 equals = ""
             if not equals:
                 raise ValueError(
-                    f"--environment.option must be NAME=VALUE with a JSON value, such as command_count=[2], got `{given}`"
+                    f"--environment.option must be NAME=VALUE with a JSON value, such as 'command_count=[2]', got `{given}`"
                 )
         return options
 

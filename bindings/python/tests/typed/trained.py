@@ -20,10 +20,10 @@ def main(folder: str) -> None:
     results: list[dict[str, float]] = evaluate(agent, seeds=range(200_000, 200_005), repetitions=1)
     print(f"{mean(results):.3f}")
     with endless_gym.make_vec("MortarMayhem-Grid-v0", 4, observation="features", autoreset="same_step") as envs:
-        observation, info = envs.reset(seed=0)
+        observation, _ = envs.reset(seed=0)
         memory = agent.initial_memory(envs.num_envs)
         output = agent.act({"features": endless_gym.torch_view(observation)}, memory, torch.Generator())
-        observation, _, done, _, info = envs.step(output.action[:, 0].numpy())
+        observation, _, done, _, _ = envs.step(output.action[:, 0].numpy())
         memory.reset(done)
 
 
