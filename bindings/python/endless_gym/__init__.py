@@ -18,6 +18,7 @@ from endless_gym.experts import Experts
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
 from endless_gym.specs import Frames, all_specs, spec
+from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
     from endless_gym.engine import serve
@@ -33,6 +34,7 @@ __all__ = [
     "Experts",
     "Frames",
     "TooManyBatchesHeld",
+    "WindowClosed",
     "__version__",
     "all_specs",
     "connect",

@@ -10,7 +10,7 @@ import gymnasium
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping, seed_source
-from endless_gym.specs import Frames, Spec, options_text, spec
+from endless_gym.specs import Frames, ObservationName, Spec, contents, options_text, spec
 
 try:
     from gymnasium.vector import AutoresetMode as AutoresetMode
@@ -22,12 +22,8 @@ except ImportError as error:
 
 Options = Mapping[str, Any]
 
-#: The names of the auto-reset modes, and the kinds of observations.
+#: The names of the auto-reset modes.
 AutoresetName = Literal["next_step", "same_step", "disabled"]
-ObservationName = Literal["rgb", "features", "rgb+features"]
-
-#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
-OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
 
 #: The auto-reset modes by their names.
 MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
@@ -118,18 +114,6 @@ def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
     if mode is None:
         raise ValueError(f"autoreset must be one of {', '.join(MODES)}, got {given!r}")
     return mode
-
-
-def contents(observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
-    if not isinstance(observation, str) or observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
-    if frames is not None and not isinstance(frames, Frames):
-        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
-    has_frames, has_features = OBSERVATIONS[observation]
-    if frames is not None and not has_frames:
-        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
-    return (frames or Frames()) if has_frames else None, has_features
 
 
 def common_options(given: Options | Sequence[Options] | None) -> Options | None:

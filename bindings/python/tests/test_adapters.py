@@ -412,8 +412,8 @@ class TestPufferLib:
             ended += done.sum()
             if done.any():
                 (statistics,) = infos
-                assert statistics["episode_return"] == info["episode"]["r"][done].tolist()
-                assert statistics["episode_length"] == info["episode"]["l"][done].tolist()
+                assert statistics["episode_return"] == info["final_info"]["reward"][done].tolist()
+                assert statistics["episode_length"] == info["final_info"]["length"][done].tolist()
                 assert all(isinstance(values, list) and len(values) == done.sum() for values in statistics.values())
             else:
                 assert infos == []

@@ -65,6 +65,9 @@ pub(super) trait EnvSlots: Send + Sync {
 
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
+
+    /// Sets the animations of that view to the current step.
+    fn align_ground_truth_view(&mut self, env: usize);
 }
 
 /// The environments of a pool, all of one family.
@@ -261,5 +264,9 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
 
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
         view::ground_truth_view(&mut self.slots[env].env, out);
+    }
+
+    fn align_ground_truth_view(&mut self, env: usize) {
+        self.slots[env].env.align_ground_truth();
     }
 }
