@@ -16,6 +16,7 @@ from endless_gym._native import EngineLost, TooManyBatchesHeld, __version__, run
 from endless_gym.env import Env
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
+from endless_gym.replay import ReplayStep, replay
 from endless_gym.specs import Frames, all_specs, spec
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ __all__ = [
     "EngineLost",
     "Env",
     "Frames",
+    "ReplayStep",
     "TooManyBatchesHeld",
     "__version__",
     "all_specs",
@@ -35,6 +37,7 @@ __all__ = [
     "make_vec",
     "pin_memory",
     "register",
+    "replay",
     "running_engines",
     "serve",
     "spec",

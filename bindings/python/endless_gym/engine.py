@@ -16,6 +16,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import AutoresetMode, Options, checked_arguments
+from endless_gym.episodes import EpisodeOptions, checked_choice
 from endless_gym.program import program
 from endless_gym.specs import Frames, json_text
 from endless_gym.vector import EndlessVectorEnv, connect
@@ -65,8 +66,8 @@ class EngineProcess:
         """Process id."""
         return self._process.pid
 
-    def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
-        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer."""
+    def connect(self, timeout: float, **arguments: Any) -> EndlessVectorEnv:
+        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer with arguments of `connect`."""
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
@@ -76,7 +77,7 @@ class EngineProcess:
                 message = text.rpartition("\nendless: ")[2].strip()
                 raise RuntimeError(message or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
-                return connect(self.service, timeout=timeout, copy=copy, engine=self)
+                return connect(self.service, timeout=timeout, engine=self, **arguments)
             if time.monotonic() >= end:
                 raise TimeoutError(f"the engine did not start within {timeout} seconds")
             time.sleep(0.01)
@@ -122,6 +123,8 @@ def serve(
     resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
 ) -> EndlessVectorEnv:
     """Start an engine in a child process, and connect to it. It stops when the environments are closed.
 
@@ -149,6 +152,8 @@ def serve(
             exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        episode_options: As for `connect`.
+        episode_info: As for `connect`; the engine can lend one batch more for it.
 
     Raises:
         TypeError: A number is not an integer.
@@ -157,12 +162,16 @@ def serve(
     """
     given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
     timeout = checked_timeout(timeout)
+    checked_choice(episode_options)
     arguments: dict[str, Any] = {
         "--env": given.described.id,
         "--num-envs": given.num_envs,
         "--threads": given.num_threads,
         "--groups": given.groups,
-        "--batches-held": integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD),
+        "--batches-held": min(
+            integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
+            _native.MAX_BATCHES_HELD,
+        ),
         "--autoreset": given.autoreset.name.lower(),
     }
     if given.seed is not None and given.seed_list is None:
@@ -190,7 +199,7 @@ def serve(
     command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:
-        return engine.connect(timeout, copy)
+        return engine.connect(timeout, copy=copy, episode_options=episode_options, episode_info=episode_info)
     except BaseException:
         engine.end()
         raise

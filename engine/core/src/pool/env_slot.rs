@@ -15,7 +15,7 @@ use crate::raster::PixelFormat;
 /// An environment with its generator, its seeds, and what is counted of its episode.
 pub(super) struct EnvSlot<E: Environment> {
     pub env: E,
-    /// The assets for the next episode.
+    /// The assets for the next episode, unless there is `next`.
     pub assets: Arc<E::Assets>,
     pub random: Generator,
     pub seeds: Seeds,
@@ -26,7 +26,14 @@ pub(super) struct EnvSlot<E: Environment> {
     pub ended: bool,
     /// The reset parameters as they were given, which `assets` were made from.
     pub options: Arc<OptionMap>,
+    /// Other assets and options from the next episode on.
+    pub next: Option<OptionSet<E>>,
+    /// The seed that the running episode started with, unless it continued the generator.
+    pub episode_seed: Option<u64>,
 }
+
+/// Reset parameters as they were given, and the assets made from them.
+pub(super) type OptionSet<E> = (Arc<<E as Environment>::Assets>, Arc<OptionMap>);
 
 impl<E: Environment> EnvSlot<E> {
     /// An environment that has not been reset yet, for observations of `stack` frames. `random` is its generator until an episode
@@ -42,6 +49,8 @@ impl<E: Environment> EnvSlot<E> {
             frame_stack: FrameStack::new(stack),
             ended: false,
             options,
+            next: None,
+            episode_seed: None,
         }
     }
 
@@ -50,8 +59,12 @@ impl<E: Environment> EnvSlot<E> {
         if let Some(seed) = seed {
             self.seeds.restart(seed);
         }
-        if let Some(seed) = seed.or_else(|| self.seeds.next()) {
+        self.episode_seed = seed.or_else(|| self.seeds.next());
+        if let Some(seed) = self.episode_seed {
             self.random = Generator::from_seed(seed);
+        }
+        if let Some(next) = self.next.take() {
+            (self.assets, self.options) = next;
         }
         self.env.reset(&self.assets, &mut self.random);
         self.frame_stack.restart(|| self.env.scene());
