@@ -116,11 +116,9 @@ def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
     return mode
 
 
-def common_options(given: Options | Sequence[Options] | None) -> Options | None:
-    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
-    if given is None or isinstance(given, Mapping):
-        return given or {}
-    return given[0] if len(given) == 1 else None
+def options_list(given: Options | Sequence[Options] | None) -> Sequence[Options]:
+    """The reset parameters as a list: one mapping for all environments, or one for each of all groups."""
+    return [given or {}] if given is None or isinstance(given, Mapping) else given
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:

@@ -17,6 +17,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.episodes import EpisodeOptions, checked_choice
 from endless_gym.program import program
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.specs import Frames, ObservationName, json_text
@@ -135,6 +136,8 @@ def serve(
     independent_episodes: bool = False,
     render_mode: str | None = None,
     view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
 ) -> EndlessVectorEnv:
     """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to
     them, and with this process.
@@ -168,6 +171,8 @@ def serve(
         independent_episodes: As for `make_vec`.
         render_mode: As for `make_vec`.
         view: As for `make_vec`.
+        episode_options: As for `connect`.
+        episode_info: As for `connect`; the engine can lend one batch more for it.
 
     Raises:
         TypeError: A number is not an integer.
@@ -189,12 +194,16 @@ def serve(
     )
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, VECTOR_MODES)
+    checked_choice(episode_options)
     arguments: dict[str, Any] = {
         "--env": given.described.id,
         "--num-envs": given.num_envs,
         "--threads": given.num_threads,
         "--groups": given.groups,
-        "--batches-held": integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD),
+        "--batches-held": min(
+            integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
+            _native.MAX_BATCHES_HELD,
+        ),
         "--autoreset": given.autoreset.name.lower(),
     }
     if given.seed is not None and given.seed_list is None:
@@ -223,7 +232,14 @@ def serve(
     command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:
-        return engine.connect(timeout, copy=copy, render_mode=render_mode, view=view)
+        return engine.connect(
+            timeout,
+            copy=copy,
+            render_mode=render_mode,
+            view=view,
+            episode_options=episode_options,
+            episode_info=episode_info,
+        )
     except BaseException:
         engine.end()
         raise

@@ -294,7 +294,7 @@ impl Engine {
             _ => outcome,
         };
         if let (Ok(_), Some(checkpointer)) = (&outcome, &mut self.checkpointer)
-            && !matches!(read_kind, Some(RequestKind::Snapshot | RequestKind::Checkpoint))
+            && !read_kind.is_some_and(RequestKind::changes_nothing)
         {
             checkpointer.mark_changed();
         }
