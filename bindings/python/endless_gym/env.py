@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.keyboard import keys_to_action
+from endless_gym.meanings import documented, metadata
 from endless_gym.rendering import SINGLE_MODES, SnapshotRenderer, View, checked_view
-from endless_gym.specs import Frames, contents, options_text, spec
+from endless_gym.specs import Frames, ObservationName, all_specs, contents, options_text, spec
 from endless_gym.window import Window, WindowClosed
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
@@ -22,12 +23,18 @@ Observation = NDArray[Any] | dict[str, NDArray[Any]]
 _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
 
+@documented(all_specs().values())
 class Env(gymnasium.Env[Any, Any]):
     """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 
     Observations are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB` return a dict
     of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+
+    As in the original, an episode shows what the one before has left: the first frames of Endless-MortarMayhem show the last
+    episode's character until the agent may move, so that `reset(seed=...)` alone does not decide them. An episode depends on its
+    seed and its options alone with `independent_episodes`.
     `copy.deepcopy` and `pickle` make an independent environment that goes on identically, with the state of the episode and of
     the generator; a window is not part of it.
 
@@ -41,6 +48,7 @@ class Env(gymnasium.Env[Any, Any]):
         frames: Format of the frames, as for `make_vec`. `None` for the original's format. Pictures always have the original's.
         view: What `rgb_array` and `human` show instead of the above: `agent` for the frame, `ground_truth` for the ground-truth
             view, for tools that know only Gymnasium's own render modes.
+        independent_episodes: Start every episode as in a new environment, and draw a seed for each episode that is given none.
 
     Raises:
         TypeError: `frames` is not `Frames`.
@@ -58,15 +66,18 @@ class Env(gymnasium.Env[Any, Any]):
         render_mode: str | None = None,
         options: dict[str, Any] | None = None,
         *,
-        observation: str = "rgb",
+        observation: ObservationName = "rgb",
         frames: Frames | None = None,
         view: View | None = None,
+        independent_episodes: bool = False,
     ) -> None:
         self._spec = spec(id)
         self._view = checked_view(render_mode, view, SINGLE_MODES)
         self._frames, self._features = contents(observation, frames)
-        # The frame rate differs from id to id.
-        self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
+        self._independent_episodes = bool(independent_episodes)
+        # The frame rate and the meanings differ from id to id.
+        fps = {"render_fps": self._spec.render_fps}
+        self.metadata = {**type(self).metadata, **fps, **metadata(self._spec)}  # type: ignore[misc]
         self.render_mode = render_mode
         self.action_space = self._spec.action_space()
         self.observation_space = self._spec.observation_space(self._frames, self._features)
@@ -190,7 +201,9 @@ class Env(gymnasium.Env[Any, Any]):
 
     def _new_native(self) -> _native.Single:
         frames = None if self._frames is None else self._frames.arguments()
-        return _native.Single(self._spec.id, options_text(self._options), frames, self._features)
+        return _native.Single(
+            self._spec.id, options_text(self._options), frames, self._features, self._independent_episodes
+        )
 
     def _check_window(self) -> None:
         """Raises `WindowClosed` if the user has closed the window."""

@@ -27,12 +27,19 @@ pub struct Single {
 #[pymethods]
 impl Single {
     #[new]
-    fn new(id: &str, options: &str, frames: Option<(bool, bool, bool, usize)>, features: bool) -> PyResult<Self> {
+    fn new(
+        id: &str,
+        options: &str,
+        frames: Option<(bool, bool, bool, usize)>,
+        features: bool,
+        independent_episodes: bool,
+    ) -> PyResult<Self> {
         let config = PoolConfig {
             options: ResetOptions::Shared(arguments::options(options)?),
             autoreset: Autoreset::Disabled,
             frames: frames.map(arguments::frames),
             features,
+            independent_episodes,
             ..PoolConfig::new(id, 1)
         };
         let threads = Threads::new(1).map_err(errors::pool)?;
