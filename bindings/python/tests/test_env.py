@@ -197,6 +197,14 @@ def play(env: endless_gym.Env, actions: list[Any]) -> Any:
             yield env.reset()
 
 
+def test_a_copy_of_an_environment_with_independent_episodes_draws_the_same_seeds() -> None:
+    env = endless_gym.Env("Endless-MortarMayhem-v0", "rgb_array", {"max_steps": 20}, independent_episodes=True)
+    env.reset(seed=1)
+    other = copy.deepcopy(env)
+    actions = [env.action_space.sample() for _ in range(90)]
+    assert plain(list(play(env, actions))) == plain(list(play(other, actions)))
+
+
 @pytest.mark.parametrize("how", COPIES.values(), ids=COPIES)
 def test_an_environment_without_an_episode_is_copied(how: Any) -> None:
     env = endless_gym.Env("MortarMayhemB-Grid-v0", options={"arena_size": 3}, observation="features")

@@ -128,6 +128,17 @@ def test_pictures_do_not_depend_on_the_observation() -> None:
         np.testing.assert_array_equal(each.render(), envs[0].render()[0])
 
 
+@pytest.mark.parametrize("where", WHERE)
+def test_a_picture_is_the_observation_at_ends_of_episodes_too(where: Any) -> None:
+    kwargs = {"options": {"max_steps": 6}, "autoreset": "same_step", "independent_episodes": True}
+    with where("Endless-MortarMayhem-v0", 2, seed=1, render_mode="rgb_array", **kwargs) as envs:
+        observation, _ = envs.reset()
+        for _ in range(20):
+            for picture, frame in zip(envs.render(), observation, strict=True):
+                np.testing.assert_array_equal(picture, frame.swapaxes(0, 1))
+            observation, *_ = envs.step(envs.action_space.sample())
+
+
 def test_the_ground_truth_view_is_an_rgb_array_for_tools_that_know_no_other() -> None:
     id = "MortarMayhem-v0"
     debug = endless_gym.Env(id, "debug_rgb_array")
