@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeGuard
 
-import gymnasium
 import numpy as np
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -17,26 +15,39 @@ from endless_gym import _native
 from endless_gym.arguments import MAX_U64, integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.backends import Backend, InProcess, Reconnection, Remote
-from endless_gym.configuration import MODES, AutoresetMode, Options, checked_arguments, common_options
-from endless_gym.specs import Frames, Spec, options_text, spec
+from endless_gym.configuration import (
+    MODES,
+    AutoresetMode,
+    AutoresetName,
+    Options,
+    checked_arguments,
+    common_options,
+)
+from endless_gym.meanings import documented, metadata
+from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.specs import Frames, ObservationName, Spec, all_specs, options_text, spec
 
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
+@documented(all_specs().values())
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
 
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+
     `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
-    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. The arrays are read-only
-    views of the memory that the engine wrote; their contents do not change while references to them exist. With `copy=True`
-    they are writable copies. `endless_gym.torch_view` returns read-only tensors that share their memory.
+    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. Observations and
+    `ground_truth` are read-only views of the memory that the engine wrote; their contents do not change while references to them
+    exist. With `copy=True` they are writable copies, as rewards and flags always are. `endless_gym.torch_view` returns read-only
+    tensors that share their memory.
 
     `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
-    (n, k) if the original has it; in steps that end episodes the original's final infos (`reward`, `length`, ...), and `episode`
-    with the return `r`, the length `l` and the seconds since the environments were created `t`. With same-step auto-reset the
-    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was
-    started without `--final-observation`.
+    (n, k) if the original has it; in steps that end episodes the original's final infos: `reward`, the episode's return, float64
+    (n,), `length`, its steps, int32 (n,), and the numbers of the task. With same-step auto-reset the final infos are in
+    `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was started without
+    `--final-observation`.
     """
 
     def __init__(
@@ -50,17 +61,27 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         autoreset: AutoresetMode,
         copy: bool = False,
         options: Options | None = None,
+        render_mode: str | None = None,
+        view: View | None = None,
     ) -> None:
         """Called by `make_vec` and `connect`. `options` is `None` if each environment has a mapping of its own."""
+        shown = checked_view(render_mode, view, VECTOR_MODES)
+        self.render_mode = render_mode
+        self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
         self._backend = backend
         self._described = described
         self.num_envs = num_envs
         self.num_groups = backend.groups
         self.single_observation_space = described.observation_space(frames, "features" in sections)
         self.single_action_space = described.action_space()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {"autoreset_mode": autoreset, "render_fps": described.render_fps, "render_modes": []}
+        self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
+        self.metadata = {
+            "autoreset_mode": autoreset,
+            "render_fps": described.render_fps,
+            "render_modes": list(VECTOR_MODES),
+        }
+        self.metadata.update(metadata(described))
         self._index = {name: place for place, name in enumerate(sections)}
         names = {
             "observation": "visual_observation",
@@ -80,7 +101,6 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._same_step = autoreset is AutoresetMode.SAME_STEP
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.flags.writeable = False
-        self._start = time.perf_counter()
         self._copy = copy
         self._options = None if options is None else dict(options)
         self._changed_options = False
@@ -242,6 +262,22 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         # A reset of no environment returns the current observations.
         return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
+    def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
+
+        With `rgb_array` the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
+        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process, from a snapshot, so
+        that the environments stay as they are. With same-step auto-reset, it shows the new episode, as everywhere in Gymnasium.
+
+        Raises:
+            ValueError: There is no such group.
+            RuntimeError, TimeoutError, EngineLost: As for `snapshot`.
+        """
+        group = self._group(group)
+        if self._renderer is None:
+            return None
+        return self._renderer.render(self._backend.snapshot(group, env) for env in range(self.num_envs))
+
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
         """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed `[row][column][channel]`.
 
@@ -371,15 +407,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
         """Adds the infos of the episodes that this step ended, if it ended any."""
         returns, lengths, infos = (arrays[place] for place in self._ends)
-        seconds = time.perf_counter() - self._start
-        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers, seconds)
+        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers)
         if ends is None:
             return
-        ended, returns, lengths, times, columns = ends
+        ended, returns, lengths, columns = ends
         final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
         for (name, _), column in zip(self._described.info, columns, strict=True):
             final[name], final[f"_{name}"] = column, ended
-        info["episode"], info["_episode"] = {"r": returns, "l": lengths, "t": times}, ended
         if not self._same_step:
             info.update(final)
             return
@@ -404,11 +438,14 @@ def make_vec(
     seed: int | None = None,
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    observation: str = "rgb",
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
+    independent_episodes: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
 ) -> EndlessVectorEnv:
     """Create environments in this process.
 
@@ -428,12 +465,30 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
+        independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
+            alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
+            an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
+            the last one's background, and an episode continues the generator that the one before has drawn from.
+        render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
+        view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
 
     Raises:
         TypeError: A number is not an integer.
         ValueError: An argument is out of its range.
     """
-    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+    )
     # As in an engine, groups share threads.
     threads = _native.Threads(given.num_threads)
     pools = [_native.Pool(config, group, threads) for group, config in enumerate(given.pools)]
@@ -446,23 +501,36 @@ def make_vec(
         autoreset=given.autoreset,
         copy=copy,
         options=common_options(options),
+        render_mode=render_mode,
+        view=view,
     )
 
 
-def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: Any = None) -> EndlessVectorEnv:
+def connect(
+    service: str,
+    *,
+    timeout: float = 30.0,
+    copy: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
+    engine: Any = None,
+) -> EndlessVectorEnv:
     """Connect to a running engine, started by `endless serve --service NAME` or by `serve`.
 
     Args:
         service: The engine's name.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
         engine: Used by `serve`.
 
     Raises:
         ConnectionError: There is no such engine, or it already has a trainer.
-        ValueError: The timeout is negative or not finite.
+        ValueError: The timeout is negative or not finite, or there is no such render mode or view.
     """
     timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
     options = specification["options"]
@@ -475,14 +543,9 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
         autoreset=MODES[specification["autoreset"]],
         copy=copy,
         options=options[0] if len(options) == 1 else None,
+        render_mode=render_mode,
+        view=view,
     )
-
-
-def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> EndlessVectorEnv:
-    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
-    if render_mode is not None:
-        raise gymnasium.error.Error(f"render_mode must be None for vector environments, got {render_mode!r}")
-    return make_vec(id, num_envs, **kwargs)
 
 
 def _has_items(seed: Seeds) -> TypeGuard[Sequence[int | None]]:

@@ -143,8 +143,8 @@ if __name__ == "__main__":
             rewards[step] = torch.tensor(reward)
             next_obs = endless_gym.torch_view(next_obs).to(device)
             next_done = torch.tensor(terminated | truncated, dtype=torch.float32, device=device)
-            if "episode" in info:
-                returns_of_episodes.extend(info["episode"]["r"][info["_episode"]])
+            if "final_info" in info:
+                returns_of_episodes.extend(info["final_info"]["reward"][info["_final_info"]])
 
         # Generalised advantage estimation
         with torch.no_grad():

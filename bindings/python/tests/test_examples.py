@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +58,26 @@ def test_cleanrl_ppo_needs_steps_for_one_update(tmp_path):
     assert "--total-timesteps must be at least num_envs * num_steps, 8192" in ran.stderr
 
 
+@pytest.mark.parametrize(
+    "script", ["cleanrl_ppo.py", "jax_service.py", "pufferlib_rollout.py", "sb3_recurrent_ppo.py", "torchrl_rollout.py"]
+)
+def test_command_lines_are_right_as_written(tmp_path, libraries_python, script):
+    """Those of the docstring, with fewer steps. The other examples have tests with shorter command lines."""
+    text = (EXAMPLES / script).read_text()
+    lines = re.findall(rf"^python {script} ?(.*)$", text, re.M)
+    assert lines, "the docstring shows no command"
+    python = libraries_python if "import jax" in text else sys.executable
+    usage = subprocess.run([python, EXAMPLES / script, "--help"], capture_output=True, text=True, check=True).stdout
+    for line in lines:
+        few = [
+            "--total-timesteps",
+            "512",
+            *(["--num-envs", "8", "--num-steps", "32"] if "--num-steps" in usage else []),
+        ]
+        _, summary = run(script, tmp_path, *shlex.split(line), *few, python=python)
+        assert int(summary[1]) >= 512
+
+
 @pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
 def test_sb3_recurrent_ppo(tmp_path, env_id):
     sizes = ("--num-envs", "8", "--num-steps", "32", "--total-timesteps", "512", "--hidden-size", "32")
@@ -86,6 +107,7 @@ def test_torchrl_rollout(tmp_path, env_id):
         ("Endless-MortarMayhem-v0", "Multiprocessing"),
         ("MysteryPath-Grid-v0", "PufferEnv"),
         ("MysteryPath-Grid-v0", "Serial"),
+        ("MysteryPath-Grid-v0", "Multiprocessing"),
     ],
 )
 def test_pufferlib_rollout(tmp_path, env_id, backend):

@@ -113,3 +113,15 @@ print("done")
 """
     ran = subprocess.run([libraries_python, "-c", program], capture_output=True, text=True)
     assert ran.stdout == "done\n", ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+def test_from_dlpack_takes_the_arrays_themselves(where) -> None:
+    with where("Endless-MortarMayhem-v0", 2, seed=1) as envs:
+        envs.reset()
+        observation, reward, *_, info = envs.step(np.zeros((2, 2), dtype=np.int64))
+        for array in (observation, reward, info["ground_truth"]):
+            same = np.from_dlpack(array)
+            assert same.ctypes.data == array.ctypes.data
+            assert same.flags.writeable == array.flags.writeable
+            assert torch.from_dlpack(array).data_ptr() == array.ctypes.data

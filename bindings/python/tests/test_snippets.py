@@ -80,6 +80,47 @@ def test_what_is_not_run_has_a_reason(capsys: pytest.CaptureFixture[str]) -> Non
     assert all(len(block.reason) > 10 for block in left)
 
 
+def test_snippets_of_docstrings_define_their_names() -> None:
+    sources = sorted((ROOT / "bindings/python/endless_gym").rglob("*.py"))
+    snippets = [block for path in sources for block in blocks(path) if block.language == "python"]
+    assert len(snippets) >= 8
+    ruff = [Path(sys.executable).parent / "ruff", "check", "--isolated", "--select", "F", "--ignore", "F401", "-"]
+    for snippet in snippets:
+        checked = subprocess.run(ruff, input=snippet.code, capture_output=True, text=True)
+        assert checked.returncode == 0, f"{snippet.name}: {checked.stdout}"
+
+
+#: What may show a command that a reader copies.
+SOURCES = (
+    "*.md",
+    "bindings/python/endless_gym/**/*.py",
+    "bindings/python/examples/*.py",
+    "engine/cli/src/*.rs",
+    "docs/**/*.md",
+)
+#: A word with brackets outside of quotes, after a program or in an argument: zsh takes it for a pattern of file names.
+GLOB = re.compile(r"""(?:pip install|--option|--environment\.option)[ =](?:[^'"`\s]+ )*[^'"`\s]*\[""")
+
+
+def test_shells_take_commands_literally() -> None:
+    """zsh, unlike bash, refuses a word with brackets that matches no file."""
+    blocks_of_shell = [block for page in pages() for block in blocks(page) if block.language in SHELL]
+    unquoted = [
+        f"{block.name}: {word}"
+        for block in blocks_of_shell
+        for line in re.sub(r"(<<'EOF'.*?^EOF$)", "", block.code, flags=re.M | re.S).splitlines()
+        for word in re.sub(r"'[^']*'|\"[^\"]*\"|#.*", "", line).split()
+        if re.search(r"\w\[|^\[\w", word)
+    ]
+    unquoted += [
+        f"{path.relative_to(ROOT)}: {found[0]}"
+        for pattern in SOURCES
+        for path in ROOT.glob(pattern)
+        for found in GLOB.finditer(path.read_text())
+    ]
+    assert not unquoted, unquoted
+
+
 def test_links_lead_to_files() -> None:
     """Links of documents that are not built by MkDocs; `cargo xtask docs` checks the others."""
     documents = [*ROOT.glob("*.md"), ROOT / "bindings/python/README.md", *(ROOT / "benches").rglob("*.md")]

@@ -24,6 +24,8 @@ pub(super) struct EnvSlot<E: Environment> {
     pub frame_stack: FrameStack<E::Scene>,
     /// Whether the last step ended the episode, so that in next-step autoreset the next one starts another.
     pub ended: bool,
+    /// Whether an episode starts as in a new environment.
+    independent_episodes: bool,
     /// The reset parameters as they were given, which `assets` were made from.
     pub options: Arc<OptionMap>,
 }
@@ -31,7 +33,14 @@ pub(super) struct EnvSlot<E: Environment> {
 impl<E: Environment> EnvSlot<E> {
     /// An environment that has not been reset yet, for observations of `stack` frames. `random` is its generator until an episode
     /// is seeded.
-    pub fn new(assets: Arc<E::Assets>, options: Arc<OptionMap>, seeds: Seeds, random: Generator, stack: usize) -> Self {
+    pub fn new(
+        assets: Arc<E::Assets>,
+        options: Arc<OptionMap>,
+        seeds: Seeds,
+        random: Generator,
+        stack: usize,
+        independent_episodes: bool,
+    ) -> Self {
         EnvSlot {
             env: E::new(&assets),
             assets,
@@ -41,6 +50,7 @@ impl<E: Environment> EnvSlot<E> {
             episode_length: 0,
             frame_stack: FrameStack::new(stack),
             ended: false,
+            independent_episodes,
             options,
         }
     }
@@ -52,6 +62,9 @@ impl<E: Environment> EnvSlot<E> {
         }
         if let Some(seed) = seed.or_else(|| self.seeds.next()) {
             self.random = Generator::from_seed(seed);
+        }
+        if self.independent_episodes {
+            self.env = E::new(&self.assets);
         }
         self.env.reset(&self.assets, &mut self.random);
         self.frame_stack.restart(|| self.env.scene());

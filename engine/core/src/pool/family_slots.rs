@@ -65,6 +65,9 @@ pub(super) trait EnvSlots: Send + Sync {
 
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
+
+    /// Sets the animations of that view to the current step.
+    fn align_ground_truth_view(&mut self, env: usize);
 }
 
 /// The environments of a pool, all of one family.
@@ -112,8 +115,11 @@ pub(super) fn family_slots<E: Environment>(
     let stack = config.frames.unwrap_or_default().stack;
     let slots = made.into_iter().enumerate().map(|(env, (options, assets))| {
         let number = config.first_env + env;
-        let seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
-        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack)
+        let mut seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        if config.independent_episodes {
+            seeds = seeds.independent(number, unseeded);
+        }
+        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack, config.independent_episodes)
     });
     Ok(FamilySlots { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
 }
@@ -258,5 +264,9 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
 
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
         view::ground_truth_view(&mut self.slots[env].env, out);
+    }
+
+    fn align_ground_truth_view(&mut self, env: usize) {
+        self.slots[env].env.align_ground_truth();
     }
 }

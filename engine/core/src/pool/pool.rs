@@ -309,4 +309,21 @@ impl Pool {
         }
         Ok(())
     }
+
+    /// Sets the animations of an environment's ground-truth view to where they are when [`ground_truth_view`](Self::ground_truth_view)
+    /// was called once for each observation of the episode before the current one. The next view is then the current step's,
+    /// whatever was viewed before. Observations do not depend on it.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
+    pub fn align_ground_truth_view(&mut self, env: usize) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => return Err(PoolError::NotReset),
+            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ => self.slots.align_ground_truth_view(env),
+        }
+        Ok(())
+    }
 }
