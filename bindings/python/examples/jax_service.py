@@ -122,8 +122,8 @@ def main() -> None:
             observation, _, terminated, truncated, info = envs.step(actions[:, 0] if discrete else actions)
             start = terminated | truncated
             steps += args.num_envs
-            if "episode" in info:
-                returns += info["episode"]["r"][info["_episode"]].tolist()
+            if "final_info" in info:
+                returns += info["final_info"]["reward"][info["_final_info"]].tolist()
         seconds = time.perf_counter() - begin
 
     mean = f"{sum(returns) / len(returns):.3f}" if returns else "none yet"
