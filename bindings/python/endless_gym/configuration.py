@@ -10,7 +10,7 @@ import gymnasium
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping, seed_source
-from endless_gym.specs import Frames, Spec, options_text, spec
+from endless_gym.specs import Frames, ObservationName, Spec, contents, options_text, spec
 
 try:
     from gymnasium.vector import AutoresetMode as AutoresetMode
@@ -22,12 +22,8 @@ except ImportError as error:
 
 Options = Mapping[str, Any]
 
-#: The names of the auto-reset modes, and the kinds of observations.
+#: The names of the auto-reset modes.
 AutoresetName = Literal["next_step", "same_step", "disabled"]
-ObservationName = Literal["rgb", "features", "rgb+features"]
-
-#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
-OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
 
 #: The auto-reset modes by their names.
 MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
@@ -120,23 +116,9 @@ def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
     return mode
 
 
-def contents(observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
-    if not isinstance(observation, str) or observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
-    if frames is not None and not isinstance(frames, Frames):
-        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
-    has_frames, has_features = OBSERVATIONS[observation]
-    if frames is not None and not has_frames:
-        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
-    return (frames or Frames()) if has_frames else None, has_features
-
-
-def common_options(given: Options | Sequence[Options] | None) -> Options | None:
-    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
-    if given is None or isinstance(given, Mapping):
-        return given or {}
-    return given[0] if len(given) == 1 else None
+def options_list(given: Options | Sequence[Options] | None) -> Sequence[Options]:
+    """The reset parameters as a list: one mapping for all environments, or one for each of all groups."""
+    return [given or {}] if given is None or isinstance(given, Mapping) else given
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:

@@ -16,9 +16,11 @@ from typing import IO, Any
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, AutoresetName, ObservationName, Options, checked_arguments
+from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.episodes import EpisodeOptions, checked_choice
 from endless_gym.program import program
-from endless_gym.specs import Frames, json_text
+from endless_gym.rendering import VECTOR_MODES, View, checked_view
+from endless_gym.specs import Frames, ObservationName, json_text
 from endless_gym.vector import EndlessVectorEnv, connect
 
 _numbers = count()
@@ -67,8 +69,8 @@ class EngineProcess:
         """Process id."""
         return self._process.pid
 
-    def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
-        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer."""
+    def connect(self, timeout: float, **kwargs: Any) -> EndlessVectorEnv:
+        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer; `kwargs` are those of `connect`."""
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
@@ -78,7 +80,7 @@ class EngineProcess:
                 message = text.rpartition("\nendless: ")[2].strip()
                 raise RuntimeError(message or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
-                return connect(self.service, timeout=timeout, copy=copy, engine=self)
+                return connect(self.service, timeout=timeout, engine=self, **kwargs)
             if time.monotonic() >= end:
                 raise TimeoutError(f"the engine did not start within {timeout} seconds")
             time.sleep(0.01)
@@ -132,6 +134,10 @@ def serve(
     timeout: float = 30.0,
     copy: bool = False,
     independent_episodes: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
 ) -> EndlessVectorEnv:
     """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to
     them, and with this process.
@@ -163,6 +169,10 @@ def serve(
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
         independent_episodes: As for `make_vec`.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
+        episode_options: As for `connect`.
+        episode_info: As for `connect`; the engine can lend one batch more for it.
 
     Raises:
         TypeError: A number is not an integer.
@@ -183,12 +193,17 @@ def serve(
         independent_episodes,
     )
     timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
+    checked_choice(episode_options)
     arguments: dict[str, Any] = {
         "--env": given.described.id,
         "--num-envs": given.num_envs,
         "--threads": given.num_threads,
         "--groups": given.groups,
-        "--batches-held": integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD),
+        "--batches-held": min(
+            integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
+            _native.MAX_BATCHES_HELD,
+        ),
         "--autoreset": given.autoreset.name.lower(),
     }
     if given.seed is not None and given.seed_list is None:
@@ -217,7 +232,14 @@ def serve(
     command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:
-        return engine.connect(timeout, copy)
+        return engine.connect(
+            timeout,
+            copy=copy,
+            render_mode=render_mode,
+            view=view,
+            episode_options=episode_options,
+            episode_info=episode_info,
+        )
     except BaseException:
         engine.end()
         raise

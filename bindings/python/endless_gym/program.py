@@ -23,4 +23,9 @@ def program() -> list[str]:
 
 def main() -> int:
     """Run the program with this process's arguments, and return its exit status."""
+    if sys.argv[1:2] == ["record"]:
+        # It needs Python's libraries, and so the whole package.
+        from endless_gym.recording import command
+
+        return command.main(sys.argv[2:])
     return _native.endless(sys.argv[1:], program())

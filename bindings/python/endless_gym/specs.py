@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -21,6 +21,12 @@ from endless_gym.meanings import ActionBranch, Meaning, meanings
 DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
 
 SCREEN = 84
+
+#: The kinds of observations.
+ObservationName = Literal["rgb", "features", "rgb+features"]
+
+#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
+OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
 
 
 @dataclass(frozen=True)
@@ -170,6 +176,18 @@ def spec(id: str) -> Spec:
     if name not in known:
         raise ValueError(f"id must be one of {', '.join(known)}, got {id!r}")
     return known[name]
+
+
+def contents(observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
+    if not isinstance(observation, str) or observation not in OBSERVATIONS:
+        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
+    if frames is not None and not isinstance(frames, Frames):
+        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
+    has_frames, has_features = OBSERVATIONS[observation]
+    if frames is not None and not has_frames:
+        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
+    return (frames or Frames()) if has_frames else None, has_features
 
 
 def options_text(options: Mapping[str, Any] | None) -> str:

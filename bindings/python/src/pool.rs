@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use serde_json::{Map, Value as Json};
 
-use crate::arguments::{self, ActionShape, Reset};
+use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
 use crate::{arrays, errors};
 
@@ -180,6 +180,22 @@ impl Pool {
         self.check_process()?;
         self.check_idle()?;
         self.pool.restore(env, snapshot).map_err(errors::snapshot)
+    }
+
+    /// Sets the options of next episodes; see `arguments::next_options`.
+    fn set_options(&mut self, sets: &str) -> PyResult<()> {
+        let sets = arguments::next_options(sets)?;
+        self.check_process()?;
+        self.check_idle()?;
+        self.pool.set_options(&sets).map_err(errors::pool)
+    }
+
+    /// What the running episodes of environments follow from.
+    fn running_episodes(&self, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
+        self.check_process()?;
+        self.check_idle()?;
+        let episodes = envs.into_iter().map(|env| self.pool.running_episode(env).map(arguments::episode));
+        episodes.collect::<Result<_, _>>().map_err(errors::pool)
     }
 
     /// The ground-truth view of one environment, indexed \[row\]\[column\]\[channel\].

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import warnings
@@ -164,6 +165,7 @@ class TestStableBaselines3:
             venv = VecNormalize(VecFrameStack(self.make(SHORT, num_envs=4), 2), norm_obs=False)
             model = PPO("CnnPolicy", venv, n_steps=32, batch_size=64, n_epochs=1, device="cpu").learn(128)
             assert model.num_timesteps == 128
+            assert model.logger.get_dir() == os.environ["SB3_LOGDIR"], "nothing is left in /tmp"
             returns, lengths = evaluate_policy(
                 model, VecFrameStack(self.make(SHORT, num_envs=2), 2), n_eval_episodes=2, return_episode_rewards=True
             )
@@ -410,8 +412,8 @@ class TestPufferLib:
             ended += done.sum()
             if done.any():
                 (statistics,) = infos
-                assert statistics["episode_return"] == info["episode"]["r"][done].tolist()
-                assert statistics["episode_length"] == info["episode"]["l"][done].tolist()
+                assert statistics["episode_return"] == info["final_info"]["reward"][done].tolist()
+                assert statistics["episode_length"] == info["final_info"]["length"][done].tolist()
                 assert all(isinstance(values, list) and len(values) == done.sum() for values in statistics.values())
             else:
                 assert infos == []

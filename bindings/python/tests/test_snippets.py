@@ -16,7 +16,9 @@ from snippets import ROOT, SHELL, Block, blocks, pages, programs
 TIMEOUT = 280
 #: Engines remove their segments. Not SIGINT, which Python's start would swallow.
 END_JOBS = "kill -TERM $(jobs -p) 2>/dev/null || true; wait"
-PROGRAMS = [program for page in pages() for program in programs(page)]
+ALL_PROGRAMS = [program for page in pages() for program in programs(page)]
+PROGRAMS = [program for program in ALL_PROGRAMS if not program[0].libraries]
+OF_LIBRARIES = [program for program in ALL_PROGRAMS if program[0].libraries]
 #: Rust in the README is a test of the crate's documentation (`src/lib.rs`).
 DOCTESTS = ROOT / "README.md"
 LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
@@ -28,6 +30,17 @@ def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], se
         code = "\n".join(block.code for block in part)
         shell = ["bash", "-euo", "pipefail", "-m", "-c", f"trap '{END_JOBS}' EXIT\n{code}"]
         run(shell if is_shell else [sys.executable, "-c", code], tmp_path, program[0].name)
+    assert not segments(), "the block left segments in /dev/shm"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in OF_LIBRARIES])
+def test_snippet_of_a_library(
+    program: list[Block], tmp_path: Path, segments: Callable[[], set[str]], libraries_python: str, ray_folder: str
+) -> None:
+    assert [block.language for block in program] == ["python"] * len(program)
+    code = "\n".join(block.code for block in program)
+    run([libraries_python, "-c", code], tmp_path, program[0].name)
     assert not segments(), "the block left segments in /dev/shm"
 
 

@@ -16,7 +16,8 @@ import pytest
 
 import endless_gym
 import endless_gym.agents
-from endless_gym.configuration import MODES, OBSERVATIONS, AutoresetName, ObservationName
+from endless_gym.configuration import MODES, AutoresetName
+from endless_gym.specs import OBSERVATIONS, ObservationName
 
 SCRIPTS = Path(__file__).parent / "typed"
 RIGHT = sorted(path for path in SCRIPTS.glob("*.py") if path.name != "wrong.py")

@@ -31,14 +31,21 @@ from endless_gym.agents.logs import Episodes, Logger
 from endless_gym.agents.ppo import learn
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
+from endless_gym.episodes import EpisodeOptions
 
 
-def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | None = None) -> Path:
+def train(
+    settings: Settings,
+    watch: Callable[[int, dict[str, float]], bool] | None = None,
+    episode_options: EpisodeOptions | None = None,
+) -> Path:
     """Train an agent: a new run, or from the last checkpoint of a run.
 
     Args:
         settings: Settings of the run.
         watch: Called after each update with its number and the means of the last 100 episodes; the run stops if it returns true.
+        episode_options: Chooses the options of each episode, as for `make_vec`: a curriculum. Only with environments in this
+            process. A checkpoint does not contain its state.
 
     Returns:
         The folder of the run, with `settings.json`, `progress.jsonl`, the TensorBoard files and `checkpoints`.
@@ -75,7 +82,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
     }
 
     ppo, started, stop = settings.ppo, time.monotonic(), Interrupt()
-    with Environments(settings) as environments, stop:
+    with Environments(settings, episode_options) as environments, stop:
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()

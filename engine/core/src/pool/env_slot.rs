@@ -15,7 +15,7 @@ use crate::raster::PixelFormat;
 /// An environment with its generator, its seeds, and what is counted of its episode.
 pub(super) struct EnvSlot<E: Environment> {
     pub env: E,
-    /// The assets for the next episode.
+    /// The assets for the next episode, unless there is `next`.
     pub assets: Arc<E::Assets>,
     pub random: Generator,
     pub seeds: Seeds,
@@ -28,7 +28,14 @@ pub(super) struct EnvSlot<E: Environment> {
     independent_episodes: bool,
     /// The reset parameters as they were given, which `assets` were made from.
     pub options: Arc<OptionMap>,
+    /// Other assets and options from the next episode on.
+    pub next: Option<OptionSet<E>>,
+    /// The seed that the running episode started with, unless it continued the generator.
+    pub episode_seed: Option<u64>,
 }
+
+/// Reset parameters as they were given, and the assets made from them.
+pub(super) type OptionSet<E> = (Arc<<E as Environment>::Assets>, Arc<OptionMap>);
 
 impl<E: Environment> EnvSlot<E> {
     /// An environment that has not been reset yet, for observations of `stack` frames. `random` is its generator until an episode
@@ -52,6 +59,8 @@ impl<E: Environment> EnvSlot<E> {
             ended: false,
             independent_episodes,
             options,
+            next: None,
+            episode_seed: None,
         }
     }
 
@@ -60,8 +69,12 @@ impl<E: Environment> EnvSlot<E> {
         if let Some(seed) = seed {
             self.seeds.restart(seed);
         }
-        if let Some(seed) = seed.or_else(|| self.seeds.next()) {
+        self.episode_seed = seed.or_else(|| self.seeds.next());
+        if let Some(seed) = self.episode_seed {
             self.random = Generator::from_seed(seed);
+        }
+        if let Some(next) = self.next.take() {
+            (self.assets, self.options) = next;
         }
         if self.independent_episodes {
             self.env = E::new(&self.assets);
