@@ -42,8 +42,8 @@ pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
         EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
-        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE, Reconnection, Rejection,
-        ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
+        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observer, ObserverStatus, ROOT_VARIABLE, Reconnection,
+        Rejection, ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
     };
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,6 +17,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import AutoresetMode, Options, checked_arguments
+from endless_gym.engine_log import EngineLog, level
 from endless_gym.program import program
 from endless_gym.specs import Frames, json_text
 from endless_gym.vector import EndlessVectorEnv, connect
@@ -39,13 +41,13 @@ class EngineProcess:
         """
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
         self._owner = os.getpid()
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         with tempfile.TemporaryFile() as file:
             file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
             file.flush()
             self._process = subprocess.Popen(
                 [
                     *program(),
+                    *level(),
                     "serve",
                     f"--child={os.getpid()}",
                     "--service",
@@ -55,10 +57,11 @@ class EngineProcess:
                 ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=self._errors,
+                stderr=subprocess.PIPE,
                 pass_fds=[file.fileno()],
                 **_OWN_GROUP,
             )
+        self._log = EngineLog(self._process)
 
     @property
     def pid(self) -> int:
@@ -70,11 +73,7 @@ class EngineProcess:
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
-                self._errors.seek(0)
-                # Logs may come before the message.
-                text = f"\n{self._errors.read().decode(errors='replace')}"
-                message = text.rpartition("\nendless: ")[2].strip()
-                raise RuntimeError(message or f"the engine ended with status {status}")
+                raise RuntimeError(self._log.message() or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
                 return connect(self.service, timeout=timeout, copy=copy, engine=self)
             if time.monotonic() >= end:
@@ -92,12 +91,14 @@ class EngineProcess:
                 self._process.stdin.flush()
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
+        # One that is stopped would not end.
+        self._process.send_signal(signal.SIGCONT)
         try:
             self._process.wait(10)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._errors.close()
+        self._log.close()
         if self._process.returncode:
             # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
             with contextlib.suppress(OSError, RuntimeError):
