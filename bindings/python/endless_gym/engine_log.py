@@ -20,7 +20,7 @@ _KEPT = 100
 
 
 def level() -> list[str]:
-    """The arguments by which the program logs what the logger `endless_gym.engine` shows now, unless `ENDLESS_GYM_LOG` says it."""
+    """The arguments by which the program logs what `endless_gym.engine` shows now, unless `ENDLESS_GYM_LOG` says it."""
     if os.environ.get("ENDLESS_GYM_LOG"):
         return []
     effective = _logger.getEffectiveLevel()

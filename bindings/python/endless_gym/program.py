@@ -5,8 +5,8 @@ import sys
 
 from endless_gym import _native
 
-# Ctrl-C ends the process until the program handles it: Python's handler only makes a note for the next line of Python, which comes
-# after the program's end. `_signal` is compiled into the interpreter. A SIGINT that is ignored stays so.
+# Ctrl-C ends the process until the program handles it: Python's handler only makes a note for the next line of Python, which
+# comes after the program's end. A SIGINT that is ignored stays so. `_signal` is compiled into the interpreter.
 #
 # Loads the native module from its file, so that neither this package nor numpy and Gymnasium are imported.
 _PROGRAM = """
