@@ -12,7 +12,7 @@ import time
 import weakref
 from collections.abc import Mapping, Sequence
 from itertools import count
-from typing import IO, Any
+from typing import Any
 
 from endless_gym import _native
 from endless_gym.arguments import integer
