@@ -92,3 +92,15 @@ def test_cleanrl_ppo(tmp_path, env_id):
     losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
     assert len(losses) == 2
     assert not any(math.isnan(loss) for loss in losses)
+
+
+def test_curriculum(tmp_path):
+    sizes = ("--commands", "2", "--num-envs", "32", "--total-timesteps", "30000")
+    output, summary = run("curriculum.py", tmp_path, *sizes)
+    assert int(summary[1]) < 30_000
+    assert float(summary[3]) >= 0.9
+    output, _ = run("curriculum.py", tmp_path, *sizes, "--compare", "1")
+    assert [line.split()[0] for line in output.splitlines() if " seed=1 " in line] == [
+        "curriculum=True",
+        "curriculum=False",
+    ]
