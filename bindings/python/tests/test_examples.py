@@ -186,3 +186,15 @@ def test_behaviour_cloning(tmp_path, env_id):
         # The reward of the one command.
         by_chance = float(re.search(r"random_return=(\S+)", output)[1])
         assert float(summary[3]) > by_chance + 0.03
+
+
+def test_curriculum(tmp_path):
+    sizes = ("--commands", "2", "--num-envs", "32", "--total-timesteps", "30000")
+    output, summary = run("curriculum.py", tmp_path, *sizes)
+    assert int(summary[1]) < 30_000
+    assert float(summary[3]) >= 0.9
+    output, _ = run("curriculum.py", tmp_path, *sizes, "--compare", "1")
+    assert [line.split()[0] for line in output.splitlines() if " seed=1 " in line] == [
+        "curriculum=True",
+        "curriculum=False",
+    ]
