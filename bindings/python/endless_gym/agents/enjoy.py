@@ -24,8 +24,7 @@ from endless_gym.agents.agent import Agent, observation_shapes
 from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.evaluate import EVALUATION_SEEDS
 from endless_gym.agents.train import choose_device
-from endless_gym.configuration import ObservationName
-from endless_gym.specs import spec
+from endless_gym.specs import ObservationName, spec
 from endless_gym.vector import EndlessVectorEnv, make_vec
 
 
