@@ -89,7 +89,8 @@ def main(args: Args) -> None:
         for episode in dataset
         if args.min_return is None or episode.rewards.sum() >= args.min_return
     ]
-    branches = [int(number) for number in np.atleast_1d(getattr(dataset.action_space, "nvec", dataset.action_space.n))]
+    space = dataset.action_space
+    branches = [int(number) for number in (space.nvec if hasattr(space, "nvec") else [space.n])]
     policy = Policy(episodes[0][0].shape[1], branches, args.hidden_size)
     optimizer = torch.optim.Adam(policy.parameters(), args.learning_rate)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1, 0, args.updates)

@@ -12,15 +12,19 @@ from pathlib import Path
 
 import pytest
 
+import endless_gym
+
 pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SUMMARY = re.compile(r"steps=(\d+) steps_per_second=(\d+) .*mean_return=(-?\d+\.\d+|none yet)")
 
 
-def run(script: str, cwd: Path, *arguments: str, python: str = sys.executable) -> tuple[str, re.Match[str]]:
+def run(
+    script: str, cwd: Path, *arguments: str, python: str = sys.executable, **variables: str
+) -> tuple[str, re.Match[str]]:
     """Run the example with `arguments`, and return what it printed, and the last line's numbers."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""} | variables
     ran = subprocess.run(
         [python, EXAMPLES / script, *arguments],
         cwd=cwd,
@@ -163,3 +167,34 @@ def test_jax_service(tmp_path, libraries_python, segments, env_id):
     if env_id.startswith("Endless"):
         assert summary[3] != "none yet"
     assert not segments()
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
+@pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MysteryPath-v0"])
+def test_behaviour_cloning(tmp_path, env_id):
+    options = {"command_count": [1]} if env_id.startswith("Mortar") else {"max_steps": 64}
+    endless_gym.record(
+        env_id, 60, options=options, observation="features", dataset="clone/short-v0", root=tmp_path, num_threads=1
+    )
+    sizes = ("--updates", "100", "--batch-size", "16", "--hidden-size", "64", "--evaluation-episodes", "30")
+    output, summary = run(
+        "behaviour_cloning.py", tmp_path, "--dataset", "clone/short-v0", *sizes, MINARI_DATASETS_PATH=str(tmp_path)
+    )
+    losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
+    assert len(losses) == 2
+    if env_id.startswith("Mortar"):
+        # The reward of the one command.
+        by_chance = float(re.search(r"random_return=(\S+)", output)[1])
+        assert float(summary[3]) > by_chance + 0.03
+
+
+def test_curriculum(tmp_path):
+    sizes = ("--commands", "2", "--num-envs", "32", "--total-timesteps", "30000")
+    output, summary = run("curriculum.py", tmp_path, *sizes)
+    assert int(summary[1]) < 30_000
+    assert float(summary[3]) >= 0.9
+    output, _ = run("curriculum.py", tmp_path, *sizes, "--compare", "1")
+    assert [line.split()[0] for line in output.splitlines() if " seed=1 " in line] == [
+        "curriculum=True",
+        "curriculum=False",
+    ]

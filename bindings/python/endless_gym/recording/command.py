@@ -1,6 +1,7 @@
 """`endless record`: record episodes of a scripted expert or of random actions as a Minari data set.
 
-The data set is for `minari.load_dataset(NAME)`. The metadata of an episode has its seed, options, error rate, return and final infos.
+The data set is for `minari.load_dataset(NAME)`.
+The metadata of an episode has its seed, options, error rate, return and final infos.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Writes episodes as a Minari data set, in the format HDF5.
 
-Minari's own writer stores frames as JPEG, which changes them, or without compression. This one compresses them without loss, in chunks that were compressed while the episodes were played. Minari reads both alike.
+Minari's own writer stores frames as JPEG, which changes them, or without compression. This one compresses them without
+loss, in chunks that were compressed while the episodes were played. Minari reads both alike.
 """
 
 from __future__ import annotations
