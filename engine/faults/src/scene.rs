@@ -47,7 +47,7 @@ pub struct Scene<'a> {
     pub filled: Option<Duration>,
     /// Since when a process's last connection is, or its attempt to connect; at first its start.
     attempts: HashMap<u32, Duration>,
-    /// Processes whose last attempt has succeeded.
+    /// Processes whose last attempt has succeeded, and the engines that they found.
     connected: HashSet<u32>,
     sender: Sender<(u32, Event)>,
     events: Receiver<(u32, Event)>,
@@ -256,7 +256,8 @@ impl<'a> Scene<'a> {
             }
             Event::Connected { incarnation, engine } => {
                 self.engines.insert(incarnation, engine);
-                self.connected.insert(process);
+                // An engine that is found has all its memory too.
+                self.connected.extend([process, engine]);
             }
             Event::Batch { at, incarnation, group, step, checksum, is_correct } => {
                 let trainer = self.trainers.get(&process);

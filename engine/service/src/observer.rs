@@ -112,8 +112,9 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TimedOut`] if there was no batch in time, which says what the engine was doing, [`ServiceError::EngineLost`] within half a second after the
-    /// engine's process has ended, [`ServiceError::RootRemoved`] if the namespace's directory was removed, and the errors of [`newest`](Observer::newest).
+    /// [`ServiceError::TimedOut`] if there was no batch in time, which says what the engine was doing, [`ServiceError::EngineLost`]
+    /// within half a second after the engine's process has ended, [`ServiceError::RootRemoved`] if the namespace's directory was
+    /// removed, and the errors of [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
         let mut last_check = start;
