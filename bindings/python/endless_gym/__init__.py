@@ -17,7 +17,9 @@ from endless_gym.env import Env
 from endless_gym.experts import Experts
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
+from endless_gym.replay import ReplayStep, replay
 from endless_gym.specs import Frames, all_specs, spec
+from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
     from endless_gym.engine import serve
@@ -32,7 +34,9 @@ __all__ = [
     "Env",
     "Experts",
     "Frames",
+    "ReplayStep",
     "TooManyBatchesHeld",
+    "WindowClosed",
     "__version__",
     "all_specs",
     "connect",
@@ -40,6 +44,7 @@ __all__ = [
     "pin_memory",
     "record",
     "register",
+    "replay",
     "running_engines",
     "serve",
     "spec",

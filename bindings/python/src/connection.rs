@@ -11,7 +11,7 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 
-use crate::arguments::{self, ActionShape, Reset};
+use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::arrays::{self, Owner};
 use crate::{errors, logs};
 
@@ -109,6 +109,24 @@ impl Connection {
     /// Sets the state of one environment of a group to that of a snapshot.
     fn restore(&mut self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8], timeout: f64) -> PyResult<()> {
         self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
+    }
+
+    /// Sets the options of next episodes; see `arguments::next_options`.
+    fn set_options(&mut self, py: Python<'_>, group: usize, sets: &str, timeout: f64) -> PyResult<()> {
+        let sets = arguments::next_options(sets)?;
+        self.wait(py, timeout, |trainer, slice| trainer.set_options(group, &sets, slice))
+    }
+
+    /// What the running episodes of environments follow from.
+    fn running_episodes(
+        &mut self,
+        py: Python<'_>,
+        group: usize,
+        envs: Vec<usize>,
+        timeout: f64,
+    ) -> PyResult<Vec<Episode>> {
+        let episodes = self.wait(py, timeout, |trainer, slice| trainer.running_episodes(group, &envs, slice))?;
+        Ok(episodes.into_iter().map(arguments::episode).collect())
     }
 
     /// Saves all environments of the engine to its checkpoint file. Returns the step of each group.

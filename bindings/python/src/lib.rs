@@ -13,6 +13,7 @@ mod experts;
 mod logs;
 mod observer;
 mod pool;
+mod renderer;
 mod single;
 
 use std::ffi::OsString;
@@ -53,6 +54,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<pool::Pool>()?;
     module.add_class::<pool::PoolConfig>()?;
     module.add_class::<pool::Threads>()?;
+    module.add_class::<renderer::Renderer>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;

@@ -8,7 +8,7 @@ import pytest
 import torch
 from agents_helpers import BRANCHES, make, settings, transformer
 
-from endless_gym import spec
+from endless_gym import make_vec, spec
 from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
 from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
@@ -164,6 +164,47 @@ def test_heads_without_their_targets_are_rejected() -> None:
         make("gru", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
     with pytest.raises(ValueError, match="needs frames, and the observation has only features"):
         make("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
+
+
+@pytest.mark.parametrize(
+    ("observation", "given", "message"),
+    [
+        (
+            "features",
+            "rgb",
+            r"`features` float32 \(n, 17\), since the agent was trained on features; got `.*` uint8 \(2, 84, 84, 3\)",
+        ),
+        (
+            "rgb",
+            "features",
+            r"`visual_observation` uint8 \(n, 84, 84, 3\), since the agent was trained on frames; got `.*` float32",
+        ),
+    ],
+)
+def test_an_observation_of_another_kind_is_an_error(observation: str, given: str, message: str) -> None:
+    small = settings("gru", env="MortarMayhem-Grid-v0")
+    agent = make_agent(replace(small, environment=replace(small.environment, observation=observation)), spec(small.env))
+    with make_vec(small.env, 2, observation=given) as envs, make_vec(small.env, 2, observation="rgb+features") as both:
+        frames, _ = envs.reset(seed=1)
+        for call in (agent.act, agent.bootstrap_value):
+            with pytest.raises(ValueError, match=message):
+                call(frames, agent.initial_memory(2))
+            with pytest.raises(ValueError, match="make the environments with observation="):
+                call({given: frames}, agent.initial_memory(2))
+        # Entries that the agent does not use are left out.
+        agent.act(both.reset(seed=1)[0], agent.initial_memory(2))
+
+
+def test_an_agent_of_two_observations_needs_both() -> None:
+    small = settings("gru", env="MortarMayhemB-Grid-v0")
+    agent = make_agent(replace(small, environment=replace(small.environment, observation="rgb")), spec(small.env))
+    with make_vec(small.env, 2) as envs:
+        observation, _ = envs.reset(seed=1)
+        agent.act(observation, agent.initial_memory(2))
+        with pytest.raises(ValueError, match=r"`vector_observation` float32 .*got one array"):
+            agent.act(observation["visual_observation"], agent.initial_memory(2))
+        with pytest.raises(ValueError, match=r"got `visual_observation` uint8 \(2, 84, 84, 3\)"):
+            agent.act({"visual_observation": observation["visual_observation"]}, agent.initial_memory(2))
 
 
 def test_atari_encoder_scales_and_permutes_frames() -> None:

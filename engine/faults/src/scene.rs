@@ -2,20 +2,22 @@
 
 use std::collections::{HashMap, HashSet};
 use std::process::Command;
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
 use endless_gym_service::{Namespace, ROOT_VARIABLE};
 
 use crate::actors::{self, Actor, is_crash};
-use crate::event::Event;
+use crate::event::{Event, now};
+use crate::ledger::Ledger;
 use crate::others::Habit;
 use crate::plan::{Fault, Plan, Role};
 use crate::report::{Failure, Outcome};
 use crate::trainer::Work;
 
-/// How long the next correct batch may take. A machine may run other work.
-pub const LIMIT: Duration = Duration::from_secs(15);
+/// How long the next correct batch, or the end of a process, may take. The machine may be busy with other work, so this is far more
+/// than what is needed: it tells slow from never.
+pub const LIMIT: Duration = Duration::from_secs(60);
 
 /// Failures of one kind that a round keeps.
 const KEPT: usize = 3;
@@ -37,6 +39,12 @@ pub struct Scene<'a> {
     pub limited: HashSet<u32>,
     /// The last process that was forked.
     pub forked: Option<u32>,
+    /// When the namespace's directory was removed.
+    pub removed: Option<Duration>,
+    /// When a stopped process was continued; the longest time if it is still stopped.
+    pub continued: Option<Duration>,
+    /// Since when a process's last connection is, or its attempt to connect; at first its start.
+    attempts: HashMap<u32, Duration>,
     sender: Sender<(u32, Event)>,
     events: Receiver<(u32, Event)>,
     /// Engines that were ended on purpose.
@@ -47,8 +55,7 @@ pub struct Scene<'a> {
     engines: HashMap<u64, u32>,
     /// Checksums by incarnation, group and step.
     checksums: HashMap<(u64, usize, u64), (bool, u32)>,
-    /// The last batch of each incarnation's groups, and its trainer.
-    steps: HashMap<(u64, usize), (u32, u64)>,
+    ledger: Ledger,
     /// The last correct batch: its time, its trainer and its engine.
     last_batch: Option<(Duration, u32, u32)>,
     started: u64,
@@ -68,13 +75,16 @@ impl<'a> Scene<'a> {
             others: Vec::new(),
             limited: HashSet::new(),
             forked: None,
+            removed: None,
+            continued: None,
+            attempts: HashMap::new(),
             sender,
             events,
             ended_engines: HashSet::new(),
             trainers: HashMap::new(),
             engines: HashMap::new(),
             checksums: HashMap::new(),
-            steps: HashMap::new(),
+            ledger: Ledger::default(),
             last_batch: None,
             started: 0,
         }
@@ -111,9 +121,12 @@ impl<'a> Scene<'a> {
     }
 
     /// Starts any process of the round.
-    pub fn spawn(&self, mut command: Command) -> Result<Actor, String> {
+    pub fn spawn(&mut self, mut command: Command) -> Result<Actor, String> {
         command.env(ROOT_VARIABLE, self.namespace.root());
-        Actor::start(command, &self.sender)
+        let start = now();
+        let actor = Actor::start(command, &self.sender)?;
+        self.attempts.insert(actor.id(), start);
+        Ok(actor)
     }
 
     /// Starts the process of a role, in place of the one that had it.
@@ -208,26 +221,35 @@ impl<'a> Scene<'a> {
         self.plan.own_memory.is_some()
     }
 
-    /// Whether a process may complain so in the present fault.
-    fn is_excused(&self, process: u32, complaint: &str) -> bool {
+    /// Whether a process may complain so.
+    pub fn is_excused(&self, process: u32, complaint: &str) -> bool {
         self.limited.contains(&process)
             || (self.is_short_of_memory() && complaint.contains("/dev/shm"))
-            || (matches!(self.current, Some(Fault::StopStarting { .. } | Fault::Stop { .. }))
-                && complaint.contains("has been locked"))
+            || (self.began_before(process, self.continued) && complaint.contains("has been locked"))
+    }
+
+    /// Whether the last attempt of a process to connect began before that time: what it reports may be due to what ended then, as late
+    /// as it reports it.
+    fn began_before(&self, process: u32, time: Option<Duration>) -> bool {
+        self.attempts.get(&process).zip(time).is_some_and(|(began, time)| *began <= time)
     }
 
     fn judge(&mut self, process: u32, event: Event) {
         match event {
-            Event::Connected { incarnation, engine, .. } => {
+            Event::Connecting { at } => {
+                self.attempts.insert(process, at);
+            }
+            Event::Connected { incarnation, engine } => {
                 self.engines.insert(incarnation, engine);
             }
             Event::Batch { at, incarnation, group, step, checksum } => {
-                let is_trainer = self.trainers.contains_key(&process);
-                if is_trainer {
-                    self.count(process, incarnation, group, step);
+                let trainer = self.trainers.get(&process);
+                if let Some(number) = trainer {
+                    self.outcome.batches += 1;
+                    self.ledger.add(incarnation, group, *number, step);
                     self.last_batch = self.engines.get(&incarnation).map(|engine| (at, process, *engine));
                 }
-                self.compare(is_trainer, (incarnation, group, step), checksum);
+                self.compare(trainer.is_some(), (incarnation, group, step), checksum);
             }
             Event::Wrong { what } => self.fail("wrong bytes", what),
             Event::Miscounted { what } => self.fail("lost or doubled step", what),
@@ -238,7 +260,7 @@ impl<'a> Scene<'a> {
                 *self.outcome.errors.entry(kind.clone()).or_default() += 1;
                 let is_lost = matches!(kind.as_str(), "EngineLost" | "EngineRestarted");
                 // An engine without its directory starts anew in the same process.
-                let is_removed = matches!(self.current, Some(Fault::RemoveRoot { .. }));
+                let is_removed = self.began_before(process, self.removed);
                 let has_crashed = self.engine.as_mut().is_some_and(|engine| engine.ended().is_some());
                 let is_running = engine.is_some_and(|engine| !self.ended_engines.contains(&engine)) && !has_crashed;
                 if is_lost && !is_removed && is_running {
@@ -249,28 +271,13 @@ impl<'a> Scene<'a> {
                     "EngineLost" | "EngineRestarted" | "UnknownEngine" | "TrainerExists" | "TimedOut" => true,
                     "TooManyObservers" | "TooManyBatchesHeld" | "NoSuchGroup" => during == "observe",
                     "RootRemoved" | "Root" => is_removed,
-                    "NamespaceLocked" => matches!(self.current, Some(Fault::Stop { .. } | Fault::StopStarting { .. })),
+                    "NamespaceLocked" => self.began_before(process, self.continued),
                     _ => false,
                 };
                 if !expected && !self.is_excused(process, &text) {
                     self.fail("unexpected error", format!("{during}: {kind}: {text}"));
                 }
             }
-        }
-    }
-
-    /// A group's batches are numbered without gaps for one trainer. The first batch of another trainer's may come after one that
-    /// the trainer before it had requested and not reported.
-    fn count(&mut self, trainer: u32, incarnation: u64, group: usize, step: u64) {
-        self.outcome.batches += 1;
-        let last = self.steps.insert((incarnation, group), (trainer, step));
-        // Within a trainer's life the trainer itself counts.
-        let Some((other, last)) = last.filter(|(other, _)| *other != trainer) else { return };
-        // One for each trainer since then.
-        let unknown = self.trainers.get(&trainer).zip(self.trainers.get(&other)).map_or(0, |(new, old)| new - old);
-        if !(last + 1..=last + 1 + unknown).contains(&step) {
-            let text = format!("group {group}: the first batch of a new trainer is {step}, after {last}");
-            self.fail("lost or doubled step", text);
         }
     }
 
@@ -289,6 +296,25 @@ impl<'a> Scene<'a> {
         }
         if self.checksums.len() > 50_000 {
             self.checksums.clear();
+        }
+    }
+
+    /// Reads what is left in the pipes of processes that have ended, and judges what only all reports together show.
+    pub fn close(&mut self) {
+        // The threads that read the pipes keep the other senders.
+        drop(std::mem::replace(&mut self.sender, channel().0));
+        loop {
+            match self.events.recv_timeout(LIMIT) {
+                Ok((process, event)) => self.judge(process, event),
+                Err(RecvTimeoutError::Disconnected) => break,
+                Err(RecvTimeoutError::Timeout) => {
+                    self.fail("left behind", "a process holds a pipe of one that has ended".to_owned());
+                    break;
+                }
+            }
+        }
+        for fault in self.ledger.faults() {
+            self.fail("lost or doubled step", fault);
         }
     }
 

@@ -182,6 +182,7 @@ fn phase(
         }
     }
     round::end(&mut scene)?;
+    scene.close();
     for left in cleanliness::leftovers(&scene.namespace) {
         scene.fail("left behind", left);
     }

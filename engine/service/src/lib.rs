@@ -23,15 +23,15 @@
 //!
 //! | header | fields |
 //! | --- | --- |
-//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore, checkpoint), incarnation, trainer, request number, seed, environment, length of the options or snapshot, process id of the trainer, batches held |
-//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of a snapshot or of the text of a rejection |
+//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore, checkpoint, options of next episodes, running episodes), incarnation, trainer, request number, seed, environment, length of the options or of the snapshot, process id of the trainer, batches held |
+//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of a snapshot, of a text about episodes or of a rejection |
 //!
 //! # Protocol
 //!
 //! | situation | behaviour |
 //! | --- | --- |
 //! | the engine receives a request | it sends exactly one response of the same group: a batch, a snapshot or a rejection; a rejected request changes no environment |
-//! | the trainer requests a snapshot or a restore | the response holds a snapshot or nothing in place of a batch; observers skip it, and may miss the batch before it |
+//! | the trainer requests a snapshot, a restore, or something about episodes | the response holds a snapshot, a text or nothing in place of a batch; observers skip it, and may miss the batch before it |
 //! | a group has a pending answer | the trainer must receive it before its next request to this group; other groups are independent |
 //! | a new trainer connects | it must reset all environments of a group before it steps them, or adopt their episodes by a reset of none ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each) with flags of 0), which returns the current batch |
 //! | the engine has a checkpoint file | it saves all environments periodically, when it stops, and when the trainer asks for it; a new engine continues from there identically |
@@ -63,6 +63,8 @@
 //! A request steps or resets a group, restores an environment, or takes a snapshot. The trainer numbers its requests, the engine
 //! numbers the batches of a group ([`BatchLease::step`]), and its status says which request it has taken, answered and executed.
 //! An engine executes each request that it takes once and sends one response; no message is repeated.
+//!
+//! For `set_options` and `running_episodes` the table says what it says for `restore` and `snapshot`.
 //!
 //! | call | failure | the request was executed | what to do |
 //! | --- | --- | --- | --- |

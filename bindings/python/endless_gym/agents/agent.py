@@ -1,11 +1,19 @@
 """The agent: an actor-critic of encoder, memory, body and heads.
 
 ```python
-memory = agent.initial_memory(num_envs)
-while playing:
-    output = agent.act(observation, memory)         # updates the memory
-    observation, done = step(output.action)
-    memory.reset(done)                              # where an episode has ended
+from endless_gym import make_vec, spec
+from endless_gym.agents.agent import make_agent
+from endless_gym.agents.settings import PRESETS
+
+settings = PRESETS["quick"]                          # with feature observations
+agent = make_agent(settings, spec(settings.env))
+with make_vec(settings.env, 8, observation="features", autoreset="same_step") as envs:
+    observation, info = envs.reset(seed=0)
+    memory = agent.initial_memory(envs.num_envs)
+    for _ in range(100):
+        output = agent.act(observation, memory)      # updates the memory
+        observation, reward, done, _, info = envs.step(output.action.numpy())
+        memory.reset(done)                           # where an episode has ended
 ```
 """
 
@@ -25,7 +33,7 @@ from torch import Tensor, nn
 from endless_gym.agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
 from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym.agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
-from endless_gym.agents.naive import POSITION, TransformState, make_observation_transform
+from endless_gym.agents.naive import TransformState, make_observation_transform
 from endless_gym.agents.recurrent import RecurrentMemory
 from endless_gym.agents.settings import Settings
 from endless_gym.agents.transformer import TransformerMemory
@@ -54,7 +62,8 @@ class AgentMemory:
 
     def reset(self, done: Tensor | NDArray[np.bool_]) -> None:
         """Mark the next observation as the first of an episode where `done`, bool (n,), is true."""
-        self.reset_mask = self.reset_mask | torch.as_tensor(done, device=self.reset_mask.device)
+        done = done if isinstance(done, Tensor) else unchecked_torch_view(done)
+        self.reset_mask = self.reset_mask | done.to(self.reset_mask.device)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything as tensors and numbers by name, for a checkpoint."""
@@ -145,6 +154,8 @@ class Agent(nn.Module):
         super().__init__()
         self.settings, self.device = settings, torch.device(device)
         self.branches = tuple(branches)
+        #: Shapes of one environment's observation, by key.
+        self.observation_shapes = {key: tuple(shape) for key, shape in shapes.items()}
         self.transform = make_observation_transform(settings, shapes, self.device)
         self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
         self.memory: AnyMemory
@@ -221,6 +232,9 @@ class Agent(nn.Module):
             memory: Memory of the same n environments; updated in place.
             generator: Generator that samples the actions, on the agent's device; None for PyTorch's default generator.
             greedy: Take the most likely choice of each branch instead of sampling.
+
+        Raises:
+            ValueError: The observation is not of the kind that the agent was trained on.
         """
         observed, transform_update = self.transform.apply(
             self.to_tensors(observation), memory.transform_state, memory.reset_mask
@@ -265,16 +279,46 @@ class Agent(nn.Module):
         return AgentOutput([branch.log_softmax(-1) for branch in logits], value, frame, truth)
 
     def to_tensors(self, observation: RawObservation) -> Observation:
-        """Convert a vector environment's observation to tensors on the agent's device; frames stay uint8."""
+        """Convert a vector environment's observation to tensors on the agent's device; frames stay uint8.
+
+        Args:
+            observation: One array (n, ...) if the agent's observation has one part, or a mapping; other keys are ignored.
+
+        Raises:
+            ValueError: The observation is not of the kind that the agent was trained on.
+        """
         if not isinstance(observation, Mapping):
-            key = next(key for key in self.transform.shapes if key != POSITION)
-            observation = {key: observation}
+            observation = (
+                {next(iter(self.observation_shapes)): observation} if len(self.observation_shapes) == 1 else {}
+            )
+        self._check_observation(observation)
         return {
             key: (value if isinstance(value, Tensor) else unchecked_torch_view(value)).to(
                 self.device, non_blocking=True
             )
-            for key, value in observation.items()
+            for key, value in ((key, observation[key]) for key in self.observation_shapes)
         }
+
+    def _check_observation(self, given: Mapping[str, Array]) -> None:
+        def is_of(key: str, shape: tuple[int, ...]) -> bool:
+            if key not in given:
+                return False
+            is_frame = str(given[key].dtype).removeprefix("torch.") == "uint8"
+            return tuple(given[key].shape[1:]) == shape and is_frame == (key == FRAME)
+
+        if all(is_of(key, shape) for key, shape in self.observation_shapes.items()):
+            return
+        kind = self.settings.environment.observation
+        expected = ", ".join(
+            f"`{key}` {'uint8' if key == FRAME else 'float32'} {('n', *shape)}".replace("'", "")
+            for key, shape in self.observation_shapes.items()
+        )
+        dtypes = {key: str(value.dtype).removeprefix("torch.") for key, value in given.items()}
+        got = ", ".join(f"`{key}` {dtypes[key]} {tuple(value.shape)}" for key, value in given.items())
+        raise ValueError(
+            f"observation must be {expected}, since the agent was trained on {'frames' if kind == 'rgb' else kind}; got "
+            f"{got or 'one array'}; make the environments with observation={kind!r}"
+        )
 
     def _sample(self, log_probs: Tensor, generator: torch.Generator | None) -> Tensor:
         """Sample one choice for each row of log-probabilities (n, choices) with the Gumbel-max trick: int64 (n, 1)."""

@@ -155,7 +155,8 @@ class Settings:
     frames) or position (encoded step number as an observation)"""
     preset: PresetName = "paper"
     """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
-    throughput: many environments, short rollouts; quick: small networks and feature observations, minutes on two CPU cores"""
+    throughput: many environments, short rollouts; quick: small networks and feature observations, minutes on two CPU cores, and a
+    stop when the task is learnt"""
     seed: int = 1
     """seed of the initial weights, the episode seeds and all sampling"""
     device: str = "auto"
@@ -182,6 +183,9 @@ class Settings:
     """minutes after which training stops with a checkpoint; 0 for no limit"""
     target_reward: float | None = None
     """stop when the mean reward of the last 100 episodes reaches this value"""
+    stop_when_learnt: bool = False
+    """stop when the last 100 episodes show that the task is learnt: with 90 % of the best possible reward in Mortar Mayhem, with
+    success in 90 % of the episodes in the other finite environments. A target reward replaces it. The default of `quick`"""
     wandb: bool = False
     """also log to Weights & Biases, if it is installed"""
     environment: Environment = field(default_factory=Environment)
@@ -205,7 +209,7 @@ class Settings:
                 equals = ""
             if not equals:
                 raise ValueError(
-                    f"--environment.option must be NAME=VALUE with a JSON value, such as command_count=[2], got `{given}`"
+                    f"--environment.option must be NAME=VALUE with a JSON value, such as 'command_count=[2]', got `{given}`"
                 )
         return options
 
@@ -325,7 +329,7 @@ def _presets() -> dict[str, Settings]:
         transformer={"sequence_length": 32},
     )
     quick = _replace(
-        dataclasses.replace(paper, preset="quick", checkpoint_interval=50),
+        dataclasses.replace(paper, preset="quick", checkpoint_interval=50, stop_when_learnt=True),
         environment={"observation": "features", "num_envs": 64},
         ppo={
             "updates": 2000,
