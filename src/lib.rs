@@ -43,8 +43,9 @@ pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
         EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
-        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, Observers, ROOT_VARIABLE,
-        Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
+        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, ObserverStatus, Observers,
+        ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
+        timeout_from_seconds,
     };
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -11,12 +12,13 @@ import time
 import weakref
 from collections.abc import Mapping, Sequence
 from itertools import count
-from typing import IO, Any
+from typing import Any
 
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.engine_log import EngineLog, level
 from endless_gym.episodes import EpisodeOptions, checked_choice
 from endless_gym.program import program
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
@@ -41,13 +43,13 @@ class EngineProcess:
             long_arguments: Further ones, which the process reads from a file: a command line has a limited length.
         """
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         with tempfile.TemporaryFile() as file:
             file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
             file.flush()
             self._process = subprocess.Popen(
                 [
                     *program(),
+                    *level(),
                     "serve",
                     f"--child={os.getpid()}",
                     "--service",
@@ -57,12 +59,13 @@ class EngineProcess:
                 ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=self._errors,
+                stderr=subprocess.PIPE,
                 pass_fds=[file.fileno()],
                 **_OWN_GROUP,
             )
+        self._log = EngineLog(self._process)
         # Also called at the exit of the interpreter. It must not refer to this object, which would then never be deleted.
-        self._end = weakref.finalize(self, _end, self._process, self._errors, os.getpid())
+        self._end = weakref.finalize(self, _end, self._process, self._log, os.getpid())
 
     @property
     def pid(self) -> int:
@@ -74,11 +77,7 @@ class EngineProcess:
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
-                self._errors.seek(0)
-                # Logs may come before the message.
-                text = f"\n{self._errors.read().decode(errors='replace')}"
-                message = text.rpartition("\nendless: ")[2].strip()
-                raise RuntimeError(message or f"the engine ended with status {status}")
+                raise RuntimeError(self._log.message() or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
                 return connect(self.service, timeout=timeout, engine=self, **kwargs)
             if time.monotonic() >= end:
@@ -90,7 +89,7 @@ class EngineProcess:
         self._end()
 
 
-def _end(process: subprocess.Popen[bytes], errors: IO[bytes], owner: int) -> None:
+def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
     """Stops an engine that the process `owner` started, and waits for its end."""
     if owner != os.getpid():
         # So that Popen does not warn of a child that runs.
@@ -103,12 +102,14 @@ def _end(process: subprocess.Popen[bytes], errors: IO[bytes], owner: int) -> Non
             process.stdin.flush()
         with contextlib.suppress(BrokenPipeError):
             process.stdin.close()
+    # One that is stopped would not end.
+    process.send_signal(signal.SIGCONT)
     try:
         process.wait(10)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    errors.close()
+    log.close()
     if process.returncode:
         # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
         with contextlib.suppress(OSError, RuntimeError):

@@ -67,6 +67,7 @@ class EpisodeTracker:
         autoreset: AutoresetMode,
         choose: EpisodeOptions | None,
         has_info: bool,
+        copy: bool,
     ) -> None:
         self._group, self._first = group, group * num_envs
         self._backend, self._options, self._choose, self._has_info = backend, options, choose, has_info
@@ -85,7 +86,8 @@ class EpisodeTracker:
         self._reset_envs: Sequence[int] | None = None
         # With next-step auto-reset, the environments whose next episode begins in the next step.
         self._ended = np.zeros(num_envs, dtype=np.bool_)
-        # What `info` has. The arrays are replaced, not changed, since the caller may keep them.
+        self._copy = copy
+        # What `info` has. The arrays are read-only and replaced, not changed, since the caller may keep them.
         self._seeds = np.zeros(num_envs, dtype=np.uint64)
         self._has_seed = np.zeros(num_envs, dtype=np.bool_)
         self._played = np.full(num_envs, None, dtype=object)
@@ -193,5 +195,7 @@ class EpisodeTracker:
             self._played[env] = episode.options
 
     def _add(self, info: dict[str, Any]) -> None:
-        info["seed"], info["_seed"] = self._seeds, self._has_seed
-        info["options"], info["_options"] = self._played, self._all
+        arrays = {"seed": self._seeds, "_seed": self._has_seed, "options": self._played, "_options": self._all}
+        for name, array in arrays.items():
+            array.flags.writeable = False
+            info[name] = array.copy() if self._copy else array

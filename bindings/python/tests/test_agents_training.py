@@ -188,6 +188,23 @@ def test_ctrl_c_writes_a_checkpoint_and_frees_shared_memory(
     assert segments() <= before
 
 
+def test_a_function_chooses_the_options_of_training_episodes(tmp_path: Path) -> None:
+    calls: list[tuple[int, int, dict[str, Any] | None]] = []
+
+    def choose(env: int, episode: int, final: dict[str, Any] | None) -> dict[str, Any]:
+        calls.append((env, episode, final))
+        return {"command_count": [1 + episode % 2]}
+
+    given = small("none", tmp_path / "run")
+    train(given, episode_options=choose)
+    assert {env for env, _, _ in calls} == set(range(given.environment.num_envs))
+    chosen = [(episode, final["options"]) for _, episode, final in calls if final is not None]
+    assert chosen
+    assert all(options == {"command_count": [1 + episode % 2]} for episode, options in chosen)
+    with pytest.raises(ValueError, match=r"--environment\.engine must be thread, got process"):
+        Environments(small("none", tmp_path / "other", engine="process"), choose)
+
+
 def test_kept_checkpoints_can_be_loaded(tmp_path: Path) -> None:
     given = replace(small("trxl", tmp_path / "run", 4), keep_checkpoints=True)
     run = train(given)

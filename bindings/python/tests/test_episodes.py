@@ -299,6 +299,7 @@ def test_info_tells_the_seeds_of_the_running_episodes(where: Callable[..., Envs]
             assert info["_seed"].tolist() == [True, True]
             assert info["options"].tolist() == [{}, {}]
         kept = info["seed"]
+        assert not any(info[name].flags.writeable for name in ("seed", "_seed", "options", "_options"))
         info = envs.reset(group=1, options=ONE, seed=[None, 9])[1]
         assert info["seed"].tolist() == [2**64 - 1, 9]
         assert info["options"].tolist() == [ONE, ONE]
@@ -321,6 +322,11 @@ def test_info_tells_the_seeds_of_the_running_episodes(where: Callable[..., Envs]
         ended = info["_final_info"]
         assert info["_seed"].tolist() == (~ended).tolist(), "a continued generator has no seed"
         assert info["final_info"]["seed"].tolist() == [8, 9]
+    with where(ID, 2, episode_info=True, copy=True) as envs:
+        info = envs.reset(seed=3)[1]
+        info["seed"][:], info["_options"][:] = 0, False
+        info = stay(envs)[4]
+        assert (info["seed"].tolist(), info["_options"].tolist()) == ([3, 4], [True, True])
     with where(ID, 2) as envs:
         assert not {"seed", "options"} & set(envs.reset()[1])
 

@@ -136,25 +136,6 @@ def test_cleanrl_ppo(tmp_path, env_id):
     assert not any(math.isnan(loss) for loss in losses)
 
 
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
-@pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MysteryPath-v0"])
-def test_behaviour_cloning(tmp_path, env_id):
-    options = {"command_count": [1]} if env_id.startswith("Mortar") else {"max_steps": 64}
-    endless_gym.record(
-        env_id, 60, options=options, observation="features", dataset="clone/short-v0", root=tmp_path, num_threads=1
-    )
-    sizes = ("--updates", "100", "--batch-size", "16", "--hidden-size", "64", "--evaluation-episodes", "30")
-    output, summary = run(
-        "behaviour_cloning.py", tmp_path, "--dataset", "clone/short-v0", *sizes, MINARI_DATASETS_PATH=str(tmp_path)
-    )
-    losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
-    assert len(losses) == 2
-    if env_id.startswith("Mortar"):
-        # The reward of the one command.
-        by_chance = float(re.search(r"random_return=(\S+)", output)[1])
-        assert float(summary[3]) > by_chance + 0.03
-
-
 @pytest.mark.parametrize(
     ("env_id", "observation", "runners", "lstm"),
     [("Endless-MortarMayhem-v0", "rgb", 0, "--lstm"), ("MysteryPath-Grid-v0", "features", 1, "--no-lstm")],
@@ -186,3 +167,34 @@ def test_jax_service(tmp_path, libraries_python, segments, env_id):
     if env_id.startswith("Endless"):
         assert summary[3] != "none yet"
     assert not segments()
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
+@pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MysteryPath-v0"])
+def test_behaviour_cloning(tmp_path, env_id):
+    options = {"command_count": [1]} if env_id.startswith("Mortar") else {"max_steps": 64}
+    endless_gym.record(
+        env_id, 60, options=options, observation="features", dataset="clone/short-v0", root=tmp_path, num_threads=1
+    )
+    sizes = ("--updates", "100", "--batch-size", "16", "--hidden-size", "64", "--evaluation-episodes", "30")
+    output, summary = run(
+        "behaviour_cloning.py", tmp_path, "--dataset", "clone/short-v0", *sizes, MINARI_DATASETS_PATH=str(tmp_path)
+    )
+    losses = [float(loss) for loss in re.findall(r"loss=(\S+)", output)]
+    assert len(losses) == 2
+    if env_id.startswith("Mortar"):
+        # The reward of the one command.
+        by_chance = float(re.search(r"random_return=(\S+)", output)[1])
+        assert float(summary[3]) > by_chance + 0.03
+
+
+def test_curriculum(tmp_path):
+    sizes = ("--commands", "2", "--num-envs", "32", "--total-timesteps", "30000")
+    output, summary = run("curriculum.py", tmp_path, *sizes)
+    assert int(summary[1]) < 30_000
+    assert float(summary[3]) >= 0.9
+    output, _ = run("curriculum.py", tmp_path, *sizes, "--compare", "1")
+    assert [line.split()[0] for line in output.splitlines() if " seed=1 " in line] == [
+        "curriculum=True",
+        "curriculum=False",
+    ]

@@ -78,6 +78,7 @@ impl Scene<'_> {
             }
             Fault::FillMemory { role, time } => {
                 fill();
+                self.filled = Some(now());
                 self.kill(role);
                 self.start(role)?;
                 self.watch(milliseconds(time))?;
@@ -117,12 +118,10 @@ impl Scene<'_> {
     fn stop(&mut self, role: Role, time: Duration) -> Result<(), String> {
         let Some(actor) = self.place(role) else { return Ok(()) };
         actor.signal(Signal::STOP);
-        self.continued = Some(Duration::MAX);
         self.watch(time)?;
         if let Some(actor) = self.place(role) {
             actor.signal(Signal::CONT);
         }
-        self.continued = Some(now());
         Ok(())
     }
 

@@ -65,7 +65,7 @@ pub fn observe(habit: &Habit) {
             match received {
                 Ok(lease) => {
                     let (step, checksum) = (lease.step(), checksum(&lease));
-                    Event::Batch { at: now(), incarnation, group, step, checksum }.report();
+                    Event::Batch { at: now(), incarnation, group, step, checksum, is_correct: true }.report();
                     held.push((lease, checksum));
                 }
                 Err(ServiceError::TimedOut { .. } | ServiceError::TooManyBatchesHeld { .. }) => {}

@@ -1,11 +1,13 @@
 //! A round's processes, and the rules by which what they report and how they end is judged.
 
 use std::collections::{HashMap, HashSet};
-use std::process::Command;
+use std::os::unix::process::ExitStatusExt;
+use std::process::{Command, ExitStatus};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
 use endless_gym_service::{Namespace, ROOT_VARIABLE};
+use rustix::process::Signal;
 
 use crate::actors::{self, Actor, is_crash};
 use crate::event::{Event, now};
@@ -41,10 +43,12 @@ pub struct Scene<'a> {
     pub forked: Option<u32>,
     /// When the namespace's directory was removed.
     pub removed: Option<Duration>,
-    /// When a stopped process was continued; the longest time if it is still stopped.
-    pub continued: Option<Duration>,
+    /// When /dev/shm was full.
+    pub filled: Option<Duration>,
     /// Since when a process's last connection is, or its attempt to connect; at first its start.
     attempts: HashMap<u32, Duration>,
+    /// Processes whose last attempt has succeeded.
+    connected: HashSet<u32>,
     sender: Sender<(u32, Event)>,
     events: Receiver<(u32, Event)>,
     /// Engines that were ended on purpose.
@@ -76,7 +80,8 @@ impl<'a> Scene<'a> {
             limited: HashSet::new(),
             forked: None,
             removed: None,
-            continued: None,
+            filled: None,
+            connected: HashSet::new(),
             attempts: HashMap::new(),
             sender,
             events,
@@ -204,9 +209,9 @@ impl<'a> Scene<'a> {
             let (Some(status), id) = (actor.ended(), actor.id()) else { continue };
             let complaint = actor.complaint();
             let text = format!("{role:?} {id} ended by itself, {status}: {complaint}");
-            if is_crash(status) {
+            if is_crash(status) && !self.lost_memory(id, status) {
                 self.fail("crash", text);
-            } else if !self.is_excused(id, &complaint) {
+            } else if !is_crash(status) && !self.is_excused(id, &complaint) {
                 self.fail("unexpected end", text);
             }
             drop(self.take(role));
@@ -225,7 +230,16 @@ impl<'a> Scene<'a> {
     pub fn is_excused(&self, process: u32, complaint: &str) -> bool {
         self.limited.contains(&process)
             || (self.is_short_of_memory() && complaint.contains("/dev/shm"))
-            || (self.began_before(process, self.continued) && complaint.contains("has been locked"))
+            // Many processes take the lock in turn. If it is never free again, the round does not go on.
+            || complaint.contains("has been locked")
+    }
+
+    /// Whether a process was connecting when the memory was filled. What it has found free may then be missing, and iceoryx2, which
+    /// allocates no pages in advance, dies of SIGBUS. A process that is connected must not.
+    fn lost_memory(&self, process: u32, status: ExitStatus) -> bool {
+        status.signal() == Some(Signal::BUS.as_raw())
+            && !self.connected.contains(&process)
+            && self.began_before(process, self.filled)
     }
 
     /// Whether the last attempt of a process to connect began before that time: what it reports may be due to what ended then, as late
@@ -238,15 +252,22 @@ impl<'a> Scene<'a> {
         match event {
             Event::Connecting { at } => {
                 self.attempts.insert(process, at);
+                self.connected.remove(&process);
             }
             Event::Connected { incarnation, engine } => {
                 self.engines.insert(incarnation, engine);
+                self.connected.insert(process);
             }
-            Event::Batch { at, incarnation, group, step, checksum } => {
+            Event::Batch { at, incarnation, group, step, checksum, is_correct } => {
                 let trainer = self.trainers.get(&process);
                 if let Some(number) = trainer {
                     self.outcome.batches += 1;
                     self.ledger.add(incarnation, group, *number, step);
+                }
+                if !is_correct {
+                    return;
+                }
+                if trainer.is_some() {
                     self.last_batch = self.engines.get(&incarnation).map(|engine| (at, process, *engine));
                 }
                 self.compare(trainer.is_some(), (incarnation, group, step), checksum);
@@ -268,10 +289,11 @@ impl<'a> Scene<'a> {
                     self.fail("false end of an engine", text);
                 }
                 let expected = match kind.as_str() {
-                    "EngineLost" | "EngineRestarted" | "UnknownEngine" | "TrainerExists" | "TimedOut" => true,
+                    "EngineLost" | "EngineRestarted" | "UnknownEngine" | "TrainerExists" | "TimedOut"
+                    | "NamespaceLocked" => true,
                     "TooManyObservers" | "TooManyBatchesHeld" | "NoSuchGroup" => during == "observe",
-                    "RootRemoved" | "Root" => is_removed,
-                    "NamespaceLocked" => self.began_before(process, self.continued),
+                    // One that joins while the files are removed sees iceoryx2 fail.
+                    "RootRemoved" | "Root" | "Middleware" => is_removed,
                     _ => false,
                 };
                 if !expected && !self.is_excused(process, &text) {

@@ -243,17 +243,16 @@ impl<'a> Play<'a> {
             group.twin.compare(&request, lease)
         };
         group.was_reset = true;
-        match compared {
-            Ok(None) => {
-                let (incarnation, checksum) = (self.incarnation, checksum(lease));
-                Event::Batch { at: now(), incarnation, group: index, step, checksum }.report();
-            }
+        match &compared {
+            Ok(None) => {}
             Ok(Some(difference)) => {
                 Event::Wrong { what: format!("group {index}, batch {step}, {request:?}: {difference}") }.report();
                 group.was_reset = false;
             }
             Err(error) => Event::Wrong { what: format!("the twin refuses what the engine played: {error}") }.report(),
         }
+        let (incarnation, checksum, is_correct) = (self.incarnation, checksum(lease), matches!(compared, Ok(None)));
+        Event::Batch { at: now(), incarnation, group: index, step, checksum, is_correct }.report();
         Ok(())
     }
 
