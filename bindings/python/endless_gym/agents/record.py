@@ -25,7 +25,7 @@ from endless_gym.agents.train import choose_device
 from endless_gym.recording import command as recording
 from endless_gym.recording import record
 from endless_gym.recording.players import Actor
-from endless_gym.specs import spec
+from endless_gym.specs import ObservationName, spec
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class AgentPlayer:
         #: The name of the algorithm in a data set.
         self.name = f"PPO, agent {agent.settings.agent}"
         #: The observation that the agent needs.
-        self.observation: str | None = agent.settings.environment.observation
+        self.observation: ObservationName | None = agent.settings.environment.observation
 
     def actor(self, num_envs: int, first_episode: int) -> Actor:
         """The agent in that number of environments, with a memory and a generator of its own."""

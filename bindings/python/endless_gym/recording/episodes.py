@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from endless_gym.configuration import OBSERVATIONS
 from endless_gym.recording.chunks import Chunks, GrowingArrays
 from endless_gym.recording.players import Errors, Player
-from endless_gym.specs import Frames, Spec
+from endless_gym.specs import OBSERVATIONS, Frames, ObservationName, Spec
 from endless_gym.vector import make_vec
 
 
@@ -68,7 +67,7 @@ def play(
     player: Player,
     plans: Sequence[Plan],
     *,
-    observation: str,
+    observation: ObservationName,
     frames: Frames | None,
     action_seed: int,
     stop: threading.Event,
@@ -147,7 +146,7 @@ def _copied(info: Mapping[str, Any]) -> NDArray[np.float64] | None:
     return info["ground_truth"].copy() if "ground_truth" in info else None
 
 
-def _union(recorded: str, needed: str | None) -> str:
+def _union(recorded: ObservationName, needed: ObservationName | None) -> ObservationName:
     """The observation that has all of what is recorded and needed."""
     contents = np.array(OBSERVATIONS[recorded]) | np.array(OBSERVATIONS[needed] if needed else (False, False))
     return next(name for name, given in OBSERVATIONS.items() if given == tuple(contents))

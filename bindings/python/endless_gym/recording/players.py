@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym.experts import Experts
-from endless_gym.specs import Spec
+from endless_gym.specs import ObservationName, Spec
 
 #: Chooses actions for observations of n environments by their keys, given which are the first of an episode, bool (n,), and which
 #: environments need an action, bool (n,). Returns actions in the shape of a vector environment.
@@ -27,7 +27,7 @@ class Player(Protocol):
         """The name of the algorithm in the data set."""
 
     @property
-    def observation(self) -> str | None:
+    def observation(self) -> ObservationName | None:
         """The observation that it needs, `rgb`, `features` or `rgb+features`; `None` if it needs none."""
 
     def actor(self, num_envs: int, first_episode: int) -> Actor:
@@ -38,7 +38,7 @@ class ExpertPlayer:
     """The scripted experts."""
 
     name = "scripted expert"
-    observation: str | None = "features"
+    observation: ObservationName | None = "features"
 
     def __init__(self, spec: Spec) -> None:
         """Make the player for that environment id."""
@@ -53,7 +53,7 @@ class RandomPlayer:
     """No policy: each step takes a random action, as with an error rate of 1."""
 
     name = "random play"
-    observation: str | None = None
+    observation: ObservationName | None = None
 
     def __init__(self, spec: Spec) -> None:
         """Make the player for that environment id."""

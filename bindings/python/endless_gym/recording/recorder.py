@@ -18,10 +18,9 @@ import gymnasium
 
 import endless_gym
 from endless_gym.arguments import MAX_U64, integer, mapping
-from endless_gym.configuration import contents
 from endless_gym.recording.episodes import Episode, Plan, play
 from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
-from endless_gym.specs import Frames, Spec, spec
+from endless_gym.specs import Frames, ObservationName, Spec, contents, spec
 from endless_gym.vector import make_vec
 
 #: Steps after which episodes are truncated in environments without a step limit, in which an expert may play for ever.
@@ -66,7 +65,7 @@ def record(
     action_seed: int = 0,
     options: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     max_steps: int | None = None,
-    observation: str = "rgb",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     dataset: str | None = None,
     root: str | os.PathLike[str] | None = None,
@@ -215,7 +214,7 @@ def _limit(described: Spec, options: Mapping[str, Any], max_steps: int | None) -
 
 
 def _env_spec(
-    described: Spec, options: Sequence[Mapping[str, Any]], observation: str
+    described: Spec, options: Sequence[Mapping[str, Any]], observation: ObservationName
 ) -> gymnasium.envs.registration.EnvSpec:
     """What makes the environment again, with frames in the original's format: a specification is kept as JSON."""
     # Not the registry's own.
