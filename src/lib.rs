@@ -24,7 +24,8 @@ pub mod envs {
     pub use endless_gym_core::envs::{
         ActionBranch, ActionError, ActionSpace, Choice, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family,
         InfoColumn, InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
-        ParameterError, ParameterKind, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec, specs, view,
+        ParameterError, ParameterKind, Progress, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec,
+        specs, view,
     };
 }
 
@@ -49,9 +50,9 @@ pub mod service {
     };
 }
 
-/// Recorded episodes of the original, and their replay.
+/// Recorded episodes of the original, their replay, and recordings of this engine.
 pub mod trace {
-    pub use endless_gym_core::trace::{Difference, Episode, Replay, Step, Trace, TraceError, replay};
+    pub use endless_gym_core::trace::{Difference, Episode, Recorder, Replay, Step, Trace, TraceError, replay};
 }
 
 /// The examples of the README, as tests.

@@ -1,7 +1,7 @@
 //! The stages of `cargo xtask test`.
 
 use crate::requirements::Requirement::{self, *};
-use crate::{cargo, docs, faults, files, instructions, modules, original, packages, python, wasm};
+use crate::{cargo, docs, faults, files, instructions, modules, original, packages, python, wasm, web};
 
 /// One part of the tests.
 #[derive(Debug)]
@@ -134,6 +134,7 @@ pub const STAGES: &[Stage] = &[
     },
     Stage { name: "loom", run: cargo::loom, needs: &[Linker, Disk], compiles: true, ..STAGE },
     Stage { name: "wasm", run: wasm::build, needs: &[Linker, Wasm], compiles: true, ..STAGE },
+    Stage { name: "web", run: web::test, needs: &[Browser], after: &["rust build", "wasm"], compiles: true, ..STAGE },
     Stage {
         name: "shared memory of other sizes",
         run: || {

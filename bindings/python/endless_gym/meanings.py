@@ -59,8 +59,8 @@ def text(specs: Iterable[Spec]) -> str:
 def _lines(spec: Spec) -> Iterable[str]:
     """The actions of an environment, and the entries of its ground truth."""
     for number, branch in enumerate(spec.actions):
-        place = f"action[{number}], {branch.name}" if spec.multi_discrete else "action"
-        yield f"{place}: {', '.join(f'{value} {choice.name}' for value, choice in enumerate(branch.choices))}"
+        name = f"action[{number}], {branch.name}" if spec.multi_discrete else "action"
+        yield f"{name}: {', '.join(f'{value} {choice.name}' for value, choice in enumerate(branch.choices))}"
     for place, column in enumerate(spec.ground_truth_columns):
         yield f'info["ground_truth"][{place}], {column.name}: {column.description}'
 

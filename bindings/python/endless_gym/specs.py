@@ -26,7 +26,11 @@ SCREEN = 84
 ObservationName = Literal["rgb", "features", "rgb+features"]
 
 #: Values of the argument `observation`, with whether the batch has frames and whether it has features.
-OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
+OBSERVATIONS: dict[ObservationName, tuple[bool, bool]] = {
+    "rgb": (True, False),
+    "features": (False, True),
+    "rgb+features": (True, True),
+}
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.learnt import learnt
 from endless_gym.agents.logs import Episodes, Logger
-from endless_gym.agents.ppo import learn
+from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
 from endless_gym.episodes import EpisodeOptions
@@ -75,6 +75,8 @@ def train(
     device = choose_device(settings.device)
     if settings.threads:
         torch.set_num_threads(settings.threads)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32
     torch.manual_seed(settings.seed)
     generators = {
         "actions": torch.Generator(device).manual_seed(settings.seed),
@@ -86,7 +88,7 @@ def train(
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()
-        optimizer = torch.optim.AdamW(agent.parameters(), lr=ppo.learning_rate)
+        optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"])
         episodes, update, steps = Episodes(), 0, 0
         if resumed is not None:

@@ -7,6 +7,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 
 use super::parameters::ResetParameters;
+use super::progress::Progress;
 use super::screen::SCREEN;
 use crate::random::Generator;
 use crate::raster::Canvas;
@@ -89,6 +90,9 @@ pub trait Environment: Send + Sync {
     ///
     /// [`InvalidState`] if a number of the state is out of its range. The environment is then unchanged.
     fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
+
+    /// How far the episode is, at any time, for a person who watches.
+    fn progress(&self) -> Vec<Progress>;
 
     /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended
     /// the episode.

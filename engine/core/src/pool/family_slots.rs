@@ -17,7 +17,7 @@ use super::seeding::{Seeding, Seeds, Unseeded};
 use super::snapshot::{Saved, SnapshotError};
 use super::threads::Threads;
 use crate::batch::BatchMut;
-use crate::envs::{EnvSpec, Environment, ParameterError, ResetParameters, view};
+use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters, view};
 use crate::raster::PixelFormat;
 
 /// The means for writing a batch.
@@ -69,6 +69,9 @@ pub(super) trait EnvSlots: Send + Sync {
 
     /// Replaces these frames.
     fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError>;
+
+    /// How far one environment's episode is.
+    fn progress(&self, env: usize) -> Vec<Progress>;
 
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
@@ -295,6 +298,10 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
         }
         self.slots[env].frame_stack.set_earlier(frames.chunks_exact(frame_bytes.max(1)).map(Arc::from));
         Ok(())
+    }
+
+    fn progress(&self, env: usize) -> Vec<Progress> {
+        self.slots[env].env.progress()
     }
 
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {

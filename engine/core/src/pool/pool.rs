@@ -15,7 +15,7 @@ use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
-use crate::envs::{self, EnvSpec, Family, SCREEN};
+use crate::envs::{self, EnvSpec, Family, Progress, SCREEN};
 use crate::raster::PixelFormat;
 
 /// Environments of one id in lockstep.
@@ -335,6 +335,20 @@ impl Pool {
     fn check_env(&self, env: usize) -> Result<(), SnapshotError> {
         let num_envs = self.layout.num_envs();
         if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnv { given: env, num_envs }) }
+    }
+
+    /// How far the episode of one environment is, for a person who watches: commands, tiles, coins, health.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
+    pub fn progress(&self, env: usize) -> Result<Vec<Progress>, PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => Err(PoolError::NotReset),
+            _ if env >= num_envs => Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ => Ok(self.slots.progress(env)),
+        }
     }
 
     /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,

@@ -26,6 +26,7 @@ pub use state::State;
 use super::character_sprites::CharacterSprites;
 use super::environment::{Environment, InvalidState, Transition};
 use super::parameters::ResetParameters;
+use super::progress::Progress;
 use crate::random::Generator;
 use crate::raster::Canvas;
 use state::DisplayedCharacter;
@@ -120,6 +121,10 @@ impl Environment for MortarMayhem {
         self.earlier_sprites = assets.displayed_sprites(&state);
         self.state = state;
         Ok(())
+    }
+
+    fn progress(&self) -> Vec<Progress> {
+        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {
