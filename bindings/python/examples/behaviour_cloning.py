@@ -1,7 +1,8 @@
 """Behaviour cloning: a recurrent network learns to act as the episodes of a Minari data set do.
 
 pip install "./bindings/python[minari]" torch tyro
-endless record MortarMayhem-Grid-v0 --episodes 2000 --error-rate 0 0.05 --observation features --name clone/mortar-v0
+endless record MortarMayhem-Grid-v0 --episodes 2000 --error-rate 0 0.1 --option "command_count=[3]" \\
+    --observation features --name clone/mortar-v0
 python behaviour_cloning.py --dataset clone/mortar-v0
 """
 
@@ -23,7 +24,7 @@ import endless_gym
 class Args:
     dataset: str = "clone/mortar-v0"
     """id of a data set with feature observations"""
-    updates: int = 600
+    updates: int = 1000
     """updates of the network"""
     batch_size: int = 64
     """episodes in each update"""

@@ -99,6 +99,8 @@ def test_other_observations_are_those_of_a_vector_environment(id: str, observati
         id, 2, observation=observation, frames=frames, options=options, autoreset="disabled"
     ) as envs:
         assert dataset.observation_space == envs.single_observation_space
+        if frames is None:
+            assert dataset.recover_environment().observation_space == dataset.observation_space
         observation, _ = envs.reset(seed=7)
         longest = max(len(episode) for episode in dataset)
         for step in range(longest + 1):
@@ -271,7 +273,7 @@ def test_the_program_records(root: Path) -> None:
     assert result["path"] == str(root / "my/path-v1")
     dataset = load("my/path-v1")
     assert dataset.total_steps == result["steps"]
-    assert dataset.recover_environment().reset(seed=0)[0].shape == (84, 84, 3)
+    assert dataset.recover_environment().reset(seed=0)[0].shape == dataset[0].observations[0].shape
     process = record(*arguments.split(), "--name", "my/path-v1")
     output, errors = process.communicate(timeout=120)
     assert (process.returncode, output) == (1, "")

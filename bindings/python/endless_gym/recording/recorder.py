@@ -142,7 +142,7 @@ def record(
         root,
         observation_space=described.observation_space(frames, has_features),
         action_space=described.action_space(),
-        env_spec=_env_spec(described, each, frames, has_features),
+        env_spec=_env_spec(described, each, observation),
         metadata=_metadata(described, player, rates, author, description),
         overwrite=overwrite,
     )
@@ -214,13 +214,15 @@ def _limit(described: Spec, options: Mapping[str, Any], max_steps: int | None) -
 
 
 def _env_spec(
-    described: Spec, options: Sequence[Mapping[str, Any]], frames: Frames | None, has_features: bool
+    described: Spec, options: Sequence[Mapping[str, Any]], observation: ObservationName
 ) -> gymnasium.envs.registration.EnvSpec:
-    """What makes the environment again."""
+    """What makes the environment again, with frames in the original's format: a specification is kept as JSON."""
     # Not the registry's own.
     env_spec = copy.deepcopy(gymnasium.spec(f"EndlessGym/{described.id}"))
     if len(options) == 1 and options[0]:
         env_spec.kwargs["options"] = dict(options[0])
+    if observation != "rgb":
+        env_spec.kwargs["observation"] = observation
     return env_spec
 
 
