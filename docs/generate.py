@@ -6,6 +6,7 @@ engine's table of environments and the messages of its errors as JSON into the f
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import messages
@@ -18,6 +19,8 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
 DATA = Path(os.environ["ENDLESS_DOCS_DATA"])
+#: Whether the site has the page that plays the environments.
+PAGE = bool(os.environ.get("ENDLESS_DOCS_PAGE"))
 ENVIRONMENTS = tables.read(DATA / "environments.json")
 MESSAGES = messages.Messages(ROOT, DATA / "errors.json")
 
@@ -63,12 +66,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return tables.overview(spec for id, spec in ENVIRONMENTS.items() if name in id)
         if kind == "errors":
             return MESSAGES.of_type(name)
+        if kind == "play":
+            return play(ENVIRONMENTS, ".")
         if kind == "python":
             return MESSAGES.of_python()
         if path.stem not in ENVIRONMENTS:
             raise PluginError(f"docs/{path} describes no environment; there are {', '.join(ENVIRONMENTS)}")
         if kind == "picture":
-            return picture(path.stem, files)
+            return picture(path.stem, files) + "\n\n" + play([path.stem], "..")
         return tables.PARTS[kind](ENVIRONMENTS[path.stem])
 
     return re.sub(r"<!-- generated: (.+?) -->", part, markdown)
@@ -79,6 +84,14 @@ def on_post_build(config: MkDocsConfig) -> None:
     for file in Path(config.site_dir).rglob("*.html"):
         if found := EXTERNAL.search(file.read_text()):
             raise PluginError(f"{file} loads something from elsewhere: {found[0]}")
+
+
+def play(ids: Iterable[str], root: str) -> str:
+    """Links to the page that plays environments, where it is part of the site; MkDocs does not know its files."""
+    if not PAGE:
+        return "This copy of the documentation was built without the page that plays environments in the browser."
+    links = (f'<a href="{root}/play/index.html#env={id}&amp;seed=1">Play {id}</a>' for id in ids)
+    return '<p class="play">' + "\n".join(links) + "</p>"
 
 
 def picture(id: str, files: Files) -> str:

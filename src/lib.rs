@@ -22,9 +22,10 @@ pub mod batch {
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{
-        ActionError, ActionSpace, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family, InfoColumn,
-        InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
-        ParameterError, ParameterKind, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec, specs, view,
+        ActionBranch, ActionError, ActionSpace, Choice, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family,
+        InfoColumn, InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
+        ParameterError, ParameterKind, Progress, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec,
+        specs, view,
     };
 }
 
@@ -43,14 +44,15 @@ pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
         EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
-        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE, Reconnection, Rejection,
-        ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
+        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, ObserverStatus, Observers,
+        ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
+        timeout_from_seconds,
     };
 }
 
-/// Recorded episodes of the original, and their replay.
+/// Recorded episodes of the original, their replay, and recordings of this engine.
 pub mod trace {
-    pub use endless_gym_core::trace::{Difference, Episode, Replay, Step, Trace, TraceError, replay};
+    pub use endless_gym_core::trace::{Difference, Episode, Recorder, Replay, Step, Trace, TraceError, replay};
 }
 
 /// The examples of the README, as tests.

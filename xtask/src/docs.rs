@@ -7,7 +7,8 @@ use std::time::Instant;
 
 use crate::requirements::Requirement;
 use crate::venv::{Install, execute, target, venv, workspace};
-use crate::{error_messages, interpreters};
+use crate::wasm::Toolchain;
+use crate::{error_messages, interpreters, web};
 
 /// Builds the site. A warning, a link to a missing page or anchor, and an error message without a cure are errors.
 pub fn build() -> Result<(), String> {
@@ -18,6 +19,12 @@ pub fn build() -> Result<(), String> {
     write(&data.join("environments.json"), &environments()?)?;
     write(&data.join("errors.json"), &error_messages::as_json()?)?;
 
+    let page = Toolchain::find().is_some();
+    if page {
+        web::build()?;
+    } else {
+        println!("    without the page: {}", Toolchain::missing());
+    }
     let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
     let folder = venv("docs", &base, &[Install::of_file("requirements-docs.txt")?])?;
     let site = target()?.join("site");
@@ -26,9 +33,16 @@ pub fn build() -> Result<(), String> {
     mkdocs.args(["build", "--strict", "--site-dir"]).arg(&site).current_dir(workspace());
     // The second variable silences an announcement of Material for MkDocs.
     mkdocs.env("ENDLESS_DOCS_DATA", &data).env("NO_MKDOCS_2_WARNING", "1");
+    if page {
+        mkdocs.env("ENDLESS_DOCS_PAGE", "1");
+    }
     let output = mkdocs.output().map_err(|error| format!("{mkdocs:?} cannot be run: {error}"))?;
     if !output.status.success() {
         return Err(format!("the documentation cannot be built:\n{}", String::from_utf8_lossy(&output.stderr)));
+    }
+
+    if page {
+        copy(&web::folder()?, &site.join("play"))?;
     }
 
     execute(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;

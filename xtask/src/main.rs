@@ -19,6 +19,7 @@ mod stages;
 mod test;
 mod venv;
 mod wasm;
+mod web;
 
 use std::process::ExitCode;
 
@@ -68,6 +69,8 @@ enum Task {
     Pictures,
     /// Build the core for wasm32-unknown-unknown.
     Wasm,
+    /// Build the page that plays the environments in a browser into target/web.
+    Web,
     /// Count the instructions of a step and compare with the budgets.
     Instructions {
         /// Write the counts as the new budgets.
@@ -135,6 +138,7 @@ impl Task {
             Task::Packages => packages::test(),
             Task::Pictures => pictures::make(),
             Task::Wasm => wasm::build(),
+            Task::Web => web::build(),
             Task::Instructions { record } => instructions::run(*record),
             Task::Bench { arguments } => python::bench(arguments),
             Task::Faults { arguments } => faults::run("faults", arguments),

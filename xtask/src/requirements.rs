@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 
 use crate::{interpreters, venv, wasm};
 
-/// Bytes that the target directory takes in a full run; 31 GB were measured, most of them virtual environments with PyTorch.
+/// Bytes that the target directory takes in a full run; 32 GB were measured, most of them virtual environments with PyTorch.
 const DISK: u64 = 35_000_000_000;
 
 /// Bytes free in /dev/shm for the tests: several engines at a time, each below 100 MB.
@@ -19,6 +19,7 @@ pub enum Requirement {
     OriginalPython,
     Valgrind,
     Wasm,
+    Browser,
     MountNamespaces,
     Root,
     SharedMemory,
@@ -33,6 +34,7 @@ impl Requirement {
             Requirement::OriginalPython => "CPython 3.11",
             Requirement::Valgrind => "valgrind",
             Requirement::Wasm => "Rust's standard library for wasm32-unknown-unknown",
+            Requirement::Browser => "Chromium",
             Requirement::MountNamespaces => "mount namespaces",
             Requirement::Root => "the rights of root",
             Requirement::SharedMemory => "shared memory",
@@ -54,6 +56,7 @@ impl Requirement {
                 "rustup target add wasm32-unknown-unknown, or on Debian .ci/wasm-toolchain, which unpacks Debian's compiler under \
                  target/"
             }
+            Requirement::Browser => "apt-get install chromium, or set CHROMIUM to the program's path",
             Requirement::MountNamespaces => {
                 "permit `unshare --mount --map-root-user` (util-linux): sysctl kernel.unprivileged_userns_clone=1, or in a container \
                  --cap-add SYS_ADMIN"
@@ -81,6 +84,7 @@ impl Requirement {
             Requirement::OriginalPython => interpreter(interpreters::for_original()),
             Requirement::Valgrind => first_line("valgrind", &["--version"]),
             Requirement::Wasm => wasm::Toolchain::find().map(|found| found.to_string()).ok_or("not found".to_owned()),
+            Requirement::Browser => browser(),
             Requirement::MountNamespaces => mount_namespaces(),
             Requirement::Root if rustix::process::geteuid().is_root() => Ok("user root".to_owned()),
             Requirement::Root => Err(format!("user {}", rustix::process::geteuid().as_raw())),
@@ -109,6 +113,16 @@ fn first_line(program: &str, arguments: &[&str]) -> Result<String, String> {
         Ok(output) => Err(format!("`{program}` failed: {}", output.status)),
         Err(error) => Err(format!("`{program}`: {error}")),
     }
+}
+
+/// The tests look for the same.
+fn browser() -> Result<String, String> {
+    if let Ok(path) = std::env::var("CHROMIUM") {
+        return first_line(&path, &["--version"]);
+    }
+    let programs = ["chromium", "chromium-browser", "google-chrome"].map(|name| first_line(name, &["--version"]));
+    let found = programs.into_iter().find_map(Result::ok);
+    found.ok_or_else(|| "none of `chromium`, `chromium-browser` and `google-chrome` is on the path".to_owned())
 }
 
 /// Whether a process may mount in a namespace of its own.

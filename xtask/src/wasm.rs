@@ -37,6 +37,8 @@ impl Toolchain {
     pub fn build(&self) -> Result<Command, String> {
         let mut command = cargo::command();
         command.args(["build", "--locked", "--target", TARGET]);
+        // A browser downloads the result: without names and lines.
+        command.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
         let Toolchain::Debian(folder) = self else { return Ok(command) };
         let paths = |variable: &str, first: &[&str]| -> Result<OsString, String> {
             let before = std::env::var_os(variable).unwrap_or_default();
@@ -52,6 +54,25 @@ impl Toolchain {
         command.env("LD_LIBRARY_PATH", paths("LD_LIBRARY_PATH", &[&libraries, "lib/llvm/lib"])?);
         Ok(command)
     }
+
+    /// The folder of the built files, with one folder for each profile.
+    ///
+    /// # Errors
+    ///
+    /// If the target directory is no usable path.
+    pub fn output(&self) -> Result<PathBuf, String> {
+        let target = target()?;
+        Ok(match self {
+            Toolchain::Own => target,
+            Toolchain::Debian(_) => target.join("wasm"),
+        }
+        .join(TARGET))
+    }
+
+    /// The error where there is none.
+    pub fn missing() -> String {
+        format!("no compiler for {TARGET}; rustup target add {TARGET}, or on Debian .ci/wasm-toolchain")
+    }
 }
 
 impl fmt::Display for Toolchain {
@@ -65,8 +86,6 @@ impl fmt::Display for Toolchain {
 
 /// Builds the core.
 pub fn build() -> Result<(), String> {
-    let toolchain = Toolchain::find().ok_or_else(|| {
-        format!("no compiler for {TARGET}; rustup target add {TARGET}, or on Debian .ci/wasm-toolchain")
-    })?;
+    let toolchain = Toolchain::find().ok_or_else(Toolchain::missing)?;
     execute(toolchain.build()?.args(["--release", "--package", "endless-gym-core", "--no-default-features"]))
 }

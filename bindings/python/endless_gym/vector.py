@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,29 +16,35 @@ from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.backends import Backend, InProcess, Reconnection, Remote
-from endless_gym.configuration import MODES, AutoresetMode, Options, checked_arguments, options_list
+from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Options, checked_arguments, options_list
 from endless_gym.episodes import EpisodeOptions, EpisodeTracker, RunningEpisode, checked_choice, running_episodes
+from endless_gym.meanings import documented, metadata
 from endless_gym.next_options import NextOptions
+from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.reset_requests import ResetRequests, Seeds
-from endless_gym.specs import Frames, Spec, spec
+from endless_gym.specs import Frames, ObservationName, Spec, all_specs, spec
 
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
+@documented(all_specs().values())
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
 
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+
     `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
-    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. The arrays are read-only
-    views of the memory that the engine wrote; their contents do not change while references to them exist. With `copy=True`
-    they are writable copies. `endless_gym.torch_view` returns read-only tensors that share their memory.
+    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. Observations and
+    `ground_truth` are read-only views of the memory that the engine wrote; their contents do not change while references to them
+    exist. With `copy=True` they are writable copies, as rewards and flags always are. `endless_gym.torch_view` returns read-only
+    tensors that share their memory.
 
     `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
-    (n, k) if the original has it; in steps that end episodes the original's final infos (`reward`, `length`, ...), and `episode`
-    with the return `r`, the length `l` and the seconds since the environments were created `t`. With same-step auto-reset the
-    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was
-    started without `--final-observation`. With `episode_info`, `info` and `final_info` also have what the episodes follow from:
-    `seed` uint64 (n,), whose mask is false for episodes that continue a generator, and `options`, an array of n dicts.
+    (n, k) if the original has it; in steps that end episodes the original's final infos: `reward`, the episode's return, float64
+    (n,), `length`, its steps, int32 (n,), and the numbers of the task. With same-step auto-reset the final infos are in
+    `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was started without
+    `--final-observation`. With `episode_info`, `info` and `final_info` also have what the episodes follow from: `seed` uint64
+    (n,), whose mask is false for episodes that continue a generator, and `options`, an array of n dicts.
     """
 
     def __init__(
@@ -54,6 +59,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         copy: bool = False,
         options: Sequence[Options] = ({},),
         knows_options: bool = True,
+        render_mode: str | None = None,
+        view: View | None = None,
         episode_options: EpisodeOptions | None = None,
         episode_info: bool = False,
     ) -> None:
@@ -62,15 +69,23 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         `options` are those given at creation: one mapping for all environments, or one for each of all groups. `knows_options` is
         false if the environments may have others.
         """
+        shown = checked_view(render_mode, view, VECTOR_MODES)
+        self.render_mode = render_mode
+        self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
         self._backend = backend
         self._described = described
         self.num_envs = num_envs
         self.num_groups = backend.groups
         self.single_observation_space = described.observation_space(frames, "features" in sections)
         self.single_action_space = described.action_space()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {"autoreset_mode": autoreset, "render_fps": described.render_fps, "render_modes": []}
+        self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
+        self.metadata = {
+            "autoreset_mode": autoreset,
+            "render_fps": described.render_fps,
+            "render_modes": list(VECTOR_MODES),
+        }
+        self.metadata.update(metadata(described))
         self._index = {name: place for place, name in enumerate(sections)}
         names = {
             "observation": "visual_observation",
@@ -91,7 +106,6 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._resets = ResetRequests(num_envs, backend.groups)
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.flags.writeable = False
-        self._start = time.perf_counter()
         self._copy = copy
         self._options = NextOptions(backend, num_envs, options, knows_options)
         self._chooses = checked_choice(episode_options) is not None
@@ -302,6 +316,22 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             self._trackers[group].after_restore(list(snapshots) or range(self.num_envs), start[1])
         return start
 
+    def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
+
+        With `rgb_array` the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
+        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process, from a snapshot, so
+        that the environments stay as they are. With same-step auto-reset, it shows the new episode, as everywhere in Gymnasium.
+
+        Raises:
+            ValueError: There is no such group.
+            RuntimeError, TimeoutError, EngineLost: As for `snapshot`.
+        """
+        group = self._group(group)
+        if self._renderer is None:
+            return None
+        return self._renderer.render(self._backend.snapshot(group, env) for env in range(self.num_envs))
+
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
         """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed `[row][column][channel]`.
 
@@ -431,15 +461,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
         """Adds the infos of the episodes that this step ended, if it ended any."""
         returns, lengths, infos = (arrays[place] for place in self._ends)
-        seconds = time.perf_counter() - self._start
-        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers, seconds)
+        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers)
         if ends is None:
             return
-        ended, returns, lengths, times, columns = ends
+        ended, returns, lengths, columns = ends
         final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
         for (name, _), column in zip(self._described.info, columns, strict=True):
             final[name], final[f"_{name}"] = column, ended
-        info["episode"], info["_episode"] = {"r": returns, "l": lengths, "t": times}, ended
         if not self._same_step:
             info.update(final)
             return
@@ -464,11 +492,14 @@ def make_vec(
     seed: int | None = None,
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    observation: str = "rgb",
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
+    independent_episodes: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
     episode_options: EpisodeOptions | None = None,
     episode_info: bool = False,
 ) -> EndlessVectorEnv:
@@ -490,6 +521,12 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
+        independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
+            alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
+            an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
+            the last one's background, and an episode continues the generator that the one before has drawn from.
+        render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
+        view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
         episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between two
             steps, before the one in which the episode may begin: with same-step auto-reset one episode ahead.
         episode_info: Whether `info` has the seed and the options of each running episode.
@@ -498,7 +535,19 @@ def make_vec(
         TypeError: A number is not an integer, or `episode_options` cannot be called.
         ValueError: An argument is out of its range.
     """
-    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+    )
     # As in an engine, groups share threads.
     threads = _native.Threads(given.num_threads)
     pools = [_native.Pool(config, group, threads) for group, config in enumerate(given.pools)]
@@ -511,6 +560,8 @@ def make_vec(
         autoreset=given.autoreset,
         copy=copy,
         options=options_list(options),
+        render_mode=render_mode,
+        view=view,
         episode_options=episode_options,
         episode_info=episode_info,
     )
@@ -521,6 +572,8 @@ def connect(
     *,
     timeout: float = 30.0,
     copy: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
     episode_options: EpisodeOptions | None = None,
     episode_info: bool = False,
     engine: Any = None,
@@ -531,6 +584,8 @@ def connect(
         service: The engine's name.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
         episode_options: As for `make_vec`. It is called in this process; options that differ from the environment's last ones
             are sent to the engine before the next step.
         episode_info: As for `make_vec`. Each step in which episodes begin asks the engine for them, which needs one of its
@@ -539,9 +594,10 @@ def connect(
 
     Raises:
         ConnectionError: There is no such engine, or it already has a trainer.
-        ValueError: The timeout is negative or not finite.
+        ValueError: The timeout is negative or not finite, or there is no such render mode or view.
     """
     timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
     return EndlessVectorEnv(
@@ -555,13 +611,8 @@ def connect(
         options=specification["options"],
         # An earlier trainer may have changed them, or a checkpoint.
         knows_options=False,
+        render_mode=render_mode,
+        view=view,
         episode_options=episode_options,
         episode_info=episode_info,
     )
-
-
-def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> EndlessVectorEnv:
-    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
-    if render_mode is not None:
-        raise gymnasium.error.Error(f"render_mode must be None for vector environments, got {render_mode!r}")
-    return make_vec(id, num_envs, **kwargs)

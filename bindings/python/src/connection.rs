@@ -16,14 +16,14 @@ use crate::arrays::{self, Owner};
 use crate::{errors, logs};
 
 /// Longest time between two runs of Python's signal handlers, among them that of Ctrl-C.
-const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+pub const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The steps of a group in the engine that is connected and in the one that was lost, and what became of the last request.
 type GroupFound = (Option<u64>, Option<u64>, &'static str);
 
 /// The owner of the arrays of one batch in shared memory. The engine writes to the memory again once all arrays are gone.
 #[pyclass(frozen)]
-struct Lease(BatchLease);
+pub struct Lease(pub BatchLease);
 
 // SAFETY: the engine does not write to a batch that a trainer holds, and its memory stays mapped for as long.
 unsafe impl Owner for Lease {
@@ -197,7 +197,7 @@ impl Connection {
 
 /// Calls `connect` with parts of the timeout until there is an engine, without the interpreter's lock, and runs Python's signal
 /// handlers between the calls.
-fn wait_for_engine<T: Send>(
+pub fn wait_for_engine<T: Send>(
     py: Python<'_>,
     timeout: f64,
     mut connect: impl FnMut(Duration) -> Result<T, ServiceError> + Send,

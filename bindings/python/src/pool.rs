@@ -33,7 +33,7 @@ pub struct PoolConfig(engine::PoolConfig);
 #[pymethods]
 impl PoolConfig {
     #[new]
-    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
+    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation, independent_episodes=false))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         id: &str,
@@ -48,6 +48,7 @@ impl PoolConfig {
         frames: Option<(bool, bool, bool, usize)>,
         features: bool,
         final_observation: bool,
+        independent_episodes: bool,
     ) -> PyResult<Self> {
         let config = engine::PoolConfig {
             options: arguments::pool_options(options)?,
@@ -56,6 +57,7 @@ impl PoolConfig {
             frames: frames.map(arguments::frames),
             features,
             final_observation,
+            independent_episodes,
             first_env,
             total_envs,
             ..engine::PoolConfig::new(id, num_envs)

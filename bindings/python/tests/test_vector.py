@@ -37,13 +37,7 @@ def test_it_does_as_gymnasiums_own_vector_environment(where, mode: AutoresetMode
             actions = envs.action_space.sample()
             step, wanted = envs.step(actions), sync.step(actions)
             ends += int(step[2].sum())
-            episode = step[4].pop("episode", None), step[4].pop("_episode", None)
             compare(step, wanted)
-            if step[2].any():
-                final = wanted[4].get("final_info", wanted[4])
-                np.testing.assert_array_equal(episode[0]["r"], final["reward"])
-                np.testing.assert_array_equal(episode[0]["l"], final["length"])
-                np.testing.assert_array_equal(episode[1], step[2])
         assert ends > 0
 
 

@@ -12,7 +12,7 @@ use crate::error::{Rejection, ServiceError};
 use crate::memory::PrefaultedChunks;
 use crate::message::{PayloadBlock, RequestHeader, RequestKind, write_text};
 use crate::namespace::Ipc;
-use crate::ports::{self, EngineServices, LeaseLimits, PortError, RequestSubscriber, ResponsePublisher};
+use crate::ports::{self, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
 
 /// A request in shared memory.
 pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
@@ -52,12 +52,7 @@ impl Group {
         let service = services.responses(number, limits)?;
         // An observer reserves its chunks when it connects.
         let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), limits.trainer_chunks());
-        let (responses, memory) = publisher.map_err(|e| match e {
-            PortError::Other(e) => e,
-            PortError::LimitReached => {
-                ServiceError::middleware("cannot create a publisher")("it exists already".to_owned())
-            }
-        })?;
+        let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
         Ok(Group { pool, requests, responses, memory, request: RequestData::default(), trainer: None })
     }
 

@@ -265,7 +265,7 @@ impl BatchSection {
             BatchSection::Observation => contents.frames.map(Frames::shape),
             BatchSection::VectorObservation => columns(spec.vector_observation),
             BatchSection::Features => columns(spec.features.len()).filter(|_| contents.features),
-            BatchSection::GroundTruth => columns(spec.ground_truth),
+            BatchSection::GroundTruth => columns(spec.ground_truth.len()),
             BatchSection::Reward
             | BatchSection::Terminated
             | BatchSection::Truncated

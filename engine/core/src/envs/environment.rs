@@ -7,6 +7,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 
 use super::parameters::ResetParameters;
+use super::progress::Progress;
 use super::screen::SCREEN;
 use crate::random::Generator;
 use crate::raster::Canvas;
@@ -68,6 +69,9 @@ pub trait Environment: Send + Sync {
     /// The state changes where the original advances an animation with every view.
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
+    /// Sets these animations to where they are when the view was drawn once after the reset and after each step before this one.
+    fn align_ground_truth(&mut self) {}
+
     /// Writes the vector observation; an environment without one writes nothing.
     fn vector_observation(&self, _out: &mut [f32]) {}
 
@@ -86,6 +90,9 @@ pub trait Environment: Send + Sync {
     ///
     /// [`InvalidState`] if a number of the state is out of its range. The environment is then unchanged.
     fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
+
+    /// How far the episode is, at any time, for a person who watches.
+    fn progress(&self) -> Vec<Progress>;
 
     /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended
     /// the episode.

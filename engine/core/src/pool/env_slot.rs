@@ -24,6 +24,8 @@ pub(super) struct EnvSlot<E: Environment> {
     pub frame_stack: FrameStack<E::Scene>,
     /// Whether the last step ended the episode, so that in next-step autoreset the next one starts another.
     pub ended: bool,
+    /// Whether an episode starts as in a new environment.
+    independent_episodes: bool,
     /// The reset parameters as they were given, which `assets` were made from.
     pub options: Arc<OptionMap>,
     /// Other assets and options from the next episode on.
@@ -38,7 +40,14 @@ pub(super) type OptionSet<E> = (Arc<<E as Environment>::Assets>, Arc<OptionMap>)
 impl<E: Environment> EnvSlot<E> {
     /// An environment that has not been reset yet, for observations of `stack` frames. `random` is its generator until an episode
     /// is seeded.
-    pub fn new(assets: Arc<E::Assets>, options: Arc<OptionMap>, seeds: Seeds, random: Generator, stack: usize) -> Self {
+    pub fn new(
+        assets: Arc<E::Assets>,
+        options: Arc<OptionMap>,
+        seeds: Seeds,
+        random: Generator,
+        stack: usize,
+        independent_episodes: bool,
+    ) -> Self {
         EnvSlot {
             env: E::new(&assets),
             assets,
@@ -48,6 +57,7 @@ impl<E: Environment> EnvSlot<E> {
             episode_length: 0,
             frame_stack: FrameStack::new(stack),
             ended: false,
+            independent_episodes,
             options,
             next: None,
             episode_seed: None,
@@ -65,6 +75,9 @@ impl<E: Environment> EnvSlot<E> {
         }
         if let Some(next) = self.next.take() {
             (self.assets, self.options) = next;
+        }
+        if self.independent_episodes {
+            self.env = E::new(&self.assets);
         }
         self.env.reset(&self.assets, &mut self.random);
         self.frame_stack.restart(|| self.env.scene());

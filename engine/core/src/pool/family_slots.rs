@@ -17,7 +17,7 @@ use super::seeding::{Seeding, Seeds, Unseeded};
 use super::snapshot::{Saved, SnapshotError};
 use super::threads::Threads;
 use crate::batch::BatchMut;
-use crate::envs::{EnvSpec, Environment, ParameterError, ResetParameters, view};
+use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters, view};
 use crate::raster::PixelFormat;
 
 /// The means for writing a batch.
@@ -70,8 +70,14 @@ pub(super) trait EnvSlots: Send + Sync {
     /// Replaces these frames.
     fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError>;
 
+    /// How far one environment's episode is.
+    fn progress(&self, env: usize) -> Vec<Progress>;
+
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
+
+    /// Sets the animations of that view to the current step.
+    fn align_ground_truth_view(&mut self, env: usize);
 }
 
 /// The environments of a pool, all of one family.
@@ -119,8 +125,11 @@ pub(super) fn family_slots<E: Environment>(
     let stack = config.frames.unwrap_or_default().stack;
     let slots = made.into_iter().enumerate().map(|(env, (options, assets))| {
         let number = config.first_env + env;
-        let seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
-        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack)
+        let mut seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        if config.independent_episodes {
+            seeds = seeds.independent(number, unseeded);
+        }
+        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack, config.independent_episodes)
     });
     Ok(FamilySlots { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
 }
@@ -291,8 +300,16 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
         Ok(())
     }
 
+    fn progress(&self, env: usize) -> Vec<Progress> {
+        self.slots[env].env.progress()
+    }
+
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
         view::ground_truth_view(&mut self.slots[env].env, out);
+    }
+
+    fn align_ground_truth_view(&mut self, env: usize) {
+        self.slots[env].env.align_ground_truth();
     }
 }
 

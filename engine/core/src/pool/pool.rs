@@ -15,7 +15,7 @@ use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
 use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
-use crate::envs::{self, EnvSpec, Family, SCREEN};
+use crate::envs::{self, EnvSpec, Family, Progress, SCREEN};
 use crate::raster::PixelFormat;
 
 /// Environments of one id in lockstep.
@@ -337,6 +337,20 @@ impl Pool {
         if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnv { given: env, num_envs }) }
     }
 
+    /// How far the episode of one environment is, for a person who watches: commands, tiles, coins, health.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
+    pub fn progress(&self, env: usize) -> Result<Vec<Progress>, PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => Err(PoolError::NotReset),
+            _ if env >= num_envs => Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ => Ok(self.slots.progress(env)),
+        }
+    }
+
     /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,
     /// indexed \[row\]\[column\]\[channel\]. `out` must have [`VIEW_BYTES`] bytes.
     ///
@@ -350,6 +364,23 @@ impl Pool {
             _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
             _ if out.len() != VIEW_BYTES => return Err(PoolError::ViewSize { given: out.len() }),
             _ => self.slots.ground_truth_view(env, out),
+        }
+        Ok(())
+    }
+
+    /// Sets the animations of an environment's ground-truth view to where they are when [`ground_truth_view`](Self::ground_truth_view)
+    /// was called once for each observation of the episode before the current one. The next view is then the current step's,
+    /// whatever was viewed before. Observations do not depend on it.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
+    pub fn align_ground_truth_view(&mut self, env: usize) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => return Err(PoolError::NotReset),
+            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ => self.slots.align_ground_truth_view(env),
         }
         Ok(())
     }

@@ -1,18 +1,21 @@
 //! The format of recorded episodes.
 
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
+use flate2::Compression;
 use flate2::read::GzDecoder;
-use serde::Deserialize;
+use flate2::write::GzEncoder;
+use serde::ser::SerializeTuple;
+use serde::{Deserialize, Serialize, Serializer};
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
 use crate::pool::PoolError;
 
 /// One recorded environment object.
-#[derive(Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct Trace {
     /// Environment id.
     pub env: String,
@@ -22,12 +25,12 @@ pub struct Trace {
     pub episodes: Vec<Episode>,
     /// Number of steps after which the recording of an episode stops if it has not ended; by default 700, and 200 in a trace with
     /// ground-truth views, as the reference traces were recorded.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_steps: Option<usize>,
 }
 
 /// One recorded episode.
-#[derive(Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct Episode {
     /// Seed of the reset; `None` continues the generator of the episode before.
     pub seed: Option<u64>,
@@ -36,14 +39,14 @@ pub struct Episode {
     /// The reset's info.
     pub reset_info: Map<String, Json>,
     /// The first vector observation; empty where there is none.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub reset_vector: Vec<f32>,
     /// The steps from the first to the last.
     pub steps: Vec<Step>,
 }
 
 /// One recorded step.
-#[derive(Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize)]
 #[serde(from = "StepFields")]
 pub struct Step {
     /// One number for each branch of the action space.
@@ -92,6 +95,25 @@ impl From<StepFields> for Step {
     }
 }
 
+/// In the form of the file: a list, with the action as a number where it is one.
+impl Serialize for Step {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut list = serializer.serialize_tuple(if self.render_crc.is_some() { 6 } else { 5 })?;
+        match self.action.as_slice() {
+            [action] => list.serialize_element(action)?,
+            actions => list.serialize_element(actions)?,
+        }
+        list.serialize_element(&self.reward)?;
+        list.serialize_element(&self.done)?;
+        list.serialize_element(&self.crc)?;
+        list.serialize_element(&self.info)?;
+        if let Some(crc) = &self.render_crc {
+            list.serialize_element(crc)?;
+        }
+        list.end()
+    }
+}
+
 impl Trace {
     /// Reads a trace file, gzipped JSON.
     ///
@@ -99,10 +121,29 @@ impl Trace {
     ///
     /// [`TraceError::Open`], [`TraceError::Format`], [`TraceError::Empty`] or [`TraceError::Truncated`].
     pub fn open(path: &Path) -> Result<Self, TraceError> {
-        let file = File::open(path).map_err(TraceError::Open)?;
+        Self::read(File::open(path).map_err(TraceError::Open)?)
+    }
+
+    /// As [`open`](Self::open), from any source of the file's bytes.
+    ///
+    /// # Errors
+    ///
+    /// [`TraceError::Format`], [`TraceError::Empty`] or [`TraceError::Truncated`].
+    pub fn read(file: impl Read) -> Result<Self, TraceError> {
         let trace: Self = serde_json::from_reader(BufReader::new(GzDecoder::new(file))).map_err(TraceError::Format)?;
         trace.check_complete()?;
         Ok(trace)
+    }
+
+    /// Writes the trace as a file, gzipped JSON.
+    ///
+    /// # Errors
+    ///
+    /// If `file` cannot be written.
+    pub fn write(&self, file: impl Write) -> io::Result<()> {
+        let mut encoder = GzEncoder::new(file, Compression::best());
+        serde_json::to_writer(&mut encoder, self)?;
+        encoder.finish()?.flush()
     }
 
     /// Checks that no episode lacks its last steps: each has ended, or has as many steps as are recorded of an episode at most.

@@ -1,4 +1,4 @@
-//! Recorded episodes of the original: their format, and their replay in this engine.
+//! Recorded episodes of the original: their format, their replay in this engine, and recordings of this engine in that format.
 //!
 //! A trace file is gzipped JSON: one environment object of the original that plays several episodes in a row.
 //!
@@ -12,7 +12,9 @@
 //! vector observation where there is one. A step may end with a sixth element, the CRC-32 of the ground-truth view.
 
 mod format;
+mod record;
 mod replay;
 
 pub use format::{Episode, Step, Trace, TraceError};
+pub use record::Recorder;
 pub use replay::{Difference, Replay, replay};

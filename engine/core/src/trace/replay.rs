@@ -7,7 +7,7 @@ use serde_json::{Map, Value as Json};
 use super::format::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
 use crate::envs::view::VIEW_BYTES;
-use crate::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use crate::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 
 /// The outcome of a replay.
 #[derive(Debug, Default)]
@@ -86,6 +86,8 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
         options: ResetOptions::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
         check_drawing: true,
+        // Only for a first episode without a seed, whose own is unknown. Entropy is not to be had everywhere.
+        seeding: Seeding::Continue { seed: Some(0) },
         ..PoolConfig::new(&trace.env, 1)
     };
     let mut pool = Pool::new(&config, &Threads::new(1)?)?;
@@ -120,8 +122,8 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
     Ok(replay)
 }
 
-/// The info dictionary in the original's form.
-fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static str, Vec<f64>)> {
+/// The info dictionary in the original's form, of the pool's only environment.
+pub(super) fn info(pool: &Pool, blocks: &[Block], done: bool) -> Vec<(&'static str, Vec<f64>)> {
     let batch = Batch::new(pool.layout(), blocks);
     let mut info = Vec::new();
     let ground_truth = batch.ground_truth();

@@ -26,6 +26,7 @@ pub use state::State;
 use super::character_sprites::CharacterSprites;
 use super::environment::{Environment, InvalidState, Transition};
 use super::parameters::ResetParameters;
+use super::progress::Progress;
 use crate::random::Generator;
 use crate::raster::Canvas;
 use state::DisplayedCharacter;
@@ -88,6 +89,10 @@ impl Environment for MortarMayhem {
         self.assets.draw_ground_truth(&mut self.state, &self.earlier_sprites, canvas);
     }
 
+    fn align_ground_truth(&mut self) {
+        self.state.align_view_display();
+    }
+
     fn vector_observation(&self, out: &mut [f32]) {
         out.fill(0.0);
         for (one_hot, command) in out.chunks_exact_mut(COMMANDS).zip(&self.state.commands) {
@@ -116,6 +121,10 @@ impl Environment for MortarMayhem {
         self.earlier_sprites = assets.displayed_sprites(&state);
         self.state = state;
         Ok(())
+    }
+
+    fn progress(&self) -> Vec<Progress> {
+        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {

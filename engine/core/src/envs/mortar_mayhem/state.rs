@@ -7,6 +7,7 @@ use super::config::Config;
 use super::display_schedule::DisplaySchedule;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_DURATION, Parameters};
 use crate::envs::character::Character;
+use crate::envs::progress::Progress;
 
 /// The character that frames show after the first frame of an episode.
 ///
@@ -125,6 +126,16 @@ impl State {
         match &self.displayed {
             DisplayedCharacter::Earlier { character, .. } => character,
             DisplayedCharacter::Initial | DisplayedCharacter::Current => &self.agent,
+        }
+    }
+
+    /// Commands executed, and of how many.
+    pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
+        let (executed, sequence) = (self.total_completed as f64, self.commands.len() as f64);
+        if config.variant.endless {
+            vec![Progress::count("commands", executed), Progress::count("commands in the sequence", sequence)]
+        } else {
+            vec![Progress::share("commands", executed, sequence)]
         }
     }
 

@@ -128,6 +128,11 @@ impl EndlessState {
         };
     }
 
+    /// Steps that are left to make progress.
+    pub(super) fn stamina_left(&self) -> i64 {
+        self.stamina
+    }
+
     /// Restores all stamina.
     pub(super) fn restore_stamina(&mut self, stamina: i64) {
         self.stamina = stamina;

@@ -40,6 +40,7 @@ pub use state::State;
 
 use super::environment::{Environment, InvalidState, Transition};
 use super::parameters::ResetParameters;
+use super::progress::Progress;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
@@ -117,6 +118,10 @@ impl Environment for MysteryPath {
         self.assets = Arc::clone(assets);
         self.state = state;
         Ok(())
+    }
+
+    fn progress(&self) -> Vec<Progress> {
+        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {

@@ -2,11 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::config::tile_at;
+use super::config::{Config, tile_at};
 use super::endless::EndlessState;
+use super::parameters::Variant;
 use super::path::Tile;
 use super::route::Route;
 use crate::envs::character::Character;
+use crate::envs::progress::Progress;
 
 /// Everything that changes during play.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -40,6 +42,16 @@ impl State {
             && self.cross.is_none_or(|(x, y)| x.abs_diff(0) < NEAR as u32 && y.abs_diff(0) < NEAR as u32)
             && [self.fails, self.tiles_visited].iter().all(|count| *count < u32::MAX / 2)
             && (0..i64::MAX / 2).contains(&self.steps)
+    }
+
+    /// Tiles of the path that the agent was on, and falls.
+    pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
+        let mut progress = vec![Progress::count("tiles", self.tiles_visited), Progress::count("falls", self.fails)];
+        if config.variant == Variant::Endless {
+            let of = config.parameters.stamina_level as f64;
+            progress.push(Progress::share("stamina", self.endless.stamina_left() as f64, of));
+        }
+        progress
     }
 
     /// The final info of the finite ids: success, and the number of falls.

@@ -57,6 +57,7 @@ pub use state::State;
 
 use super::environment::{Environment, InvalidState, Transition};
 use super::parameters::ResetParameters;
+use super::progress::Progress;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
@@ -133,6 +134,10 @@ impl Environment for SearingSpotlights {
         self.assets = Arc::clone(assets);
         self.state = state;
         Ok(())
+    }
+
+    fn progress(&self) -> Vec<Progress> {
+        self.state.progress(&self.assets.config)
     }
 
     fn info(&self, out: &mut [f64]) {

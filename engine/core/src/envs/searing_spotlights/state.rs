@@ -3,10 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::circle::Circle;
-use super::config::MAX_COORDINATE;
+use super::config::{Config, MAX_COORDINATE};
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
 use super::spotlight::Spotlight;
 use crate::envs::character::Character;
+use crate::envs::progress::Progress;
 use crate::envs::screen::SCREEN;
 
 /// The background of the screen.
@@ -140,6 +141,16 @@ impl State {
     /// The share of health points that is left.
     pub(super) fn health_share(&self, parameters: &Parameters) -> f64 {
         self.health / parameters.agent_health
+    }
+
+    /// Coins, and health points.
+    pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
+        let coins = self.coins_collected;
+        let coins = match config.variant.endless {
+            true => Progress::count("coins", coins),
+            false => Progress::share("coins", coins, self.num_coins as f64),
+        };
+        vec![coins, Progress::share("health", self.health, config.parameters.agent_health)]
     }
 
     /// The final info of the finite id: share of health, share of coins, success. The share of coins is NaN without

@@ -1,0 +1,212 @@
+// The page: the engine, the episode, the wall, and the address that names them.
+
+import { Engine } from "./engine.js";
+import { ParameterForm } from "./form.js";
+import { episodeLink, readLink, wallLink } from "./link.js";
+import { Play } from "./play.js";
+import { Wall } from "./wall.js";
+
+const $ = (id) => document.getElementById(id);
+const FIRST = "MortarMayhem-v0";
+
+function say(text, isNote = false) {
+  $("message").textContent = text;
+  $("message").classList.toggle("note", isNote);
+  $("message").hidden = text === "";
+}
+
+const report = (error) => say(error.message);
+
+/** One of the seeds that the paper trains on. */
+const randomSeed = () => String(crypto.getRandomValues(new Uint32Array(1))[0] % 100_000);
+
+class App {
+  constructor(engine) {
+    this.engine = engine;
+    this.specs = engine.request("specs");
+    this.form = new ParameterForm($("fields"), (options) => engine.request({ check: { id: $("environment").value, options } }));
+    this.play = new Play(engine, this.specs, { changed: (state) => this.#playing(state), report });
+    this.wall = new Wall(engine, this.specs, {
+      changed: (wall) => this.#address(wallLink(wall)),
+      play: (id) => this.start({ id, options: {}, seed: randomSeed() }),
+      report,
+    });
+    this.#environments();
+    this.#listen();
+  }
+
+  /** Starts what the address names. */
+  follow() {
+    const link = readLink(location.hash);
+    if (link.wall !== undefined) return this.showWall(link);
+    this.start({ id: link.id ?? FIRST, options: link.options, seed: link.seed ?? randomSeed() });
+  }
+
+  /** Starts an episode, or says why not. */
+  start(episode) {
+    this.#view("play");
+    say("");
+    try {
+      this.play.start(episode);
+    } catch (error) {
+      report(error);
+      if (!this.play.state) this.play.start({ id: FIRST, options: {}, seed: randomSeed() });
+    }
+  }
+
+  showWall(link) {
+    this.#view("wall");
+    say("");
+    this.#allOption(true);
+    this.wall.start(link);
+    if (this.wall.id) $("environment").value = this.wall.id;
+  }
+
+  #environments() {
+    const option = (id) => Object.assign(document.createElement("option"), { value: id, textContent: id });
+    $("environment").replaceChildren(...this.specs.map((spec) => option(spec.id)));
+  }
+
+  #allOption(wanted) {
+    const all = $("environment").querySelector("[value=all]");
+    if (wanted && !all) $("environment").prepend(Object.assign(document.createElement("option"), { value: "all", textContent: "All ten" }));
+    if (!wanted) all?.remove();
+  }
+
+  #view(name) {
+    const play = name === "play";
+    $("play").hidden = !play;
+    $("wall").hidden = play;
+    $("to-play").setAttribute("aria-pressed", String(play));
+    $("to-wall").setAttribute("aria-pressed", String(!play));
+    this.play.active = play;
+    if (play) {
+      this.wall.stop();
+      this.#allOption(false);
+    } else {
+      this.play.stop();
+    }
+  }
+
+  #playing(state) {
+    $("environment").value = state.id;
+    $("seed").value = state.seed ?? "";
+    document.title = `${state.id} – Endless Gym`;
+    this.form.show(this.play.spec, state.options);
+    if (Object.keys(state.options).length > 0) $("parameters").open = true;
+    this.#address(episodeLink({ ...state, seed: state.seed ?? "0" }));
+  }
+
+  #address(hash) {
+    if (location.hash !== hash) history.replaceState(null, "", hash);
+  }
+
+  #listen() {
+    addEventListener("hashchange", () => this.follow());
+    $("to-play").addEventListener("click", () => {
+      const id = this.wall.id && this.wall.id !== "all" ? this.wall.id : this.play.state?.id ?? FIRST;
+      if (this.play.state?.id !== id) return this.start({ id, options: {}, seed: randomSeed() });
+      this.#view("play");
+      this.#playing(this.play.state);
+    });
+    $("to-wall").addEventListener("click", () => this.showWall({ wall: "all", count: "100", by: "expert" }));
+    $("environment").addEventListener("change", () => {
+      const id = $("environment").value;
+      if (this.play.active) this.start({ id, options: {}, seed: $("seed").value || randomSeed() });
+      else this.wall.start({ wall: id, count: $("wall-count").value, by: $("wall-by").value });
+      // The arrow keys are for playing.
+      $("environment").blur();
+    });
+    $("seed").addEventListener("change", () => this.#restart());
+    $("form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#restart();
+    });
+    $("defaults").addEventListener("click", () => {
+      this.form.show(this.play.spec, {});
+      this.#restart();
+    });
+    $("save").addEventListener("click", () => this.#save());
+    $("open").addEventListener("click", () => $("file").click());
+    $("file").addEventListener("change", () => this.#open($("file").files[0]));
+    addEventListener("dragover", (event) => event.preventDefault());
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      this.#open(event.dataTransfer.files[0]);
+    });
+    $("copy").addEventListener("click", () => this.#copy());
+    $("theme").addEventListener("click", () => {
+      const dark = getComputedStyle(document.documentElement).colorScheme.startsWith("dark") ||
+        (!document.documentElement.dataset.theme && matchMedia("(prefers-color-scheme: dark)").matches);
+      setTheme(dark ? "light" : "dark");
+    });
+  }
+
+  #restart() {
+    const seed = $("seed").value;
+    this.start({ id: $("environment").value, options: this.form.options(), seed });
+    // What was typed stays, also where the engine refuses it.
+    if (!$("message").hidden) $("seed").value = seed;
+  }
+
+  #save() {
+    const { bytes, name } = this.play.recording();
+    const url = URL.createObjectURL(new Blob([bytes], { type: "application/gzip" }));
+    Object.assign(document.createElement("a"), { href: url, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 10_000);
+    say(`Saved as ${name}; \`endless verify ${name}\` replays it.`, true);
+  }
+
+  async #open(file) {
+    $("file").value = "";
+    if (!file) return;
+    try {
+      const { episodes, steps, differences, first } = this.play.open(new Uint8Array(await file.arrayBuffer()));
+      this.#view("play");
+      const verdict = differences === 0 ? "replayed without a difference" : `${differences} differences, the first in ${first}`;
+      say(`${file.name}: ${count(episodes, "episode")}, ${count(steps, "step")}, ${verdict}.`, differences === 0);
+    } catch (error) {
+      say(`${file.name}: ${error.message}`);
+    }
+  }
+
+  async #copy() {
+    try {
+      await navigator.clipboard.writeText(location.href);
+      say("The link to this episode is in the clipboard.", true);
+    } catch {
+      say(`The clipboard is not to be had; the link is ${location.href}`);
+    }
+  }
+}
+
+function count(number, what) {
+  return `${number} ${what}${number === 1 ? "" : "s"}`;
+}
+
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  try {
+    localStorage.setItem("theme", theme);
+  } catch {
+    // A browser may refuse to store; the choice then lasts until the page is left.
+  }
+}
+
+try {
+  const theme = localStorage.getItem("theme");
+  if (theme === "light" || theme === "dark") document.documentElement.dataset.theme = theme;
+} catch {
+  // As above.
+}
+
+try {
+  const app = new App(await Engine.load());
+  // For tests, and for the curious.
+  globalThis.endless = app;
+  app.follow();
+} catch (error) {
+  report(error);
+}
+
+if ("serviceWorker" in navigator) navigator.serviceWorker.register("worker.js").catch(() => {});

@@ -1,0 +1,81 @@
+// The engine: WebAssembly behind a few functions. bindings/web/src/lib.rs describes its side.
+
+const JSON_REPLY = 0;
+const ERROR_REPLY = 1;
+
+/** An error with the engine's own text. */
+export class EngineError extends Error {}
+
+export class Engine {
+  #wasm;
+
+  /** Loads the engine from beside the page. */
+  static async load(url = new URL("engine.wasm", import.meta.url)) {
+    const response = await fetch(url);
+    if (!response.ok) throw new EngineError(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
+    const { instance } = await WebAssembly.instantiate(await response.arrayBuffer());
+    return new Engine(instance.exports);
+  }
+
+  constructor(wasm) {
+    this.#wasm = wasm;
+  }
+
+  /** Carries out a request of src/request.rs. Returns its answer: JSON, or bytes. */
+  request(request) {
+    this.#put(new TextEncoder().encode(JSON.stringify(request)));
+    return this.#reply(() => this.#wasm.call());
+  }
+
+  /** Opens the file of a trace, replays it and makes it the game. */
+  open(bytes) {
+    this.#put(bytes);
+    return this.#reply(() => this.#wasm.open());
+  }
+
+  /** Steps every environment of the wall. */
+  stepWall(count) {
+    return this.#reply(() => this.#wasm.step_wall(count));
+  }
+
+  /** The game's observation, as a picture of 84x84. */
+  observation() {
+    return this.#picture(this.#wasm.observation(), 84, 84);
+  }
+
+  /** The game's ground-truth view, as a picture of 84x84. */
+  view() {
+    return this.#picture(this.#wasm.view(), 84, 84);
+  }
+
+  /** The wall, as a picture of the size that the answer to its request states. */
+  wall(width, height) {
+    return this.#picture(this.#wasm.draw_wall(), width, height);
+  }
+
+  #put(bytes) {
+    const place = this.#wasm.input(bytes.length);
+    new Uint8Array(this.#wasm.memory.buffer, place, bytes.length).set(bytes);
+  }
+
+  #output() {
+    return new Uint8Array(this.#wasm.memory.buffer, this.#wasm.output(), this.#wasm.output_length());
+  }
+
+  #reply(call) {
+    let kind;
+    try {
+      kind = call();
+    } catch (trap) {
+      const said = new TextDecoder().decode(this.#output());
+      throw new Error(`the engine failed: ${said || trap.message}; load the page again`);
+    }
+    const output = this.#output();
+    if (kind === ERROR_REPLY) throw new EngineError(new TextDecoder().decode(output));
+    return kind === JSON_REPLY ? JSON.parse(new TextDecoder().decode(output)) : output.slice();
+  }
+
+  #picture(place, width, height) {
+    return new ImageData(new Uint8ClampedArray(this.#wasm.memory.buffer, place, width * height * 4), width, height);
+  }
+}

@@ -1,0 +1,81 @@
+// The reset parameters as a form, made from the engine's table.
+
+/** Makes the fields of an environment in `place`. `check(options)` throws the engine's error. */
+export class ParameterForm {
+  #fields = new Map();
+
+  constructor(place, check) {
+    this.place = place;
+    this.check = check;
+  }
+
+  /** Shows the parameters of `spec` with the given texts, and the defaults of the rest. */
+  show(spec, options) {
+    this.#fields.clear();
+    this.place.replaceChildren(...spec.parameters.map((parameter) => this.#field(parameter, options[parameter.name])));
+    this.validate();
+  }
+
+  /** The texts that differ from the defaults. */
+  options() {
+    const options = {};
+    for (const [name, { parameter, input }] of this.#fields) {
+      const text = input.type === "checkbox" ? String(input.checked) : input.value.trim();
+      if (text !== parameter.default_text && text !== "") options[name] = text;
+    }
+    return options;
+  }
+
+  /** Shows at each field what the engine says about it. Returns whether all are valid. */
+  validate() {
+    let valid = true;
+    const options = this.options();
+    for (const [name, { input, error }] of this.#fields) {
+      let message = "";
+      if (name in options) {
+        try {
+          this.check({ [name]: options[name] });
+        } catch (refused) {
+          message = refused.message;
+        }
+      }
+      error.textContent = message && `✕ ${message}`;
+      input.setAttribute("aria-invalid", String(message !== ""));
+      valid &&= message === "";
+    }
+    return valid;
+  }
+
+  #field(parameter, text) {
+    const field = document.createElement("div");
+    field.className = "field";
+    const id = `parameter-${parameter.name}`;
+    const label = document.createElement("label");
+    label.htmlFor = id;
+    label.textContent = parameter.name;
+    const input = document.createElement("input");
+    input.id = id;
+    input.name = parameter.name;
+    input.autocomplete = "off";
+    input.spellcheck = false;
+    if (parameter.type === "bool") {
+      input.type = "checkbox";
+      input.checked = (text ?? parameter.default_text) === "true";
+    } else {
+      input.value = text ?? parameter.default_text;
+      if (parameter.type !== "int_list") input.inputMode = "decimal";
+    }
+    const hint = document.createElement("p");
+    hint.className = "hint";
+    hint.id = `${id}-hint`;
+    hint.textContent = `${parameter.description} Default ${parameter.default_text}; ${parameter.allowed}.`;
+    const error = document.createElement("p");
+    error.className = "error";
+    error.id = `${id}-error`;
+    input.setAttribute("aria-describedby", `${hint.id} ${error.id}`);
+    input.addEventListener("input", () => this.validate());
+    field.append(label, input, hint, error);
+    this.#fields.set(parameter.name, { parameter, input, error });
+    return field;
+  }
+}

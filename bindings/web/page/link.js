@@ -1,0 +1,26 @@
+// The address: environment, reset parameters and seed, or a wall.
+
+/** What an address asks for. */
+export function readLink(hash) {
+  const fields = new URLSearchParams(hash.replace(/^#/, ""));
+  const take = (name) => {
+    const value = fields.get(name);
+    fields.delete(name);
+    return value;
+  };
+  const wall = take("wall");
+  if (wall !== null) return { wall, count: take("count"), by: take("by") };
+  const id = take("env");
+  const seed = take("seed");
+  return { id, seed, options: Object.fromEntries(fields) };
+}
+
+/** The address of an episode. */
+export function episodeLink({ id, seed, options }) {
+  return "#" + new URLSearchParams({ env: id, seed, ...options });
+}
+
+/** The address of a wall. */
+export function wallLink({ wall, count, by }) {
+  return "#" + new URLSearchParams({ wall, count, by });
+}

@@ -1,0 +1,43 @@
+// A clock that calls for steps at a pace, once for each frame of the screen.
+
+/** Most steps between two frames of the screen; what the machine cannot keep up with is dropped. */
+const MOST = 200;
+
+export class Pace {
+  #last = null;
+  #due = 0;
+  #running = false;
+
+  /** Calls `steps(count)` while it runs. */
+  constructor(stepsPerSecond, steps) {
+    this.stepsPerSecond = stepsPerSecond;
+    this.steps = steps;
+  }
+
+  get running() {
+    return this.#running;
+  }
+
+  start() {
+    if (this.#running) return;
+    this.#running = true;
+    this.#last = null;
+    // The first step does not wait.
+    this.#due = 1;
+    requestAnimationFrame((now) => this.#frame(now));
+  }
+
+  stop() {
+    this.#running = false;
+  }
+
+  #frame(now) {
+    if (!this.#running) return;
+    if (this.#last !== null) this.#due += ((now - this.#last) / 1000) * this.stepsPerSecond;
+    this.#last = now;
+    const count = Math.min(Math.floor(this.#due), MOST);
+    this.#due = Math.min(this.#due - count, 1);
+    if (count > 0) this.steps(count);
+    requestAnimationFrame((next) => this.#frame(next));
+  }
+}

@@ -1,0 +1,297 @@
+// The episode on the screen: who plays it, at which pace, and what is shown of it.
+
+import { Directions, isTyping } from "./keys.js";
+import { Pace } from "./pace.js";
+import { enable, tone } from "./sound.js";
+import { actionFor, commandsOf, directionsOf, steering, TASKS } from "./tasks.js";
+
+const $ = (id) => document.getElementById(id);
+
+const PADS = {
+  8: [["left up", "↖"], ["up", "↑"], ["right up", "↗"], ["left", "←"], null, ["right", "→"], ["left down", "↙"], ["down", "↓"], ["right down", "↘"]],
+  turn: [null, ["up", "↑"], null, ["left", "↺"], null, ["right", "↻"], null, null, null],
+  ahead: [null, ["up", "↑"], null, null, null, ["right", "→"], null, ["down", "↓"], null],
+};
+
+const DIRECTION_SIGNS = { left: "←", right: "→", up: "↑", down: "↓" };
+
+// A phone has no keys.
+const TOUCH = matchMedia("(pointer: coarse)").matches;
+const GO = TOUCH ? "A tap" : "Space";
+const AGAIN = TOUCH ? "" : "Enter: next seed. R: again.";
+
+export class Play {
+  /** `changed(episode)` is called when an episode starts, `report(error)` with what the engine refuses. */
+  constructor(engine, specs, { changed, report }) {
+    this.engine = engine;
+    this.specs = specs;
+    this.changed = changed;
+    this.report = report;
+    this.state = null;
+    this.player = "person";
+    this.directions = new Directions(() => this.#takeOver());
+    this.directions.attach($("pad"));
+    this.pace = new Pace(25, (count) => this.#steps(count));
+    this.active = true;
+    this.#listen();
+  }
+
+  get spec() {
+    return this.specs.find((spec) => spec.id === this.state?.id);
+  }
+
+  /** Starts an episode of the given environment. Throws what the engine refuses. */
+  start({ id, options, seed }, player = "person") {
+    const state = this.engine.request({ start: { id, options, seed } });
+    this.player = player;
+    this.#begin(state);
+    if (player === "expert") this.play();
+  }
+
+  /** Opens a trace's file. */
+  open(bytes) {
+    const { state, ...outcome } = this.engine.open(bytes);
+    this.player = "trace";
+    this.file = bytes;
+    this.#begin(state);
+    return outcome;
+  }
+
+  /** Continues where it stands. */
+  play() {
+    if (!this.state || this.#over()) return;
+    this.pace.start();
+    this.#show();
+  }
+
+  stop() {
+    this.pace.stop();
+    this.#show();
+  }
+
+  /** The same episode again. */
+  restart() {
+    if (!this.state) return;
+    if (this.player === "trace") this.#attempt(() => this.open(this.file));
+    else this.#attempt(() => this.start(this.state, this.player));
+  }
+
+  /** The episode of a seed that is `by` larger. */
+  otherSeed(by) {
+    if (!this.state) return;
+    const seed = BigInt.asUintN(64, BigInt(this.state.seed ?? 0) + BigInt(by)).toString();
+    this.#attempt(() => this.start({ ...this.state, seed }, this.player === "expert" ? "expert" : "person"));
+  }
+
+  /** Lets the expert play, which remembers an episode from its start, or ends that. */
+  toggleExpert() {
+    if (!this.state) return;
+    if (this.player === "expert") {
+      this.player = "person";
+      return this.stop();
+    }
+    // A recording may start without a seed.
+    this.#attempt(() => this.start({ ...this.state, seed: this.state.seed ?? "0" }, "expert"));
+  }
+
+  /** Plays one step and stops. */
+  oneStep() {
+    if (!this.state || this.#over()) return;
+    this.pace.stop();
+    this.#steps(1);
+  }
+
+  /** The recording as the file of a trace, and its name. */
+  recording() {
+    const { id, seed, length } = this.state;
+    return { bytes: this.engine.request("save"), name: `${id}.seed-${seed ?? "none"}.${length}-steps.json.gz` };
+  }
+
+  setPace(stepsPerSecond) {
+    if (stepsPerSecond > 0) this.pace.stepsPerSecond = stepsPerSecond;
+  }
+
+  #begin(state) {
+    const other = this.state?.id !== state.id;
+    this.pace.stop();
+    this.state = state;
+    this.directions.clear();
+    if (other) {
+      $("task").textContent = TASKS[state.id] ?? this.spec.summary;
+      this.#pad();
+      this.#originalPace();
+    }
+    this.changed(state);
+    this.#show();
+    $("view").setAttribute("aria-label", `Ground truth of ${state.id}`);
+  }
+
+  #originalPace() {
+    $("pace").value = this.spec.render_fps;
+    this.setPace(this.spec.render_fps);
+  }
+
+  /** Whether there is nothing more to play. */
+  #over() {
+    if (!this.state) return true;
+    return this.player === "trace" ? this.state.recording.over : this.state.done;
+  }
+
+  #takeOver() {
+    if (!this.active || !this.state || this.state.done) return;
+    if (this.player !== "person") this.player = "person";
+    this.play();
+  }
+
+  #steps(count) {
+    this.#attempt(() => {
+      for (let step = 0; step < count && !this.#over(); step += 1) {
+        if (this.player === "expert") this.state = this.engine.request("step_of_expert");
+        else if (this.player === "trace") this.state = this.engine.request("step_of_trace");
+        else {
+          const action = actionFor(this.spec, this.directions.take());
+          this.state = this.engine.request({ step: { action } });
+        }
+        this.#sound();
+      }
+    });
+    if (this.#over()) this.pace.stop();
+    this.#show();
+  }
+
+  #sound() {
+    if (!$("sound").checked) return;
+    if (this.state.done) tone(this.state.return > 0 ? 330 : 165, 0.3);
+    else if (this.state.reward > 0) tone(660, 0.12);
+    else if (this.state.reward < 0) tone(165, 0.12);
+  }
+
+  #attempt(action) {
+    try {
+      action();
+    } catch (error) {
+      this.pace.stop();
+      this.report(error);
+    }
+  }
+
+  #show() {
+    const { state, spec } = this;
+    if (!state) return;
+    $("observation").getContext("2d").putImageData(this.engine.observation(), 0, 0);
+    $("view").getContext("2d").putImageData(this.engine.view(), 0, 0);
+    this.#numbers();
+    const { arrows, words } = commandsOf(state.vector);
+    $("commands").hidden = state.vector.length === 0;
+    $("arrows").textContent = arrows;
+    $("words").textContent = words;
+    const running = this.pace.running;
+    $("pause").textContent = running ? "Pause" : state.length === 0 ? "Start" : "Continue";
+    $("pause").disabled = $("step").disabled = this.#over();
+    $("expert").setAttribute("aria-pressed", String(this.player === "expert"));
+    $("status").textContent = this.#said(spec, state);
+    const overlay = this.#overlay();
+    $("overlay").hidden = overlay === "";
+    $("overlay").textContent = overlay;
+  }
+
+  #said(spec, state) {
+    const signs = directionsOf(spec, state.action).map((direction) => DIRECTION_SIGNS[direction]).join(" ") || "nothing";
+    const action = state.length > 0 ? `last action ${signs}` : "no step yet";
+    if (this.player === "expert") return `The expert plays; ${action}. A direction key takes over.`;
+    if (this.player === "trace") {
+      const { episode, episodes, steps } = state.recording;
+      return `Recording, episode ${episode + 1} of ${episodes}, step ${state.length} of ${steps}; ${action}. A direction key takes over.`;
+    }
+    return `You play; ${action}.`;
+  }
+
+  #overlay() {
+    const { state } = this;
+    if (this.#over() && state.done) {
+      const success = state.info?.success === 1 && state.return > 0 ? "Done" : "Episode over";
+      return `${success}: return ${round(state.return)} in ${state.length} steps. ${AGAIN}`;
+    }
+    if (this.#over()) return "The recording ends here.";
+    if (state.length === 0 && !this.pace.running) {
+      return this.player === "trace" ? `${GO} replays the recording.` : `A direction starts, or ${TOUCH ? "a tap" : "Space"}.`;
+    }
+    return this.pace.running ? "" : `Paused. ${GO} continues.`;
+  }
+
+  #numbers() {
+    const { state } = this;
+    const rows = [
+      { name: "steps", value: state.length },
+      { name: "last reward", value: round(state.reward) },
+      { name: "return", value: round(state.return) },
+      ...state.progress,
+    ];
+    const list = $("numbers");
+    const names = rows.map((row) => row.name).join();
+    if (list.dataset.names !== names) {
+      list.dataset.names = names;
+      list.replaceChildren(...rows.map(({ name, of }) => {
+        const item = document.createElement("div");
+        item.append(Object.assign(document.createElement("dt"), { textContent: name }), document.createElement("dd"));
+        if (of != null) item.append(Object.assign(document.createElement("progress"), { ariaLabel: name }));
+        return item;
+      }));
+    }
+    rows.forEach(({ value, of }, index) => {
+      const [, number, bar] = list.children[index].children;
+      number.textContent = of == null ? round(value) : `${round(value)} of ${round(of)}`;
+      if (bar) Object.assign(bar, { max: Math.max(of, 1e-9), value: Math.min(Math.max(value, 0), of) });
+    });
+  }
+
+  #pad() {
+    const meaning = steering(this.spec);
+    const kind = this.spec.action_branches.length === 2 ? 8 : "left" in meaning ? "turn" : "ahead";
+    $("pad").replaceChildren(...PADS[kind].map((entry) => {
+      if (!entry) return document.createElement("span");
+      const [directions, sign] = entry;
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: sign, ariaLabel: directions });
+      button.dataset.directions = directions;
+      return button;
+    }));
+  }
+
+  #listen() {
+    $("pause").addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
+    $("observation").addEventListener("click", () => (this.pace.running ? this.stop() : this.play()));
+    $("step").addEventListener("click", () => this.oneStep());
+    $("restart").addEventListener("click", () => this.restart());
+    $("next").addEventListener("click", () => this.otherSeed(1));
+    $("expert").addEventListener("click", () => this.toggleExpert());
+    $("pace").addEventListener("input", () => this.setPace(Number($("pace").value)));
+    $("original-pace").addEventListener("click", () => this.spec && this.#originalPace());
+    $("sound").addEventListener("change", () => $("sound").checked && enable());
+    $("show-truth").addEventListener("change", (event) => {
+      event.target.closest("figure").classList.toggle("covered", !event.target.checked);
+    });
+    const keys = {
+      Space: () => (this.pace.running ? this.stop() : this.play()),
+      KeyN: () => this.oneStep(),
+      KeyR: () => this.restart(),
+      KeyE: () => this.toggleExpert(),
+      Enter: () => this.otherSeed(1),
+      PageDown: () => this.otherSeed(1),
+      PageUp: () => this.otherSeed(-1),
+    };
+    addEventListener("keydown", (event) => {
+      const action = keys[event.code];
+      if (!this.active || !action || event.ctrlKey || event.metaKey || event.altKey || isTyping(event.target)) return;
+      // Space and Enter belong to a button that has the focus.
+      const onControl = event.target instanceof Element && event.target.matches("button, summary, a");
+      if (onControl && (event.code === "Space" || event.code === "Enter")) return;
+      event.preventDefault();
+      action();
+    });
+  }
+}
+
+/** A number as people read it. */
+function round(value) {
+  return value === null ? "–" : String(Math.round(value * 1000) / 1000);
+}

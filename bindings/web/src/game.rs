@@ -1,0 +1,187 @@
+//! One environment that a person, its expert or a trace plays, with a recording.
+
+use endless_gym_core::batch::{Batch, Block, zeroed};
+use endless_gym_core::envs::view::VIEW_BYTES;
+use endless_gym_core::envs::{self, Expert};
+use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::trace::{Recorder, Trace};
+use serde_json::{Map, Value as Json, json};
+
+use crate::error::WebError;
+use crate::pixels::{RGBA_BYTES, put_observation, put_view};
+
+/// Who chooses the action of a step.
+pub enum Player {
+    Person(Vec<i32>),
+    Expert,
+    Trace,
+}
+
+pub struct Game {
+    pool: Pool,
+    blocks: Vec<Block>,
+    options: OptionMap,
+    seed: Option<u64>,
+    recorder: Recorder,
+    expert: Box<dyn Expert>,
+    /// The expert has seen every observation of the episode so far.
+    expert_is_in: bool,
+    action: Vec<i32>,
+    /// The trace that is replayed, and the number of the episode.
+    script: Option<(Trace, usize)>,
+    observation: Vec<u8>,
+    view: Vec<u8>,
+    magnified: Vec<u8>,
+}
+
+impl Game {
+    /// Starts an episode of a new environment, so that it follows from these arguments alone.
+    pub fn start(id: &str, options: OptionMap, seed: u64) -> Result<Self, WebError> {
+        Self::new(id, options, Some(seed), None)
+    }
+
+    /// Starts the first episode of a trace.
+    pub fn replay(trace: Trace) -> Result<Self, WebError> {
+        let (id, options) = (trace.env.clone(), trace.options.clone());
+        let seed = trace.episodes.first().and_then(|episode| episode.seed);
+        Self::new(&id, options, seed, Some((trace, 0)))
+    }
+
+    fn new(id: &str, options: OptionMap, seed: Option<u64>, script: Option<(Trace, usize)>) -> Result<Self, WebError> {
+        let config = PoolConfig {
+            options: ResetOptions::Shared(options.clone()),
+            autoreset: Autoreset::Disabled,
+            seeding: Seeding::Continue { seed: Some(0) },
+            features: true,
+            ..PoolConfig::new(id, 1)
+        };
+        let pool = Pool::new(&config, &Threads::new(1)?)?;
+        let blocks = zeroed(pool.layout().blocks());
+        let mut game = Game {
+            expert: envs::expert(pool.spec()),
+            expert_is_in: true,
+            action: vec![0; pool.spec().action_space.branches().len()],
+            recorder: Recorder::new(id, &options),
+            pool,
+            blocks,
+            options,
+            seed,
+            script,
+            observation: vec![0; RGBA_BYTES],
+            view: vec![0; RGBA_BYTES],
+            magnified: vec![0; VIEW_BYTES],
+        };
+        game.reset(seed)?;
+        Ok(game)
+    }
+
+    fn reset(&mut self, seed: Option<u64>) -> Result<(), WebError> {
+        self.seed = seed;
+        match seed {
+            Some(seed) => self.pool.reset(ResetRequest::Seed(seed), &mut self.blocks)?,
+            None => self.pool.reset(ResetRequest::All, &mut self.blocks)?,
+        }
+        self.recorder.reset(seed, &self.pool, &self.blocks);
+        self.expert.reset();
+        self.expert_is_in = true;
+        self.action.fill(0);
+        self.draw()
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        Batch::new(self.pool.layout(), &self.blocks)
+    }
+
+    /// Plays one step. After the last step of a trace's episode, a step of the trace starts its next one.
+    pub fn step(&mut self, player: Player) -> Result<(), WebError> {
+        match player {
+            Player::Person(action) => {
+                self.expert_is_in = false;
+                self.action = action;
+            }
+            Player::Expert if !self.expert_is_in => return Err(WebError::LateExpert),
+            Player::Expert => {
+                let batch = Batch::new(self.pool.layout(), &self.blocks);
+                self.expert.act(batch.features(), batch.vector_observation(), &mut self.action);
+            }
+            Player::Trace => {
+                let played = self.length();
+                let (trace, number) = self.script.as_mut().ok_or(WebError::NoScript)?;
+                match trace.episodes[*number].steps.get(played) {
+                    Some(step) => self.action.clone_from(&step.action),
+                    None => {
+                        let next = trace.episodes.get(*number + 1).ok_or(WebError::ScriptIsOver)?;
+                        let seed = next.seed;
+                        *number += 1;
+                        return self.reset(seed);
+                    }
+                }
+                self.expert_is_in = false;
+            }
+        }
+        self.pool.step(&self.action, &mut self.blocks)?;
+        self.recorder.step(&self.action, &self.pool, &self.blocks);
+        self.draw()
+    }
+
+    /// Steps of the episode.
+    fn length(&self) -> usize {
+        self.batch().episode_length()[0] as usize
+    }
+
+    /// Draws both pictures. The ground-truth view shows the next picture of a clue with each call, so one call a step.
+    fn draw(&mut self) -> Result<(), WebError> {
+        self.pool.ground_truth_view(0, &mut self.magnified)?;
+        put_view(&self.magnified, &mut self.view);
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        put_observation(batch.observation(), &mut self.observation, envs::SCREEN);
+        Ok(())
+    }
+
+    /// The observation, 84x84 RGBA.
+    pub fn observation(&self) -> &[u8] {
+        &self.observation
+    }
+
+    /// The ground-truth view, 84x84 RGBA.
+    pub fn view(&self) -> &[u8] {
+        &self.view
+    }
+
+    /// The recording, as the file of a trace.
+    pub fn file(&self) -> Result<Vec<u8>, WebError> {
+        let mut file = Vec::new();
+        self.recorder.write(&mut file)?;
+        Ok(file)
+    }
+
+    /// What the page shows beside the pictures.
+    pub fn state(&self) -> Result<Json, WebError> {
+        let batch = self.batch();
+        let done = batch.terminated()[0] == 1;
+        let columns = self.pool.spec().info.iter().zip(batch.info());
+        let info: Map<String, Json> = columns.map(|(column, value)| (column.name.to_owned(), json!(value))).collect();
+        let options: Map<String, Json> =
+            self.options.iter().map(|(name, value)| (name.clone(), value.to_string().into())).collect();
+        let recording = self.script.as_ref().map(|(trace, number)| {
+            let steps = trace.episodes[*number].steps.len();
+            let over = self.length() >= steps && number + 1 == trace.episodes.len();
+            json!({"episode": number, "episodes": trace.episodes.len(), "steps": steps, "over": over})
+        });
+        Ok(json!({
+            "id": self.pool.spec().id,
+            "options": options,
+            // As text: JavaScript's numbers do not have 64 bits.
+            "seed": self.seed.map(|seed| seed.to_string()),
+            "length": self.length(),
+            "reward": batch.reward()[0],
+            "return": batch.episode_return()[0],
+            "done": done,
+            "info": done.then_some(info),
+            "progress": self.pool.progress(0)?,
+            "action": self.action,
+            "vector": batch.vector_observation(),
+            "recording": recording,
+        }))
+    }
+}

@@ -1,0 +1,98 @@
+//! Environments of one id that play by themselves.
+
+use endless_gym_core::batch::{Batch, Block, zeroed};
+use endless_gym_core::envs::{self, Expert};
+use endless_gym_core::pool::{OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::random::Generator;
+use serde_json::{Value as Json, json};
+
+use crate::error::WebError;
+
+enum Policy {
+    /// One expert for each environment, and whether its next observation is an episode's first.
+    Experts(Vec<(Box<dyn Expert>, bool)>),
+    Random(Generator),
+}
+
+pub struct Group {
+    pool: Pool,
+    blocks: Vec<Block>,
+    policy: Policy,
+    actions: Vec<i32>,
+    episodes: u64,
+    returns: f64,
+    lengths: f64,
+}
+
+impl Group {
+    pub fn new(id: &str, num_envs: usize, options: OptionMap, expert: bool, seed: u64) -> Result<Self, WebError> {
+        let config = PoolConfig {
+            options: ResetOptions::Shared(options),
+            seeding: Seeding::Continue { seed: Some(seed) },
+            features: expert,
+            ..PoolConfig::new(id, num_envs)
+        };
+        let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::All, &mut blocks)?;
+        let spec = pool.spec();
+        let policy = match expert {
+            true => Policy::Experts((0..num_envs).map(|_| (envs::expert(spec), true)).collect()),
+            false => Policy::Random(Generator::from_seed(seed)),
+        };
+        let actions = vec![0; num_envs * spec.action_space.branches().len()];
+        Ok(Group { pool, blocks, policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 })
+    }
+
+    /// Steps every environment. An ended episode is followed by the next one in the step after.
+    pub fn step(&mut self) -> Result<(), WebError> {
+        let spec = self.pool.spec();
+        let branches = spec.action_space.branches();
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        let rows = self.actions.chunks_exact_mut(branches.len());
+        match &mut self.policy {
+            Policy::Random(random) => {
+                for row in rows {
+                    for (number, choices) in row.iter_mut().zip(branches) {
+                        *number = random.integers(0, i64::from(*choices)) as i32;
+                    }
+                }
+            }
+            Policy::Experts(experts) => {
+                let features = batch.features().chunks_exact(spec.features.len());
+                for (env, ((row, (expert, first)), features)) in rows.zip(experts).zip(features).enumerate() {
+                    if std::mem::replace(first, batch.terminated()[env] == 1) {
+                        expert.reset();
+                    }
+                    let width = spec.vector_observation;
+                    expert.act(features, &batch.vector_observation()[env * width..][..width], row);
+                }
+            }
+        }
+        self.pool.step(&self.actions, &mut self.blocks)?;
+        let batch = Batch::new(self.pool.layout(), &self.blocks);
+        for env in (0..batch.terminated().len()).filter(|env| batch.terminated()[*env] == 1) {
+            self.episodes += 1;
+            self.returns += batch.episode_return()[env];
+            self.lengths += f64::from(batch.episode_length()[env]);
+        }
+        Ok(())
+    }
+
+    /// The observations, one after the other.
+    pub fn observations(&self) -> impl Iterator<Item = &[u8]> {
+        Batch::new(self.pool.layout(), &self.blocks).observation().chunks_exact(envs::FRAME_BYTES)
+    }
+
+    /// Episodes so far, and the means of their returns and lengths.
+    pub fn state(&self) -> Json {
+        let mean = |sum: f64| (self.episodes > 0).then(|| sum / self.episodes as f64);
+        json!({
+            "id": self.pool.spec().id,
+            "num_envs": self.pool.layout().num_envs(),
+            "episodes": self.episodes,
+            "mean_return": mean(self.returns),
+            "mean_length": mean(self.lengths),
+        })
+    }
+}

@@ -1,0 +1,117 @@
+//! The core for the page: one game that a person, an expert or a trace plays, and a wall of many environments.
+//!
+//! The interface to JavaScript is a few functions that pass numbers. [`input`] makes room for a request, JSON or the bytes of a
+//! trace; [`call`] and [`open`] answer in [`output`], with JSON, an error's text or bytes. Pictures are read from the memory, RGBA,
+//! \[row\]\[column\]. No function takes a pointer, so nothing here is unsafe, and the page needs no generated code.
+
+mod error;
+mod game;
+mod group;
+mod pixels;
+mod request;
+mod wall;
+
+use std::cell::RefCell;
+
+use game::Game;
+use request::Request;
+use wall::Wall;
+
+/// What [`call`] and [`open`] return: the kind of bytes in [`output`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(u32)]
+enum Kind {
+    Json = 0,
+    Error = 1,
+    Bytes = 2,
+}
+
+#[derive(Default)]
+struct App {
+    game: Option<Game>,
+    wall: Option<Wall>,
+}
+
+thread_local! {
+    static APP: RefCell<App> = RefCell::default();
+    static INPUT: RefCell<Vec<u8>> = RefCell::default();
+    static OUTPUT: RefCell<Vec<u8>> = RefCell::default();
+}
+
+/// Room for a request of `length` bytes.
+#[unsafe(no_mangle)]
+pub extern "C" fn input(length: usize) -> *mut u8 {
+    INPUT.with_borrow_mut(|input| {
+        input.clear();
+        input.resize(length, 0);
+        input.as_mut_ptr()
+    })
+}
+
+/// Carries out the request in the input, JSON. Returns the kind of the output: 0 JSON, 1 the text of an error, 2 bytes.
+#[unsafe(no_mangle)]
+pub extern "C" fn call() -> u32 {
+    reply(|app, input| serde_json::from_slice::<Request>(input).map_err(error::WebError::Request)?.carry_out(app))
+}
+
+/// Opens the trace in the input, replays it, and makes it the game. Returns as [`call`] does.
+#[unsafe(no_mangle)]
+pub extern "C" fn open() -> u32 {
+    reply(|app, input| request::open(app, input))
+}
+
+/// The answer to the last call, or after a trap what the engine said.
+#[unsafe(no_mangle)]
+pub extern "C" fn output() -> *const u8 {
+    OUTPUT.with_borrow(Vec::as_ptr)
+}
+
+/// Bytes of [`output`].
+#[unsafe(no_mangle)]
+pub extern "C" fn output_length() -> usize {
+    OUTPUT.with_borrow(Vec::len)
+}
+
+/// The game's observation: 84x84 RGBA; null without a game.
+#[unsafe(no_mangle)]
+pub extern "C" fn observation() -> *const u8 {
+    APP.with_borrow(|app| app.game.as_ref().map_or(std::ptr::null(), |game| game.observation().as_ptr()))
+}
+
+/// The game's ground-truth view, not magnified: 84x84 RGBA; null without a game.
+#[unsafe(no_mangle)]
+pub extern "C" fn view() -> *const u8 {
+    APP.with_borrow(|app| app.game.as_ref().map_or(std::ptr::null(), |game| game.view().as_ptr()))
+}
+
+/// Steps every environment of the wall `count` times. Returns as [`call`] does.
+#[unsafe(no_mangle)]
+pub extern "C" fn step_wall(count: u32) -> u32 {
+    reply(|app, _| request::step_wall(app, count))
+}
+
+/// Draws the wall: RGBA, of the size that the answer to its request states; null without a wall.
+#[unsafe(no_mangle)]
+pub extern "C" fn draw_wall() -> *const u8 {
+    APP.with_borrow_mut(|app| app.wall.as_mut().map_or(std::ptr::null(), |wall| wall.draw().as_ptr()))
+}
+
+fn reply(answer: impl FnOnce(&mut App, &[u8]) -> Result<request::Reply, error::WebError>) -> u32 {
+    // The text of a panic, which JavaScript only sees as a trap.
+    #[cfg(target_arch = "wasm32")]
+    std::panic::set_hook(Box::new(|panic| {
+        let said = panic.to_string().into_bytes();
+        OUTPUT.with(|output| output.try_borrow_mut().map(|mut output| *output = said).unwrap_or_default());
+    }));
+    let answer = INPUT.with_borrow(|input| APP.with_borrow_mut(|app| answer(app, input)));
+    let (kind, bytes) = match answer {
+        Ok(request::Reply::Json(json)) => (Kind::Json, json.to_string().into_bytes()),
+        Ok(request::Reply::Bytes(bytes)) => (Kind::Bytes, bytes),
+        Err(error) => (Kind::Error, error.to_string().into_bytes()),
+    };
+    OUTPUT.set(bytes);
+    kind as u32
+}
+
+#[cfg(test)]
+mod tests;

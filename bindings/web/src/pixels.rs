@@ -1,0 +1,53 @@
+//! Frames as a canvas of a browser wants them: RGBA, \[row\]\[column\].
+
+use endless_gym_core::envs::SCREEN;
+use endless_gym_core::envs::view::VIEW;
+
+/// Bytes of a frame.
+pub const RGBA_BYTES: usize = SCREEN * SCREEN * 4;
+
+/// Writes an observation, indexed \[x\]\[y\]\[channel\], into `out`, whose rows are `stride` pixels long, with its first pixel at
+/// the start of `out`.
+pub fn put_observation(observation: &[u8], out: &mut [u8], stride: usize) {
+    let (pixels, out) = (observation.as_chunks::<3>().0, out.as_chunks_mut::<4>().0);
+    for y in 0..SCREEN {
+        let row = &mut out[y * stride..][..SCREEN];
+        for (to, [red, green, blue]) in row.iter_mut().zip(pixels[y..].iter().step_by(SCREEN)) {
+            *to = [*red, *green, *blue, 255];
+        }
+    }
+}
+
+/// Writes a ground-truth view, indexed \[row\]\[column\]\[channel\] and magnified, in its original size.
+pub fn put_view(view: &[u8], out: &mut [u8]) {
+    const SCALE: usize = VIEW / SCREEN;
+    let (pixels, out) = (view.as_chunks::<3>().0, out.as_chunks_mut::<4>().0);
+    for (row, to) in out.chunks_exact_mut(SCREEN).enumerate() {
+        for (to, [red, green, blue]) in to.iter_mut().zip(pixels[row * SCALE * VIEW..].iter().step_by(SCALE)) {
+            *to = [*red, *green, *blue, 255];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use endless_gym_core::envs::FRAME_BYTES;
+    use endless_gym_core::envs::view::VIEW_BYTES;
+
+    #[test]
+    fn pictures_are_not_transposed() {
+        let (x, y) = (5, 70);
+        let mut observation = [0; FRAME_BYTES];
+        observation[(x * SCREEN + y) * 3 + 1] = 9;
+        let mut view = vec![0; VIEW_BYTES];
+        view[(y * 4 * VIEW + x * 4) * 3 + 1] = 9;
+        let mut wide = vec![0; SCREEN * (SCREEN + 3) * 4];
+        put_observation(&observation, &mut wide, SCREEN + 3);
+        assert_eq!(wide[(y * (SCREEN + 3) + x) * 4..][..4], [0, 9, 0, 255]);
+        let mut square = vec![0; RGBA_BYTES];
+        put_view(&view, &mut square);
+        assert_eq!(square[(y * SCREEN + x) * 4..][..4], [0, 9, 0, 255]);
+        assert_eq!(square.iter().filter(|byte| **byte == 9).count(), 1);
+    }
+}

@@ -1,0 +1,138 @@
+//! The page's requests, and their answers.
+
+use endless_gym_core::envs::{self, EnvSpec};
+use endless_gym_core::pool::{OptionMap, PoolConfig, ResetOptions};
+use endless_gym_core::trace::{Trace, replay};
+use serde::Deserialize;
+use serde_json::{Map, Value as Json, json};
+
+use crate::App;
+use crate::error::WebError;
+use crate::game::{Game, Player};
+use crate::group::Group;
+use crate::wall::Wall;
+
+/// Reset parameters as a form has them: each value is text. Text that is no JSON is the text itself, so that the engine says what
+/// it should have been.
+type Options = Map<String, Json>;
+
+#[derive(Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Request {
+    /// The table of environments.
+    Specs,
+    /// Whether reset parameters are valid.
+    Check {
+        id: String,
+        options: Options,
+    },
+    /// Starts an episode.
+    Start {
+        id: String,
+        options: Options,
+        seed: String,
+    },
+    /// Plays a step with the action of a person, of the expert or of the trace.
+    Step {
+        action: Vec<i32>,
+    },
+    StepOfExpert,
+    StepOfTrace,
+    /// The recording of the game, as bytes.
+    Save,
+    /// Starts a wall.
+    Wall {
+        groups: Vec<WallGroup>,
+        columns: usize,
+        expert: bool,
+        seed: String,
+    },
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WallGroup {
+    id: String,
+    num_envs: usize,
+    options: Options,
+}
+
+pub enum Reply {
+    Json(Json),
+    Bytes(Vec<u8>),
+}
+
+impl Request {
+    pub fn carry_out(self, app: &mut App) -> Result<Reply, WebError> {
+        let player = match self {
+            Request::Specs => return Ok(Reply::Json(envs::specs().map(spec).collect())),
+            Request::Check { id, options } => {
+                let options = ResetOptions::Shared(parse(&options));
+                PoolConfig { options, ..PoolConfig::new(&id, 1) }.validate()?;
+                return Ok(Reply::Json(Json::Null));
+            }
+            Request::Start { id, options, seed } => {
+                let game = Game::start(&id, parse(&options), parse_seed(&seed)?)?;
+                return Ok(Reply::Json(app.game.insert(game).state()?));
+            }
+            Request::Save => return Ok(Reply::Bytes(app.game.as_ref().ok_or(WebError::NoGame)?.file()?)),
+            Request::Wall { groups, columns, expert, seed } => {
+                let seed = parse_seed(&seed)?;
+                let make =
+                    |group: &WallGroup| Group::new(&group.id, group.num_envs, parse(&group.options), expert, seed);
+                let groups = groups.iter().map(make).collect::<Result<_, _>>()?;
+                return Ok(Reply::Json(app.wall.insert(Wall::new(groups, columns)?).state()));
+            }
+            Request::Step { action } => Player::Person(action),
+            Request::StepOfExpert => Player::Expert,
+            Request::StepOfTrace => Player::Trace,
+        };
+        let game = app.game.as_mut().ok_or(WebError::NoGame)?;
+        game.step(player)?;
+        Ok(Reply::Json(game.state()?))
+    }
+}
+
+/// Replays a trace's file, and makes it the game.
+pub fn open(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
+    let trace = Trace::read(file)?;
+    let outcome = replay(&trace)?;
+    let state = app.game.insert(Game::replay(trace)?).state()?;
+    Ok(Reply::Json(json!({
+        "episodes": outcome.episodes,
+        "steps": outcome.steps,
+        "views": outcome.views,
+        "differences": outcome.differences,
+        "first": outcome.first.map(|first| first.to_string()),
+        "state": state,
+    })))
+}
+
+pub fn step_wall(app: &mut App, count: u32) -> Result<Reply, WebError> {
+    let wall = app.wall.as_mut().ok_or(WebError::NoWall)?;
+    wall.step(count)?;
+    Ok(Reply::Json(wall.state()))
+}
+
+/// The entry of the table, with the texts that the engine itself uses for limits and defaults.
+fn spec(spec: &'static EnvSpec) -> Json {
+    let mut value = json!(spec);
+    value["action_branches"] = json!(spec.action_space.branches());
+    for (parameter, json) in spec.parameters.iter().zip(value["parameters"].as_array_mut().into_iter().flatten()) {
+        json["default_text"] = parameter.default_text().into();
+        json["allowed"] = parameter.allowed().into();
+    }
+    value
+}
+
+fn parse(options: &Options) -> OptionMap {
+    let value = |value: &Json| match value {
+        Json::String(text) => serde_json::from_str(text).unwrap_or_else(|_| value.clone()),
+        other => other.clone(),
+    };
+    options.iter().map(|(name, text)| (name.clone(), value(text))).collect()
+}
+
+fn parse_seed(text: &str) -> Result<u64, WebError> {
+    text.trim().parse().map_err(|_| WebError::Seed { given: text.to_owned() })
+}

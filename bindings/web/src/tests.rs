@@ -1,0 +1,124 @@
+//! The interface, as JavaScript uses it.
+
+use super::*;
+use endless_gym_core::envs::{SCREEN, specs};
+use serde_json::{Value as Json, json};
+
+fn put(bytes: &[u8]) {
+    input(bytes.len());
+    INPUT.with_borrow_mut(|input| input.copy_from_slice(bytes));
+}
+
+fn answer() -> Vec<u8> {
+    assert_eq!(output_length(), OUTPUT.with_borrow(Vec::len));
+    OUTPUT.with_borrow(Clone::clone)
+}
+
+fn request(request: &Json) -> Result<Json, String> {
+    put(request.to_string().as_bytes());
+    let kind = call();
+    let text = String::from_utf8(answer()).unwrap();
+    if kind == Kind::Error as u32 { Err(text) } else { Ok(serde_json::from_str(&text).unwrap()) }
+}
+
+fn start(id: &str, seed: &str) -> Result<Json, String> {
+    request(&json!({"start": {"id": id, "options": {}, "seed": seed}}))
+}
+
+#[test]
+fn every_environment_is_played_saved_and_opened_again() {
+    for spec in specs() {
+        let mut state = start(spec.id, "7").unwrap();
+        assert_eq!(state["seed"], "7");
+        while state["done"] == false && state["length"].as_u64() < Some(300) {
+            state = request(&json!("step_of_expert")).unwrap();
+        }
+        put(br#""save""#);
+        assert_eq!(call(), Kind::Bytes as u32);
+        let file = answer();
+        put(&file);
+        assert_eq!(open(), Kind::Json as u32, "{}", String::from_utf8_lossy(&answer()));
+        let opened: Json = serde_json::from_slice(&answer()).unwrap();
+        assert_eq!(opened["differences"], 0, "{}: {}", spec.id, opened["first"]);
+        assert_eq!(opened["steps"], state["length"]);
+        // The page replays it step by step, with the same numbers.
+        let mut replayed = opened["state"].clone();
+        while replayed["recording"]["over"] == false {
+            replayed = request(&json!("step_of_trace")).unwrap();
+        }
+        for same in ["return", "length", "done", "progress", "seed", "action", "info"] {
+            assert_eq!(replayed[same], state[same], "{}: {same}", spec.id);
+        }
+        assert_eq!(request(&json!("step_of_trace")).unwrap_err(), "the recording has no more steps");
+    }
+}
+
+#[test]
+fn errors_are_the_engines() {
+    for (wrong, message) in [
+        (json!({"start": {"id": "Pong-v0", "options": {}, "seed": "1"}}), "no environment `Pong-v0`; there are Mort"),
+        (
+            json!({"check": {"id": "MysteryPath-v0", "options": {"agent_scale": "large"}}}),
+            r#"reset parameter `agent_scale` must be a number, 0 to 4, got "large""#,
+        ),
+        (
+            json!({"check": {"id": "MysteryPath-v0", "options": {"cardinal_origin_choice": "[0, 9]"}}}),
+            "reset parameter `cardinal_origin_choice` must be a list of 1 to 4096 integers, 0 to 3, got [0,9]",
+        ),
+        (
+            json!({"start": {"id": "MysteryPath-v0", "options": {}, "seed": "-1"}}),
+            "seed must be an integer, 0 to 18446744073709551615, got `-1`",
+        ),
+        (json!("dance"), "the request cannot be read: unknown variant `dance`"),
+        (json!("step_of_expert"), "there is no episode"),
+        (json!({"wall": {"groups": [], "columns": 3, "expert": false, "seed": "1"}}), "a wall must have at least one"),
+    ] {
+        let found = request(&wrong).unwrap_err();
+        assert!(found.starts_with(message), "{found}");
+    }
+    assert_eq!(step_wall(1), Kind::Error as u32);
+    put(b"no trace");
+    assert_eq!(open(), Kind::Error as u32);
+    assert!(answer().starts_with(b"the file must be a trace (gzipped JSON)"));
+    assert!(observation().is_null() && view().is_null() && draw_wall().is_null());
+}
+
+#[test]
+fn the_expert_plays_from_the_first_step_or_not_at_all() {
+    start("MortarMayhem-v0", "18446744073709551615").unwrap();
+    request(&json!({"step": {"action": [0, 0]}})).unwrap();
+    let late = request(&json!("step_of_expert")).unwrap_err();
+    assert!(late.starts_with("the expert must play an episode from its first step"), "{late}");
+    assert!(request(&json!({"step": {"action": [0, 3]}})).unwrap_err().contains("must be in MultiDiscrete([3, 3])"));
+    // Its episode is still there.
+    assert_eq!(request(&json!({"step": {"action": [0, 0]}})).unwrap()["length"], 2);
+}
+
+#[test]
+fn the_table_has_what_a_form_needs() {
+    let table = request(&json!("specs")).unwrap();
+    assert_eq!(table.as_array().unwrap().len(), specs().count());
+    let parameter = &table[0]["parameters"][4];
+    assert_eq!(
+        (&parameter["name"], &parameter["type"], &parameter["default_text"], &parameter["allowed"]),
+        (&json!("command_count"), &json!("int_list"), &json!("[10]"), &json!("list of 1 to 4096 integers, 1 to 1000"))
+    );
+}
+
+#[test]
+fn a_wall_plays_all_environments_at_once() {
+    for expert in [false, true] {
+        let groups: Vec<Json> = specs().map(|spec| json!({"id": spec.id, "num_envs": 3, "options": {}})).collect();
+        let wall = json!({"wall": {"groups": groups, "columns": 7, "expert": expert, "seed": "3"}});
+        let state = request(&wall).unwrap();
+        // 30 environments in rows of 7.
+        assert_eq!((&state["width"], &state["height"]), (&json!(7 * 88 - 4), &json!(5 * 88 - 4)));
+        assert_eq!(step_wall(150), Kind::Json as u32);
+        let state: Json = serde_json::from_slice(&answer()).unwrap();
+        let episodes = |group: &Json| group["episodes"].as_u64().unwrap();
+        assert!(state["groups"].as_array().unwrap().iter().map(episodes).sum::<u64>() > 0);
+        let picture = APP.with_borrow_mut(|app| app.wall.as_mut().unwrap().draw().to_vec());
+        let opaque = picture.chunks_exact(4).filter(|pixel| pixel[3] == 255).count();
+        assert_eq!(opaque, 30 * SCREEN * SCREEN);
+    }
+}

@@ -1,0 +1,59 @@
+//! Many environments as one picture.
+
+use endless_gym_core::envs::SCREEN;
+use serde_json::{Value as Json, json};
+
+use crate::error::WebError;
+use crate::group::Group;
+use crate::pixels::put_observation;
+
+/// Transparent pixels between two environments.
+const GAP: usize = 4;
+
+pub struct Wall {
+    groups: Vec<Group>,
+    columns: usize,
+    rows: usize,
+    picture: Vec<u8>,
+}
+
+impl Wall {
+    /// Environments in rows of `columns`, those of the first group first.
+    pub fn new(groups: Vec<Group>, columns: usize) -> Result<Self, WebError> {
+        let count = groups.iter().map(|group| group.observations().count()).sum::<usize>();
+        if count == 0 || columns == 0 {
+            return Err(WebError::EmptyWall);
+        }
+        let mut wall = Wall { groups, columns, rows: count.div_ceil(columns), picture: Vec::new() };
+        wall.picture = vec![0; wall.width() * wall.height() * 4];
+        Ok(wall)
+    }
+
+    fn width(&self) -> usize {
+        self.columns * (SCREEN + GAP) - GAP
+    }
+
+    fn height(&self) -> usize {
+        self.rows * (SCREEN + GAP) - GAP
+    }
+
+    pub fn step(&mut self, count: u32) -> Result<(), WebError> {
+        (0..count).try_for_each(|_| self.groups.iter_mut().try_for_each(Group::step))
+    }
+
+    /// The picture, RGBA.
+    pub fn draw(&mut self) -> &[u8] {
+        let stride = self.width();
+        for (number, observation) in self.groups.iter().flat_map(Group::observations).enumerate() {
+            let (row, column) = (number / self.columns, number % self.columns);
+            let start = (row * stride + column) * (SCREEN + GAP);
+            put_observation(observation, &mut self.picture[4 * start..], stride);
+        }
+        &self.picture
+    }
+
+    pub fn state(&self) -> Json {
+        let groups: Vec<Json> = self.groups.iter().map(Group::state).collect();
+        json!({"width": self.width(), "height": self.height(), "columns": self.columns, "groups": groups})
+    }
+}

@@ -1,0 +1,404 @@
+//! The page in a real browser. `cargo xtask stage web` builds the page and runs these tests.
+
+mod chromium;
+mod server;
+
+use std::path::{Path, PathBuf};
+
+use chromium::Chromium;
+use endless_gym_core::envs::specs;
+use endless_gym_core::trace::{Trace, replay};
+use serde_json::{Value as Json, json};
+use server::PageServer;
+
+const WIDE: (u32, u32) = (1440, 900);
+
+/// The engine is there, and an episode or a wall is shown.
+const READY: &str = "globalThis.endless && (endless.play.state || endless.wall.state)";
+
+/// What an episode is made of, in the page.
+const STATE: &str = "endless.play.state";
+
+fn start(name: &str) -> Chromium {
+    Chromium::start(&PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("browser").join(name), WIDE)
+}
+
+/// Loads the page with what stands after `#` in its address. Each time as if it were the first.
+fn visit(browser: &mut Chromium, server: &PageServer, link: &str) {
+    browser.load("about:blank");
+    browser.load(&format!("{}#{link}", server.url()));
+    browser.wait(READY);
+}
+
+fn traces(folder: &str) -> Vec<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/reference").join(folder);
+    let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    files
+}
+
+fn open(browser: &mut Chromium, file: &[u8]) -> Json {
+    browser.value(&format!("endless.engine.open(new Uint8Array({}))", json!(file)))
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn recorded_episodes_replay_without_a_difference() {
+    let (server, mut browser) = (PageServer::start(), start("traces"));
+    visit(&mut browser, &server, "");
+    for (folder, least) in [("traces", 100), ("views", 40)] {
+        let files = traces(folder);
+        assert!(files.len() >= least, "{} files in {folder}", files.len());
+        for spec in specs() {
+            let of_id =
+                |path: &&PathBuf| path.file_name().unwrap().to_string_lossy().starts_with(&format!("{}.", spec.id));
+            let files: Vec<&PathBuf> = files.iter().filter(of_id).collect();
+            assert!(files.len() >= 4, "{} in {folder}", spec.id);
+            for path in files {
+                let expected = Trace::open(path).unwrap();
+                let steps: usize = expected.episodes.iter().map(|episode| episode.steps.len()).sum();
+                let found = open(&mut browser, &std::fs::read(path).unwrap());
+                assert_eq!(found["differences"], 0, "{}: {}", path.display(), found["first"]);
+                assert_eq!(found["steps"], steps, "{}", path.display());
+                assert_eq!(found["views"], if folder == "views" { steps } else { 0 }, "{}", path.display());
+            }
+        }
+    }
+    // A wrong checksum is found.
+    let mut wrong = Trace::open(&traces("traces")[0]).unwrap();
+    wrong.episodes[0].steps[3].crc ^= 1;
+    let mut file = Vec::new();
+    wrong.write(&mut file).unwrap();
+    let found = open(&mut browser, &file);
+    assert_eq!(found["differences"], 1);
+    assert!(found["first"].as_str().unwrap().starts_with("episode 0, step 4: observation checksum"), "{found}");
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn every_environment_is_played_with_the_keyboard() {
+    let (server, mut browser) = (PageServer::start(), start("keyboard"));
+    for spec in specs() {
+        visit(&mut browser, &server, &format!("env={}&seed=3", spec.id));
+        assert_eq!(browser.value(STATE)["id"], spec.id);
+        assert_eq!(browser.value(STATE)["length"], 0, "nothing moves before a key");
+        // Two directions in one step, at the single step's key.
+        for code in ["ArrowRight", "KeyW"] {
+            browser.key("rawKeyDown", code);
+        }
+        browser.wait(&format!("{STATE}.length > 0"));
+        browser.press("Space");
+        assert_eq!(browser.value("document.getElementById('pause').textContent"), "Continue", "{}", spec.id);
+        let before = browser.value(STATE)["length"].as_u64().unwrap();
+        browser.press("KeyN");
+        let state = browser.value(STATE);
+        assert_eq!(state["length"], before + 1, "{}", spec.id);
+        let expected = match spec.action_space.branches().len() {
+            2 => json!([2, 1]),
+            _ if spec.id == "Endless-MysteryPath-v0" => json!([2]),
+            _ => json!([3]),
+        };
+        assert_eq!(state["action"], expected, "{}", spec.id);
+        for code in ["ArrowRight", "KeyW"] {
+            browser.key("keyUp", code);
+        }
+        browser.press("KeyN");
+        assert!(browser.value(STATE)["action"].as_array().unwrap().iter().all(|number| *number == 0), "{}", spec.id);
+        // The canvas has the engine's pixels, and the ground truth is another picture.
+        let same = |canvas: &str, picture: &str| {
+            format!(
+                "(() => {{ const a = document.getElementById('{canvas}').getContext('2d').getImageData(0, 0, 84, 84).data; \
+                 const b = endless.engine.{picture}().data; return a.every((byte, i) => byte === b[i]) }})()"
+            )
+        };
+        assert_eq!(browser.value(&same("observation", "observation")), true, "{}", spec.id);
+        assert_eq!(browser.value(&same("view", "view")), true, "{}", spec.id);
+        browser.press("KeyR");
+        assert_eq!(browser.value(STATE)["length"], 0);
+        browser.press("PageDown");
+        assert_eq!(browser.value(STATE)["seed"], "4");
+        browser.press("PageUp");
+        assert_eq!(browser.value("location.hash"), format!("#env={}&seed=3", spec.id));
+    }
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn an_address_names_an_episode() {
+    let (server, mut browser) = (PageServer::start(), start("address"));
+    let link = "env=SearingSpotlights-v0&seed=18446744073709551615&num_coins=%5B3%5D&agent_visible=true";
+    let mut pictures = Vec::new();
+    for _ in 0..2 {
+        visit(&mut browser, &server, link);
+        browser.value("for (let step = 0; step < 20; step += 1) endless.play.oneStep()");
+        pictures.push(browser.value("Array.from(endless.engine.observation().data)"));
+        let state = browser.value(STATE);
+        assert_eq!(state["options"], json!({"num_coins": "[3]", "agent_visible": "true"}));
+        assert_eq!(state["seed"], "18446744073709551615");
+        assert_eq!(browser.value("document.getElementById('parameter-num_coins').value"), "[3]");
+        assert_eq!(browser.value("document.getElementById('parameter-agent_visible').checked"), true);
+        assert_eq!(browser.value("new URLSearchParams(location.hash.slice(1)).get('num_coins')"), "[3]");
+    }
+    assert_eq!(pictures[0], pictures[1]);
+    // What is wrong with an address is said by the engine, and another episode is shown.
+    for (link, message) in [
+        ("env=Pong-v0&seed=1", "no environment `Pong-v0`; there are MortarMayhem-v0"),
+        ("env=MysteryPath-v0&seed=one", "seed must be an integer, 0 to 18446744073709551615, got `one`"),
+        ("env=MysteryPath-v0&seed=1&speed=9", "MysteryPath-v0 has no reset parameter `speed`; it has max_steps"),
+        (
+            "env=MysteryPath-v0&seed=1&agent_speed=900",
+            "reset parameter `agent_speed` must be a number, 0 to 84, got 900",
+        ),
+        ("wall=Pong-v0", "no environment `Pong-v0`"),
+    ] {
+        browser.load("about:blank");
+        browser.load(&format!("{}#{link}", server.url()));
+        browser.wait("globalThis.endless && !document.getElementById('message').hidden");
+        let said = browser.value("document.getElementById('message').textContent");
+        assert!(said.as_str().unwrap().starts_with(message), "{link}: {said}");
+    }
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn the_form_is_the_engines_table() {
+    let (server, mut browser) = (PageServer::start(), start("form"));
+    for spec in specs() {
+        visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
+        let names = browser.value("[...document.querySelectorAll('#fields input')].map((input) => input.name)");
+        assert_eq!(names, spec.parameters.iter().map(|parameter| parameter.name).collect::<Json>());
+        for parameter in spec.parameters {
+            let hint =
+                browser.value(&format!("document.getElementById('parameter-{}-hint').textContent", parameter.name));
+            let hint = hint.as_str().unwrap();
+            assert!(hint.contains(parameter.description) && hint.contains(&parameter.allowed()), "{hint}");
+        }
+    }
+    visit(&mut browser, &server, "env=MortarMayhem-v0&seed=1");
+    let fill = |name: &str, text: &str| {
+        format!(
+            "(() => {{ const field = document.getElementById('parameter-{name}'); field.value = '{text}'; \
+             field.dispatchEvent(new Event('input')); document.getElementById('form').requestSubmit() }})()"
+        )
+    };
+    let message = "reset parameter `arena_size` must be an integer, 2 to 6, got 99";
+    browser.value(&fill("arena_size", "99"));
+    assert_eq!(
+        browser.value("document.getElementById('parameter-arena_size-error').textContent"),
+        format!("✕ {message}")
+    );
+    assert_eq!(browser.value("document.getElementById('parameter-arena_size').ariaInvalid"), "true");
+    assert_eq!(browser.value("document.getElementById('message').textContent"), message);
+    assert_eq!(browser.value(STATE)["options"], json!({}), "the episode before goes on");
+    browser.value(&fill("arena_size", "3"));
+    assert_eq!(browser.value(STATE)["options"], json!({"arena_size": "3"}));
+    assert_eq!(browser.value("document.getElementById('message').hidden"), true);
+    assert_eq!(browser.value("location.hash"), "#env=MortarMayhem-v0&seed=1&arena_size=3");
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn a_played_episode_is_saved_verified_and_opened() {
+    let (server, mut browser) = (PageServer::start(), start("recording"));
+    visit(&mut browser, &server, "env=MysteryPath-v0&seed=5&show_goal=true");
+    browser.value("document.getElementById('pace').value = 100; endless.play.setPace(100)");
+    for (code, steps) in [("ArrowRight", 15), ("KeyS", 30)] {
+        browser.key("rawKeyDown", code);
+        browser.wait(&format!("{STATE}.length > {steps}"));
+        browser.key("keyUp", code);
+    }
+    browser.press("Space");
+    let played = browser.value(STATE);
+    browser.value("document.getElementById('save').click()");
+    let file = browser.download();
+    // `endless verify` calls the same.
+    let replayed = replay(&Trace::open(&file).unwrap()).unwrap();
+    assert_eq!((replayed.differences, json!(replayed.steps)), (0, played["length"].clone()));
+
+    browser.value("endless.play.start({id: 'MortarMayhem-v0', options: {}, seed: '1'})");
+    browser.choose("#file", &file);
+    browser.wait(&format!("{STATE}.recording"));
+    let said = browser.value("document.getElementById('message').textContent");
+    assert!(said.as_str().unwrap().ends_with("replayed without a difference."), "{said}");
+    browser.press("Space");
+    browser.wait(&format!("{STATE}.recording.over"));
+    let shown = browser.value(STATE);
+    for same in ["id", "options", "seed", "return", "length", "progress"] {
+        assert_eq!(shown[same], played[same], "{same}");
+    }
+
+    let broken = file.with_file_name("broken.json.gz");
+    std::fs::write(&broken, b"no trace").unwrap();
+    browser.choose("#file", &broken);
+    browser
+        .wait("document.getElementById('message').textContent.startsWith('broken.json.gz: the file must be a trace')");
+    assert_eq!(browser.value(STATE)["id"], "MysteryPath-v0", "the episode before is still there");
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn experts_and_walls_play_by_themselves() {
+    let (server, mut browser) = (PageServer::start(), start("experts"));
+    for spec in specs() {
+        visit(&mut browser, &server, &format!("env={}&seed=2", spec.id));
+        browser.value("endless.play.setPace(10000)");
+        browser.press("KeyE");
+        let limit = if spec.id.starts_with("Endless") { 150 } else { 10_000 };
+        browser.wait(&format!("{STATE}.done || {STATE}.length >= {limit}"));
+        browser.value("endless.play.stop()");
+        let state = browser.value(STATE);
+        assert!(state["return"].as_f64() > Some(0.0), "{}: {state}", spec.id);
+    }
+    visit(&mut browser, &server, "wall=all&count=100&by=expert");
+    assert_eq!(browser.value("endless.wall.state.groups.map((group) => group.num_envs)"), json!(vec![10; 10]));
+    browser.value("endless.wall.pace.stepsPerSecond = 10000");
+    browser.wait("endless.wall.state.groups.some((group) => group.episodes > 0)");
+    let opaque = "(() => { const { width, height } = document.getElementById('picture'); \
+                  const data = document.getElementById('picture').getContext('2d').getImageData(0, 0, width, height).data; \
+                  return data.filter((byte, i) => i % 4 === 3 && byte === 255).length })()";
+    assert_eq!(browser.value(opaque), 100 * 84 * 84);
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn a_phone_plays_by_touch() {
+    let (server, mut browser) = (PageServer::start(), start("phone"));
+    browser.resize(390, 844, true);
+    visit(&mut browser, &server, "env=Endless-SearingSpotlights-v0&seed=1");
+    browser.touch("touchStart", "#pad [data-directions='right up']");
+    browser.wait(&format!("{STATE}.length > 1"));
+    assert_eq!(browser.value(STATE)["action"], json!([2, 1]));
+    browser.touch("touchEnd", "#pad");
+    browser.wait(&format!("{STATE}.action.every((number) => number === 0)"));
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn nothing_jumps_while_loading_and_nothing_is_cut_off() {
+    let (server, mut browser) = (PageServer::start(), start("layout"));
+    // The sum of what moved, as browsers measure it.
+    let shifts = "new Promise((done) => { let sum = 0; const observer = new PerformanceObserver((list) => { \
+                  for (const entry of list.getEntries()) sum += entry.value; }); \
+                  observer.observe({ type: 'layout-shift', buffered: true }); setTimeout(() => done(sum), 300) })";
+    for (width, height, phone) in [(1440, 900, false), (1024, 700, false), (390, 844, true), (320, 640, true)] {
+        browser.resize(width, height, phone);
+        // The longest text, the shortest, the most numbers, commands.
+        for id in ["Endless-MysteryPath-v0", "SearingSpotlights-v0", "MortarMayhemB-v0"] {
+            visit(&mut browser, &server, &format!("env={id}&seed=1"));
+            let shifted = browser.value(shifts).as_f64().unwrap();
+            assert!(shifted < 0.02, "{id} at {width}x{height}: {shifted}");
+            let cut = browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth");
+            assert_eq!(cut, 0, "{id} at {width}x{height}");
+        }
+        visit(&mut browser, &server, "wall=all");
+        let cut = browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth");
+        assert_eq!(cut, 0, "the wall at {width}x{height}");
+    }
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn it_works_without_a_network_once_loaded() {
+    let (server, mut browser) = (PageServer::start(), start("offline"));
+    visit(&mut browser, &server, "env=MysteryPath-v0&seed=1");
+    browser.value("navigator.serviceWorker.ready.then(() => true)");
+    browser.wait("navigator.serviceWorker.controller");
+    let url = server.url();
+    drop(server);
+    browser.load("about:blank");
+    browser.load(&format!("{url}#env=SearingSpotlights-v0&seed=4"));
+    browser.wait(READY);
+    browser.press("KeyN");
+    assert_eq!(browser.value(STATE)["length"], 1);
+    assert_eq!(browser.value(STATE)["id"], "SearingSpotlights-v0");
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn every_control_has_a_name_and_is_reached_by_the_keyboard() {
+    let (server, mut browser) = (PageServer::start(), start("controls"));
+    visit(&mut browser, &server, "env=SearingSpotlights-v0&seed=1");
+    browser.value("document.querySelectorAll('details').forEach((details) => (details.open = true))");
+    let tree = browser.call("Accessibility.getFullAXTree", &json!({}));
+    let roles = ["button", "checkbox", "textbox", "combobox", "spinbutton", "image", "progressbar"];
+    let nodes: Vec<&Json> = tree["nodes"].as_array().unwrap().iter().filter(|node| node["ignored"] == false).collect();
+    let named: Vec<&&Json> =
+        nodes.iter().filter(|node| roles.iter().any(|role| node["role"]["value"] == *role)).collect();
+    assert!(named.len() > 40, "{}", named.len());
+    for node in named {
+        assert_ne!(node["name"]["value"].as_str().unwrap_or_default(), "", "{node}");
+    }
+    let unreachable = "[...document.querySelectorAll('button, input, select, summary')] \
+                       .filter((control) => control.checkVisibility() && control.tabIndex < 0).length";
+    assert_eq!(browser.value(unreachable), 0);
+    // The colours of text against what is behind it, dark and light: 4.5 is what WCAG asks for.
+    let contrast = "(() => { const luminance = (color) => { const channels = color.match(/[\\d.]+/g).slice(0, 3).map((c) => c / 255) \
+                    .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)); \
+                    return 0.2126 * channels[0] + 0.7152 * channels[1] + 0.0722 * channels[2] }; \
+                    const behind = (e) => { for (; e; e = e.parentElement) { const c = getComputedStyle(e).backgroundColor; \
+                    if (!c.endsWith(', 0)')) return c } return getComputedStyle(document.documentElement).backgroundColor }; \
+                    return Math.min(...[...document.querySelectorAll('p, dt, dd, label, button, summary, h1, th')] \
+                    .filter((e) => e.checkVisibility() && !e.disabled && e.id !== 'overlay').map((e) => { const pair = [luminance(getComputedStyle(e).color), \
+                    luminance(behind(e))].sort((a, b) => b - a); return (pair[0] + 0.05) / (pair[1] + 0.05) })) })()";
+    for theme in ["light", "dark"] {
+        browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
+        // Colours of buttons change over some frames.
+        browser.value("new Promise((done) => setTimeout(done, 300))");
+        let least = browser.value(contrast).as_f64().unwrap();
+        assert!(least >= 4.5, "{theme}: {least}");
+    }
+}
+
+/// Not a test: `cargo test --package endless-gym-web --test browser -- --ignored --nocapture measure`.
+#[test]
+#[ignore = "a measurement"]
+fn measure_steps_per_second() {
+    let (server, mut browser) = (PageServer::start(), start("speed"));
+    visit(&mut browser, &server, "");
+    browser.value("endless.play.stop()");
+    println!("{}", browser.value("navigator.userAgent"));
+    for spec in specs() {
+        let wall = json!({"wall": {"groups": [{"id": spec.id, "num_envs": 64, "options": {}}], "columns": 8,
+            "expert": false, "seed": "1"}});
+        let measure = format!(
+            "(() => {{ endless.engine.request({wall}); endless.engine.stepWall(200); const rates = []; \
+             for (let round = 0; round < 7; round += 1) {{ const start = performance.now(); endless.engine.stepWall(500); \
+             rates.push(Math.round(64 * 500 / (performance.now() - start))) }} \
+             return rates.sort((a, b) => a - b) }})()"
+        );
+        println!("{:30} thousand steps a second, 7 rounds sorted: {}", spec.id, browser.value(&measure));
+    }
+}
+
+/// Not a test: pictures of the page in target/tmp/browser-*.png.b64, to look at.
+#[test]
+#[ignore = "pictures to look at"]
+fn measure_by_eye() {
+    let (server, mut browser) = (PageServer::start(), start("eye"));
+    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    for (name, size, phone, theme, link) in [
+        ("wide-light", (1440, 900), false, "light", "env=MortarMayhem-v0&seed=3"),
+        ("wide-dark", (1440, 900), false, "dark", "env=SearingSpotlights-v0&seed=3&num_coins=%5B3%5D"),
+        ("middle-dark", (1024, 768), false, "dark", "env=MortarMayhemB-v0&seed=3"),
+        ("narrow-light", (390, 844), true, "light", "env=Endless-MysteryPath-v0&seed=3"),
+        ("narrow-dark", (390, 844), true, "dark", "env=MortarMayhem-Grid-v0&seed=3"),
+        ("wall-dark", (1440, 900), false, "dark", "wall=all&count=100&by=expert"),
+        ("wall-narrow", (390, 844), true, "light", "wall=all&count=100&by=random"),
+    ] {
+        browser.resize(size.0, size.1, phone);
+        visit(&mut browser, &server, link);
+        browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
+        browser.value("new Promise((done) => setTimeout(done, 2500))");
+        if !link.starts_with("wall") {
+            browser.value("for (let step = 0; step < 3; step += 1) endless.play.oneStep()");
+        }
+        browser.value("new Promise((done) => setTimeout(done, 300))");
+        std::fs::write(folder.join(format!("browser-{name}.png.b64")), browser.screenshot()).unwrap();
+    }
+}

@@ -1,0 +1,80 @@
+//! A web server for the page, as simple as any that the page must work with.
+
+use std::io::{BufRead, BufReader, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+
+pub struct PageServer {
+    address: SocketAddr,
+    stopped: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl PageServer {
+    /// Serves what `cargo xtask web` has built.
+    pub fn start() -> Self {
+        // It lies beside the folder for the files of tests.
+        let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).with_file_name("web");
+        assert!(folder.join("index.html").exists(), "{} is not built; cargo xtask web", folder.display());
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let (address, stopped) = (listener.local_addr().unwrap(), Arc::new(AtomicBool::new(false)));
+        let stop = Arc::clone(&stopped);
+        let thread = std::thread::spawn(move || {
+            for connection in listener.incoming().flatten() {
+                if stop.load(Ordering::Relaxed) {
+                    return;
+                }
+                let folder = folder.clone();
+                // A browser opens connections that it does not use yet; one of them must not hold up the others.
+                std::thread::spawn(move || drop(answer(&folder, connection)));
+            }
+        });
+        PageServer { address, stopped, thread: Some(thread) }
+    }
+
+    /// The address of the page.
+    pub fn url(&self) -> String {
+        format!("http://{}/", self.address)
+    }
+}
+
+impl Drop for PageServer {
+    fn drop(&mut self) {
+        self.stopped.store(true, Ordering::Relaxed);
+        let _ = TcpStream::connect(self.address);
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+/// Answers one request and closes the connection.
+fn answer(folder: &Path, mut connection: TcpStream) -> std::io::Result<()> {
+    let mut lines = BufReader::new(connection.try_clone()?).lines();
+    let Some(request) = lines.next().transpose()? else { return Ok(()) };
+    for line in lines {
+        if line?.is_empty() {
+            break;
+        }
+    }
+    let path = request.split(' ').nth(1).unwrap_or("/").trim_start_matches('/');
+    let name = path.split(['?', '#']).next().filter(|name| !name.is_empty()).unwrap_or("index.html");
+    let kind = match name.rsplit('.').next() {
+        Some("html") => "text/html",
+        Some("css") => "text/css",
+        Some("js") => "text/javascript",
+        Some("wasm") => "application/wasm",
+        Some("svg") => "image/svg+xml",
+        _ => "application/octet-stream",
+    };
+    // The page's files lie beside each other.
+    let file = if name.contains('/') { None } else { std::fs::read(folder.join(name)).ok() };
+    let (status, bytes) = file.map_or(("404 Not Found", Vec::new()), |bytes| ("200 OK", bytes));
+    let length = bytes.len();
+    write!(
+        connection,
+        "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
+    )?;
+    connection.write_all(&bytes)
+}
