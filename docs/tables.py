@@ -48,7 +48,7 @@ def spaces(spec: Spec) -> str:
     observation = f"uint8 {shape}, indexed `[x][y][channel]`"
     if length := spec["vector_observation"]:
         observation = f"a dict: `visual_observation`, {observation}; `vector_observation`, float32 ({length},)"
-    truth = f'float64 ({spec["ground_truth"]},), `info["ground_truth"]`' if spec["ground_truth"] else "none"
+    truth = f'float64 ({len(spec["ground_truth"])},), `info["ground_truth"]`' if spec["ground_truth"] else "none"
     rows = [
         ["action space", f"`{actions(spec)}`"],
         ["observation", observation],
@@ -56,6 +56,24 @@ def spaces(spec: Spec) -> str:
         ["frames per second, when shown to people", spec["render_fps"]],
     ]
     return table(["", ""], rows)
+
+
+def meanings(spec: Spec) -> str:
+    """What the numbers of an action mean, by branch."""
+    branches = spec["actions"]
+    several = len(branches) > 1
+    rows = [
+        [*([f"`action[{number}]`, {branch['name']}"] if several else []), value, choice["name"], choice["description"]]
+        for number, branch in enumerate(branches)
+        for value, choice in enumerate(branch["choices"])
+    ]
+    return table([*(["branch"] if several else []), "number", "name", "meaning"], rows)
+
+
+def ground_truth(spec: Spec) -> str:
+    """The numbers of `info["ground_truth"]`."""
+    rows = [[place, f"`{each['name']}`", each["description"]] for place, each in enumerate(spec["ground_truth"])]
+    return table(["index", "name", "meaning"], rows)
 
 
 def parameters(spec: Spec) -> str:
@@ -105,4 +123,11 @@ def ranges(template: str, names: Sequence[str]) -> str:
     return template.format(*(f"{{{min(place)}..{max(place)}}}" for place in places))
 
 
-PARTS = {"spaces": spaces, "parameters": parameters, "infos": infos, "features": features}
+PARTS = {
+    "spaces": spaces,
+    "actions": meanings,
+    "ground truth": ground_truth,
+    "parameters": parameters,
+    "infos": infos,
+    "features": features,
+}

@@ -22,8 +22,8 @@ pub mod batch {
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{
-        ActionError, ActionSpace, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family, InfoColumn,
-        InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
+        ActionBranch, ActionError, ActionSpace, Choice, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family,
+        InfoColumn, InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
         ParameterError, ParameterKind, Progress, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec,
         specs, view,
     };
@@ -32,8 +32,9 @@ pub mod envs {
 /// Many environments in this process, stepped in lockstep.
 pub mod pool {
     pub use endless_gym_core::pool::{
-        Autoreset, MAX_ENVS, MAX_THREADS, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest,
-        ResumeError, SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
+        Autoreset, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError, ResetOptions,
+        ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError, Threads,
+        UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }
@@ -43,8 +44,9 @@ pub mod service {
     pub use endless_gym_service::{
         BatchLease, CHECKPOINT_VERSION, CheckpointConfig, CheckpointError, ConnectConfig, Engine, EngineActivity,
         EngineConfig, EngineProcesses, EngineStatus, EngineSummary, GroupReconnection, GroupStatus, LastRequest,
-        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observer, ROOT_VARIABLE, Reconnection, Rejection,
-        ServiceError, ServiceSpecification, Trainer, running_engines, timeout_from_seconds,
+        LockHolder, MAX_BATCHES_HELD, MAX_GROUPS, Namespace, Observed, Observer, ObserverStatus, Observers,
+        ROOT_VARIABLE, Reconnection, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
+        timeout_from_seconds,
     };
 }
 

@@ -13,7 +13,8 @@ struct Root(PathBuf);
 
 impl Root {
     fn new(name: &str) -> Self {
-        Root(std::env::temp_dir().join(format!("eg-{name}-{}", std::process::id())))
+        // The path of a root is short, that of the directory for temporary files may not be.
+        Root(PathBuf::from(format!("/tmp/eg-{name}-{}", std::process::id())))
     }
 
     fn command(&self, program: &Path) -> Command {

@@ -92,7 +92,7 @@ fn any_request_is_answered() {
     let foreign = Foreign::new(place.namespace(), &specification);
     let good = RequestHeader::reset_all(&specification);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
-    let header = (0..9_u32, [(); 3].map(|()| numbers()), any::<bool>());
+    let header = (0..11_u32, [(); 3].map(|()| numbers()), any::<bool>());
     let requests = (header, 1..=foreign.blocks(), any::<u64>(), 0..=8_usize);
     let mut runner = TestRunner::new(ProptestConfig { failure_persistence: None, ..property_cases(300) });
     runner
@@ -121,7 +121,7 @@ fn requests_may_change_while_the_engine_reads_them() {
     let foreign = Foreign::new(place.namespace(), &specification);
     let mut random = SmallRng::seed_from_u64(1);
     for _ in 0..300 {
-        let (kind, bytes) = (random.random_range(1..7), random.random_range(0..5000));
+        let (kind, bytes) = (random.random_range(1..10), random.random_range(0..5000));
         let header = RequestHeader { kind, bytes, ..RequestHeader::reset_all(&specification) };
         foreign
             .ask_while_changing(header, || if random.random() { random.random_range(0..8) } else { random.random() });

@@ -93,6 +93,12 @@ fn a_step_that_takes_long_is_named_with_its_duration() {
     let place = Place::new();
     let engine = place.engine("gym", 1024, 2);
     let mut trainer = place.trainer("gym").unwrap();
+    let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
+    let mut activity = || match observer.next(SHORT) {
+        Err(ServiceError::TimedOut { activity, .. }) => activity,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(activity(), EngineActivity::Idle { group: 1, since: None, process: engine.id() });
     // The engine draws every frame twice, which takes some tens of milliseconds.
     trainer.reset(1, ResetRequest::All).unwrap();
     wait_until("the reset runs", || status(&place).groups[1].busy.is_some());
@@ -109,10 +115,14 @@ fn a_step_that_takes_long_is_named_with_its_duration() {
         assert!(since >= SHORT);
         assert!(error.to_string().contains("the reset of group 1 has been running for 0."), "{error}");
     }
+    assert!(matches!(activity(), EngineActivity::Busy { group: 1, kind: "reset", .. }));
     signal(&engine, Signal::CONT);
     trainer.receive(0, SECONDS).unwrap();
     trainer.receive(1, SECONDS).unwrap();
     assert_eq!(status(&place).groups[1].busy, None);
+    observer.next(SECONDS).unwrap();
+    let error = observer.next(SHORT).unwrap_err();
+    assert!(error.to_string().contains("the trainer has requested nothing of group 1 for "), "{error}");
 }
 
 /// Starts an engine of the same kind, connects the trainer to it, and returns what became of its last request.

@@ -144,6 +144,16 @@ fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
     engine.0.kill().unwrap();
     engine.0.wait().unwrap();
 
+    // Two engines do not save to one file, whatever their names are.
+    let first = serve(&room, &[&checkpoint, "--resume"]);
+    drop(room.connect("gym"));
+    let named = ENVIRONMENTS.map(|argument| if argument == "--service=gym" { "--service=second" } else { argument });
+    let second = room.run(&[&["serve"], &named[..], &[&checkpoint, "--resume"]].concat());
+    let message = format!("is in use by another engine (process {}); stop it, or choose another file", first.0.id());
+    assert_eq!(second.status.code(), Some(1));
+    assert!(text(&second.stderr).contains(&message), "{}", text(&second.stderr));
+    drop(first);
+
     // Without `--resume`, the file is not overwritten.
     let refused = room.run(&[&["serve"], &ENVIRONMENTS[..], &[&checkpoint]].concat());
     assert_eq!(refused.status.code(), Some(1));
@@ -240,7 +250,7 @@ fn status_shows_engines_and_their_processes() {
         (&engine.0.id().into(), &[own].into(), &Json::Array(vec![]))
     );
     assert_eq!((&idle["groups"][0]["trainer_process"], &idle["env_steps"]), (&Json::Null, &0.into()));
-    let _observer = Observer::connect(&room.config("gym"), 1).unwrap();
+    let mut observer = Observer::connect(&room.config("gym"), 1).unwrap();
     let mut twin = Twin::new();
     twin.reset(&mut trainer);
     twin.play(Some(&mut trainer), 0..50);
@@ -249,21 +259,39 @@ fn status_shows_engines_and_their_processes() {
     trainer.send(0, &[0; NUM_ENVS]).unwrap();
     let lease = trainer.receive(0, SECONDS).unwrap();
     drop(lease);
+    let seen = observer.next(SECONDS).unwrap();
+    trainer.send(1, &[0; NUM_ENVS]).unwrap();
+    trainer.receive(1, SECONDS).unwrap();
+    let seen = [seen, observer.next(SECONDS).unwrap()];
 
     let before = room.everything();
     let status = room.status("gym");
     assert_eq!((&status["trainers"], &status["observers"]), (&[own].into(), &[own].into()));
-    assert_eq!((&status["env_steps"], &status["groups"][0]["step"]), (&(102 * NUM_ENVS).into(), &53.into()));
+    assert_eq!((&status["env_steps"], &status["groups"][0]["step"]), (&(103 * NUM_ENVS).into(), &53.into()));
+    let observers = [0, 1].map(|group| status["groups"][group]["observers"].as_array().unwrap().len());
+    assert_eq!(observers, [0, 1], "{status}");
+    let of_group = &status["groups"][1]["observers"][0];
+    assert_eq!((&of_group["process"], &of_group["held"], &of_group["batches"]), (&own.into(), &2.into(), &2.into()));
     assert_eq!((&status["groups"][0]["held"], &status["groups"][0]["kind"]), (&1.into(), &"step".into()));
     assert_eq!(status["incarnation"], format!("{:016x}", trainer.specification().incarnation));
     assert!(status["shared_memory_bytes"].as_u64().unwrap() > 1_000_000, "{status}");
     assert!(status["groups"][1]["seconds_since_request"].as_f64().unwrap() < 60.0);
     let table = room.run(&["status"]);
-    for part in ["gym", "Endless-MysteryPath-v0", "2 x 3", "306", &own.to_string(), &engine.0.id().to_string()] {
+    for part in [
+        "gym",
+        "Endless-MysteryPath-v0",
+        "2 x 3",
+        "309",
+        "held by observers",
+        &own.to_string(),
+        &engine.0.id().to_string(),
+    ] {
         assert!(text(&table.stdout).contains(part), "{part}: {}", text(&table.stdout));
     }
     assert!(text(&room.run(&["status", "gym"]).stdout).contains("incarnation"));
     assert_eq!(room.everything(), before, "looking leaves nothing and removes nothing");
+    drop((seen, observer));
+    assert_eq!(room.status("gym")["groups"][1]["observers"], Json::Array(vec![]));
 
     // An engine that is stopped does not answer, and its status can still be read.
     signal(&engine.0, Signal::STOP);

@@ -5,7 +5,8 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-folder=$(mktemp -d "${TMPDIR:-/tmp}/fresh machine XXXXXX")
+# Without a space: the compiler that PyTorch starts for files in TMPDIR cannot do with one.
+folder=$(mktemp -d "${TMPDIR:-/tmp}/fresh-machine-XXXXXX")
 checkout="$folder/endless gym"
 user=
 # Called when the script ends.

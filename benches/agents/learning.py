@@ -13,6 +13,7 @@ import argparse
 import dataclasses
 import json
 import os
+import shlex
 import tempfile
 import time
 from pathlib import Path
@@ -25,15 +26,15 @@ from endless_gym.agents.train import parse, train
 FOLDER = Path(__file__).parent / "learning"
 #: Flags, time limit in minutes, target reward, and the largest possible reward if it is known.
 TASKS = {
-    "one-command": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[1]", 15, 0.097, 0.1),
+    "one-command": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]'", 15, 0.097, 0.1),
     "one-command-pixels": (
-        "--env MortarMayhem-Grid-v0 --environment.option command_count=[1] --environment.observation rgb",
+        "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --environment.observation rgb",
         30,
         0.097,
         0.1,
     ),
-    "two-commands": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[2]", 30, 0.19, 0.2),
-    "three-commands": ("--env MortarMayhem-Grid-v0 --environment.option command_count=[3]", 30, 0.28, 0.3),
+    "two-commands": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[2]'", 30, 0.19, 0.2),
+    "three-commands": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[3]'", 30, 0.28, 0.3),
     "mystery-path-grid-with-cues": (
         "--env MysteryPath-Grid-v0 --environment.option show_origin=true show_goal=true reward_path_progress=0.1",
         30,
@@ -53,7 +54,7 @@ def run(flags: list[str], folder: Path) -> dict:
     rows = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
     results = evaluate(done.agent, num_threads=1)
     return {
-        "command": f"endless-train {' '.join(flags)}",
+        "command": f"endless-train {shlex.join(flags)}",
         "agent": settings.agent,
         "seed": settings.seed,
         "updates": done.update,
@@ -163,7 +164,7 @@ def main() -> None:
                 if agent == "none" and others:
                     given += f" --ppo.updates {max(others)}"
                 with tempfile.TemporaryDirectory() as folder:
-                    row = run(given.split(), Path(folder) / "run")
+                    row = run(shlex.split(given), Path(folder) / "run")
                 kept = [old for old in data["runs"] if (old["agent"], old["seed"]) != (agent, seed)]
                 data["runs"] = [*kept, row]
                 file.write_text(as_json(data))

@@ -5,13 +5,27 @@ use std::process::Command;
 use std::time::Instant;
 
 use crate::requirements::Requirement;
-use crate::venv::{Install, execute, target, venv, workspace};
+use crate::venv::{Install, execute, folder, target, venv, venv_above, workspace};
 use crate::{interpreters, original};
+
+const NAME: &str = "python";
+const LIBRARIES: &str = "libraries";
 
 /// The folder of the virtual environment with what the tests need; creates it if it does not exist.
 pub fn environment() -> Result<PathBuf, String> {
     let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    venv("python", &base, &[Install::of_file("requirements-test.txt")?, pufferlib()?])
+    venv(NAME, &base, &[Install::of_file("requirements-test.txt")?, pufferlib()?])
+}
+
+/// The folder of the virtual environment for the examples of libraries that do not fit in [`environment`], whose packages it has
+/// too; creates it if it does not exist.
+pub fn libraries() -> Result<PathBuf, String> {
+    environment()?;
+    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
+    let mut install = Install::of_file("requirements-libraries.txt")?;
+    // PufferLib asks for another Gymnasium; it is not used here.
+    install.arguments.push("--no-warn-conflicts".to_owned());
+    venv_above(NAME, LIBRARIES, &base, &[install])
 }
 
 /// Checks the format of the Python files and lints them.
@@ -42,7 +56,8 @@ pub fn mypy() -> Result<(), String> {
 pub fn pytest(markers: &str) -> Result<(), String> {
     let mut pytest = Command::new(environment()?.join("bin/pytest"));
     pytest.args(["-q", "--timeout", "300", "--durations", "30", "-m", markers]).current_dir(package());
-    execute(pytest.env("ENDLESS_ORIGINAL_PYTHON", original::path()?))
+    pytest.env("ENDLESS_ORIGINAL_PYTHON", original::path()?);
+    execute(pytest.env("ENDLESS_LIBRARIES_PYTHON", folder(LIBRARIES)?.join("bin/python")))
 }
 
 /// Compares steps per second with the original's and, for scale, with EnvPool's own environments where it can be installed.

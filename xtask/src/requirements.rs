@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 
 use crate::{interpreters, venv, wasm};
 
-/// Bytes that the target directory takes in a full run; 31 GB were measured, most of them virtual environments with PyTorch.
+/// Bytes that the target directory takes in a full run; 32 GB were measured, most of them virtual environments with PyTorch.
 const DISK: u64 = 35_000_000_000;
 
 /// Bytes free in /dev/shm for the tests: several engines at a time, each below 100 MB.

@@ -1,7 +1,7 @@
 //! The stages of `cargo xtask test`.
 
 use crate::requirements::Requirement::{self, *};
-use crate::{cargo, docs, files, instructions, modules, original, packages, python, wasm, web};
+use crate::{cargo, docs, faults, files, instructions, modules, original, packages, python, wasm, web};
 
 /// One part of the tests.
 #[derive(Debug)]
@@ -79,6 +79,12 @@ pub const STAGES: &[Stage] = &[
         needs: &[OriginalPython, Disk],
         ..STAGE
     },
+    Stage {
+        name: "libraries environment",
+        run: || python::libraries().map(drop),
+        after: &["python environment"],
+        ..STAGE
+    },
     Stage { name: "ruff", run: python::ruff, after: &["python environment"], ..QUICK },
     Stage { name: "mypy", run: python::mypy, after: &["python environment"], ..QUICK },
     Stage {
@@ -98,7 +104,7 @@ pub const STAGES: &[Stage] = &[
     Stage {
         name: "pytest slow",
         run: || python::pytest("slow and not original"),
-        after: &["wheel"],
+        after: &["wheel", "libraries environment"],
         needs: &[SharedMemory],
         ..STAGE
     },
@@ -147,6 +153,15 @@ pub const STAGES: &[Stage] = &[
         run: || cargo::ignored_test("service_faults", "as_root_a_segment_of_another_user_is_reported_or_avoided"),
         needs: &[Root],
         after: &["rust build"],
+        ..STAGE
+    },
+    Stage {
+        name: "faults",
+        run: faults::test,
+        // It leaves out what needs mount namespaces or another user where they are missing.
+        needs: &[SharedMemory],
+        after: &["rust build"],
+        compiles: true,
         ..STAGE
     },
     Stage {

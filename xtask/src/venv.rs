@@ -46,16 +46,35 @@ pub fn folder(name: &str) -> Result<PathBuf, String> {
 /// The folder of the virtual environment `name`, created from the Python `base` with the packages of `installs`, in that order. An
 /// existing one with the same packages is reused.
 pub fn venv(name: &str, base: &Interpreter, installs: &[Install]) -> Result<PathBuf, String> {
+    create(name, base, installs, None)
+}
+
+/// As [`venv`], with the packages of the environment `below`, made from the same Python, where it has none of its own. They take no
+/// space a second time.
+pub fn venv_above(below: &str, name: &str, base: &Interpreter, installs: &[Install]) -> Result<PathBuf, String> {
+    create(name, base, installs, Some(below))
+}
+
+fn create(name: &str, base: &Interpreter, installs: &[Install], below: Option<&str>) -> Result<PathBuf, String> {
     let folder = folder(name)?;
     let stamp = folder.join("packages");
     // Without the place of the checkout, which may move.
-    let wanted = format!("{installs:#?}").replace(&workspace().display().to_string(), ".");
+    let mut wanted = format!("{installs:#?}").replace(&workspace().display().to_string(), ".");
+    if let Some(below) = below {
+        let path = self::folder(below)?.join("packages");
+        wanted += &std::fs::read_to_string(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+    }
     // Its Python is a link to one that may have been removed.
     if std::fs::read_to_string(&stamp).is_ok_and(|made| made == wanted) && folder.join("bin/python").exists() {
         return Ok(folder);
     }
     eprintln!("==> virtual environment {}", folder.display());
     execute(Command::new(&base.path).args(["-m", "venv", "--clear"]).arg(&folder))?;
+    if let Some(below) = below {
+        let packages = format!("lib/python3.{}/site-packages", base.minor);
+        let path = folder.join(&packages).join("below.pth");
+        std::fs::write(path, format!("../../../../{below}/{packages}\n")).map_err(|error| error.to_string())?;
+    }
     for install in installs {
         let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
         let mut command = Command::new(folder.join("bin/python"));

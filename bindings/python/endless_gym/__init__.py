@@ -14,35 +14,53 @@ from typing import TYPE_CHECKING, Any
 
 from endless_gym._native import EngineLost, TooManyBatchesHeld, __version__, running_engines
 from endless_gym.env import Env
+from endless_gym.experts import Experts
 from endless_gym.interop import DLPackView, pin_memory, torch_view
 from endless_gym.registration import register
+from endless_gym.replay import ReplayStep, replay
 from endless_gym.specs import Frames, all_specs, spec
+from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
     from endless_gym.engine import serve
+    from endless_gym.recording import record
     from endless_gym.vector import EndlessVectorEnv, connect, make_vec
+    from endless_gym.watching import watch
 
 __all__ = [
     "DLPackView",
     "EndlessVectorEnv",
     "EngineLost",
     "Env",
+    "Experts",
     "Frames",
+    "ReplayStep",
     "TooManyBatchesHeld",
+    "WindowClosed",
     "__version__",
     "all_specs",
     "connect",
     "make_vec",
     "pin_memory",
+    "record",
     "register",
+    "replay",
     "running_engines",
     "serve",
     "spec",
     "torch_view",
+    "watch",
 ]
 
 # Loaded on first use, since they need Gymnasium 1.1; the rest of the package works with 0.29.
-_LATER = {"serve": "engine", "EndlessVectorEnv": "vector", "connect": "vector", "make_vec": "vector"}
+_LATER = {
+    "serve": "engine",
+    "EndlessVectorEnv": "vector",
+    "connect": "vector",
+    "make_vec": "vector",
+    "record": "recording",
+    "watch": "watching",
+}
 
 
 def __getattr__(name: str) -> Any:

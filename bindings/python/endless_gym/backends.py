@@ -5,6 +5,7 @@ Both have the same interface, and raise the same exceptions with the same messag
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ class Backend:
         """Step a group; `receive` returns its arrays. The actions are copied."""
         raise NotImplementedError
 
-    def send_reset(self, group: int, request: _native.Reset | None) -> None:
+    def send_reset(self, group: int, request: _native.Reset | None, options: str | None) -> None:
         """Reset a group; `receive` returns its arrays."""
         raise NotImplementedError
 
@@ -69,6 +70,14 @@ class Backend:
 
     def restore(self, group: int, env: int, snapshot: bytes) -> None:
         """Set the state of one environment."""
+        raise NotImplementedError
+
+    def set_options(self, group: int, sets: str) -> None:
+        """Set the options of next episodes, from the JSON text of a list of objects with `options` and `envs`."""
+        raise NotImplementedError
+
+    def running_episodes(self, group: int, envs: Sequence[int]) -> list[_native.Episode]:
+        """What the running episodes of environments follow from."""
         raise NotImplementedError
 
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
@@ -107,8 +116,8 @@ class InProcess(Backend):
         self._pool(group).send(actions)
         self._sent[group] = None
 
-    def send_reset(self, group: int, request: _native.Reset | None) -> None:
-        self._pool(group).send_reset(request)
+    def send_reset(self, group: int, request: _native.Reset | None, options: str | None) -> None:
+        self._pool(group).send_reset(request, options)
         self._sent[group] = None
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
@@ -122,6 +131,12 @@ class InProcess(Backend):
 
     def restore(self, group: int, env: int, snapshot: bytes) -> None:
         self._pool(group).restore(env, snapshot)
+
+    def set_options(self, group: int, sets: str) -> None:
+        self._pool(group).set_options(sets)
+
+    def running_episodes(self, group: int, envs: Sequence[int]) -> list[_native.Episode]:
+        return self._pool(group).running_episodes(envs)
 
     def ground_truth_view(self, env: int) -> NDArray[np.uint8]:
         return self._pool(0).ground_truth_view(env)
@@ -156,8 +171,8 @@ class Remote(Backend):
     def send(self, actions: Any, group: int) -> None:
         self._connected().send(group, actions)
 
-    def send_reset(self, group: int, request: _native.Reset | None) -> None:
-        self._connected().reset(group, request)
+    def send_reset(self, group: int, request: _native.Reset | None, options: str | None) -> None:
+        self._connected().reset(group, request, options)
 
     def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
         return self._connected().receive(group, self._timeout)
@@ -167,6 +182,12 @@ class Remote(Backend):
 
     def restore(self, group: int, env: int, snapshot: bytes) -> None:
         self._connected().restore(group, env, snapshot, self._timeout)
+
+    def set_options(self, group: int, sets: str) -> None:
+        self._connected().set_options(group, sets, self._timeout)
+
+    def running_episodes(self, group: int, envs: Sequence[int]) -> list[_native.Episode]:
+        return self._connected().running_episodes(group, envs, self._timeout)
 
     def checkpoint(self) -> list[int]:
         return self._connected().checkpoint(self._timeout)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping, seed_source
-from endless_gym.specs import Frames, Spec, options_text, spec
+from endless_gym.specs import Frames, ObservationName, Spec, contents, options_text, spec
 
 try:
     from gymnasium.vector import AutoresetMode as AutoresetMode
@@ -22,8 +22,8 @@ except ImportError as error:
 
 Options = Mapping[str, Any]
 
-#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
-OBSERVATIONS = {"rgb": (True, False), "features": (False, True), "rgb+features": (True, True)}
+#: The names of the auto-reset modes.
+AutoresetName = Literal["next_step", "same_step", "disabled"]
 
 #: The auto-reset modes by their names.
 MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
@@ -43,6 +43,7 @@ class Arguments:
     autoreset: AutoresetMode
     frames: Frames | None
     features: bool
+    independent_episodes: bool
     #: The configuration of each group, which the engine has checked.
     pools: list[_native.PoolConfig]
 
@@ -55,9 +56,10 @@ def checked_arguments(
     seed: int | None,
     seeds: range | Sequence[int] | None,
     options: Options | Sequence[Options] | None,
-    autoreset: str | AutoresetMode,
-    observation: str,
+    autoreset: AutoresetName | AutoresetMode,
+    observation: ObservationName,
     frames: Frames | None,
+    independent_episodes: bool = False,
 ) -> Arguments:
     """Check arguments of `make_vec`.
 
@@ -86,13 +88,27 @@ def checked_arguments(
             frames=frames.arguments() if frames else None,
             features=features,
             final_observation=True,
+            independent_episodes=bool(independent_episodes),
         )
         for group in range(groups)
     ]
-    return Arguments(described, num_envs, threads, groups, seed, seed_range, seed_list, mode, frames, features, pools)
+    return Arguments(
+        described=described,
+        num_envs=num_envs,
+        num_threads=threads,
+        groups=groups,
+        seed=seed,
+        seed_range=seed_range,
+        seed_list=seed_list,
+        autoreset=mode,
+        frames=frames,
+        features=features,
+        independent_episodes=bool(independent_episodes),
+        pools=pools,
+    )
 
 
-def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
+def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
     """Gymnasium's auto-reset mode, from the mode or its name."""
     mode = given if isinstance(given, AutoresetMode) else MODES.get(given) if isinstance(given, str) else None
     if mode is None:
@@ -100,23 +116,9 @@ def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
     return mode
 
 
-def contents(observation: str, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
-    if not isinstance(observation, str) or observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
-    if frames is not None and not isinstance(frames, Frames):
-        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
-    has_frames, has_features = OBSERVATIONS[observation]
-    if frames is not None and not has_frames:
-        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
-    return (frames or Frames()) if has_frames else None, has_features
-
-
-def common_options(given: Options | Sequence[Options] | None) -> Options | None:
-    """The reset parameters of all environments; `None` if there is one mapping for each of several."""
-    if given is None or isinstance(given, Mapping):
-        return given or {}
-    return given[0] if len(given) == 1 else None
+def options_list(given: Options | Sequence[Options] | None) -> Sequence[Options]:
+    """The reset parameters as a list: one mapping for all environments, or one for each of all groups."""
+    return [given or {}] if given is None or isinstance(given, Mapping) else given
 
 
 def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:

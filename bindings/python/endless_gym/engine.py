@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+import weakref
 from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
@@ -15,9 +17,12 @@ from typing import Any
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, Options, checked_arguments
+from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.engine_log import EngineLog, level
+from endless_gym.episodes import EpisodeOptions, checked_choice
 from endless_gym.program import program
-from endless_gym.specs import Frames, json_text
+from endless_gym.rendering import VECTOR_MODES, View, checked_view
+from endless_gym.specs import Frames, ObservationName, json_text
 from endless_gym.vector import EndlessVectorEnv, connect
 
 _numbers = count()
@@ -28,7 +33,7 @@ _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11)
 
 
 class EngineProcess:
-    """A child process that serves environments. `end` stops it, and it stops when this process ends."""
+    """A child process that serves environments. It stops by `end`, when nothing refers to this object, and with this process."""
 
     def __init__(self, arguments: list[str], long_arguments: Sequence[str] = ()) -> None:
         """Start the process.
@@ -38,14 +43,13 @@ class EngineProcess:
             long_arguments: Further ones, which the process reads from a file: a command line has a limited length.
         """
         self.service = f"python-{os.getpid()}-{next(_numbers)}"
-        self._owner = os.getpid()
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         with tempfile.TemporaryFile() as file:
             file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
             file.flush()
             self._process = subprocess.Popen(
                 [
                     *program(),
+                    *level(),
                     "serve",
                     f"--child={os.getpid()}",
                     "--service",
@@ -55,53 +59,61 @@ class EngineProcess:
                 ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=self._errors,
+                stderr=subprocess.PIPE,
                 pass_fds=[file.fileno()],
                 **_OWN_GROUP,
             )
+        self._log = EngineLog(self._process)
+        # Also called at the exit of the interpreter. It must not refer to this object, which would then never be deleted.
+        self._end = weakref.finalize(self, _end, self._process, self._log, os.getpid())
 
     @property
     def pid(self) -> int:
         """Process id."""
         return self._process.pid
 
-    def connect(self, timeout: float, copy: bool) -> EndlessVectorEnv:
-        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer."""
+    def connect(self, timeout: float, **kwargs: Any) -> EndlessVectorEnv:
+        """Waits up to `timeout` seconds for the engine to start, and connects as its trainer; `kwargs` are those of `connect`."""
         end = time.monotonic() + timeout
         while True:
             if (status := self._process.poll()) is not None:
-                self._errors.seek(0)
-                # Logs may come before the message.
-                text = f"\n{self._errors.read().decode(errors='replace')}"
-                message = text.rpartition("\nendless: ")[2].strip()
-                raise RuntimeError(message or f"the engine ended with status {status}")
+                raise RuntimeError(self._log.message() or f"the engine ended with status {status}")
             if self.service in _native.running_engines():
-                return connect(self.service, timeout=timeout, copy=copy, engine=self)
+                return connect(self.service, timeout=timeout, engine=self, **kwargs)
             if time.monotonic() >= end:
                 raise TimeoutError(f"the engine did not start within {timeout} seconds")
             time.sleep(0.01)
 
     def end(self) -> None:
         """Stops the process and waits for its end. Does nothing in a process that was forked from the one that started it."""
-        if self._owner != os.getpid():
-            return
-        if self._process.stdin is not None:
-            # Closing it is not enough: processes that were forked from this one keep it open.
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.write(b"\n")
-                self._process.stdin.flush()
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.close()
-        try:
-            self._process.wait(10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._errors.close()
-        if self._process.returncode:
-            # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
-            with contextlib.suppress(OSError, RuntimeError):
-                _native.running_engines()
+        self._end()
+
+
+def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
+    """Stops an engine that the process `owner` started, and waits for its end."""
+    if owner != os.getpid():
+        # So that Popen does not warn of a child that runs.
+        process.returncode = 0
+        return
+    if process.stdin is not None:
+        # Closing it is not enough: processes that were forked from this one keep it open.
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(b"\n")
+            process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+    # One that is stopped would not end.
+    process.send_signal(signal.SIGCONT)
+    try:
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    log.close()
+    if process.returncode:
+        # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
+        with contextlib.suppress(OSError, RuntimeError):
+            _native.running_engines()
 
 
 def serve(
@@ -113,8 +125,8 @@ def serve(
     seed: int | None = None,
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    observation: str = "rgb",
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     batches_held: int = 4,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -122,10 +134,18 @@ def serve(
     resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
+    independent_episodes: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
 ) -> EndlessVectorEnv:
-    """Start an engine in a child process, and connect to it. It stops when the environments are closed.
+    """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to
+    them, and with this process.
 
     ```python
+    import endless_gym
+
     with endless_gym.serve("Endless-MortarMayhem-v0", num_envs=256, groups=2) as envs:
         observation, info = envs.reset()
     ```
@@ -149,20 +169,42 @@ def serve(
             exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        independent_episodes: As for `make_vec`.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
+        episode_options: As for `connect`.
+        episode_info: As for `connect`; the engine can lend one batch more for it.
 
     Raises:
         TypeError: A number is not an integer.
         ValueError: An argument is out of its range; or `checkpoint_every` or `resume` is given without `checkpoint`.
         RuntimeError: The engine cannot start; the message says why.
     """
-    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+    )
     timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
+    checked_choice(episode_options)
     arguments: dict[str, Any] = {
         "--env": given.described.id,
         "--num-envs": given.num_envs,
         "--threads": given.num_threads,
         "--groups": given.groups,
-        "--batches-held": integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD),
+        "--batches-held": min(
+            integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
+            _native.MAX_BATCHES_HELD,
+        ),
         "--autoreset": given.autoreset.name.lower(),
     }
     if given.seed is not None and given.seed_list is None:
@@ -180,6 +222,7 @@ def serve(
     command = [f"{name}={value}" for name, value in arguments.items()]
     command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
     command += ["--features"] if given.features else []
+    command += ["--independent-episodes"] if given.independent_episodes else []
     command += given.frames.command() if given.frames else ["--no-frames"]
     if options is None or isinstance(options, Mapping):
         long = [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
@@ -190,7 +233,14 @@ def serve(
     command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:
-        return engine.connect(timeout, copy)
+        return engine.connect(
+            timeout,
+            copy=copy,
+            render_mode=render_mode,
+            view=view,
+            episode_options=episode_options,
+            episode_info=episode_info,
+        )
     except BaseException:
         engine.end()
         raise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import gymnasium
@@ -12,57 +11,87 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
-from endless_gym.specs import options_text, spec
+from endless_gym.keyboard import keys_to_action
+from endless_gym.meanings import documented, metadata
+from endless_gym.rendering import SINGLE_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.specs import Frames, ObservationName, all_specs, contents, options_text, spec
+from endless_gym.window import Window, WindowClosed
 
-Observation = NDArray[np.uint8] | dict[str, NDArray[Any]]
+Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 #: Ids whose ground truth is an integer array in the original.
 _INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
-#: Side of the ground-truth view in pixels.
-_VIEW = 336
 
-
+@documented(all_specs().values())
 class Env(gymnasium.Env[Any, Any]):
     """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 
     Observations are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB` return a dict
     of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+
+    As in the original, an episode shows what the one before has left: the first frames of Endless-MortarMayhem show the last
+    episode's character until the agent may move, so that `reset(seed=...)` alone does not decide them. An episode depends on its
+    seed and its options alone with `independent_episodes`.
+    `copy.deepcopy` and `pickle` make an independent environment that goes on identically, with the state of the episode and of
+    the generator; a window is not part of it.
+
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
         render_mode: `rgb_array`: `render` returns the frame, uint8 (84, 84, 3); `debug_rgb_array`: the ground-truth view, uint8
             (336, 336, 3); both indexed `[row][column][channel]`. `human`: every step shows that view in a window (needs pygame).
         options: Reset parameters for every episode. Options of `reset` override them.
+        observation: `rgb` for frames, `features` for a vector that describes what the frame shows, or `rgb+features` for a dict
+            of both, as for `make_vec`.
+        frames: Format of the frames, as for `make_vec`. `None` for the original's format. Pictures always have the original's.
+        view: What `rgb_array` and `human` show instead of the above: `agent` for the frame, `ground_truth` for the ground-truth
+            view, for tools that know only Gymnasium's own render modes.
+        independent_episodes: Start every episode as in a new environment, and draw a seed for each episode that is given none.
 
     Raises:
-        ValueError: The id or the render mode is unknown, or a reset parameter is unknown or out of its range.
+        TypeError: `frames` is not `Frames`.
+        ValueError: The id, the render mode or the observation is unknown, or a reset parameter is unknown or out of its range.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's
-        "render_modes": ["human", "rgb_array", "debug_rgb_array"],
+        "render_modes": list(SINGLE_MODES),
         "render_fps": 25,
     }
 
-    def __init__(self, id: str, render_mode: str | None = None, options: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        id: str,
+        render_mode: str | None = None,
+        options: dict[str, Any] | None = None,
+        *,
+        observation: ObservationName = "rgb",
+        frames: Frames | None = None,
+        view: View | None = None,
+        independent_episodes: bool = False,
+    ) -> None:
         self._spec = spec(id)
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            known = ", ".join(self.metadata["render_modes"])
-            raise ValueError(f"render_mode must be None or one of {known}, got {render_mode!r}")
-        # The frame rate differs from id to id.
-        self.metadata = {**type(self).metadata, "render_fps": self._spec.render_fps}  # type: ignore[misc]
+        self._view = checked_view(render_mode, view, SINGLE_MODES)
+        self._frames, self._features = contents(observation, frames)
+        self._independent_episodes = bool(independent_episodes)
+        # The frame rate and the meanings differ from id to id.
+        fps = {"render_fps": self._spec.render_fps}
+        self.metadata = {**type(self).metadata, **fps, **metadata(self._spec)}  # type: ignore[misc]
         self.render_mode = render_mode
         self.action_space = self._spec.action_space()
-        self.observation_space = self._spec.observation_space()
+        self.observation_space = self._spec.observation_space(self._frames, self._features)
         self.has_ground_truth_info = self._spec.ground_truth > 0
         if self.has_ground_truth_info:
             self.ground_truth_space = self._spec.ground_truth_space()
         self._truth_dtype = np.int64 if self._spec.id in _INTEGER_GROUND_TRUTH else np.float64
         self._options = mapping("options", options)
-        self._native = _native.Single(self._spec.id, options_text(self._options))
+        self._native = self._new_native()
+        self._renderer: SnapshotRenderer | None = None
         self._seed: int | None = None
-        self._window: _Window | None = None
+        self._window: Window | None = None
         self._is_shown = False
+        self._was_closed = False
         self._was_reset = False
         #: Reset parameters of the current episode, the defaults included.
         self.reset_params: dict[str, Any] = {**self._spec.reset_parameters, **self._options}
@@ -83,7 +112,10 @@ class Env(gymnasium.Env[Any, Any]):
 
         Raises:
             ValueError: The seed is out of its range, or a reset parameter is unknown or out of its range.
+            RuntimeError: The render mode is `human` and there is no display.
+            WindowClosed: The user has closed the window. No episode was started.
         """
+        self._check_window()
         seed = None if seed is None else integer("seed", seed)
         super().reset(seed=seed)
         given = {**self._options, **mapping("options", options)}
@@ -103,7 +135,9 @@ class Env(gymnasium.Env[Any, Any]):
             ResetNeeded: The environment has not been reset.
             TypeError: The action is not an integer or a sequence of integers.
             ValueError: The action is out of its range.
+            WindowClosed: The user has closed the window. No step was played.
         """
+        self._check_window()
         if not self._was_reset:
             raise ResetNeeded("call `env.reset()` before `env.step()`")
         arrays, reward, terminated, end = self._native.step(action)
@@ -119,14 +153,16 @@ class Env(gymnasium.Env[Any, Any]):
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The current frame or view of the render mode; `None` for `human` and without a render mode."""
-        if self.render_mode == "rgb_array":
-            return self._native.rgb_array()
-        if self.render_mode == "debug_rgb_array":
-            return self._native.ground_truth_view()
         if self.render_mode == "human":
             # `reset` and `step` show the picture, as Gymnasium requires; in the original only `render` does.
+            self._check_window()
             self._show()
-        return None
+            return None
+        return None if self._view is None else self._picture()
+
+    def get_keys_to_action(self) -> dict[tuple[int, ...] | str, Any]:
+        """The actions of the keys W, A, S, D and the arrow keys, for `gymnasium.utils.play.play`."""
+        return keys_to_action(self._spec)
 
     def snapshot(self) -> bytes:
         """The complete state, including the generator, which `restore` accepts."""
@@ -144,55 +180,65 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), self._info(arrays)
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if there is one. The environment can still be used; it then opens another."""
+        self._was_closed = False
         if self._window is not None:
             self._window.close()
             self._window = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        left_out = ("_native", "_window", "_was_closed", "_renderer")
+        state = {name: value for name, value in self.__dict__.items() if name not in left_out}
+        return {**state, "saved": self._native.save()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        saved = state.pop("saved")
+        self.__dict__.update(state)
+        self._window, self._was_closed, self._renderer = None, False, None
+        self._native = self._new_native()
+        if saved is not None:
+            self._native.resume(*saved)
+
+    def _new_native(self) -> _native.Single:
+        frames = None if self._frames is None else self._frames.arguments()
+        return _native.Single(
+            self._spec.id, options_text(self._options), frames, self._features, self._independent_episodes
+        )
+
+    def _check_window(self) -> None:
+        """Raises `WindowClosed` if the user has closed the window."""
+        if self._window is not None and self._window.is_closed_by_user():
+            self.close()
+            self._was_closed = True
+        if self._was_closed:
+            raise WindowClosed("the window was closed; call `env.close()`, after which `env.reset()` opens another one")
+
+    def _picture(self) -> NDArray[np.uint8]:
+        if self._view == "ground_truth":
+            # In the original, each picture of this mode advances a clue that is shown. The other modes show the current step's.
+            return self._native.ground_truth_view(self.render_mode != "debug_rgb_array")
+        if self._frames == Frames():
+            return self._native.rgb_array()
+        if self._renderer is None:
+            self._renderer = SnapshotRenderer(self._spec.id, "agent")
+        return self._renderer.render([self.snapshot()])[0]
+
     def _show(self) -> None:
-        """Shows the current picture once: each call of the ground-truth view advances a shown clue."""
+        """Shows the current picture once, in the original's frame rate."""
         if self._is_shown:
             return
         if self._window is None:
-            self._window = _Window()
-        self._window.show(self._native.ground_truth_view(), f"{self._spec.id}, seed {self._seed}")
+            self._window = Window()
+        self._window.show(self._picture(), f"{self._spec.id}, seed {self._seed}")
         self._window.wait(self.metadata["render_fps"])
         self._is_shown = True
 
     def _observation(self, arrays: _native.SingleArrays) -> Observation:
-        if arrays[1] is None:
-            return arrays[0]
-        return {"visual_observation": arrays[0], "vector_observation": arrays[1]}
+        frames, features, vector, _ = arrays
+        parts = {"visual_observation": frames, "features": features, "vector_observation": vector}
+        given = {key: array for key, array in parts.items() if array is not None}
+        return given if len(given) > 1 else next(iter(given.values()))
 
     def _info(self, arrays: _native.SingleArrays) -> dict[str, Any]:
-        return {} if arrays[2] is None else {"ground_truth": arrays[2].astype(self._truth_dtype, copy=False)}
-
-
-class _Window:
-    """A window that shows pictures, by pygame."""
-
-    def __init__(self) -> None:
-        try:
-            import pygame
-        except ImportError as error:
-            raise ImportError(
-                "render_mode=\"human\" needs pygame: pip install './bindings/python[render]', or the wheel file with `[render]` "
-                "appended"
-            ) from error
-        self._pygame = pygame
-        pygame.display.init()
-        self._screen = pygame.display.set_mode((_VIEW, _VIEW))
-        self._next = time.monotonic()
-
-    def show(self, picture: NDArray[np.uint8], title: str) -> None:
-        self._pygame.display.set_caption(title)
-        self._pygame.surfarray.blit_array(self._screen, picture.swapaxes(0, 1))
-        self._pygame.display.flip()
-        self._pygame.event.pump()
-
-    def wait(self, fps: int) -> None:
-        time.sleep(max(0.0, self._next - time.monotonic()))
-        self._next = time.monotonic() + 1 / fps
-
-    def close(self) -> None:
-        self._pygame.display.quit()
+        truth = arrays[3]
+        return {} if truth is None else {"ground_truth": truth.astype(self._truth_dtype, copy=False)}

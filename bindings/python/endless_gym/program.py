@@ -1,12 +1,19 @@
 """The command-line program `endless`."""
 
+import signal
 import sys
 
 from endless_gym import _native
 
+# Ctrl-C ends the process until the program handles it: Python's handler only makes a note for the next line of Python, which
+# comes after the program's end. A SIGINT that is ignored stays so. `_signal` is compiled into the interpreter.
+#
 # Loads the native module from its file, so that neither this package nor numpy and Gymnasium are imported.
 _PROGRAM = """
+import _signal
 import sys
+if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 from importlib.util import module_from_spec, spec_from_file_location
 spec = spec_from_file_location("_native", sys.argv[1])
 native = module_from_spec(spec)
@@ -23,4 +30,11 @@ def program() -> list[str]:
 
 def main() -> int:
     """Run the program with this process's arguments, and return its exit status."""
+    if sys.argv[1:2] == ["record"]:
+        # It needs Python's libraries, and so the whole package.
+        from endless_gym.recording import command
+
+        return command.main(sys.argv[2:])
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     return _native.endless(sys.argv[1:], program())

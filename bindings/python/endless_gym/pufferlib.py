@@ -133,9 +133,9 @@ def _first_seed(seed: int | None, num_envs: int) -> int | None:
 
 def _statistics(info: dict[str, Any]) -> dict[str, list[float]]:
     """Return the statistics in a vector environment's `info` of the episodes that have just ended."""
-    ended = info["_episode"]
-    statistics = {"episode_return": info["episode"]["r"], "episode_length": info["episode"]["l"]}
-    for key, values in info["final_info"].items():
+    ended, final = info["_final_info"], info["final_info"]
+    statistics = {"episode_return": final["reward"], "episode_length": final["length"]}
+    for key, values in final.items():
         if not key.startswith("_") and values.ndim == 1:
             statistics[key] = values
     return {key: values[ended].tolist() for key, values in statistics.items()}

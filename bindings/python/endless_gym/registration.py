@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
 
+from endless_gym.env import Env
 from endless_gym.specs import all_specs
+
+if TYPE_CHECKING:
+    from endless_gym.vector import EndlessVectorEnv
 
 
 def register(namespace: str | None = "EndlessGym") -> None:
@@ -18,10 +24,28 @@ def register(namespace: str | None = "EndlessGym") -> None:
         gymnasium.registry.pop(id, None)
         gymnasium.register(
             id,
-            entry_point="endless_gym.env:Env",
-            vector_entry_point="endless_gym.vector:gymnasium_vec",
-            kwargs={"id": spec.id},
+            entry_point="endless_gym.registration:single",
+            vector_entry_point="endless_gym.registration:vector",
+            # Not `id`, which is a parameter of `gymnasium.make`, to which `gymnasium.make_vec` and RLlib pass these on.
+            kwargs={"env_id": spec.id},
             # The environment checks its arguments itself, and the wrappers cost more than its steps.
             disable_env_checker=True,
             order_enforce=False,
         )
+
+
+def single(env_id: str, **kwargs: Any) -> Env:
+    """The entry point of `gymnasium.make`; keyword arguments are those of `Env`."""
+    return Env(env_id, **kwargs)
+
+
+# Gymnasium reads the render modes of an entry point.
+single.metadata = Env.metadata  # type: ignore[attr-defined]
+
+
+def vector(env_id: str, num_envs: int = 1, **kwargs: Any) -> EndlessVectorEnv:
+    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
+    # It needs Gymnasium 1.1, single environments do not.
+    from endless_gym.vector import make_vec
+
+    return make_vec(env_id, num_envs, **kwargs)

@@ -11,7 +11,9 @@ RecurrentPPO("CnnLstmPolicy", venv).learn(1_000_000)
 
 from __future__ import annotations
 
+import time
 import warnings
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -60,8 +62,10 @@ class EndlessVecEnv(VecEnv):
                 "the engine must write final observations for Stable-Baselines3; start it with --final-observation"
             )
         self.envs = envs
+        self.metadata = envs.metadata
         self._actions: np.ndarray | None = None
         self.info: dict[str, Any] = {}
+        self._start = time.perf_counter()
         self._running: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         # Stable-Baselines3 converts observations with `torch.as_tensor`, which warns about read-only arrays, and never writes to
@@ -118,10 +122,20 @@ class EndlessVecEnv(VecEnv):
         observations, rewards, terminated, truncated, self.info = self.envs.step(self._actions)
         dones = np.logical_or(terminated, truncated)
         infos = self._running.copy()
+        seconds = time.perf_counter() - self._start
         for index in np.flatnonzero(dones).tolist():
             infos[index] = _final_row(self.info, index)
+            infos[index]["episode"] = {"r": infos[index]["reward"], "l": infos[index]["length"], "t": seconds}
             infos[index]["TimeLimit.truncated"] = bool(truncated[index] and not terminated[index])
         return observations, rewards.astype(np.float32), dones, infos
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Return the picture of each environment, uint8 (height, width, 3), as the render mode of the environments says.
+
+        Stable-Baselines3 records and shows only those of the render mode `rgb_array`. They are the ground-truth views if the
+        environments were made with `view="ground_truth"`.
+        """
+        return self.envs.render() or [None] * self.num_envs
 
     def close(self) -> None:
         """Close the environments."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -15,11 +15,22 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer
+from endless_gym.meanings import ActionBranch, Meaning, meanings
 
 #: The environment id that programs use by default.
 DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
 
 SCREEN = 84
+
+#: The kinds of observations.
+ObservationName = Literal["rgb", "features", "rgb+features"]
+
+#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
+OBSERVATIONS: dict[ObservationName, tuple[bool, bool]] = {
+    "rgb": (True, False),
+    "features": (False, True),
+    "rgb+features": (True, True),
+}
 
 
 @dataclass(frozen=True)
@@ -82,14 +93,20 @@ class Spec:
     branches: tuple[int, ...]
     #: Whether the action space is MultiDiscrete; otherwise it is Discrete, with one branch.
     multi_discrete: bool
+    #: What the numbers of each branch mean: `actions[branch].choices[number]`.
+    actions: tuple[ActionBranch, ...]
     #: Length of the vector observation; 0 without one.
     vector_observation: int
     #: Length of `info["ground_truth"]`; 0 without one.
     ground_truth: int
+    #: What its numbers mean.
+    ground_truth_columns: tuple[Meaning, ...]
     #: Names of the final infos besides `reward` and `length`, and whether the original's value is an int.
     info: tuple[tuple[str, bool], ...]
     #: Names of the feature observation's columns.
     features: tuple[str, ...]
+    #: What its numbers mean.
+    feature_columns: tuple[Meaning, ...]
     #: Reset parameters with their defaults.
     reset_parameters: dict[str, Any]
     render_fps: int
@@ -165,6 +182,18 @@ def spec(id: str) -> Spec:
     return known[name]
 
 
+def contents(observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
+    if not isinstance(observation, str) or observation not in OBSERVATIONS:
+        raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
+    if frames is not None and not isinstance(frames, Frames):
+        raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
+    has_frames, has_features = OBSERVATIONS[observation]
+    if frames is not None and not has_frames:
+        raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
+    return (frames or Frames()) if has_frames else None, has_features
+
+
 def options_text(options: Mapping[str, Any] | None) -> str:
     """Reset parameters as JSON text."""
     return "{}" if not options else json_text(dict(options))
@@ -190,10 +219,13 @@ def _spec(described: dict[str, Any]) -> Spec:
         summary=described["summary"],
         branches=tuple(choices) if multi_discrete else (choices,),
         multi_discrete=multi_discrete,
+        actions=tuple(ActionBranch(branch["name"], meanings(branch["choices"])) for branch in described["actions"]),
         vector_observation=described["vector_observation"],
-        ground_truth=described["ground_truth"],
+        ground_truth=len(described["ground_truth"]),
+        ground_truth_columns=meanings(described["ground_truth"]),
         info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
         features=tuple(column["name"] for column in described["features"]),
+        feature_columns=meanings(described["features"]),
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
         render_fps=described["render_fps"],
     )

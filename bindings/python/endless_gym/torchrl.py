@@ -37,7 +37,10 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
 
     * `observation`: uint8 (84, 84, 3); if the observation space is a dict, one entry for each of its keys,
     * `action`: int64 () for Discrete, (branches,) for MultiDiscrete spaces,
-    * `reward`: float32 (1,); `done`, `terminated`, `truncated`: bool (1,).
+    * `reward`: float32 (1,); `done`, `terminated`, `truncated`: bool (1,),
+    * `ground_truth`: float64 (k,), if the original has it,
+    * `("final_info", NAME)`: the original's final infos, such as `success` or `commands_completed`: float64 (1,), or int64 (1,)
+      for those that are integers, with `reward` float64 (1,) and `length` int64 (1,) of the episode. Zeros where no episode ends.
 
     At the end of an episode, `next` holds its last observation. `rollout` and collectors then reset the environment. On the CPU,
     observations are copied, since TorchRL stores them and transforms may modify them in place; to other devices they are
@@ -59,11 +62,19 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         space = envs.single_observation_space
         spaces = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
         batch = self.batch_size
-        self.observation_spec = Composite(
-            {key: _observation_spec(space, batch, self.device) for key, space in spaces.items()},
-            shape=batch,
-            device=device,
-        )
+        entries = {key: _observation_spec(space, batch, self.device) for key, space in spaces.items()}
+        described = envs._described
+        if described.ground_truth:
+            entries["ground_truth"] = Unbounded(
+                shape=(*batch, described.ground_truth), dtype=torch.float64, device=self.device
+            )
+        self._final = {name: torch.int64 if is_integer else torch.float64 for name, is_integer in described.info}
+        self._final |= {"reward": torch.float64, "length": torch.int64}
+        final = {
+            name: Unbounded(shape=(*batch, 1), dtype=dtype, device=self.device) for name, dtype in self._final.items()
+        }
+        entries["final_info"] = Composite(final, shape=batch, device=device)
+        self.observation_spec = Composite(entries, shape=batch, device=device)
         self.action_spec = _action_spec(envs.single_action_space, batch, self.device)
         self.reward_spec = Unbounded(shape=(*batch, 1), dtype=torch.float32, device=self.device)
         flag = Categorical(2, shape=torch.Size((*batch, 1)), dtype=torch.bool, device=self.device)
@@ -79,23 +90,24 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or bool(mask.all()):
-            observations, _ = self.envs.reset(seed=self._seed)
+            observations, info = self.envs.reset(seed=self._seed)
             self._seed = None
         else:
             mask = mask.reshape(self.batch_size).cpu().numpy()
-            observations, _ = self.envs.reset(options={"reset_mask": mask})
+            observations, info = self.envs.reset(options={"reset_mask": mask})
         return TensorDict(
-            {**self._to_tensors(observations), **self.full_done_spec.zero()},
+            {**self._to_tensors(observations), **self._infos(info), **self.full_done_spec.zero()},
             batch_size=self.batch_size,
             device=self.device,
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = tensordict.get("action").cpu().numpy()
-        observations, reward, terminated, truncated, _ = self.envs.step(actions)
+        observations, reward, terminated, truncated, info = self.envs.step(actions)
         return TensorDict(
             {
                 **self._to_tensors(observations),
+                **self._infos(info),
                 "reward": torch.tensor(reward, dtype=torch.float32, device=self.device).unsqueeze(-1),
                 "done": torch.tensor(np.logical_or(terminated, truncated), device=self.device).unsqueeze(-1),
                 "terminated": torch.tensor(terminated, device=self.device).unsqueeze(-1),
@@ -112,6 +124,18 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
         """Close the environments."""
         super().close(**kwargs)
         self.envs.close()
+
+    def _infos(self, info: dict[str, Any]) -> dict[str, Any]:
+        """The entries `ground_truth` and `final_info`. A vector environment has final infos only in steps that end episodes."""
+        zeros = np.zeros(self.batch_size[0])
+        final = {
+            name: torch.tensor(info.get(name, zeros), dtype=dtype, device=self.device).unsqueeze(-1)
+            for name, dtype in self._final.items()
+        }
+        entries: dict[str, Any] = {"final_info": TensorDict(final, batch_size=self.batch_size, device=self.device)}
+        if "ground_truth" in info:
+            entries["ground_truth"] = torch.tensor(info["ground_truth"], device=self.device)
+        return entries
 
     def _to_tensors(self, observations: np.ndarray | dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
         if not isinstance(observations, dict):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeGuard
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,29 +13,38 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.arguments import MAX_U64, integer, mapping
+from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.backends import Backend, InProcess, Reconnection, Remote
-from endless_gym.configuration import MODES, AutoresetMode, Options, checked_arguments, common_options
-from endless_gym.specs import Frames, Spec, options_text, spec
+from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Options, checked_arguments, options_list
+from endless_gym.episodes import EpisodeOptions, EpisodeTracker, RunningEpisode, checked_choice, running_episodes
+from endless_gym.meanings import documented, metadata
+from endless_gym.next_options import NextOptions
+from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
+from endless_gym.reset_requests import ResetRequests, Seeds
+from endless_gym.specs import Frames, ObservationName, Spec, all_specs, spec
 
-Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
+@documented(all_specs().values())
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
 
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+
     `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
-    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. The arrays are read-only
-    views of the memory that the engine wrote; their contents do not change while references to them exist. With `copy=True`
-    they are writable copies. `endless_gym.torch_view` returns read-only tensors that share their memory.
+    of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. Observations and
+    `ground_truth` are read-only views of the memory that the engine wrote; their contents do not change while references to them
+    exist. With `copy=True` they are writable copies, as rewards and flags always are. `endless_gym.torch_view` returns read-only
+    tensors that share their memory.
 
     `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
-    (n, k) if the original has it; in steps that end episodes the original's final infos (`reward`, `length`, ...), and `episode`
-    with the return `r`, the length `l` and the seconds since the environments were created `t`. With same-step auto-reset the
-    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was
-    started without `--final-observation`.
+    (n, k) if the original has it; in steps that end episodes the original's final infos: `reward`, the episode's return, float64
+    (n,), `length`, its steps, int32 (n,), and the numbers of the task. With same-step auto-reset the final infos are in
+    `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was started without
+    `--final-observation`. With `episode_info`, `info` and `final_info` also have what the episodes follow from: `seed` uint64
+    (n,), whose mask is false for episodes that continue a generator, and `options`, an array of n dicts.
     """
 
     def __init__(
@@ -49,18 +57,35 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         sections: Sequence[str],
         autoreset: AutoresetMode,
         copy: bool = False,
-        options: Options | None = None,
+        options: Sequence[Options] = ({},),
+        knows_options: bool = True,
+        render_mode: str | None = None,
+        view: View | None = None,
+        episode_options: EpisodeOptions | None = None,
+        episode_info: bool = False,
     ) -> None:
-        """Called by `make_vec` and `connect`. `options` is `None` if each environment has a mapping of its own."""
+        """Called by `make_vec` and `connect`.
+
+        `options` are those given at creation: one mapping for all environments, or one for each of all groups. `knows_options` is
+        false if the environments may have others.
+        """
+        shown = checked_view(render_mode, view, VECTOR_MODES)
+        self.render_mode = render_mode
+        self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
         self._backend = backend
         self._described = described
         self.num_envs = num_envs
         self.num_groups = backend.groups
         self.single_observation_space = described.observation_space(frames, "features" in sections)
         self.single_action_space = described.action_space()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {"autoreset_mode": autoreset, "render_fps": described.render_fps, "render_modes": []}
+        self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
+        self.metadata = {
+            "autoreset_mode": autoreset,
+            "render_fps": described.render_fps,
+            "render_modes": list(VECTOR_MODES),
+        }
+        self.metadata.update(metadata(described))
         self._index = {name: place for place, name in enumerate(sections)}
         names = {
             "observation": "visual_observation",
@@ -78,13 +103,17 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._ends = [self._index[name] for name in ("episode_return", "episode_length", "info")]
         self._integers = [is_integer for _, is_integer in described.info]
         self._same_step = autoreset is AutoresetMode.SAME_STEP
+        self._resets = ResetRequests(num_envs, backend.groups)
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.flags.writeable = False
-        self._start = time.perf_counter()
         self._copy = copy
-        self._options = None if options is None else dict(options)
-        self._changed_options = False
-        self._seed: int | None = None
+        self._options = NextOptions(backend, num_envs, options, knows_options)
+        self._chooses = checked_choice(episode_options) is not None
+        # By group; none if nobody wants to follow the episodes.
+        self._trackers = [
+            EpisodeTracker(group, num_envs, backend, self._options, autoreset, episode_options, episode_info, copy)
+            for group in range(backend.groups if self._chooses or episode_info else 0)
+        ]
 
     def reset(  # type: ignore[override]
         self,
@@ -99,9 +128,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`. Or a list or an array with a seed or
                 `None` for each environment of a group, or of all groups. Later episodes follow from this seed alone. `None`
                 uses the seeds given at creation for the first reset, and continues the generators afterwards.
-            options: Reset parameters until the next `reset`, which override those given at creation; and `reset_mask`, bool (n,),
-                the environments that start an episode. If the environments were created with one mapping each, only
-                `reset_mask`.
+            options: Reset parameters of the environments that are reset, until their next `reset` or `set_options`; they
+                override those given at creation and by `set_options`. And `reset_mask`, bool (n,), the environments that start
+                an episode. The others go on, and keep their options.
             group: The group to reset. `None` resets all groups and returns the arrays of group 0.
 
         Returns:
@@ -121,20 +150,11 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             group = self._group(group)
         given = mapping("options", options)
         mask = given.pop("reset_mask", None)
-        text = None
-        if given and self._options is None:
-            raise ValueError(
-                "options must be empty or contain only reset_mask, since the environments were created with one mapping each, "
-                f"got {given}"
-            )
-        if self._options is not None and (given or self._changed_options):
-            text = options_text({**self._options, **given})
-            self._changed_options = bool(given)
-        if group is not None or self.num_groups == 1:
-            return self._start_of(self._backend.reset(group or 0, self._request(seed, mask, group or 0), text))
-        requests = [self._request(seed, mask, number) for number in range(self.num_groups)]
-        batches = [self._backend.reset(number, request, text) for number, request in enumerate(requests)]
-        return self._start_of(batches[0])
+        groups = range(self.num_groups) if group is None else [group]
+        # All of them are checked before the first group is reset.
+        requests = {number: self._resets.request(seed, mask, number) for number in groups}
+        starts = [self._reset(number, request, mask, given) for number, request in requests.items()]
+        return starts[0]
 
     def step(self, actions: Any) -> Step:
         """Play one step of every environment.
@@ -159,7 +179,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             EngineLost: A served engine has ended; see `reconnect`.
             TooManyBatchesHeld: As for `reset`.
         """
-        return self._step(self._backend.step(actions))
+        if not self._trackers:
+            return self._step(self._backend.step(actions))
+        self._trackers[0].before_step()
+        return self._followed(0, self._step(self._backend.step(actions)))
 
     def send(self, actions: Any, group: int = 0) -> None:
         """Step a group without waiting for the result, which `recv` returns.
@@ -175,7 +198,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             ValueError: As for `step`, or there is no such group.
             RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
-        self._backend.send(actions, self._group(group))
+        group = self._group(group)
+        if self._trackers:
+            self._trackers[group].before_step()
+        self._backend.send(actions, group)
 
     def recv(self, group: int | None = None) -> Step:
         """Wait for the result of a group's `send` or `send_reset`, and return it as `step` does.
@@ -196,6 +222,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         number, arrays = self._backend.receive(None if group is None else self._group(group))
         step = self._step(arrays)
         step[4]["group"] = number
+        if self._trackers:
+            self._followed(number, step)
         return step
 
     def send_reset(self, group: int = 0, *, seed: Seeds = None) -> None:
@@ -210,7 +238,49 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
         group = self._group(group)
-        self._backend.send_reset(group, self._request(seed, None, group))
+        request, envs = self._resets.request(seed, None, group), range(self.num_envs)
+        text = self._before_reset(group, envs, {})
+        self._backend.send_reset(group, request, text)
+        self._sent_reset(group, envs, {}, text)
+
+    def set_options(
+        self,
+        options: Options | Sequence[Options | None],
+        *,
+        mask: NDArray[np.bool_] | None = None,
+        group: int | None = None,
+    ) -> None:
+        """Set the reset parameters of the next episodes, however these begin: by auto-reset or by a reset.
+
+        They override those given at creation, and replace those of earlier calls and of the last `reset`. Running episodes do not
+        change. With same-step auto-reset the next episode begins in the step that ends the running one.
+
+        Args:
+            options: One mapping for all environments, or a sequence with one for each environment of a group, or of all groups;
+                `None` in a sequence leaves an environment as it is. An empty mapping returns to the options of creation.
+            mask: bool (n,), the environments of a group whose options are set; `None` for all.
+            group: The group; `None` for all groups.
+
+        Raises:
+            TypeError: The options are neither a mapping nor a sequence of mappings.
+            ValueError: An option is unknown or out of its range, the sequence or the mask has a wrong length, or
+                `episode_options` chooses the options. Groups with a lower number have changed.
+            RuntimeError: The group's last `send` or `send_reset` has not been received.
+            TimeoutError: A served engine did not answer in time. The call may be repeated.
+        """
+        if self._chooses:
+            raise ValueError("options must not be set, since `episode_options` chooses those of each episode")
+        groups = range(self.num_groups) if group is None else [self._group(group)]
+        self._options.set_all(groups, self._resets.envs(mask, "mask"), options)
+
+    def running_episodes(self, group: int = 0) -> list[RunningEpisode]:
+        """What the running episodes of a group's environments follow from: seeds and options; see `RunningEpisode`.
+
+        Raises:
+            ValueError: There is no such group.
+            RuntimeError: As for `snapshot`.
+        """
+        return list(running_episodes(self._backend, self._group(group), range(self.num_envs)).values())
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
         """The complete state of one environment, which `restore` accepts for any environment of the same id.
@@ -239,8 +309,28 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         group = self._group(group)
         for env, snapshot in snapshots.items():
             self._backend.restore(group, self._env(env), snapshot)
+            self._options.forget(group, [env])
         # A reset of no environment returns the current observations.
-        return self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
+        start = self._start_of(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
+        if self._trackers:
+            self._trackers[group].after_restore(list(snapshots) or range(self.num_envs), start[1])
+        return start
+
+    def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
+
+        With `rgb_array` the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
+        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process, from a snapshot, so
+        that the environments stay as they are. With same-step auto-reset, it shows the new episode, as everywhere in Gymnasium.
+
+        Raises:
+            ValueError: There is no such group.
+            RuntimeError, TimeoutError, EngineLost: As for `snapshot`.
+        """
+        group = self._group(group)
+        if self._renderer is None:
+            return None
+        return self._renderer.render(self._backend.snapshot(group, env) for env in range(self.num_envs))
 
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
         """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed `[row][column][channel]`.
@@ -293,7 +383,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             RuntimeError: The environments are in this process.
             ValueError: The timeout is negative or not finite.
         """
-        return self._backend.reconnect(checked_timeout(timeout))
+        found = self._backend.reconnect(checked_timeout(timeout))
+        for group in range(self.num_groups if found.restarted else 0):
+            self._options.forget(group, range(self.num_envs))
+        return found
 
     def close_extras(self, **kwargs: Any) -> None:
         """Disconnect, and stop the engine if `serve` started it. Arrays remain valid."""
@@ -311,38 +404,35 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _group(self, given: int) -> int:
         return integer("group", given, 0, self.num_groups - 1)
 
-    def _request(self, seed: Seeds, mask: Any, group: int) -> _native.Reset | None:
-        if mask is None and not _has_items(seed):
-            return None if seed is None else integer("seed", seed)
-        if mask is None:
-            chosen = self._all
-        else:
-            chosen = np.asarray(mask)
-            if chosen.dtype != np.bool_ or chosen.shape != (self.num_envs,):
-                raise ValueError(
-                    f"reset_mask must be a bool array of shape ({self.num_envs},), got {chosen.dtype} {chosen.shape}"
-                )
-        seeds = self._seeds(seed, group)
-        reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
-        return reset, [given or 0 for given in seeds]
+    def _before_reset(self, group: int, envs: Sequence[int], given: Options) -> str | None:
+        if self._trackers:
+            self._trackers[group].before_reset(envs)
+        return self._options.prepare(group, envs, given)
 
-    def _seeds(self, seed: Seeds, group: int) -> list[int | None]:
-        """One seed for each environment of a group."""
-        if seed is None:
-            return [None] * self.num_envs
-        if not _has_items(seed):
-            # Sums wrap, as in the engine.
-            first = integer("seed", seed) + group * self.num_envs
-            return [(first + env) & MAX_U64 for env in range(self.num_envs)]
-        given: list[Any] = list(seed)
-        if len(given) == self.num_envs * self.num_groups:
-            given = given[group * self.num_envs :][: self.num_envs] if self.num_groups > 1 else given
-        elif len(given) != self.num_envs:
-            allowed = f"{self.num_envs} items, one for each environment"
-            if self.num_groups > 1:
-                allowed += f" of a group, or {self.num_envs * self.num_groups} for all groups"
-            raise ValueError(f"seed must have {allowed}, got {len(given)}")
-        return [None if each is None else integer("seed", each) for each in given]
+    def _reset(
+        self, group: int, request: _native.Reset | None, mask: Any, given: Options
+    ) -> tuple[Any, dict[str, Any]]:
+        envs = self._resets.envs(mask)
+        text = self._before_reset(group, envs, given)
+        try:
+            start = self._start_of(self._backend.reset(group, request, text))
+        except (TimeoutError, _native.TooManyBatchesHeld):
+            # `recv` can still return the result.
+            self._sent_reset(group, envs, given, text)
+            raise
+        self._options.started(group, envs, given, text)
+        if self._trackers:
+            self._trackers[group].after_reset(envs, start[1])
+        return start
+
+    def _sent_reset(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:
+        self._options.started(group, envs, given, text)
+        if self._trackers:
+            self._trackers[group].sent_reset(envs)
+
+    def _followed(self, group: int, step: Step) -> Step:
+        self._trackers[group].after_step(step[2], step[4])
+        return step
 
     def _observation(self, arrays: _native.Arrays, places: list[tuple[str, int]]) -> Any:
         if len(places) == 1:
@@ -371,15 +461,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
         """Adds the infos of the episodes that this step ended, if it ended any."""
         returns, lengths, infos = (arrays[place] for place in self._ends)
-        seconds = time.perf_counter() - self._start
-        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers, seconds)
+        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers)
         if ends is None:
             return
-        ended, returns, lengths, times, columns = ends
+        ended, returns, lengths, columns = ends
         final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
         for (name, _), column in zip(self._described.info, columns, strict=True):
             final[name], final[f"_{name}"] = column, ended
-        info["episode"], info["_episode"] = {"r": returns, "l": lengths, "t": times}, ended
         if not self._same_step:
             info.update(final)
             return
@@ -404,11 +492,16 @@ def make_vec(
     seed: int | None = None,
     seeds: range | Sequence[int] | None = None,
     options: Options | Sequence[Options] | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    observation: str = "rgb",
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
+    independent_episodes: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
 ) -> EndlessVectorEnv:
     """Create environments in this process.
 
@@ -428,12 +521,33 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
+        independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
+            alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
+            an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
+            the last one's background, and an episode continues the generator that the one before has drawn from.
+        render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
+        view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
+        episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between two
+            steps, before the one in which the episode may begin: with same-step auto-reset one episode ahead.
+        episode_info: Whether `info` has the seed and the options of each running episode.
 
     Raises:
-        TypeError: A number is not an integer.
+        TypeError: A number is not an integer, or `episode_options` cannot be called.
         ValueError: An argument is out of its range.
     """
-    given = checked_arguments(id, num_envs, num_threads, groups, seed, seeds, options, autoreset, observation, frames)
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+    )
     # As in an engine, groups share threads.
     threads = _native.Threads(given.num_threads)
     pools = [_native.Pool(config, group, threads) for group, config in enumerate(given.pools)]
@@ -445,27 +559,47 @@ def make_vec(
         sections=pools[0].sections(),
         autoreset=given.autoreset,
         copy=copy,
-        options=common_options(options),
+        options=options_list(options),
+        render_mode=render_mode,
+        view=view,
+        episode_options=episode_options,
+        episode_info=episode_info,
     )
 
 
-def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: Any = None) -> EndlessVectorEnv:
+def connect(
+    service: str,
+    *,
+    timeout: float = 30.0,
+    copy: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
+    engine: Any = None,
+) -> EndlessVectorEnv:
     """Connect to a running engine, started by `endless serve --service NAME` or by `serve`.
 
     Args:
         service: The engine's name.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
+        episode_options: As for `make_vec`. It is called in this process; options that differ from the environment's last ones
+            are sent to the engine before the next step.
+        episode_info: As for `make_vec`. Each step in which episodes begin asks the engine for them, which needs one of its
+            `batches_held`.
         engine: Used by `serve`.
 
     Raises:
         ConnectionError: There is no such engine, or it already has a trainer.
-        ValueError: The timeout is negative or not finite.
+        ValueError: The timeout is negative or not finite, or there is no such render mode or view.
     """
     timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
-    options = specification["options"]
     return EndlessVectorEnv(
         Remote(connection, specification["groups"], timeout, engine),
         described=spec(specification["id"]),
@@ -474,17 +608,11 @@ def connect(service: str, *, timeout: float = 30.0, copy: bool = False, engine: 
         sections=[section["name"] for section in specification["batch"]["sections"]],
         autoreset=MODES[specification["autoreset"]],
         copy=copy,
-        options=options[0] if len(options) == 1 else None,
+        options=specification["options"],
+        # An earlier trainer may have changed them, or a checkpoint.
+        knows_options=False,
+        render_mode=render_mode,
+        view=view,
+        episode_options=episode_options,
+        episode_info=episode_info,
     )
-
-
-def gymnasium_vec(id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> EndlessVectorEnv:
-    """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
-    if render_mode is not None:
-        raise gymnasium.error.Error(f"render_mode must be None for vector environments, got {render_mode!r}")
-    return make_vec(id, num_envs, **kwargs)
-
-
-def _has_items(seed: Seeds) -> TypeGuard[Sequence[int | None]]:
-    """Whether there is a seed for each environment, instead of one for all."""
-    return isinstance(seed, Sequence) or (isinstance(seed, np.ndarray) and seed.ndim > 0)

@@ -102,6 +102,11 @@ class Agent(nn.Module):
 
 if __name__ == "__main__":
     args = tyro.cli(Args)
+    batch_size = args.num_envs * args.num_steps
+    if isinstance(endless_gym.spec(args.env_id).observation_space(), gym.spaces.Dict):
+        raise SystemExit(f"{args.env_id} has dict observations, which this program does not support; choose another id")
+    if args.total_timesteps < batch_size:
+        raise SystemExit(f"--total-timesteps must be at least num_envs * num_steps, {batch_size}, for one update")
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
@@ -125,7 +130,6 @@ if __name__ == "__main__":
     returns_of_episodes: deque[float] = deque(maxlen=100)
     start_time = time.time()
 
-    batch_size = args.num_envs * args.num_steps
     for iteration in range(1, args.total_timesteps // batch_size + 1):
         initial_state = tuple(part.clone() for part in next_state)
         for step in range(args.num_steps):
@@ -139,8 +143,8 @@ if __name__ == "__main__":
             rewards[step] = torch.tensor(reward)
             next_obs = endless_gym.torch_view(next_obs).to(device)
             next_done = torch.tensor(terminated | truncated, dtype=torch.float32, device=device)
-            if "episode" in info:
-                returns_of_episodes.extend(info["episode"]["r"][info["_episode"]])
+            if "final_info" in info:
+                returns_of_episodes.extend(info["final_info"]["reward"][info["_final_info"]])
 
         # Generalised advantage estimation
         with torch.no_grad():

@@ -59,6 +59,8 @@ def main() -> None:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     parser.add_argument("--device", default=device, help="PyTorch device; by default CUDA if available")
     args = parser.parse_args()
+    if "MortarMayhemB" in args.env_id:
+        parser.error(f"{args.env_id} has dict observations, which the policy here does not support; choose another id")
 
     torch.manual_seed(args.seed)
     env = EndlessEnv.make(args.env_id, args.num_envs, device=args.device)

@@ -5,7 +5,9 @@ use std::time::Duration;
 use endless_gym::batch::Frames;
 use endless_gym::batch::PixelFormat;
 use endless_gym::envs::ActionSpace;
-use endless_gym::pool::{Autoreset, ResetOptions, ResetRequest, Seeding, UnknownAutoreset};
+use endless_gym::pool::{
+    Autoreset, NextOptions, ResetOptions, ResetRequest, RunningEpisode, Seeding, UnknownAutoreset,
+};
 use endless_gym::service::timeout_from_seconds;
 use numpy::{
     Element, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
@@ -133,6 +135,19 @@ pub fn timeout(seconds: f64) -> PyResult<Duration> {
 /// Reset parameters from the JSON text of an object.
 pub fn options(text: &str) -> PyResult<Map<String, Json>> {
     serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
+}
+
+/// The options of next episodes, from the JSON text of a list of objects with `options` and `envs`.
+pub fn next_options(text: &str) -> PyResult<Vec<NextOptions>> {
+    serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
+}
+
+/// A running episode: the environment's number, the seed, the JSON text of the options, and whether the last step ended it.
+pub type Episode = (usize, Option<u64>, String, bool);
+
+/// A running episode for Python.
+pub fn episode(RunningEpisode { env, seed, options, ended }: RunningEpisode) -> Episode {
+    (env, seed, Json::from(options).to_string(), ended)
 }
 
 /// The reset parameters of a pool, from the JSON text of one object for all environments, or of a list with one for each.

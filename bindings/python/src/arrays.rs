@@ -2,7 +2,7 @@
 
 use std::ffi::c_void;
 
-use endless_gym::batch::{Block, Dtype, Layout, MAX_DIMENSIONS, RowShape, Section, SectionTable};
+use endless_gym::batch::{BatchSection, Block, Dtype, Layout, MAX_DIMENSIONS, RowShape, Section, SectionTable};
 use numpy::npyffi::{NPY_ARRAY_ALIGNED, NPY_ARRAY_C_CONTIGUOUS, NpyTypes, PY_ARRAY_API, PyArrayObject, npy_intp};
 use numpy::{PyArrayDescr, PyArrayDescrMethods, dtype, npyffi};
 use pyo3::PyClass;
@@ -21,7 +21,13 @@ pub unsafe trait Owner {
     fn memory(&self) -> (*const Block, usize);
 }
 
-/// The sections of a batch in the layout's order, each a read-only array whose base is `owner`.
+/// Whether Python gets a copy of a section, which it may write to: a few bytes for each environment, which Gymnasium's wrappers and
+/// trainers change in place.
+fn is_copied(section: BatchSection) -> bool {
+    matches!(section, BatchSection::Reward | BatchSection::Terminated | BatchSection::Truncated)
+}
+
+/// The sections of a batch in the layout's order: copies of rewards and flags, and otherwise read-only arrays whose base is `owner`.
 pub fn sections<'py, T: PyClass<Frozen = True> + Owner + Sync>(
     owner: &Bound<'py, T>,
     layout: &Layout,
@@ -43,11 +49,12 @@ pub fn sections<'py, T: PyClass<Frozen = True> + Owner + Sync>(
             }
             let shape = &mut shape[..=section.shape().len()];
             let data = memory.wrapping_byte_add(section.offset());
+            let owner = (!is_copied(section.name())).then_some(owner.as_any());
             // SAFETY: a layout is checked when it is made or deserialised, so the section lies within its blocks, at a multiple of
             // 64 bytes, and there are as many blocks. The memory stays mapped and is not written to while the owner lives, which
             // the array keeps alive. Every bit pattern is valid for the dtype: numpy takes any nonzero byte of a boolean array as
             // true.
-            unsafe { array(py, descriptor(py, section), shape, data, owner.as_any()) }
+            unsafe { array(py, descriptor(py, section), shape, data, owner) }
         })
         .collect::<PyResult<Vec<_>>>()?;
     PyTuple::new(py, arrays)
@@ -65,20 +72,27 @@ fn descriptor<'py>(py: Python<'py>, section: &Section) -> Bound<'py, PyArrayDesc
     }
 }
 
-/// A read-only array over foreign memory.
+/// A read-only array over foreign memory, whose base is `owner`; without an owner, an array with a copy of it.
 ///
 /// # Safety
 ///
-/// `data` points to numbers of that type and shape in C order, which stay mapped and unchanged for as long as `owner` lives.
+/// `data` points to numbers of that type and shape in C order, which stay mapped and unchanged during the call, and for as long as
+/// `owner` lives.
 unsafe fn array<'py>(
     py: Python<'py>,
     descriptor: Bound<'py, PyArrayDescr>,
     shape: &mut [npy_intp],
     data: *const Block,
-    owner: &Bound<'py, PyAny>,
+    owner: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    // SAFETY: the arguments are as numpy's documentation requires; both calls steal a reference, to the descriptor and to the
-    // owner, even if they fail.
+    let bytes = shape.iter().map(|length| *length as usize).product::<usize>() * descriptor.itemsize();
+    let (memory, flags) = match owner {
+        Some(_) => (data.cast_mut().cast::<c_void>(), NPY_ARRAY_ALIGNED | NPY_ARRAY_C_CONTIGUOUS),
+        // numpy allocates the memory of a writable array in C order.
+        None => (std::ptr::null_mut(), 0),
+    };
+    // SAFETY: the arguments are as numpy's documentation requires; the calls steal a reference, to the descriptor and to the
+    // owner, even if they fail. A new array has `bytes` bytes, which nothing else refers to.
     unsafe {
         let array = PY_ARRAY_API.PyArray_NewFromDescr(
             py,
@@ -87,14 +101,18 @@ unsafe fn array<'py>(
             shape.len() as i32,
             shape.as_mut_ptr(),
             std::ptr::null_mut(),
-            data.cast_mut().cast::<c_void>(),
-            NPY_ARRAY_ALIGNED | NPY_ARRAY_C_CONTIGUOUS,
+            memory,
+            flags,
             std::ptr::null_mut(),
         );
         let array = Bound::from_owned_ptr_or_err(py, array)?;
-        let base = owner.clone().into_ptr();
-        if PY_ARRAY_API.PyArray_SetBaseObject(py, array.as_ptr().cast::<PyArrayObject>(), base) < 0 {
-            return Err(PyErr::fetch(py));
+        let object = array.as_ptr().cast::<PyArrayObject>();
+        match owner {
+            None => std::ptr::copy_nonoverlapping(data.cast::<u8>(), (*object).fields.data.cast::<u8>(), bytes),
+            Some(owner) if PY_ARRAY_API.PyArray_SetBaseObject(py, object, owner.clone().into_ptr()) < 0 => {
+                return Err(PyErr::fetch(py));
+            }
+            Some(_) => {}
         }
         Ok(array)
     }

@@ -11,19 +11,19 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 
-use crate::arguments::{self, ActionShape, Reset};
+use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::arrays::{self, Owner};
 use crate::{errors, logs};
 
 /// Longest time between two runs of Python's signal handlers, among them that of Ctrl-C.
-const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+pub const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The steps of a group in the engine that is connected and in the one that was lost, and what became of the last request.
 type GroupFound = (Option<u64>, Option<u64>, &'static str);
 
 /// The owner of the arrays of one batch in shared memory. The engine writes to the memory again once all arrays are gone.
 #[pyclass(frozen)]
-struct Lease(BatchLease);
+pub struct Lease(pub BatchLease);
 
 // SAFETY: the engine does not write to a batch that a trainer holds, and its memory stays mapped for as long.
 unsafe impl Owner for Lease {
@@ -111,6 +111,24 @@ impl Connection {
         self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
+    /// Sets the options of next episodes; see `arguments::next_options`.
+    fn set_options(&mut self, py: Python<'_>, group: usize, sets: &str, timeout: f64) -> PyResult<()> {
+        let sets = arguments::next_options(sets)?;
+        self.wait(py, timeout, |trainer, slice| trainer.set_options(group, &sets, slice))
+    }
+
+    /// What the running episodes of environments follow from.
+    fn running_episodes(
+        &mut self,
+        py: Python<'_>,
+        group: usize,
+        envs: Vec<usize>,
+        timeout: f64,
+    ) -> PyResult<Vec<Episode>> {
+        let episodes = self.wait(py, timeout, |trainer, slice| trainer.running_episodes(group, &envs, slice))?;
+        Ok(episodes.into_iter().map(arguments::episode).collect())
+    }
+
     /// Saves all environments of the engine to its checkpoint file. Returns the step of each group.
     fn checkpoint(&mut self, py: Python<'_>, timeout: f64) -> PyResult<Vec<u64>> {
         self.wait(py, timeout, Trainer::checkpoint)
@@ -179,7 +197,7 @@ impl Connection {
 
 /// Calls `connect` with parts of the timeout until there is an engine, without the interpreter's lock, and runs Python's signal
 /// handlers between the calls.
-fn wait_for_engine<T: Send>(
+pub fn wait_for_engine<T: Send>(
     py: Python<'_>,
     timeout: f64,
     mut connect: impl FnMut(Duration) -> Result<T, ServiceError> + Send,

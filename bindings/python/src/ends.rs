@@ -10,8 +10,8 @@ use pyo3::prelude::*;
 
 type Column<'py> = Bound<'py, PyAny>;
 
-/// Of a step that ended episodes: which environments' episodes ended, their returns and lengths, `seconds` in their rows, and the
-/// columns of `info`, as int64 where `integers` says so. `None` if no episode ended.
+/// Of a step that ended episodes: which environments' episodes ended, their returns and lengths, and the columns of `info`, as
+/// int64 where `integers` says so. `None` if no episode ended.
 ///
 /// `ended` may lie in shared memory. Each byte is read once; any nonzero byte is true.
 #[pyfunction]
@@ -23,8 +23,7 @@ pub fn ended_episodes<'py>(
     episode_length: PyReadonlyArray1<'py, i32>,
     info: PyReadonlyArray2<'py, f64>,
     integers: Vec<bool>,
-    seconds: f64,
-) -> PyResult<Option<(Column<'py>, Column<'py>, Column<'py>, Column<'py>, Vec<Column<'py>>)>> {
+) -> PyResult<Option<(Column<'py>, Column<'py>, Column<'py>, Vec<Column<'py>>)>> {
     let len = ended.len();
     let (returns, lengths, info) = (episode_return.as_array(), episode_length.as_array(), info.as_array());
     if [returns.len(), lengths.len(), info.nrows()] != [len; 3] || info.ncols() != integers.len() {
@@ -48,7 +47,6 @@ pub fn ended_episodes<'py>(
         column(py, len, &rows, |_| true)?,
         column(py, len, &rows, |row| returns[row])?,
         column(py, len, &rows, |row| lengths[row])?,
-        column(py, len, &rows, |_| seconds)?,
         columns.collect::<PyResult<_>>()?,
     )))
 }

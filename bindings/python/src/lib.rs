@@ -9,8 +9,11 @@ mod connection;
 mod dlpack;
 mod ends;
 mod errors;
+mod experts;
 mod logs;
+mod observer;
 mod pool;
+mod renderer;
 mod single;
 
 use std::ffi::OsString;
@@ -46,9 +49,12 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("MAX_BATCHES_HELD", endless_gym::service::MAX_BATCHES_HELD)?;
     module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
+    module.add_class::<experts::Experts>()?;
+    module.add_class::<observer::Observer>()?;
     module.add_class::<pool::Pool>()?;
     module.add_class::<pool::PoolConfig>()?;
     module.add_class::<pool::Threads>()?;
+    module.add_class::<renderer::Renderer>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;

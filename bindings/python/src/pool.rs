@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use serde_json::{Map, Value as Json};
 
-use crate::arguments::{self, ActionShape, Reset};
+use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
 use crate::{arrays, errors};
 
@@ -33,7 +33,7 @@ pub struct PoolConfig(engine::PoolConfig);
 #[pymethods]
 impl PoolConfig {
     #[new]
-    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation))]
+    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation, independent_episodes=false))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         id: &str,
@@ -48,6 +48,7 @@ impl PoolConfig {
         frames: Option<(bool, bool, bool, usize)>,
         features: bool,
         final_observation: bool,
+        independent_episodes: bool,
     ) -> PyResult<Self> {
         let config = engine::PoolConfig {
             options: arguments::pool_options(options)?,
@@ -56,6 +57,7 @@ impl PoolConfig {
             frames: frames.map(arguments::frames),
             features,
             final_observation,
+            independent_episodes,
             first_env,
             total_envs,
             ..engine::PoolConfig::new(id, num_envs)
@@ -178,6 +180,22 @@ impl Pool {
         self.check_process()?;
         self.check_idle()?;
         self.pool.restore(env, snapshot).map_err(errors::snapshot)
+    }
+
+    /// Sets the options of next episodes; see `arguments::next_options`.
+    fn set_options(&mut self, sets: &str) -> PyResult<()> {
+        let sets = arguments::next_options(sets)?;
+        self.check_process()?;
+        self.check_idle()?;
+        self.pool.set_options(&sets).map_err(errors::pool)
+    }
+
+    /// What the running episodes of environments follow from.
+    fn running_episodes(&self, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
+        self.check_process()?;
+        self.check_idle()?;
+        let episodes = envs.into_iter().map(|env| self.pool.running_episode(env).map(arguments::episode));
+        episodes.collect::<Result<_, _>>().map_err(errors::pool)
     }
 
     /// The ground-truth view of one environment, indexed \[row\]\[column\]\[channel\].

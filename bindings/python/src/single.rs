@@ -1,18 +1,19 @@
 //! One environment with the interface of the original. Every step returns newly allocated arrays.
 
-use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
 use endless_gym::envs::{ActionSpace, FRAME_BYTES, SCREEN};
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
-use numpy::{PyArray1, PyArrayMethods};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, SavedEnv, Threads};
+use numpy::{Element, PyArray1, PyArrayMethods};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arguments::{self, ActionShape};
 use crate::errors;
 
-/// Frame, vector observation and ground truth; `None` for those that the environment does not have.
-type Arrays<'py> = (Bound<'py, PyAny>, Option<Bound<'py, PyAny>>, Option<Bound<'py, PyAny>>);
+/// Frames, features, vector observation and ground truth; `None` for those that the environment does not have.
+type Arrays<'py> = [Option<Bound<'py, PyAny>>; 4];
 
 /// One environment without auto-reset.
 #[pyclass(module = "endless_gym._native")]
@@ -26,10 +27,19 @@ pub struct Single {
 #[pymethods]
 impl Single {
     #[new]
-    fn new(id: &str, options: &str) -> PyResult<Self> {
+    fn new(
+        id: &str,
+        options: &str,
+        frames: Option<(bool, bool, bool, usize)>,
+        features: bool,
+        independent_episodes: bool,
+    ) -> PyResult<Self> {
         let config = PoolConfig {
             options: ResetOptions::Shared(arguments::options(options)?),
             autoreset: Autoreset::Disabled,
+            frames: frames.map(arguments::frames),
+            features,
+            independent_episodes,
             ..PoolConfig::new(id, 1)
         };
         let threads = Threads::new(1).map_err(errors::pool)?;
@@ -67,15 +77,19 @@ impl Single {
         Ok((self.arrays(py)?, batch.reward()[0], ended, end))
     }
 
-    /// The last frame, indexed \[row\]\[column\]\[channel\].
+    /// The last frame of the original's format, indexed \[row\]\[column\]\[channel\].
     fn rgb_array<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let mut picture = vec![0; FRAME_BYTES];
         rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), &mut picture);
         Ok(PyArray1::from_vec(py, picture).reshape([SCREEN, SCREEN, 3])?.into_any())
     }
 
-    /// The ground-truth view, indexed \[row\]\[column\]\[channel\].
-    fn ground_truth_view<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+    /// The ground-truth view, indexed \[row\]\[column\]\[channel\]: the one that follows the last view, as in the original, or that of
+    /// the current step.
+    fn ground_truth_view<'py>(&mut self, py: Python<'py>, of_current_step: bool) -> PyResult<Bound<'py, PyAny>> {
+        if of_current_step {
+            self.pool.align_ground_truth_view(0).map_err(errors::pool)?;
+        }
         let mut view = vec![0; VIEW_BYTES];
         self.pool.ground_truth_view(0, &mut view).map_err(errors::pool)?;
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
@@ -90,16 +104,36 @@ impl Single {
         self.pool.observe(&mut self.blocks).map_err(errors::pool)?;
         self.arrays(py)
     }
+
+    /// The complete state: a snapshot, and the earlier frames of a stacked observation; `None` before the first reset.
+    fn save<'py>(&self, py: Python<'py>) -> PyResult<Option<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)>> {
+        let saved = self.pool.save().map_err(errors::snapshot)?.and_then(|mut saved| saved.pop());
+        Ok(saved.map(|saved| (PyBytes::new(py, &saved.snapshot), PyBytes::new(py, &saved.earlier_frames))))
+    }
+
+    /// Continues from what `save` returned.
+    fn resume(&mut self, snapshot: Vec<u8>, earlier_frames: Vec<u8>) -> PyResult<()> {
+        let saved = [SavedEnv { snapshot, earlier_frames }];
+        self.pool.resume(&saved).map_err(|error| PyValueError::new_err(error.to_string()))?;
+        self.pool.observe(&mut self.blocks).map_err(errors::pool)
+    }
 }
 
 impl Single {
     fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Arrays<'py>> {
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        let frame = PyArray1::from_slice(py, batch.observation()).reshape([SCREEN, SCREEN, 3])?.into_any();
-        let vector = batch.vector_observation();
-        let truth = batch.ground_truth();
-        let vector = (!vector.is_empty()).then(|| PyArray1::from_slice(py, vector).into_any());
-        let truth = (!truth.is_empty()).then(|| PyArray1::from_slice(py, truth).into_any());
-        Ok((frame, vector, truth))
+        let shape = self.pool.layout().section(BatchSection::Observation).map(|section| section.shape().to_vec());
+        let frames = shape.map(|shape| PyArray1::from_slice(py, batch.observation()).reshape(shape)).transpose()?;
+        Ok([
+            frames.map(Bound::into_any),
+            row(py, batch.features()),
+            row(py, batch.vector_observation()),
+            row(py, batch.ground_truth()),
+        ])
     }
+}
+
+/// The only row of a section; `None` if the batch does not have it.
+fn row<'py, T: Element>(py: Python<'py>, numbers: &[T]) -> Option<Bound<'py, PyAny>> {
+    (!numbers.is_empty()).then(|| PyArray1::from_slice(py, numbers).into_any())
 }

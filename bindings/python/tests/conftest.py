@@ -26,6 +26,31 @@ def original_python() -> str:
     return python
 
 
+@pytest.fixture(scope="session")
+def libraries_python() -> str:
+    """A Python that has Ray, JAX and Jupyter's kernel, and what this one has."""
+    python = os.environ.get("ENDLESS_LIBRARIES_PYTHON")
+    if not python:
+        pytest.fail("ENDLESS_LIBRARIES_PYTHON names no Python with requirements-libraries.txt; run `cargo xtask test`")
+    return python
+
+
+@pytest.fixture
+def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A folder for Ray's logs and sockets, whose paths must be short, with nothing sent or written elsewhere."""
+    with tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        monkeypatch.setenv("RAY_TMPDIR", folder)
+        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # otherwise it writes a token to the home directory
+        monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        yield folder
+
+
+@pytest.fixture(autouse=True, scope="session")
+def sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The folder for the logs of Stable-Baselines3, in this process and its children; by default it makes new ones in /tmp."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
 @pytest.fixture(autouse=True, scope="session")
 def own_namespace() -> Iterator[Path]:
     """A namespace root of this test run, so that runs at the same time do not see each other's engines and segments."""

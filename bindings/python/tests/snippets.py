@@ -4,6 +4,7 @@ A comment before a block says how to treat it; readers of the page do not see it
 
     <!-- not run: REASON -->    the block is not run; the reason is reported
     <!-- continues -->          the block is run after the one before it, in the same folder; Python blocks share their names
+    <!-- libraries -->          the block is run with the packages of requirements-libraries.txt
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ ROOT = Path(__file__).parents[3]
 FENCE = re.compile(
     r"^(?P<indent> *)```(?P<language>[a-z]*)(?P<attributes>\S*)[^\n]*\n(?P<code>.*?)^(?P=indent)```$", re.M | re.S
 )
-COMMENT = re.compile(r"<!-- (not run: (?P<reason>.+?)|(?P<continues>continues)) -->\s*\Z")
+COMMENT = re.compile(r"<!-- (not run: (?P<reason>.+?)|(?P<continues>continues)|(?P<libraries>libraries)) -->\s*\Z")
 SHELL = ("sh", "bash", "console")
 
 
@@ -33,6 +34,7 @@ class Block:
     #: Why it is not run.
     reason: str = ""
     continues: bool = False
+    libraries: bool = False
 
     @property
     def name(self) -> str:
@@ -55,9 +57,9 @@ def blocks(file: Path) -> Iterator[Block]:
     for found in FENCE.finditer(text):
         comment = COMMENT.search(text[: found.start()])
         reason = (comment and comment["reason"]) or ""
-        continues = bool(comment and comment["continues"])
+        continues, libraries = (bool(comment and comment[name]) for name in ("continues", "libraries"))
         line = text[: found.start()].count("\n") + 1
-        yield Block(file, line, found["language"], textwrap.dedent(found["code"]), reason, continues)
+        yield Block(file, line, found["language"], textwrap.dedent(found["code"]), reason, continues, libraries)
 
 
 def programs(file: Path) -> list[list[Block]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import warnings
@@ -25,9 +26,9 @@ def random_actions(envs, rng: np.random.Generator, num_envs: int) -> np.ndarray:
     return rng.integers(0, highest, size=(num_envs, *space.shape))
 
 
-def reference(env_id: str, num_envs: int, autoreset: str, seed: int):
+def reference(env_id: str, num_envs: int, autoreset: str, seed: int, **kwargs):
     """The package's own vector environment, which an adapter is compared with."""
-    envs = endless_gym.make_vec(env_id, num_envs=num_envs, autoreset=autoreset)
+    envs = endless_gym.make_vec(env_id, num_envs=num_envs, autoreset=autoreset, **kwargs)
     return envs, envs.reset(seed=seed)[0]
 
 
@@ -164,6 +165,7 @@ class TestStableBaselines3:
             venv = VecNormalize(VecFrameStack(self.make(SHORT, num_envs=4), 2), norm_obs=False)
             model = PPO("CnnPolicy", venv, n_steps=32, batch_size=64, n_epochs=1, device="cpu").learn(128)
             assert model.num_timesteps == 128
+            assert model.logger.get_dir() == os.environ["SB3_LOGDIR"], "nothing is left in /tmp"
             returns, lengths = evaluate_policy(
                 model, VecFrameStack(self.make(SHORT, num_envs=2), 2), n_eval_episodes=2, return_episode_rewards=True
             )
@@ -281,6 +283,41 @@ class TestTorchRL:
         env.close()
         envs.close()
 
+    @pytest.mark.parametrize(
+        "env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "Endless-SearingSpotlights-v0"]
+    )
+    def test_final_infos_and_ground_truth_are_kept(self, env_id):
+        import torch
+
+        num_envs, steps, rng = 4, 120, np.random.default_rng(5)
+        options = {"max_steps": 30}
+        envs, _ = reference(env_id, num_envs, "disabled", seed=3, options=options)
+        env = self.make(env_id, num_envs=num_envs, options=options)
+        env.set_seed(3)
+        actions = torch.from_numpy(np.stack([random_actions(envs, rng, num_envs) for _ in range(steps)]))
+        numbers = iter(actions)
+        data = env.rollout(steps, lambda td: td.set("action", next(numbers)), break_when_any_done=False)
+        described, ended = endless_gym.spec(env_id), 0
+        names = ["reward", "length", *(name for name, _ in described.info)]
+        assert sorted(data["next", "final_info"].keys()) == sorted(names)
+        for t in range(steps):
+            *_, terminated, _, info = envs.step(actions[t].numpy())
+            given = data["next", "final_info"][:, t]
+            for name in names:
+                expected = info.get(name, np.zeros(num_envs))
+                np.testing.assert_array_equal(given[name][:, 0], np.where(terminated, expected, 0))
+            if described.ground_truth:
+                np.testing.assert_array_equal(data["next", "ground_truth"][:, t], info["ground_truth"])
+            ended += terminated.sum()
+            if terminated.any():
+                envs.reset(options={"reset_mask": terminated})
+        assert ended >= num_envs
+        assert {name: data["next", "final_info", name].is_floating_point() for name, _ in described.info} == {
+            name: not is_integer for name, is_integer in described.info
+        }
+        env.close()
+        envs.close()
+
     def test_observations_may_be_written_to(self):
         env = self.make(SHORT, num_envs=2)
         first = env.reset()
@@ -375,8 +412,8 @@ class TestPufferLib:
             ended += done.sum()
             if done.any():
                 (statistics,) = infos
-                assert statistics["episode_return"] == info["episode"]["r"][done].tolist()
-                assert statistics["episode_length"] == info["episode"]["l"][done].tolist()
+                assert statistics["episode_return"] == info["final_info"]["reward"][done].tolist()
+                assert statistics["episode_length"] == info["final_info"]["length"][done].tolist()
                 assert all(isinstance(values, list) and len(values) == done.sum() for values in statistics.values())
             else:
                 assert infos == []

@@ -1,5 +1,6 @@
 """The evaluation protocol: metrics from known infos, and results of checkpoints."""
 
+import io
 import json
 import sys
 from collections import Counter
@@ -15,7 +16,7 @@ from endless_gym.agents import protocol
 from endless_gym.agents.evaluate import evaluate
 from endless_gym.agents.metrics import metric, path_length, task_progress
 from endless_gym.agents.protocol import EvalArguments, evaluate_runs, find
-from endless_gym.agents.results import label, read, to_json
+from endless_gym.agents.results import Experiment, Run, label, read, to_json
 from endless_gym.agents.train import parse, train
 from endless_gym.env import Env
 from endless_gym.specs import spec
@@ -184,6 +185,25 @@ def test_results_round_trip_through_json(runs: Path, tmp_path: Path, capsys: pyt
     assert f"{last['mean']:.4f}" in table
     assert none["summary"][-1]["over"] == "15 episodes"
     assert to_json(read(file), written["protocol"], True) == written
+
+
+def test_the_table_says_which_metric_to_trust() -> None:
+    """An agent that executes no command, which the original reports as a success."""
+    episodes = [{"reward": 0.0, "success": 1.0, "commands_completed": 1.0, "task_progress": 0.39, "seed": 1.0}] * 3
+
+    def printed(env: str) -> str:
+        run = Run("run", 1)
+        run.add(64, episodes)
+        console = Console(width=100, record=True, file=io.StringIO())
+        console.print(protocol.table(Experiment(env, "gru", {}, [run])))
+        return " ".join(console.export_text().split())
+
+    table = printed(GRID)
+    assert "64 success * 1.0000" in table and "64 commands_completed * 1.0000" in table
+    assert "64 task_progress 0.3900" in table
+    assert "Trust task_progress. * as the original reports it: a last command that failed counts as executed" in table
+    for env in ("MysteryPath-v0", "SearingSpotlights-v0"):
+        assert "*" not in printed(env) and "Trust" not in printed(env)
 
 
 @pytest.mark.parametrize(

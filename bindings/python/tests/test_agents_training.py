@@ -188,6 +188,23 @@ def test_ctrl_c_writes_a_checkpoint_and_frees_shared_memory(
     assert segments() <= before
 
 
+def test_a_function_chooses_the_options_of_training_episodes(tmp_path: Path) -> None:
+    calls: list[tuple[int, int, dict[str, Any] | None]] = []
+
+    def choose(env: int, episode: int, final: dict[str, Any] | None) -> dict[str, Any]:
+        calls.append((env, episode, final))
+        return {"command_count": [1 + episode % 2]}
+
+    given = small("none", tmp_path / "run")
+    train(given, episode_options=choose)
+    assert {env for env, _, _ in calls} == set(range(given.environment.num_envs))
+    chosen = [(episode, final["options"]) for _, episode, final in calls if final is not None]
+    assert chosen
+    assert all(options == {"command_count": [1 + episode % 2]} for episode, options in chosen)
+    with pytest.raises(ValueError, match=r"--environment\.engine must be thread, got process"):
+        Environments(small("none", tmp_path / "other", engine="process"), choose)
+
+
 def test_kept_checkpoints_can_be_loaded(tmp_path: Path) -> None:
     given = replace(small("trxl", tmp_path / "run", 4), keep_checkpoints=True)
     run = train(given)
@@ -238,7 +255,8 @@ def test_target_reward_needs_a_hundred_episodes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("engine", ["thread", "process"])
 def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: Path) -> None:
-    """Four segments, against environments with the same seeds that are stepped in a plain loop."""
+    """Eight segments, against environments with the same seeds that are stepped in a plain loop."""
+    torch.manual_seed(1)
     given = small("none", tmp_path, engine=engine)
     ppo = replace(given.ppo, ground_truth_coefficient=0.1)
     given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))
@@ -251,7 +269,7 @@ def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: P
         collector = RolloutCollector(
             make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1)
         )
-        for _ in range(4):
+        for _ in range(8):
             segment, episodes = collector.collect(Clock())
             ended = []
             for step in range(16):
@@ -383,11 +401,16 @@ def one_command(agent: str, run: Path, **changes: Any) -> Settings:
 
 
 @pytest.mark.timeout(600)
-def test_memory_matters(tmp_path: Path) -> None:
-    """One command that is shown and then hidden: the GRU learns to execute it; an agent without memory cannot."""
-    gru = checkpoint.load(train(one_command("gru", tmp_path / "gru")))
-    assert mean(evaluate(gru.agent, num_threads=1)) >= 0.085
-    updates = gru.update
+@pytest.mark.parametrize("agent", ["gru", "trxl"])
+def test_memory_matters(agent: str, tmp_path: Path) -> None:
+    """One command that is shown and then hidden: an agent with memory learns to execute it."""
+    trained = checkpoint.load(train(one_command(agent, tmp_path / agent)))
+    assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085
+
+
+@pytest.mark.timeout(600)
+def test_without_memory_the_task_is_not_learned(tmp_path: Path) -> None:
+    """The task of `test_memory_matters`, with as many updates as those agents need."""
     given = one_command("none", tmp_path / "none")
-    none = checkpoint.load(train(replace(given, ppo=replace(given.ppo, updates=updates))))
+    none = checkpoint.load(train(replace(given, ppo=replace(given.ppo, updates=70))))
     assert mean(evaluate(none.agent, num_threads=1)) < 0.04

@@ -232,26 +232,24 @@ def test_the_native_module_checks_shapes() -> None:
         (flags, numbers, lengths, infos, [True]),
     ):
         with pytest.raises(ValueError, match="same number of"):
-            _native.ended_episodes(*arguments, 0.0)
+            _native.ended_episodes(*arguments)
 
 
 def test_flags_may_be_any_byte() -> None:
     raw = np.array([0, 1, 2, 255, 0, 128], np.uint8)
     infos = np.arange(12.0).reshape(6, 2)
     ends = _native.ended_episodes(
-        raw.view(np.bool_), np.arange(6.0), np.arange(6, dtype=np.int32), infos, [True, False], 7.0
+        raw.view(np.bool_), np.arange(6.0), np.arange(6, dtype=np.int32), infos, [True, False]
     )
-    ended, returns, lengths, times, (first, second) = ends
+    ended, returns, lengths, (first, second) = ends
     np.testing.assert_array_equal(ended.view(np.uint8), [0, 1, 1, 1, 0, 1])
     np.testing.assert_array_equal(returns, [0, 1, 2, 3, 0, 5])
     np.testing.assert_array_equal(lengths, [0, 1, 2, 3, 0, 5])
-    np.testing.assert_array_equal(times, [0, 7, 7, 7, 0, 7])
     np.testing.assert_array_equal(first, [0, 2, 4, 6, 0, 10])
     np.testing.assert_array_equal(second, [0, 3, 5, 7, 0, 11])
     assert (
-        _native.ended_episodes(raw[:1].view(np.bool_), np.ones(1), np.ones(1, np.int32), infos[:1], [True] * 2, 0)
-        is None
+        _native.ended_episodes(raw[:1].view(np.bool_), np.ones(1), np.ones(1, np.int32), infos[:1], [True] * 2) is None
     )
     # A part of another array, with strides.
     parts = raw[::2].view(np.bool_), np.arange(6.0)[::2], np.arange(6, dtype=np.int32)[::2], infos[::2]
-    np.testing.assert_array_equal(_native.ended_episodes(*parts, [True, False], 7.0)[1], [0, 2, 0])
+    np.testing.assert_array_equal(_native.ended_episodes(*parts, [True, False])[1], [0, 2, 0])

@@ -1,9 +1,11 @@
 """One environment: the original's, byte for byte, and Gymnasium's own checks."""
 
+import copy
 import json
 import pickle
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -26,6 +28,8 @@ def plain(value: object) -> object:
         return ("array", str(value.dtype), value.shape, value.tobytes())
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
     return value
 
 
@@ -154,3 +158,135 @@ def test_the_originals_ids_and_classes() -> None:
     assert isinstance(env.unwrapped, endless_gym.Env)
     other = memory_gym.GridMortarMayhemEnv(render_mode="rgb_array")
     np.testing.assert_array_equal(env.reset(seed=2)[0], other.reset(seed=2)[0])
+
+
+#: How a second environment is made from one.
+COPIES = {
+    "deepcopy": copy.deepcopy,
+    "copy": copy.copy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+}
+
+
+@pytest.mark.parametrize("how", COPIES.values(), ids=COPIES)
+@pytest.mark.parametrize("id", IDS)
+def test_a_copy_goes_on_identically_and_on_its_own(how: Any, id: str) -> None:
+    env = endless_gym.Env(
+        id, "debug_rgb_array", {"agent_scale": 0.3}, frames=endless_gym.Frames(grayscale=True, stack=3)
+    )
+    env.action_space.seed(1)
+    env.reset(seed=1, options={"agent_scale": 0.2})
+    for _ in range(10):
+        env.step(env.action_space.sample())
+        env.render()
+    other = how(env)
+    assert type(other) is type(env)
+    assert other.reset_params == env.reset_params
+    assert other.observation_space == env.observation_space
+    actions = [env.action_space.sample() for _ in range(150)]
+    played = [list(play(each, actions)) for each in (env, other)]
+    assert plain(played[0]) == plain(played[1])
+
+
+def play(env: endless_gym.Env, actions: list[Any]) -> Any:
+    """Plays over the ends of episodes."""
+    for action in actions:
+        *step, info = env.step(action)
+        yield (*step, info, env.render())
+        if step[2]:
+            yield env.reset()
+
+
+@pytest.mark.parametrize("how", COPIES.values(), ids=COPIES)
+def test_an_environment_without_an_episode_is_copied(how: Any) -> None:
+    env = endless_gym.Env("MortarMayhemB-Grid-v0", options={"arena_size": 3}, observation="features")
+    other = how(env)
+    with pytest.raises(ResetNeeded):
+        other.step(0)
+    np.testing.assert_array_equal(other.reset(seed=1)[0]["features"], env.reset(seed=1)[0]["features"])
+
+
+def test_made_environments_and_the_originals_classes_are_pickled() -> None:
+    import endless_gym.memory_gym as memory_gym
+
+    for env in (gymnasium.make("EndlessGym/MysteryPath-v0"), memory_gym.MysteryPathEnv()):
+        env.reset(seed=1)
+        other = pickle.loads(pickle.dumps(env))
+        assert type(other.unwrapped) is type(env.unwrapped)
+        np.testing.assert_array_equal(env.step([1, 0])[0], other.step([1, 0])[0])
+
+
+@pytest.mark.parametrize("where", ["EndlessGym/", ""])
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_gymnasiums_asynchronous_environments(where: str, context: str) -> None:
+    import endless_gym.memory_gym
+
+    id = f"{where}Endless-MysteryPath-v0"
+    kwargs: dict[str, Any] = {"options": {"max_steps": 5}, "frames": endless_gym.Frames(grayscale=True)}
+    sync = gymnasium.make_vec(id, 2, vectorization_mode="sync", **kwargs)
+    asynchronous = gymnasium.make_vec(id, 2, vectorization_mode="async", vector_kwargs={"context": context}, **kwargs)
+    try:
+        assert plain(sync.reset(seed=1)) == plain(asynchronous.reset(seed=1))
+        sync.action_space.seed(1)
+        for _ in range(12):
+            actions = sync.action_space.sample()
+            assert plain(sync.step(actions)) == plain(asynchronous.step(actions))
+    finally:
+        asynchronous.close()
+
+
+def test_an_environment_travels_to_a_spawned_worker() -> None:
+    env = endless_gym.Env("MysteryPath-v0")
+    env.reset(seed=1)
+    # The environment itself is pickled, not only what makes it.
+    asynchronous = gymnasium.vector.AsyncVectorEnv([lambda: env] * 2, context="spawn")
+    try:
+        observation, _ = asynchronous.reset(seed=[3, 4])
+        np.testing.assert_array_equal(observation[1], env.reset(seed=4)[0])
+    finally:
+        asynchronous.close()
+
+
+def test_gymnasium_makes_it_with_render_modes_of_its_own() -> None:
+    env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array_list")
+    env.reset(seed=1)
+    env.step([1, 0])
+    assert [picture.shape for picture in env.render()] == [(84, 84, 3)] * 2
+    assert gymnasium.spec("EndlessGym/MysteryPath-v0").to_json()
+
+
+@pytest.mark.parametrize("id", ["MortarMayhemB-v0", "Endless-SearingSpotlights-v0"])
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"observation": "features"},
+        {"observation": "rgb+features"},
+        {"frames": endless_gym.Frames(channels_first=True, row_major=True, stack=4)},
+        {"observation": "rgb+features", "frames": endless_gym.Frames(grayscale=True)},
+    ],
+    ids=str,
+)
+def test_observations_are_those_of_a_vector_environment(id: str, kwargs: dict[str, Any]) -> None:
+    env = gymnasium.make(f"EndlessGym/{id}", **kwargs)
+    with endless_gym.make_vec(id, 1, autoreset="disabled", **kwargs) as envs:
+        assert env.observation_space == envs.single_observation_space
+        envs.action_space.seed(1)
+        given, wanted = env.reset(seed=1)[0], envs.reset(seed=1)[0]
+        for _ in range(30):
+            assert given in env.observation_space
+            assert plain(given) == plain(
+                {key: value[0] for key, value in wanted.items()} if isinstance(wanted, dict) else wanted[0]
+            )
+            actions = envs.action_space.sample()
+            given, wanted = env.step(actions[0])[0], envs.step(actions)[0]
+
+
+def test_observations_that_cannot_be_are_refused() -> None:
+    for kwargs, error, match in (
+        ({"observation": "pixels"}, ValueError, "observation must be one of rgb, features"),
+        ({"observation": "features", "frames": endless_gym.Frames()}, ValueError, "has no frames"),
+        ({"frames": "grayscale"}, TypeError, "frames must be endless_gym.Frames or None"),
+        ({"frames": endless_gym.Frames(stack=65)}, ValueError, "1 to 64, got 65"),
+    ):
+        with pytest.raises(error, match=match):
+            endless_gym.Env("MysteryPath-v0", **kwargs)

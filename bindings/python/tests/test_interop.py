@@ -1,5 +1,6 @@
 """Tensors of other libraries on the engine's memory."""
 
+import subprocess
 import sys
 import types
 import warnings
@@ -80,3 +81,47 @@ def test_without_torch_the_message_says_so(observation: np.ndarray, monkeypatch:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.warns(UserWarning, match="not installed"):
         assert not endless_gym.pin_memory(observation)
+
+
+@pytest.mark.slow
+def test_jax_shares_the_memory_and_never_writes_to_it(libraries_python: str) -> None:
+    program = """
+import jax, jax.numpy as jnp, numpy as np, endless_gym
+
+add_one = jax.jit(lambda frames: frames + jnp.uint8(1), donate_argnums=0)
+for make in (endless_gym.make_vec, endless_gym.serve):
+    with make("MortarMayhemB-Grid-v0", 3, seed=0) as envs:
+        observation, _ = envs.reset()
+        kept = {key: array.copy() for key, array in observation.items()}
+        shared = jax.device_put(observation, may_alias=True)
+        for key, array in observation.items():
+            assert shared[key].unsafe_buffer_pointer() == array.ctypes.data, (make, key)
+        frames = shared["visual_observation"]
+        for _ in range(3):
+            observation, *_ = envs.step(np.ones(3, dtype=np.int64))
+        np.testing.assert_array_equal(frames, kept["visual_observation"])
+        # XLA cannot use this memory for the result; if it did, it would crash on a served batch.
+        np.testing.assert_array_equal(add_one(frames), kept["visual_observation"] + np.uint8(1))
+        frames = observation["visual_observation"]
+        before = frames.copy()
+        add_one(jax.device_put(frames, may_alias=True)).block_until_ready()
+        np.testing.assert_array_equal(frames, before)
+        part = jax.device_put(frames[1:], may_alias=True)
+        np.testing.assert_array_equal(part, before[1:])
+        del shared, frames, part, observation
+print("done")
+"""
+    ran = subprocess.run([libraries_python, "-c", program], capture_output=True, text=True)
+    assert ran.stdout == "done\n", ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+def test_from_dlpack_takes_the_arrays_themselves(where) -> None:
+    with where("Endless-MortarMayhem-v0", 2, seed=1) as envs:
+        envs.reset()
+        observation, reward, *_, info = envs.step(np.zeros((2, 2), dtype=np.int64))
+        for array in (observation, reward, info["ground_truth"]):
+            same = np.from_dlpack(array)
+            assert same.ctypes.data == array.ctypes.data
+            assert same.flags.writeable == array.flags.writeable
+            assert torch.from_dlpack(array).data_ptr() == array.ctypes.data

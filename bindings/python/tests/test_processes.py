@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -369,9 +370,57 @@ def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
 def test_events_are_logged_by_python(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, logger="endless_gym"), endless_gym.serve(ID) as envs:
         envs.reset()
-    assert any("connected to an engine" in record.message for record in caplog.records), caplog.records
-    assert all(record.name == "endless_gym" for record in caplog.records)
+    for name, part in (
+        ("endless_gym", "connected to an engine"),
+        ("endless_gym.engine", "a trainer sends its first request"),
+    ):
+        assert any(part in record.message for record in caplog.records if record.name == name), caplog.records
+    assert {record.name for record in caplog.records} == {"endless_gym", "endless_gym.engine"}
+    assert {record.levelno for record in caplog.records} == {logging.INFO}
     caplog.clear()
     with endless_gym.serve(ID) as envs:
         envs.reset()
     assert caplog.records == []
+
+
+def test_the_errors_of_an_engine_are_logged(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    folder = tmp_path / "removed"
+    folder.mkdir()
+    end = time.monotonic() + 60
+    with endless_gym.serve(ID, checkpoint=folder / "state", checkpoint_every=0.02) as envs:
+        shutil.rmtree(folder)
+        while not caplog.records and time.monotonic() < end:
+            envs.reset()
+        assert "cannot save a checkpoint" in caplog.text
+    # The last one fails as well, and with it the engine.
+    last = caplog.records[-1]
+    assert (last.name, last.levelno) == ("endless_gym.engine", logging.ERROR)
+    assert last.message.startswith(
+        f"engine {endless_gym_process(envs)}: checkpoint {folder}/state cannot be written"
+    ), last
+
+
+def test_an_engine_that_is_stopped_ends_regularly() -> None:
+    envs = endless_gym.serve(ID, 4)
+    process = envs._backend._engine._process
+    os.kill(process.pid, signal.SIGSTOP)
+    envs.close()
+    assert process.returncode == 0
+
+
+def test_ctrl_c_ends_the_program_while_it_starts(tmp_path: Path) -> None:
+    native = tmp_path / "native.py"
+    native.write_text(
+        "import signal\n"
+        "def endless(arguments, executable):\n"
+        "    print(signal.getsignal(signal.SIGINT), flush=True)\n"
+        "    return len(arguments)\n"
+    )
+    command = [*program()[:-1], str(native), "serve"]
+    for ignored, expected in ((False, signal.SIG_DFL), (True, signal.SIG_IGN)):
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+        try:
+            found = subprocess.run(command, capture_output=True, text=True)
+        finally:
+            signal.signal(signal.SIGINT, before)
+        assert (found.returncode, found.stdout) == (1, f"{expected!s}\n"), found

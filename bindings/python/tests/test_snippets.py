@@ -16,7 +16,9 @@ from snippets import ROOT, SHELL, Block, blocks, pages, programs
 TIMEOUT = 280
 #: Engines remove their segments. Not SIGINT, which Python's start would swallow.
 END_JOBS = "kill -TERM $(jobs -p) 2>/dev/null || true; wait"
-PROGRAMS = [program for page in pages() for program in programs(page)]
+ALL_PROGRAMS = [program for page in pages() for program in programs(page)]
+PROGRAMS = [program for program in ALL_PROGRAMS if not program[0].libraries]
+OF_LIBRARIES = [program for program in ALL_PROGRAMS if program[0].libraries]
 #: Rust in the README is a test of the crate's documentation (`src/lib.rs`).
 DOCTESTS = ROOT / "README.md"
 LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
@@ -28,6 +30,17 @@ def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], se
         code = "\n".join(block.code for block in part)
         shell = ["bash", "-euo", "pipefail", "-m", "-c", f"trap '{END_JOBS}' EXIT\n{code}"]
         run(shell if is_shell else [sys.executable, "-c", code], tmp_path, program[0].name)
+    assert not segments(), "the block left segments in /dev/shm"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in OF_LIBRARIES])
+def test_snippet_of_a_library(
+    program: list[Block], tmp_path: Path, segments: Callable[[], set[str]], libraries_python: str, ray_folder: str
+) -> None:
+    assert [block.language for block in program] == ["python"] * len(program)
+    code = "\n".join(block.code for block in program)
+    run([libraries_python, "-c", code], tmp_path, program[0].name)
     assert not segments(), "the block left segments in /dev/shm"
 
 
@@ -65,6 +78,47 @@ def test_what_is_not_run_has_a_reason(capsys: pytest.CaptureFixture[str]) -> Non
         for block in left:
             print(f"  {block.name}: {block.reason}")
     assert all(len(block.reason) > 10 for block in left)
+
+
+def test_snippets_of_docstrings_define_their_names() -> None:
+    sources = sorted((ROOT / "bindings/python/endless_gym").rglob("*.py"))
+    snippets = [block for path in sources for block in blocks(path) if block.language == "python"]
+    assert len(snippets) >= 8
+    ruff = [Path(sys.executable).parent / "ruff", "check", "--isolated", "--select", "F", "--ignore", "F401", "-"]
+    for snippet in snippets:
+        checked = subprocess.run(ruff, input=snippet.code, capture_output=True, text=True)
+        assert checked.returncode == 0, f"{snippet.name}: {checked.stdout}"
+
+
+#: What may show a command that a reader copies.
+SOURCES = (
+    "*.md",
+    "bindings/python/endless_gym/**/*.py",
+    "bindings/python/examples/*.py",
+    "engine/cli/src/*.rs",
+    "docs/**/*.md",
+)
+#: A word with brackets outside of quotes, after a program or in an argument: zsh takes it for a pattern of file names.
+GLOB = re.compile(r"""(?:pip install|--option|--environment\.option)[ =](?:[^'"`\s]+ )*[^'"`\s]*\[""")
+
+
+def test_shells_take_commands_literally() -> None:
+    """zsh, unlike bash, refuses a word with brackets that matches no file."""
+    blocks_of_shell = [block for page in pages() for block in blocks(page) if block.language in SHELL]
+    unquoted = [
+        f"{block.name}: {word}"
+        for block in blocks_of_shell
+        for line in re.sub(r"(<<'EOF'.*?^EOF$)", "", block.code, flags=re.M | re.S).splitlines()
+        for word in re.sub(r"'[^']*'|\"[^\"]*\"|#.*", "", line).split()
+        if re.search(r"\w\[|^\[\w", word)
+    ]
+    unquoted += [
+        f"{path.relative_to(ROOT)}: {found[0]}"
+        for pattern in SOURCES
+        for path in ROOT.glob(pattern)
+        for found in GLOB.finditer(path.read_text())
+    ]
+    assert not unquoted, unquoted
 
 
 def test_links_lead_to_files() -> None:

@@ -37,13 +37,7 @@ def test_it_does_as_gymnasiums_own_vector_environment(where, mode: AutoresetMode
             actions = envs.action_space.sample()
             step, wanted = envs.step(actions), sync.step(actions)
             ends += int(step[2].sum())
-            episode = step[4].pop("episode", None), step[4].pop("_episode", None)
             compare(step, wanted)
-            if step[2].any():
-                final = wanted[4].get("final_info", wanted[4])
-                np.testing.assert_array_equal(episode[0]["r"], final["reward"])
-                np.testing.assert_array_equal(episode[0]["l"], final["length"])
-                np.testing.assert_array_equal(episode[1], step[2])
         assert ends > 0
 
 
@@ -229,8 +223,8 @@ def test_options_of_single_environments_are_kept_at_reset(where) -> None:
     each = [{"arena_size": 2}, {"arena_size": 5}]
     with made(where, "MortarMayhem-v0", 2, seed=1, options=each) as envs:
         first, _ = envs.reset(seed=1)
-        with pytest.raises(ValueError, match=r"one mapping each, got \{'arena_size': 3\}"):
-            envs.reset(seed=1, options={"arena_size": 3})
+        changed, _ = envs.reset(seed=1, options={"arena_size": 3})
+        assert (changed != first).any()
         for options in (None, {"reset_mask": np.ones(2, dtype=bool)}):
             np.testing.assert_array_equal(envs.reset(seed=1, options=options)[0], first)
     with made(where, "MortarMayhem-v0", 1, seed=1, options=each[:1]) as envs:

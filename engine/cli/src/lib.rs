@@ -14,10 +14,12 @@ mod options;
 mod output;
 mod picture;
 mod play;
+mod record;
 mod serve;
 mod status;
 mod stop;
 mod verify;
+mod watch;
 
 use std::ffi::OsString;
 
@@ -50,6 +52,11 @@ enum Command {
     Serve(serve::Args),
     /// Show what the running engines are doing, without disturbing them.
     Status(status::Args),
+    /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
+    Watch(watch::Args),
+    /// Record episodes of scripted experts or of random actions as a Minari data set (Python package).
+    #[command(disable_help_flag = true)]
+    Record(record::Args),
     /// Measure steps per second, in process and through shared memory.
     ///
     /// Actions are random, and resets are included. Each round measures every method once. The median over the rounds is reported,
@@ -75,7 +82,7 @@ const FAILURE: u8 = 1;
 ///
 /// The first call of a process that has no subscriber of `tracing` yet installs one that logs to standard error.
 ///
-/// `demo`, `serve` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
+/// `demo`, `serve`, `watch` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
 /// stops the command, and a second one ends the process at once. Do not run two of them at the
 /// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
@@ -114,6 +121,8 @@ fn run(cli: Cli) -> Result<bool, Failure> {
         Command::Demo(args) => demo::run(&args)?,
         Command::Serve(args) => serve::run(&args)?,
         Command::Status(args) => status::run(&args)?,
+        Command::Watch(args) => watch::run(&args)?,
+        Command::Record(_) => return Err(record::run()),
         Command::Bench(args) => bench::run(&args)?,
         Command::Frames(args) => frames::run(&args)?,
         Command::Verify(args) => return verify::run(&args),

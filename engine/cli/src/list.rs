@@ -1,6 +1,6 @@
 //! `endless list`.
 
-use endless_gym_core::envs::{self, EnvSpec, SCREEN};
+use endless_gym_core::envs::{self, ActionBranch, EnvSpec, SCREEN};
 use serde_json::json;
 
 use super::failure::Failure;
@@ -59,24 +59,35 @@ fn as_json(spec: &EnvSpec) -> serde_json::Value {
     value
 }
 
+/// What the numbers of a branch mean: `0 nothing, 1 left, 2 right`.
+fn choices(branch: &ActionBranch) -> String {
+    let named: Vec<_> = branch.choices.iter().enumerate().map(|(n, choice)| format!("{n} {}", choice.name)).collect();
+    named.join(", ")
+}
+
 /// Everything about one environment, as text.
 fn description(spec: &EnvSpec) -> String {
     let mut parts = vec![format!("{}: {}\n", spec.id, spec.summary)];
     parts.push(format!("actions      {}", spec.action_space));
+    parts.extend(spec.actions.iter().map(|branch| format!("  {}: {}", branch.name, choices(branch))));
     parts.push(format!("observation  {}, indexed [x][y][channel]", observation(spec)));
-    if spec.ground_truth > 0 {
-        parts.push(format!("ground truth float64 ({},)", spec.ground_truth));
+    if !spec.ground_truth.is_empty() {
+        parts.push(format!("ground truth float64 ({},), in 0 to 1", spec.ground_truth.len()));
     }
     let mut rows = table(["reset parameter", "default", "allowed", "description"]);
     for parameter in spec.parameters {
         rows.add_row([parameter.name, &parameter.default_text(), &parameter.allowed(), parameter.description]);
     }
     parts.push(format!("\n{rows}"));
+    let truth: Vec<_> = spec.ground_truth.iter().map(|column| [column.name, column.description]).collect();
     let info: Vec<_> = spec.info.iter().map(|column| [column.name, column.description]).collect();
     let features: Vec<_> = spec.features.iter().map(|column| [column.name, column.description]).collect();
-    for (title, columns) in
-        [("info of an episode's last step", info), ("feature (`endless serve --features`)", features)]
-    {
+    let tables = [
+        ("ground truth (`info[\"ground_truth\"]`)", truth),
+        ("info of an episode's last step", info),
+        ("feature (`endless serve --features`)", features),
+    ];
+    for (title, columns) in tables.into_iter().filter(|(_, columns)| !columns.is_empty()) {
         let mut rows = table([title, "description"]);
         for column in columns {
             rows.add_row(column);

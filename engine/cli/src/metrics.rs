@@ -70,7 +70,7 @@ fn answer(request: Request, namespace: &Namespace, service: &str) {
 /// A metric of a group: name, type, help, value.
 type GroupMetric = (&'static str, &'static str, &'static str, fn(&GroupStatus) -> f64);
 
-const GROUP_METRICS: [GroupMetric; 11] = [
+const GROUP_METRICS: [GroupMetric; 12] = [
     ("step", "gauge", "Batches returned, counted on from the checkpoint that the engine resumed from.", |g| {
         g.step as f64
     }),
@@ -80,6 +80,9 @@ const GROUP_METRICS: [GroupMetric; 11] = [
     ("rejected_total", "counter", "Requests that were rejected.", |g| g.rejected as f64),
     ("undelivered_total", "counter", "Batches that no process received.", |g| g.undelivered as f64),
     ("trainers_total", "counter", "Trainers that sent requests.", |g| g.trainers as f64),
+    ("observer_held_batches", "gauge", "Batches that the observers held when they received their last ones.", |g| {
+        g.observers.iter().map(|observer| f64::from(observer.held)).sum()
+    }),
     ("held_batches", "gauge", "Batches that the trainer held at its last request.", |g| f64::from(g.held)),
     ("pending_requests", "gauge", "Requests that were taken and not answered.", |g| {
         f64::from(u8::from(g.busy.is_some()))

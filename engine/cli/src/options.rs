@@ -71,6 +71,10 @@ pub struct EnvironmentArgs {
     /// Seeds of the episodes, in turn, repeated from the start [default: as for `--seed-range`].
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
+    /// Episodes depend on their seed and reset parameters alone [default: as in the original, some show what an earlier one left, and
+    /// continue its generator].
+    #[arg(long)]
+    independent_episodes: bool,
 }
 
 /// Parses `START..END` or `START..END:STEP`.
@@ -92,6 +96,7 @@ impl EnvironmentArgs {
             let seeds: Vec<String> = self.seed_list.iter().map(u64::to_string).collect();
             arguments.push(format!("--seed-list={}", seeds.join(",")));
         }
+        arguments.extend(self.independent_episodes.then(|| "--independent-episodes".to_owned()));
         arguments
     }
 
@@ -117,7 +122,8 @@ impl EnvironmentArgs {
             (None, []) => Seeding::Continue { seed: self.seed },
             (None, list) => Seeding::List(list.to_vec()),
         };
-        Ok(PoolConfig { options, seeding, ..PoolConfig::new(id, num_envs) })
+        let independent_episodes = self.independent_episodes;
+        Ok(PoolConfig { options, seeding, independent_episodes, ..PoolConfig::new(id, num_envs) })
     }
 }
 
@@ -142,7 +148,8 @@ mod tests {
             #[command(flatten)]
             environment: EnvironmentArgs,
         }
-        let given = ["", "--option=-x=1", "--option=arena_size=6", "--seed=3", "--seed-range=0..9:2"];
+        let given =
+            ["", "--option=-x=1", "--option=arena_size=6", "--seed=3", "--seed-range=0..9:2", "--independent-episodes"];
         let parse = |arguments: &[String]| Arguments::try_parse_from(arguments).map(|parsed| parsed.environment);
         let given = parse(&given.map(str::to_owned)).unwrap();
         let passed = parse(&[vec![String::new()], given.arguments()].concat()).unwrap();

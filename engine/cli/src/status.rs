@@ -104,6 +104,11 @@ fn sum(status: &EngineStatus, field: fn(&GroupStatus) -> u64) -> u64 {
     status.groups.iter().map(field).fold(0, u64::saturating_add)
 }
 
+/// Batches that the observers of a group held when they received their last ones.
+fn held_by_observers(group: &GroupStatus) -> u64 {
+    group.observers.iter().map(|observer| u64::from(observer.held)).sum()
+}
+
 fn show(args: &Args, readings: &[Reading]) -> Result<(), Failure> {
     match readings {
         _ if args.json => {
@@ -137,6 +142,7 @@ fn engines(readings: &[Reading]) -> String {
         "trainer",
         "observers",
         "held batches",
+        "held by observers",
         "shared memory",
         "recoveries",
         "last message",
@@ -158,6 +164,7 @@ fn engines(readings: &[Reading]) -> String {
             list(&processes.trainers),
             list(&processes.observers),
             sum(status, |group| u64::from(group.held)).to_string(),
+            sum(status, held_by_observers).to_string(),
             shared_memory.map_or_else(|| "-".to_owned(), |bytes| format!("{} MB", bytes.div_ceil(1_000_000))),
             status.recoveries.to_string(),
             duration(status.groups.iter().filter_map(|group| group.last_request).min()),
@@ -174,7 +181,18 @@ fn list(processes: &BTreeSet<u32>) -> String {
 
 /// One row for each group of an engine.
 fn groups(status: &EngineStatus) -> String {
-    let mut rows = table(["group", "batch", "steps", "episodes", "rejected", "held", "last request", "since", "busy"]);
+    let mut rows = table([
+        "group",
+        "batch",
+        "steps",
+        "episodes",
+        "rejected",
+        "held",
+        "held by observers",
+        "last request",
+        "since",
+        "busy",
+    ]);
     for (number, group) in status.groups.iter().enumerate() {
         rows.add_row([
             number.to_string(),
@@ -183,6 +201,7 @@ fn groups(status: &EngineStatus) -> String {
             grouped(group.episodes as f64),
             grouped(group.rejected as f64),
             group.held.to_string(),
+            held_by_observers(group).to_string(),
             group.kind.unwrap_or("-").to_owned(),
             duration(group.last_request),
             duration(group.busy),

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
@@ -15,11 +16,16 @@ use crate::event::Event;
 /// Bytes of a process's standard error that are kept.
 const KEPT: usize = 4000;
 
+/// How long the rest of a process's standard error is waited for.
+const REMAINDER: Duration = Duration::from_secs(2);
+
 /// A process of a round. It is killed when this is dropped.
 pub struct Actor {
     child: Child,
     stdin: Option<ChildStdin>,
     stderr: Arc<Mutex<String>>,
+    /// Reads standard error to its end.
+    reader: Option<JoinHandle<()>>,
 }
 
 impl Actor {
@@ -40,7 +46,7 @@ impl Actor {
             });
         }
         let stderr = Arc::new(Mutex::new(String::new()));
-        if let Some(mut pipe) = child.stderr.take() {
+        let reader = child.stderr.take().map(|mut pipe| {
             let kept = Arc::clone(&stderr);
             std::thread::spawn(move || {
                 let mut bytes = [0; 1024];
@@ -50,10 +56,10 @@ impl Actor {
                         kept.push_str(&String::from_utf8_lossy(&bytes[..count]));
                     }
                 }
-            });
-        }
+            })
+        });
         let stdin = child.stdin.take();
-        Ok(Actor { child, stdin, stderr })
+        Ok(Actor { child, stdin, stderr, reader })
     }
 
     /// The process id.
@@ -103,10 +109,13 @@ impl Actor {
         }
     }
 
-    /// What it wrote to standard error, in one line.
+    /// What it wrote to standard error before it ended, in one line.
     pub fn complaint(&self) -> String {
-        // The pipe is read by another thread.
-        std::thread::sleep(Duration::from_millis(20));
+        // A process that it has forked may keep the pipe open.
+        let start = Instant::now();
+        while self.reader.as_ref().is_some_and(|reader| !reader.is_finished()) && start.elapsed() < REMAINDER {
+            std::thread::sleep(Duration::from_millis(1));
+        }
         let text = self.stderr.lock().map(|text| text.clone()).unwrap_or_default();
         text.split_whitespace().collect::<Vec<_>>().join(" ")
     }

@@ -139,7 +139,10 @@ fn difference(layout: &Layout, expected: &[Block], given: &[u8], only_numbers: b
         let row = section.bytes() / layout.num_envs();
         let is_final = matches!(
             section.name(),
-            BatchSection::FinalObservation | BatchSection::FinalVectorObservation | BatchSection::FinalFeatures
+            BatchSection::FinalObservation
+                | BatchSection::FinalVectorObservation
+                | BatchSection::FinalFeatures
+                | BatchSection::FinalGroundTruth
         );
         (0..layout.num_envs()).find_map(|env| {
             let start = section.offset() + env * row;

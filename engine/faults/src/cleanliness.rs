@@ -10,8 +10,8 @@ use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
 /// Longer than the ages from which files count as abandoned.
 const ABANDONED: Duration = Duration::from_secs(60);
 
-/// How long removal may take.
-const LIMIT: Duration = Duration::from_secs(15);
+/// How long removal may take, on a machine that is busy with other work.
+const LIMIT: Duration = Duration::from_secs(60);
 
 /// The files of a namespace: those in its directory and its segments.
 pub fn files(namespace: &Namespace) -> Vec<PathBuf> {
@@ -51,19 +51,14 @@ pub fn processes(namespace: &Namespace) -> Vec<u32> {
 ///
 /// Files of processes that died while they started or ended are recognised by their age. Instead of waiting, they are made old.
 pub fn leftovers(namespace: &Namespace) -> Vec<String> {
-    let processes = processes(namespace).into_iter().map(|id| format!("process {id}"));
-    let mut left: Vec<String> = processes.collect();
     let start = Instant::now();
     loop {
-        if let Err(error) = running_engines(namespace) {
-            left.push(format!("engines cannot be listed: {error}"));
-        }
-        let files = files(namespace);
-        if files.is_empty() {
-            return left;
-        }
-        if start.elapsed() >= LIMIT || !left.is_empty() {
-            left.extend(files.iter().map(|path| path.display().to_string()));
+        // A process that was killed may take a while to end.
+        let processes = processes(namespace).into_iter().map(|id| format!("process {id}"));
+        let error = running_engines(namespace).err().map(|error| format!("engines cannot be listed: {error}"));
+        let files = files(namespace).into_iter().map(|path| path.display().to_string());
+        let left: Vec<String> = processes.chain(error).chain(files).collect();
+        if left.is_empty() || start.elapsed() >= LIMIT {
             return left;
         }
         set_age(namespace, -(ABANDONED.as_secs() as i64));

@@ -10,10 +10,12 @@ use serde::{Deserialize, Serialize};
 /// A line of a trainer, an observer or a visitor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Event {
+    /// An attempt to connect, to reconnect or to list engines begins.
+    Connecting { at: Duration },
     /// A connection to a run of the engine.
-    Connected { at: Duration, incarnation: u64, engine: u32 },
-    /// A batch, which a trainer has compared with its twin.
-    Batch { at: Duration, incarnation: u64, group: usize, step: u64, checksum: u32 },
+    Connected { incarnation: u64, engine: u32 },
+    /// A batch. A trainer has compared it with its twin, and says whether it is correct.
+    Batch { at: Duration, incarnation: u64, group: usize, step: u64, checksum: u32, is_correct: bool },
     /// Bytes differ from the twin's, or changed while the batch was held.
     Wrong { what: String },
     /// A step was lost or doubled.

@@ -6,6 +6,7 @@ mod checker;
 mod cleanliness;
 mod event;
 mod faults;
+mod ledger;
 mod options;
 mod others;
 mod plan;

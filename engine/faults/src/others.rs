@@ -45,6 +45,7 @@ pub fn observe(habit: &Habit) {
     while !must_stop() {
         let group = draws.integers(0, groups as i64) as usize;
         let config = ConnectConfig { timeout: PATIENCE, ..ConnectConfig::new(SERVICE) };
+        Event::Connecting { at: now() }.report();
         let mut observer = match Observer::connect(&config, group) {
             Ok(observer) => observer,
             Err(error) => {
@@ -56,7 +57,7 @@ pub fn observe(habit: &Habit) {
         };
         let (incarnation, engine) = (observer.specification().incarnation, observer.specification().engine_pid);
         groups = observer.specification().groups;
-        Event::Connected { at: now(), incarnation, engine }.report();
+        Event::Connected { incarnation, engine }.report();
         let mut held: Vec<(BatchLease, u32)> = Vec::new();
         let batches = draws.integers(1, 200);
         for _ in 0..batches {
@@ -64,7 +65,7 @@ pub fn observe(habit: &Habit) {
             match received {
                 Ok(lease) => {
                     let (step, checksum) = (lease.step(), checksum(&lease));
-                    Event::Batch { at: now(), incarnation, group, step, checksum }.report();
+                    Event::Batch { at: now(), incarnation, group, step, checksum, is_correct: true }.report();
                     held.push((lease, checksum));
                 }
                 Err(ServiceError::TimedOut { .. } | ServiceError::TooManyBatchesHeld { .. }) => {}
@@ -98,6 +99,7 @@ pub fn visit(seed: u64, times: usize) {
         if stop.load(Ordering::Relaxed) {
             break;
         }
+        Event::Connecting { at: now() }.report();
         if let Err(error) = running_engines(&Namespace::default()) {
             Event::error("list", &error, None).report();
         }

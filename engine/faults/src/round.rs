@@ -31,6 +31,7 @@ pub fn play(plan: &Plan, rights: Rights) -> Result<Outcome, String> {
     }
     scene.current = None;
     end(&mut scene)?;
+    scene.close();
     for left in cleanliness::leftovers(&scene.namespace) {
         scene.fail("left behind", left);
     }

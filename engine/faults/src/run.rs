@@ -18,7 +18,7 @@ use crate::rights::Rights;
 use crate::round;
 
 /// Longer than any round takes.
-const ROUND_LIMIT: Duration = Duration::from_secs(600);
+const ROUND_LIMIT: Duration = Duration::from_secs(1800);
 
 /// Arguments of `faults`.
 #[derive(clap::Args)]
@@ -128,7 +128,10 @@ fn in_own_process(seed: u64, number: u64, plan: &Plan, stop: &AtomicBool) -> Res
     if stop.load(Ordering::Relaxed) {
         return Ok(outcome.unwrap_or_default());
     }
-    outcome.map_err(|_| format!("round {number} of seed {seed} did not end regularly: {}", output.status))
+    outcome.map_err(|_| {
+        let status = output.status;
+        format!("a round did not end regularly, {status}; again: cargo xtask faults --seed {seed} --round {number}")
+    })
 }
 
 fn kill(process: u32) {

@@ -71,7 +71,7 @@ pub fn run(work: &Work) -> Result<(), String> {
             continue;
         };
         let (incarnation, engine) = (connected.specification().incarnation, connected.specification().engine_pid);
-        Event::Connected { at: now(), incarnation, engine }.report();
+        Event::Connected { incarnation, engine }.report();
         let mut play = Play::new(work, &connected).map_err(|error| error.to_string())?;
         while !orders.must_stop() {
             if orders.fork.swap(false, Ordering::Relaxed) {
@@ -109,12 +109,14 @@ struct Requested {
 
 fn connect() -> Option<Trainer> {
     let config = ConnectConfig { timeout: PATIENCE, ..ConnectConfig::new(SERVICE) };
+    Event::Connecting { at: now() }.report();
     Trainer::connect(&config).inspect_err(|error| Event::error("connect", error, None).report()).ok()
 }
 
 /// Reconnects, and checks what it is told about its last requests. A trainer that cannot reconnect makes a new connection.
 fn reconnect(mut trainer: Trainer, requested: &[Requested]) -> Option<Trainer> {
     for _ in 0..3 {
+        Event::Connecting { at: now() }.report();
         match trainer.reconnect(PATIENCE) {
             Ok(found) => {
                 for (index, (before, group)) in requested.iter().zip(&found.groups).enumerate() {
@@ -241,17 +243,16 @@ impl<'a> Play<'a> {
             group.twin.compare(&request, lease)
         };
         group.was_reset = true;
-        match compared {
-            Ok(None) => {
-                let (incarnation, checksum) = (self.incarnation, checksum(lease));
-                Event::Batch { at: now(), incarnation, group: index, step, checksum }.report();
-            }
+        match &compared {
+            Ok(None) => {}
             Ok(Some(difference)) => {
                 Event::Wrong { what: format!("group {index}, batch {step}, {request:?}: {difference}") }.report();
                 group.was_reset = false;
             }
             Err(error) => Event::Wrong { what: format!("the twin refuses what the engine played: {error}") }.report(),
         }
+        let (incarnation, checksum, is_correct) = (self.incarnation, checksum(lease), matches!(compared, Ok(None)));
+        Event::Batch { at: now(), incarnation, group: index, step, checksum, is_correct }.report();
         Ok(())
     }
 

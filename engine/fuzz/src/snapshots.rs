@@ -28,6 +28,8 @@ const MAX_CHANGES: usize = 12;
 struct Content<S> {
     id: String,
     options: String,
+    next_options: Option<String>,
+    episode_seed: Option<u64>,
     random: Pcg,
     seeds: Seeds,
     episode_return: f64,

@@ -1,9 +1,9 @@
-//! What an engine was doing when an answer did not arrive in time.
+//! What an engine was doing when an answer or a batch did not arrive in time.
 
 use std::fmt;
 use std::time::Duration;
 
-/// What an engine was doing when an answer did not arrive in time.
+/// What an engine was doing when an answer, or a batch that is observed, did not arrive in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EngineActivity {
     /// Its process is running; its status cannot be read.
@@ -26,6 +26,15 @@ pub enum EngineActivity {
     },
     /// It has answered the request; the answer can be received.
     Answered,
+    /// It executes nothing, and there is no request for the group that is observed.
+    Idle {
+        /// The group.
+        group: usize,
+        /// Time since the group's last request; `None` if it had none.
+        since: Option<Duration>,
+        /// Process id of the engine.
+        process: u32,
+    },
 }
 
 impl fmt::Display for EngineActivity {
@@ -40,6 +49,16 @@ impl fmt::Display for EngineActivity {
                 f,
                 "the engine (process {process}) has not taken the request and executes nothing; its process may be stopped"
             ),
+            EngineActivity::Idle { group, since: Some(since), process } => {
+                let seconds = since.as_secs_f64();
+                write!(
+                    f,
+                    "the trainer has requested nothing of group {group} for {seconds:.1} s (engine process {process})"
+                )
+            }
+            EngineActivity::Idle { group, since: None, process } => {
+                write!(f, "no trainer has requested anything of group {group} yet (engine process {process})")
+            }
             EngineActivity::Answered => write!(f, "the engine has just answered; receive the answer"),
         }
     }

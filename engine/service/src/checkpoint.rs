@@ -39,6 +39,7 @@ pub(crate) struct CheckpointHead {
 impl CheckpointHead {
     pub(crate) fn new(config: &EngineConfig, specification: &ServiceSpecification) -> Self {
         let seeding = match &config.pool.seeding {
+            Seeding::Continue { .. } if config.pool.independent_episodes => "a drawn seed for each episode".to_owned(),
             Seeding::Continue { .. } => "continued generators".to_owned(),
             Seeding::Range { start, end, step, .. } => format!("seeds drawn from {start}..{end}:{step}"),
             Seeding::List(seeds) => {
@@ -49,6 +50,8 @@ impl CheckpointHead {
                 )
             }
         };
+        // Part of the text, so that the format is that of earlier checkpoints.
+        let independent = if config.pool.independent_episodes { ", independent episodes" } else { "" };
         CheckpointHead {
             package: PACKAGE_VERSION.to_owned(),
             id: specification.id.clone(),
@@ -57,7 +60,7 @@ impl CheckpointHead {
             autoreset: specification.autoreset.name().to_owned(),
             frames: specification.frames,
             features: config.pool.features,
-            seeding,
+            seeding: seeding + independent,
             options: specification.options.clone(),
         }
     }

@@ -12,7 +12,8 @@ pub const CHECKPOINT_VERSION: u32 = 1;
 /// Where an engine saves its environments, and whether it continues from there.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CheckpointConfig {
-    /// The file. A new checkpoint is written beside it, as `FILE.new`, and replaces it when it is complete and on the disk.
+    /// The file. A new checkpoint is written beside it, as `FILE.new`, and replaces it when it is complete and on the disk. As long as
+    /// the engine exists, it holds a lock on `FILE.lock`, so that no other engine saves to the same file.
     pub path: PathBuf,
     /// How often the engine saves while it runs; `None` saves only when the engine stops and when a trainer asks for it.
     pub every: Option<Duration>,
@@ -42,6 +43,18 @@ pub enum CheckpointError {
     Exists {
         /// The file.
         path: PathBuf,
+    },
+    /// Another engine saves to the file.
+    #[error(
+        "checkpoint {} is in use by another engine{}; stop it, or choose another file",
+        path.display(),
+        process.map(|process| format!(" (process {process})")).unwrap_or_default()
+    )]
+    InUse {
+        /// The file.
+        path: PathBuf,
+        /// Process id of that engine; `None` if it cannot be read.
+        process: Option<u32>,
     },
     /// The file cannot be read.
     #[error("checkpoint {} cannot be read: {reason}", path.display())]

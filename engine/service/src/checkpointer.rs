@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use crate::checkpoint::{self, CheckpointHead, SavedGroup};
 use crate::checkpoint_config::{CheckpointConfig, CheckpointError};
+use crate::checkpoint_lock::CheckpointLock;
 use crate::group::Group;
 use crate::status_record::now;
 use crate::status_writer::StatusWriter;
@@ -19,6 +20,8 @@ pub(crate) struct Checkpointer {
     /// Whether a request was executed since the last checkpoint.
     changed: bool,
     writing: Option<JoinHandle<Result<(), CheckpointError>>>,
+    // Released when nothing is written any more.
+    _lock: CheckpointLock,
 }
 
 impl Checkpointer {
@@ -26,11 +29,20 @@ impl Checkpointer {
         if config.every.is_some_and(|every| every.is_zero()) {
             return Err(CheckpointError::Interval);
         }
+        // First: another engine may be about to create the file.
+        let lock = CheckpointLock::acquire(&config.path)?;
         if !config.resume && config.path.exists() {
             return Err(CheckpointError::Exists { path: config.path.clone() });
         }
         checkpoint::check_writable(&config.path)?;
-        Ok(Checkpointer { config: config.clone(), head, last: Instant::now(), changed: false, writing: None })
+        Ok(Checkpointer {
+            config: config.clone(),
+            head,
+            last: Instant::now(),
+            changed: false,
+            writing: None,
+            _lock: lock,
+        })
     }
 
     /// Continues from the file, if the configuration asks for it and the file exists.

@@ -146,8 +146,10 @@ impl Engine {
         let names = ServiceNames::new(&config.service, specification.incarnation);
         let services = EngineServices { node: &node, names, mode: OpenMode::Create };
         let creating = node.creating()?;
-        let to_engine = ports::listener(&services.events("to_engine", config.groups)?)?;
-        let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?)?;
+        let to_engine = ports::listener(&services.events("to_engine", config.groups)?);
+        let to_engine = to_engine.map_err(|e| e.unexpected("a listener"))?;
+        let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?);
+        let to_trainer = to_trainer.map_err(|e| e.unexpected("a notifier"))?;
         let mut groups: Vec<_> = pools
             .into_iter()
             .enumerate()
@@ -292,7 +294,7 @@ impl Engine {
             _ => outcome,
         };
         if let (Ok(_), Some(checkpointer)) = (&outcome, &mut self.checkpointer)
-            && !matches!(read_kind, Some(RequestKind::Snapshot | RequestKind::Checkpoint))
+            && !read_kind.is_some_and(RequestKind::changes_nothing)
         {
             checkpointer.mark_changed();
         }
@@ -363,6 +365,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
             ResetOptions::Shared(options) => vec![options.clone()],
             ResetOptions::Each(each) => each.clone(),
         },
+        independent_episodes: config.pool.independent_episodes,
         autoreset: config.pool.autoreset,
         render_fps: spec.render_fps,
         batches_held: config.batches_held,

@@ -297,7 +297,7 @@ pub enum ServiceError {
         /// The engine's explanation.
         message: String,
     },
-    /// The environments could not be created.
+    /// The environments could not be created, or there is no environment of that number.
     #[error(transparent)]
     Pool(#[from] PoolError),
     /// The environments could not be saved, or not continued from a checkpoint.

@@ -3,7 +3,7 @@
 use endless_gym_core::batch::{
     ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for,
 };
-use endless_gym_core::pool::{Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError};
+use endless_gym_core::pool::{NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError};
 use iceoryx2::port::ReceiveError;
 use iceoryx2::sample::Sample;
 use serde_json::{Map, Value as Json};
@@ -12,7 +12,7 @@ use crate::error::{Rejection, ServiceError};
 use crate::memory::PrefaultedChunks;
 use crate::message::{PayloadBlock, RequestHeader, RequestKind, write_text};
 use crate::namespace::Ipc;
-use crate::ports::{self, EngineServices, LeaseLimits, PortError, RequestSubscriber, ResponsePublisher};
+use crate::ports::{self, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
 
 /// A request in shared memory.
 pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
@@ -52,12 +52,7 @@ impl Group {
         let service = services.responses(number, limits)?;
         // An observer reserves its chunks when it connects.
         let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), limits.trainer_chunks());
-        let (responses, memory) = publisher.map_err(|e| match e {
-            PortError::Other(e) => e,
-            PortError::LimitReached => {
-                ServiceError::middleware("cannot create a publisher")("it exists already".to_owned())
-            }
-        })?;
+        let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
         Ok(Group { pool, requests, responses, memory, request: RequestData::default(), trainer: None })
     }
 
@@ -83,12 +78,12 @@ impl Group {
         let kind = self.request.read(layout, header, payload)?;
         // A new trainer must not step the episodes of another one by mistake. It may adopt them, by a reset of no environment.
         let is_allowed = match kind {
-            RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore => false,
+            RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore | RequestKind::Episodes => false,
             RequestKind::ResetEach => {
                 let count = self.request.reset.iter().filter(|flag| **flag != 0).count();
                 count == 0 || count == self.request.reset.len()
             }
-            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Checkpoint => true,
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Checkpoint | RequestKind::SetOptions => true,
         };
         if !is_allowed && self.trainer != Some(header.trainer) {
             let text = "this trainer must reset all environments of the group first, or none to adopt their episodes";
@@ -104,7 +99,7 @@ impl Group {
         header: &RequestHeader,
         payload: &mut [Block],
     ) -> Result<Outcome, Rejected> {
-        let RequestData { action, reset, seed, snapshot, options, .. } = &self.request;
+        let RequestData { action, reset, seed, snapshot, options, next_options, .. } = &self.request;
         let (options, env) = (options.as_ref(), usize::try_from(header.env).unwrap_or(usize::MAX));
         let batch_blocks = self.pool.layout().blocks();
         let batch = &mut payload[..batch_blocks];
@@ -118,6 +113,8 @@ impl Group {
             RequestKind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
             RequestKind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
             RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each { reset, seed }, options, batch),
+            RequestKind::SetOptions => self.pool.set_options(next_options),
+            RequestKind::Episodes => return self.write_episodes(payload),
             // The engine executes it.
             RequestKind::Checkpoint => return Ok(Outcome::Snapshot { bytes: 0 }),
         };
@@ -125,6 +122,9 @@ impl Group {
             PoolError::NotReset => (Rejection::NotReset, e.to_string()),
             e => (Rejection::Pool, e.to_string()),
         })?;
+        if kind == RequestKind::SetOptions {
+            return Ok(Outcome::Snapshot { bytes: 0 });
+        }
         self.trainer = Some(header.trainer);
         let (env_steps, episodes) = match kind {
             RequestKind::Step => {
@@ -157,6 +157,31 @@ impl Group {
         write_text(payload, text)
     }
 
+    /// Writes what the running episodes of the requested environments follow from over the batch in `payload`, as JSON text: those
+    /// of as many environments as fit, at least one.
+    fn write_episodes(&self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
+        self.forget_frames(payload);
+        let text: &mut [u8] = bytemuck::cast_slice_mut(payload);
+        let mut end = 0;
+        for env in (0..self.request.reset.len()).filter(|env| self.request.reset[*env] != 0) {
+            let episode = self.pool.running_episode(env).map_err(|e| (Rejection::NotReset, e.to_string()))?;
+            let item = serde_json::to_vec(&episode).map_err(|e| (Rejection::Pool, e.to_string()))?;
+            // A separator before it, and a bracket behind the last.
+            if end + item.len() + 2 > text.len() {
+                break;
+            }
+            text[end] = if end == 0 { b'[' } else { b',' };
+            text[end + 1..][..item.len()].copy_from_slice(&item);
+            end += 1 + item.len();
+        }
+        if end == 0 {
+            text[0] = b'[';
+            end = 1;
+        }
+        text[end] = b']';
+        Ok(Outcome::Snapshot { bytes: end + 1 })
+    }
+
     /// Writes a snapshot of an environment over the batch in `payload`.
     fn write_snapshot(&self, env: usize, payload: &mut [Block]) -> Result<Outcome, Rejected> {
         let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
@@ -183,6 +208,7 @@ struct RequestData {
     snapshot: Vec<u8>,
     options_text: Vec<u8>,
     options: Option<Map<String, Json>>,
+    next_options: Vec<NextOptions>,
 }
 
 impl RequestData {
@@ -197,7 +223,8 @@ impl RequestData {
             return Err((Rejection::Version, text));
         }
         let Some(kind) = RequestKind::from_code(header.kind) else {
-            return Err((Rejection::Kind, format!("request kind must be 1 to 7, got {}", header.kind)));
+            let text = format!("request kind must be 1 to {}, got {}", RequestKind::ALL.len(), header.kind);
+            return Err((Rejection::Kind, text));
         };
         if payload.len() < layout.blocks() {
             let text = format!("payload must have {} blocks of 64 bytes, got {}", layout.blocks(), payload.len());
@@ -209,10 +236,16 @@ impl RequestData {
                 copy(&mut self.reset, layout.read(payload, ActionSection::Reset));
                 copy(&mut self.seed, layout.read(payload, ActionSection::Seed));
             }
-            RequestKind::Restore => {
+            RequestKind::Episodes => copy(&mut self.reset, layout.read(payload, ActionSection::Reset)),
+            RequestKind::Restore | RequestKind::SetOptions => {
                 copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes));
             }
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot | RequestKind::Checkpoint => {}
+        }
+        if kind == RequestKind::SetOptions {
+            let sets = serde_json::from_slice(&self.snapshot);
+            let wrong = |e| (Rejection::Options, format!("options of next episodes must be a JSON list: {e}"));
+            self.next_options = sets.map_err(wrong)?;
         }
         self.options = match kind {
             RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::ResetEach if header.bytes > 0 => {

@@ -23,16 +23,17 @@
 //!
 //! | header | fields |
 //! | --- | --- |
-//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore, checkpoint), incarnation, trainer, request number, seed, environment, length of the options or snapshot, process id of the trainer, batches held |
-//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of a snapshot or of the text of a rejection |
+//! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore, checkpoint, options of next episodes, running episodes), incarnation, trainer, request number, seed, environment, length of the options or of the snapshot, process id of the trainer, batches held |
+//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of a snapshot, of a text about episodes or of a rejection |
 //!
 //! # Protocol
 //!
 //! | situation | behaviour |
 //! | --- | --- |
 //! | the engine receives a request | it sends exactly one response of the same group: a batch, a snapshot or a rejection; a rejected request changes no environment |
-//! | the trainer requests a snapshot or a restore | the response holds a snapshot or nothing in place of a batch; observers skip it, and may miss the batch before it |
+//! | the trainer requests a snapshot, a restore, or something about episodes | the response holds a snapshot, a text or nothing in place of a batch; observers skip it, and may miss the batch before it |
 //! | a group has a pending answer | the trainer must receive it before its next request to this group; other groups are independent |
+//! | two engines are given one checkpoint file | the second one ends with [`CheckpointError::InUse`], which names the first one's process |
 //! | a new trainer connects | it must reset all environments of a group before it steps them, or adopt their episodes by a reset of none ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each) with flags of 0), which returns the current batch |
 //! | the engine has a checkpoint file | it saves all environments periodically, when it stops, and when the trainer asks for it; a new engine continues from there identically |
 //! | a second trainer connects | it is refused, because `act` accepts one publisher |
@@ -49,9 +50,10 @@
 //! | situation | behaviour |
 //! | --- | --- |
 //! | `/dev/shm` is full, or too few file descriptors may be opened | [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] before iceoryx2 creates anything; the soft limit of descriptors is raised if the hard limit permits it |
+//! | another process takes the last of `/dev/shm` while a process connects or starts | SIGBUS may end it, since iceoryx2 allocates no memory in advance; what is connected has its memory |
 //! | a process dies while it creates something | the next process that has the locks removes it, whatever its age; while another process creates something, or is stopped at it, nothing incomplete is removed |
 //! | dead processes fill `/dev/shm`, or their directory was removed | the next process that joins a namespace of the same path removes what no process uses, by the locks of the prefixes |
-//! | a process is stopped while it holds the namespace's lock | the others wait: an engine 30 s to start, a trainer or observer as long as its timeout and at least 5 s; after a second they log who holds it, and [`ServiceError::NamespaceLocked`] names it |
+//! | a process is stopped while it holds the namespace's lock | the others wait: an engine 30 s to start, a trainer or observer as long as its timeout and at least 5 s, and up to six times that while one process takes it after another; after a second they log who holds it, and [`ServiceError::NamespaceLocked`] names it |
 //! | two directories have the same path (containers that share `/dev/shm` and not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
 //! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts anew in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
 //! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix, otherwise [`ServiceError::ForeignSegment`]; no segment that stays is accessible to other users |
@@ -63,6 +65,8 @@
 //! A request steps or resets a group, restores an environment, or takes a snapshot. The trainer numbers its requests, the engine
 //! numbers the batches of a group ([`BatchLease::step`]), and its status says which request it has taken, answered and executed.
 //! An engine executes each request that it takes once and sends one response; no message is repeated.
+//!
+//! For `set_options` and `running_episodes` the table says what it says for `restore` and `snapshot`.
 //!
 //! | call | failure | the request was executed | what to do |
 //! | --- | --- | --- | --- |
@@ -83,6 +87,7 @@ mod activity;
 mod blackboard;
 mod checkpoint;
 mod checkpoint_config;
+mod checkpoint_lock;
 mod checkpointer;
 mod cleanup;
 mod connect;
@@ -104,6 +109,8 @@ mod message;
 mod namespace;
 mod node;
 mod observer;
+mod observer_status;
+mod observers;
 mod pending;
 mod ports;
 mod process;
@@ -129,8 +136,9 @@ pub use inspect::EngineProcesses;
 pub use lease::BatchLease;
 pub use namespace::{Namespace, ROOT_VARIABLE};
 pub use observer::Observer;
+pub use observers::{Observed, Observers};
 pub use process::LockHolder;
 pub use reconnection::{GroupReconnection, LastRequest, Reconnection};
 pub use specification::ServiceSpecification;
-pub use status::{EngineStatus, GroupStatus};
+pub use status::{EngineStatus, GroupStatus, ObserverStatus};
 pub use trainer::Trainer;

@@ -14,7 +14,8 @@
 //!
 //! It is held for milliseconds. A holder that is stopped (SIGSTOP, a debugger, a frozen container) may be in the middle of a
 //! removal, so its lock is never broken: the others wait for as long as their caller does, continue within a millisecond when it
-//! is free, and name the holder in a warning after a second and in their error.
+//! is free, and name the holder in a warning after a second and in their error. Where several processes hold it in turn, as on a busy
+//! machine, the others wait longer: only a holder that stays is an error.
 
 use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
@@ -32,6 +33,12 @@ pub(crate) const LOCK_TIMEOUT: Duration = Duration::from_secs(5);
 const WARNING_AFTER: Duration = Duration::from_secs(1);
 
 const RETRY_INTERVAL: Duration = Duration::from_millis(1);
+
+/// How often a waiter looks who holds the lock.
+const HOLDER_INTERVAL: Duration = Duration::from_millis(250);
+
+/// How many times its timeout a process waits in all while one holder follows another.
+const LONGEST_WAIT: u32 = 6;
 
 /// The lock while it is held. Every acquisition opens the directory anew, so that threads of one process exclude each other too.
 /// A thread must not acquire it twice.
@@ -59,11 +66,12 @@ impl NamespaceLock {
         };
         let directory = File::open(root).map_err(unusable)?;
         let (start, mut warned) = (Instant::now(), false);
+        let mut patience = Patience::new(timeout);
         loop {
             match directory.try_lock() {
                 Ok(()) => break,
                 Err(TryLockError::Error(e)) => return Err(unusable(e)),
-                Err(TryLockError::WouldBlock) if start.elapsed() >= timeout => {
+                Err(TryLockError::WouldBlock) if patience.is_over(start.elapsed(), || holder(&directory)) => {
                     let holder = holder(&directory);
                     return Err(ServiceError::NamespaceLocked { path: root.to_owned(), waited: timeout, holder });
                 }
@@ -93,6 +101,36 @@ impl Drop for NamespaceLock {
     }
 }
 
+/// How long a process waits, by the time since it began to wait.
+#[derive(Debug)]
+struct Patience {
+    timeout: Duration,
+    /// The last holder that was seen, since when, and when it was looked for.
+    holder: Option<u32>,
+    since: Duration,
+    looked: Duration,
+}
+
+impl Patience {
+    fn new(timeout: Duration) -> Self {
+        Patience { timeout, holder: None, since: Duration::ZERO, looked: Duration::ZERO }
+    }
+
+    /// Whether one holder has had the lock for the whole timeout, as far as was seen, or the wait has taken too long in all.
+    fn is_over(&mut self, now: Duration, holder: impl FnOnce() -> Option<LockHolder>) -> bool {
+        if now >= self.looked + HOLDER_INTERVAL {
+            let pid = holder().map(|holder| holder.pid);
+            if pid != self.holder {
+                // The first holder that is seen may have held it from the beginning.
+                self.since = if self.looked.is_zero() { Duration::ZERO } else { now };
+                self.holder = pid;
+            }
+            self.looked = now;
+        }
+        now - self.since >= self.timeout || now >= self.timeout.saturating_mul(LONGEST_WAIT)
+    }
+}
+
 /// The process that holds the lock on `directory`, from `/proc/locks`; `None` if it cannot be found, such as one that died after it
 /// forked a child, which then shares the lock.
 fn holder(directory: &File) -> Option<LockHolder> {
@@ -111,6 +149,21 @@ fn holder(directory: &File) -> Option<LockHolder> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_a_holder_that_stays_exhausts_the_patience() {
+        let first_error = |pid: fn(u64) -> u32| {
+            let mut patience = Patience::new(LOCK_TIMEOUT);
+            (0..100_000).find(|now| {
+                let holder = || Some(LockHolder { pid: pid(*now), stopped: false });
+                patience.is_over(Duration::from_millis(*now), holder)
+            })
+        };
+        assert_eq!(first_error(|_| 7), Some(5000));
+        assert_eq!(first_error(|now| if now < 3000 { 7 } else { 8 }), Some(8000));
+        assert_eq!(first_error(|now| (now / 1000) as u32), Some(30_000));
+        assert!(Patience::new(Duration::ZERO).is_over(Duration::ZERO, || None));
+    }
 
     #[test]
     fn one_holder_excludes_all_others_and_is_named() {

@@ -45,10 +45,14 @@ pub(crate) enum RequestKind {
     Restore,
     /// Save all groups to the engine's checkpoint file and return their steps.
     Checkpoint,
+    /// Set the options of environments' next episodes from the JSON text in the payload's `snapshot`.
+    SetOptions,
+    /// Return what the running episodes of the environments in the payload's `reset` follow from.
+    Episodes,
 }
 
 impl RequestKind {
-    const ALL: [RequestKind; 7] = [
+    pub(crate) const ALL: [RequestKind; 9] = [
         RequestKind::Step,
         RequestKind::ResetAll,
         RequestKind::ResetSeed,
@@ -56,6 +60,8 @@ impl RequestKind {
         RequestKind::Snapshot,
         RequestKind::Restore,
         RequestKind::Checkpoint,
+        RequestKind::SetOptions,
+        RequestKind::Episodes,
     ];
 
     /// The code in the header. 0 is not a code.
@@ -71,6 +77,8 @@ impl RequestKind {
             RequestKind::Snapshot => "snapshot",
             RequestKind::Restore => "restore",
             RequestKind::Checkpoint => "checkpoint",
+            RequestKind::SetOptions => "options",
+            RequestKind::Episodes => "episodes",
         }
     }
 
@@ -79,9 +87,15 @@ impl RequestKind {
         RequestKind::ALL.into_iter().find(|kind| kind.code() == code)
     }
 
-    /// Whether the response holds a batch and not a snapshot.
+    /// Whether the response holds a batch and not a snapshot or text.
     pub(crate) fn returns_batch(self) -> bool {
-        !matches!(self, RequestKind::Snapshot | RequestKind::Restore | RequestKind::Checkpoint)
+        use RequestKind::{ResetAll, ResetEach, ResetSeed, Step};
+        matches!(self, Step | ResetAll | ResetSeed | ResetEach)
+    }
+
+    /// Whether executing it leaves all environments as they were.
+    pub(crate) fn changes_nothing(self) -> bool {
+        matches!(self, RequestKind::Snapshot | RequestKind::Checkpoint | RequestKind::Episodes)
     }
 }
 
@@ -103,7 +117,8 @@ pub(crate) struct RequestHeader {
     pub seed: u64,
     /// Environment of a [`RequestKind::Snapshot`] or a [`RequestKind::Restore`].
     pub env: u64,
-    /// Length in bytes of the payload's `options` (JSON text of a reset; 0: keep the reset parameters) or `snapshot`.
+    /// Length in bytes of the payload's `options` (JSON text of a reset; 0: keep the reset parameters) or of what its `snapshot`
+    /// holds.
     pub bytes: u64,
     /// Process id of the trainer, for people.
     pub process: u32,
@@ -114,14 +129,16 @@ pub(crate) struct RequestHeader {
 /// Status of a response that holds a batch.
 const BATCH: u32 = 0;
 
-/// Status of a response whose payload starts with a snapshot. All other numbers are rejections.
+/// Status of a response whose payload starts with a snapshot, or with other bytes that are no batch. All other numbers are
+/// rejections.
 const SNAPSHOT: u32 = u32::MAX;
 
 /// What a response holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ResponseContent {
     Batch,
-    /// A snapshot of that many bytes; 0 bytes in the response to a [`RequestKind::Restore`].
+    /// A snapshot, steps or JSON text of that many bytes; 0 bytes in the response to a [`RequestKind::Restore`] or a
+    /// [`RequestKind::SetOptions`].
     Snapshot {
         bytes: usize,
     },

@@ -97,11 +97,6 @@ impl Namespace {
         if !metadata.is_dir() {
             return Err(unusable("it must be a directory".to_owned()));
         }
-        if owner != user {
-            return Err(unusable(format!(
-                "it must belong to user {user}, who runs this process, and belongs to user {owner}"
-            )));
-        }
         let mode = metadata.permissions().mode();
         // A directory with the sticky bit, such as `/tmp`, is shared on purpose.
         if mode & 0o022 != 0 && mode & 0o1000 != 0 {
@@ -109,6 +104,11 @@ impl Namespace {
             return Err(unusable(format!(
                 "it is shared with other users; use a directory in it, such as {}",
                 own.display()
+            )));
+        }
+        if owner != user {
+            return Err(unusable(format!(
+                "it must belong to user {user}, who runs this process, and belongs to user {owner}"
             )));
         }
         if mode & 0o022 != 0 {
@@ -168,7 +168,7 @@ mod tests {
         assert!(reason(&Namespace::at("/dev/null")).contains("/dev/null"));
         let shared = reason(&Namespace::at("/tmp"));
         assert!(shared.contains("/tmp") && !shared.contains("chmod"), "{shared}");
-        let open = std::env::temp_dir().join(format!("endless-open-{}", std::process::id()));
+        let open = PathBuf::from(format!("/tmp/endless-open-{}", std::process::id()));
         fs::create_dir(&open).unwrap();
         fs::set_permissions(&open, fs::Permissions::from_mode(0o777)).unwrap();
         let advice = reason(&Namespace::at(&open));

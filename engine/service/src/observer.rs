@@ -3,16 +3,21 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::activity::EngineActivity;
 use crate::connect::{ConnectConfig, connect_to_engine};
 use crate::descriptors;
 use crate::error::ServiceError;
 use crate::lease::{BatchLease, Response, ResponsePort};
 use crate::node::NamespaceNode;
+use crate::observer_status::ObserverStatusWriter;
 use crate::ports::{EngineServices, OpenMode, ServiceNames};
 use crate::reservation;
 use crate::specification::ServiceSpecification;
+use crate::status;
+use crate::status_file::{self, StatusReader};
 use crate::wait::LIVENESS_INTERVAL;
+
+/// The files of the engine's status and of the observer's own.
+const STATUS_DESCRIPTORS: usize = 2;
 
 /// How often a waiting observer polls.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
@@ -38,6 +43,10 @@ const POLL_INTERVAL: Duration = Duration::from_millis(1);
 /// ```
 pub struct Observer {
     port: Arc<ResponsePort>,
+    group: usize,
+    /// The engine's status; `None` if it cannot be read.
+    engine: Option<StatusReader>,
+    status: Option<ObserverStatusWriter>,
     specification: Arc<ServiceSpecification>,
     node: Arc<NamespaceNode>,
 }
@@ -62,13 +71,21 @@ impl Observer {
             }
             let names = ServiceNames::new(&service, specification.incarnation);
             let services = EngineServices { node, names, mode: OpenMode::Open };
-            descriptors::reserve(descriptors::of_trainer(1))?;
+            descriptors::reserve(descriptors::of_trainer(1) + STATUS_DESCRIPTORS)?;
             // One observer at a time, so that each counts those before it.
             let _lock = node.lock()?;
             reservation::reserve_for_observer(&services, group, specification)?;
             ResponsePort::open(&services, node, group, specification)
         })?;
-        Ok(Observer { port: Arc::new(port), specification: Arc::new(specification), node })
+        let status = status_file::path(node.prefix(), &specification.service, specification.incarnation);
+        Ok(Observer {
+            port: Arc::new(port),
+            group,
+            engine: StatusReader::open(&status),
+            status: ObserverStatusWriter::create(&node, &specification, group),
+            specification: Arc::new(specification),
+            node,
+        })
     }
 
     /// The engine's specification.
@@ -83,14 +100,19 @@ impl Observer {
     /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held, and
     /// [`ServiceError::IncompatibleTypes`] for a malformed message.
     pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
-        Ok(self.port.receive(&self.specification)?.and_then(Response::into_batch))
+        let batch = self.port.receive(&self.specification)?.and_then(Response::into_batch);
+        if let (Some(status), Some(_)) = (&mut self.status, &batch) {
+            // Each lease holds the port.
+            status.received(Arc::strong_count(&self.port) - 1);
+        }
+        Ok(batch)
     }
 
     /// The next batch. Waits for it up to `timeout`.
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TimedOut`] if there was no batch in time, [`ServiceError::EngineLost`] within half a second after the
+    /// [`ServiceError::TimedOut`] if there was no batch in time, which says what the engine was doing, [`ServiceError::EngineLost`] within half a second after the
     /// engine's process has ended, [`ServiceError::RootRemoved`] if the namespace's directory was removed, and the errors of [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
@@ -109,11 +131,8 @@ impl Observer {
                 return Err(ServiceError::EngineLost { service: service(), pid: self.specification.engine_pid });
             }
             if is_over {
-                return Err(ServiceError::TimedOut {
-                    service: service(),
-                    waited: timeout,
-                    activity: EngineActivity::Unknown,
-                });
+                let activity = status::observed_activity(self.engine.as_ref(), self.group);
+                return Err(ServiceError::TimedOut { service: service(), waited: timeout, activity });
             }
             if is_due {
                 last_check = Instant::now();

@@ -11,7 +11,7 @@ pub(crate) struct Request {
     pub seed: u64,
     /// Environment of a [`RequestKind::Snapshot`] or a [`RequestKind::Restore`].
     pub env: usize,
-    /// Checksum of the snapshot of a [`RequestKind::Restore`].
+    /// Checksum of the payload of a [`RequestKind::Restore`], a [`RequestKind::SetOptions`] or a [`RequestKind::Episodes`].
     pub checksum: u32,
 }
 

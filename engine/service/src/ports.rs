@@ -1,8 +1,8 @@
 //! The iceoryx2 services and ports of an engine.
 
 use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::port::listener::Listener;
-use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::listener::{Listener, ListenerCreateError};
+use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{
@@ -234,6 +234,7 @@ pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
 }
 
 /// Why a port could not be created.
+#[derive(Debug)]
 pub(crate) enum PortError {
     /// The service already has its maximum number of such ports.
     LimitReached,
@@ -255,16 +256,44 @@ impl From<PublisherCreateError> for PortError {
     }
 }
 
+impl From<NotifierCreateError> for PortError {
+    fn from(error: NotifierCreateError) -> Self {
+        match error {
+            NotifierCreateError::ExceedsMaxSupportedNotifiers => PortError::LimitReached,
+            e => PortError::Other(ServiceError::middleware("cannot create a notifier")(e.to_string())),
+        }
+    }
+}
+
+impl From<ListenerCreateError> for PortError {
+    fn from(error: ListenerCreateError) -> Self {
+        match error {
+            ListenerCreateError::ExceedsMaxSupportedListeners => PortError::LimitReached,
+            e => PortError::Other(ServiceError::middleware("cannot create a listener")(e.to_string())),
+        }
+    }
+}
+
+impl PortError {
+    /// The error where no other process can have such a port.
+    pub(crate) fn unexpected(self, port: &str) -> ServiceError {
+        match self {
+            PortError::Other(e) => e,
+            PortError::LimitReached => {
+                ServiceError::middleware("cannot create a port")(format!("{port} exists already"))
+            }
+        }
+    }
+}
+
 /// The port that wakes the waiter of the other process.
-pub(crate) fn notifier(events: &event::PortFactory<Ipc>) -> Result<Notifier<Ipc>, ServiceError> {
-    let failed = |e: String| ServiceError::middleware("cannot create a notifier")(e);
-    events.notifier_builder().create().map_err(|e| failed(e.to_string()))
+pub(crate) fn notifier(events: &event::PortFactory<Ipc>) -> Result<Notifier<Ipc>, PortError> {
+    Ok(events.notifier_builder().create()?)
 }
 
 /// The port that this process parks on.
-pub(crate) fn listener(events: &event::PortFactory<Ipc>) -> Result<Listener<Ipc>, ServiceError> {
-    let failed = |e: String| ServiceError::middleware("cannot create a listener")(e);
-    events.listener_builder().create().map_err(|e| failed(e.to_string()))
+pub(crate) fn listener(events: &event::PortFactory<Ipc>) -> Result<Listener<Ipc>, PortError> {
+    Ok(events.listener_builder().create()?)
 }
 
 /// Wakes the waiter of the other process. A failure is not an error: a waiter also polls after a timeout.

@@ -42,6 +42,9 @@ pub struct ServiceSpecification {
     pub features: Vec<String>,
     /// The reset parameters that were given: one map for all environments, or one for each environment of all groups.
     pub options: Vec<Map<String, Json>>,
+    /// [`PoolConfig::independent_episodes`](endless_gym_core::pool::PoolConfig::independent_episodes).
+    #[serde(default)]
+    pub independent_episodes: bool,
     /// When a new episode starts after the end of one.
     pub autoreset: Autoreset,
     /// Nominal rendering rate in frames per second (`metadata["render_fps"]`).
@@ -102,6 +105,7 @@ impl ServiceSpecification {
             ("action space", self.action_space == other.action_space),
             ("set of columns", self.info == other.info && self.features == other.features),
             ("set of options", self.options == other.options),
+            ("independence of episodes", self.independent_episodes == other.independent_episodes),
             ("auto-reset mode", self.autoreset == other.autoreset),
         ];
         same.into_iter().find(|(_, same)| !same).map(|(what, _)| what)

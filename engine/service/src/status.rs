@@ -8,7 +8,7 @@ use crate::activity::EngineActivity;
 use crate::identity::Identity;
 use crate::namespace::Namespace;
 use crate::status_file::{self, StatusReader};
-use crate::status_record::{EngineRecord, GroupRecord, now, unpadded};
+use crate::status_record::{EngineRecord, GroupRecord, ObserverRecord, now, unpadded};
 
 /// The status of an engine, read from shared memory. Reading it affects neither the engine nor its trainer.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -60,6 +60,8 @@ pub struct GroupStatus {
     pub trainer_process: Option<u32>,
     /// Batches that the trainer held when it sent its last request.
     pub held: u32,
+    /// The group's observers, sorted by process id.
+    pub observers: Vec<ObserverStatus>,
     /// Number of the last request that the engine has taken, and of the last that it has answered.
     pub last_taken: u64,
     /// See [`last_taken`](GroupStatus::last_taken).
@@ -72,6 +74,20 @@ pub struct GroupStatus {
     /// Time since the last request; `None` before the first.
     #[serde(rename = "seconds_since_request", serialize_with = "optional_seconds")]
     pub last_request: Option<Duration>,
+}
+
+/// The status of an observer.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ObserverStatus {
+    /// Its process id.
+    pub process: u32,
+    /// Batches that it has received.
+    pub batches: u64,
+    /// Batches that it held when it received the last one, including that one.
+    pub held: u32,
+    /// Time since it received the last one; `None` before the first.
+    #[serde(rename = "seconds_since_batch", serialize_with = "optional_seconds")]
+    pub last_batch: Option<Duration>,
 }
 
 fn seconds<S: serde::Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
@@ -89,9 +105,10 @@ impl EngineStatus {
     /// Creates and removes nothing, also where the namespace's directory does not exist. Engines of another version are left out.
     pub fn all(namespace: &Namespace) -> Vec<Self> {
         let Some(identity) = Identity::existing(namespace) else { return Vec::new() };
-        let readers = status_file::paths(identity.prefix()).into_iter().filter_map(|path| StatusReader::open(&path));
-        let running = readers.filter(StatusReader::is_engine_alive);
-        let mut found: Vec<_> = running.filter_map(|reader| EngineStatus::read(&reader)).collect();
+        let prefix = identity.prefix();
+        let readers = status_file::paths(prefix).into_iter().filter_map(|path| StatusReader::open(&path));
+        let running = readers.filter(StatusReader::is_alive);
+        let mut found: Vec<_> = running.filter_map(|reader| EngineStatus::read(&reader, prefix)).collect();
         found.sort_by(|a, b| a.service.cmp(&b.service));
         found
     }
@@ -101,14 +118,15 @@ impl EngineStatus {
         EngineStatus::all(namespace).into_iter().find(|status| status.service == service)
     }
 
-    fn read(reader: &StatusReader) -> Option<Self> {
+    fn read(reader: &StatusReader, prefix: &str) -> Option<Self> {
         let engine = reader.engine()?;
-        let now = now();
         let groups: Option<Vec<_>> = (0..engine.groups as usize).map(|group| reader.group(group)).collect();
-        Some(EngineStatus::new(&engine, &groups?, now))
+        let observers = status_file::observer_paths(prefix, engine.incarnation);
+        let observers: Vec<_> = observers.iter().filter_map(|path| StatusReader::running_observer(path)).collect();
+        Some(EngineStatus::new(&engine, &groups?, &observers, now()))
     }
 
-    fn new(engine: &EngineRecord, groups: &[GroupRecord], now: u64) -> Self {
+    fn new(engine: &EngineRecord, groups: &[GroupRecord], observers: &[ObserverRecord], now: u64) -> Self {
         EngineStatus {
             service: unpadded(&engine.service),
             id: unpadded(&engine.id),
@@ -120,14 +138,23 @@ impl EngineStatus {
             recoveries: engine.recoveries,
             checkpoints: engine.checkpoints,
             last_checkpoint: since(engine.last_checkpoint, now),
-            groups: groups.iter().map(|group| GroupStatus::new(group, now)).collect(),
+            groups: groups
+                .iter()
+                .enumerate()
+                .map(|(number, group)| {
+                    let observers = observers.iter().filter(|observer| observer.group as usize == number);
+                    GroupStatus::new(group, observers, now)
+                })
+                .collect(),
         }
     }
 }
 
 impl GroupStatus {
-    fn new(group: &GroupRecord, now: u64) -> Self {
+    fn new<'a>(group: &GroupRecord, observers: impl Iterator<Item = &'a ObserverRecord>, now: u64) -> Self {
         let had_request = group.last_request != 0;
+        let mut observers: Vec<_> = observers.map(|observer| ObserverStatus::new(observer, now)).collect();
+        observers.sort_by_key(|observer| observer.process);
         GroupStatus {
             step: group.step,
             batches: group.batches,
@@ -138,11 +165,23 @@ impl GroupStatus {
             trainers: group.trainers,
             trainer_process: had_request.then_some(group.trainer_process),
             held: group.held,
+            observers,
             last_taken: group.taken,
             last_answered: group.answered,
             kind: had_request.then(|| group.kind()),
             busy: since(group.busy_since, now),
             last_request: since(group.last_request, now),
+        }
+    }
+}
+
+impl ObserverStatus {
+    fn new(observer: &ObserverRecord, now: u64) -> Self {
+        ObserverStatus {
+            process: observer.process,
+            batches: observer.batches,
+            held: observer.held,
+            last_batch: since(observer.last_batch, now),
         }
     }
 }
@@ -170,6 +209,19 @@ pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize
     EngineActivity::NotTaken { process: engine.process }
 }
 
+/// What the engine does while an observer waits for a batch of a group.
+pub(crate) fn observed_activity(status: Option<&StatusReader>, group: usize) -> EngineActivity {
+    // No trainer has the number 0.
+    match activity(status, 0, group, u64::MAX) {
+        EngineActivity::NotTaken { process } => {
+            let record = status.and_then(|status| status.group(group));
+            let since = record.and_then(|record| since(record.last_request, now()));
+            EngineActivity::Idle { group, since, process }
+        }
+        busy => busy,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -185,9 +237,10 @@ mod tests {
         fn any_records_are_a_status(
             engine in record::<EngineRecord>(),
             groups in prop::collection::vec(record::<GroupRecord>(), 0..4),
+            observers in prop::collection::vec(record::<ObserverRecord>(), 0..4),
             now: u64,
         ) {
-            let status = EngineStatus::new(&engine, &groups, now);
+            let status = EngineStatus::new(&engine, &groups, &observers, now);
             prop_assert_eq!(status.groups.len(), groups.len());
             prop_assert!(!status.service.chars().any(char::is_control));
             serde_json::to_string(&status).unwrap();

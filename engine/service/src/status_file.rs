@@ -1,10 +1,14 @@
-//! The file in shared memory that holds an engine's status.
+//! The files in shared memory that hold the status of an engine and of its observers.
 //!
-//! The engine maps the file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a writer
-//! does can harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence lock).
+//! The engine or the observer maps its file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a
+//! writer does can harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence
+//! lock).
 //!
-//! The engine holds an `flock` on the file from before it has its name until its process ends. A file without that lock belongs to
-//! a dead engine and may be removed, independent of process ids, which another container would not see.
+//! The writer holds an `flock` on the file from before it has its name until its process ends. A file without that lock belongs to
+//! a dead process and may be removed, independent of process ids, which another container would not see.
+//!
+//! A process that truncated the file would end its writer by SIGBUS, as with every segment of shared memory. The file is read-only,
+//! so that this does not happen by mistake; root, and a process of the same user that changes the mode first, still can.
 
 use std::fs::{self, File};
 use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
@@ -17,19 +21,22 @@ use rustix::fs::{FallocateFlags, FlockOperation, OFlags, fallocate, flock};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 
 use crate::error::ServiceError;
-use crate::status_record::{EngineRecord, GroupRecord};
+use crate::status_record::{EngineRecord, GroupRecord, ObserverRecord};
 
 const DIRECTORY: &str = "/dev/shm";
 
-/// End of the names of status files.
+/// End of the names of the files of engines, and of observers.
 const SUFFIX: &str = ".status";
+const OBSERVER_SUFFIX: &str = ".observer";
 
 const WORD: usize = size_of::<u64>();
 
 /// Words from one record to the next, with its sequence number: whole cache lines.
 const ENGINE_WORDS: usize = 32;
 const GROUP_WORDS: usize = 24;
+const OBSERVER_WORDS: usize = 8;
 const _: () = assert!(size_of::<EngineRecord>() / WORD < ENGINE_WORDS && size_of::<GroupRecord>() / WORD < GROUP_WORDS);
+const _: () = assert!(size_of::<ObserverRecord>() / WORD < OBSERVER_WORDS);
 
 /// How often a reader tries to read a record that is being written.
 const READ_ATTEMPTS: usize = 100;
@@ -39,20 +46,34 @@ pub(crate) fn path(prefix: &str, service: &str, incarnation: u64) -> PathBuf {
     Path::new(DIRECTORY).join(format!("{prefix}{service}.{incarnation:016x}{SUFFIX}"))
 }
 
-/// The status files of a namespace.
+/// The file of an observer of an engine, with a random number.
+pub(crate) fn observer_path(prefix: &str, incarnation: u64, number: u64) -> PathBuf {
+    Path::new(DIRECTORY).join(format!("{prefix}{incarnation:016x}.{number:016x}{OBSERVER_SUFFIX}"))
+}
+
+/// The status files of a namespace's engines.
 pub(crate) fn paths(prefix: &str) -> Vec<PathBuf> {
-    let is_status = |name: &str| name.starts_with(prefix) && name.ends_with(SUFFIX);
+    paths_with(prefix, SUFFIX)
+}
+
+/// The files of an engine's observers.
+pub(crate) fn observer_paths(prefix: &str, incarnation: u64) -> Vec<PathBuf> {
+    paths_with(&format!("{prefix}{incarnation:016x}."), OBSERVER_SUFFIX)
+}
+
+fn paths_with(prefix: &str, suffix: &str) -> Vec<PathBuf> {
+    let is_status = |name: &str| name.starts_with(prefix) && name.ends_with(suffix);
     let entries = fs::read_dir(DIRECTORY).into_iter().flatten().flatten();
     let named = entries.filter(|entry| entry.file_name().to_str().is_some_and(is_status));
     named.map(|entry| entry.path()).collect()
 }
 
-/// Removes the status files of dead engines.
+/// Removes the files of dead engines and observers.
 pub(crate) fn remove_abandoned(prefix: &str) {
-    for path in paths(prefix) {
+    for path in paths(prefix).into_iter().chain(paths_with(prefix, OBSERVER_SUFFIX)) {
         let Some(file) = open(&path) else { continue };
         if flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok() {
-            tracing::debug!(path = %path.display(), "removing the status of a dead engine");
+            tracing::debug!(path = %path.display(), "removing the status of a dead process");
             // An error means that another process has removed it.
             let _ = fs::remove_file(&path);
         }
@@ -72,7 +93,7 @@ fn words(groups: usize) -> usize {
     ENGINE_WORDS + groups * GROUP_WORDS
 }
 
-/// The status file of an engine in this process. It is removed when this is dropped.
+/// The status file of an engine or an observer in this process. It is removed when this is dropped.
 #[derive(Debug)]
 pub(crate) struct StatusFile {
     start: NonNull<AtomicU64>,
@@ -89,18 +110,26 @@ unsafe impl Send for StatusFile {}
 unsafe impl Sync for StatusFile {}
 
 impl StatusFile {
-    /// Creates the file with these records. It appears under its name complete and locked.
+    /// Creates the file of an engine with these records. It appears under its name complete and locked.
     pub(crate) fn create(path: PathBuf, engine: &EngineRecord, groups: usize) -> Result<Self, ServiceError> {
+        Self::with_record(path, words(groups), bytemuck::cast_slice(std::slice::from_ref(engine)))
+    }
+
+    /// Creates the file of an observer.
+    pub(crate) fn create_observer(path: PathBuf, record: &ObserverRecord) -> Result<Self, ServiceError> {
+        Self::with_record(path, OBSERVER_WORDS, bytemuck::cast_slice(std::slice::from_ref(record)))
+    }
+
+    fn with_record(path: PathBuf, words: usize, record: &[u64]) -> Result<Self, ServiceError> {
         let failed = |e: &dyn std::fmt::Display| ServiceError::middleware("cannot create the status")(e.to_string());
         let unnamed = path.with_extension("new");
         let file = File::options()
             .read(true)
             .write(true)
             .create_new(true)
-            .mode(0o600)
+            .mode(0o400)
             .open(&unnamed)
             .map_err(|e| failed(&format_args!("{}: {e}", unnamed.display())))?;
-        let words = words(groups);
         let prepared = flock(&file, FlockOperation::NonBlockingLockExclusive)
             // Without allocation, writing to the mapping of a file for which there is no memory raises SIGBUS.
             .and_then(|()| fallocate(&file, FallocateFlags::empty(), 0, (words * WORD) as u64))
@@ -117,7 +146,7 @@ impl StatusFile {
         })?;
         let start = NonNull::new(start.cast()).ok_or_else(|| failed(&"the mapping has no address"))?;
         let status = StatusFile { start, words, path, process: std::process::id(), _file: file };
-        status.write_engine(engine);
+        status.write(0, record);
         fs::rename(&unnamed, &status.path).map_err(|e| {
             let _ = fs::remove_file(&unnamed);
             failed(&e)
@@ -126,6 +155,10 @@ impl StatusFile {
     }
 
     pub(crate) fn write_engine(&self, record: &EngineRecord) {
+        self.write(0, bytemuck::cast_slice(std::slice::from_ref(record)));
+    }
+
+    pub(crate) fn write_observer(&self, record: &ObserverRecord) {
         self.write(0, bytemuck::cast_slice(std::slice::from_ref(record)));
     }
 
@@ -158,21 +191,27 @@ impl Drop for StatusFile {
     }
 }
 
-/// Reads the status of an engine in another process, also after its end.
+/// Reads the status of an engine or an observer in another process, also after its end.
 #[derive(Debug)]
 pub(crate) struct StatusReader {
     file: File,
 }
 
 impl StatusReader {
-    /// Opens a status file; `None` if it is missing, or not of this version.
+    /// Opens an engine's file; `None` if it is missing, or not of this version.
     pub(crate) fn open(path: &Path) -> Option<Self> {
         let reader = StatusReader { file: open(path)? };
         reader.engine().map(|_| reader)
     }
 
-    /// Whether the engine's process is running.
-    pub(crate) fn is_engine_alive(&self) -> bool {
+    /// The record of an observer that is running; `None` if it cannot be read.
+    pub(crate) fn running_observer(path: &Path) -> Option<ObserverRecord> {
+        let reader = StatusReader { file: open(path)? };
+        if reader.is_alive() { reader.read(0) } else { None }
+    }
+
+    /// Whether the process that writes the file is running.
+    pub(crate) fn is_alive(&self) -> bool {
         match flock(&self.file, FlockOperation::NonBlockingLockShared) {
             Ok(()) => {
                 let _ = flock(&self.file, FlockOperation::Unlock);
@@ -213,6 +252,8 @@ impl StatusReader {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
     use bytemuck::Zeroable;
     use endless_gym_core::batch::LAYOUT_VERSION;
 
@@ -235,13 +276,15 @@ mod tests {
         let file = StatusFile::create(path.clone(), &record(), 2).unwrap();
         let reader = StatusReader::open(&path).unwrap();
         assert_eq!(reader.engine(), Some(record()));
+        let mode = fs::metadata(&path).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o400, "no other process truncates it by mistake");
         let group = GroupRecord { step: 7, taken: 9, held: 2, ..GroupRecord::default() };
         file.write_group(1, &group);
         assert_eq!((reader.group(0), reader.group(1)), (Some(GroupRecord::default()), Some(group)));
         assert_eq!(reader.group(2), None);
-        assert!(reader.is_engine_alive());
+        assert!(reader.is_alive());
         drop(file);
-        assert!(!path.exists() && !reader.is_engine_alive());
+        assert!(!path.exists() && !reader.is_alive());
         assert_eq!(reader.group(1), Some(group), "the last status remains readable");
     }
 
@@ -273,9 +316,18 @@ mod tests {
         fs::copy(&running, &dead).unwrap();
         assert!(StatusReader::open(&other).is_none() && StatusReader::open(&short).is_none());
         assert!(StatusReader::open(&path(&prefix, "missing", 1)).is_none());
-        assert!(!StatusReader::open(&dead).unwrap().is_engine_alive());
+        assert!(!StatusReader::open(&dead).unwrap().is_alive());
         assert_eq!(paths(&prefix).len(), 4);
+        let [observer, gone] = [1, 2].map(|number| observer_path(&prefix, 9, number));
+        let seen = ObserverRecord { group: 1, held: 2, ..ObserverRecord::default() };
+        let file_of_observer = StatusFile::create_observer(observer.clone(), &seen).unwrap();
+        fs::copy(&observer, &gone).unwrap();
+        assert_eq!(StatusReader::running_observer(&observer), Some(seen));
+        assert_eq!(StatusReader::running_observer(&gone), None);
         remove_abandoned(&prefix);
+        assert_eq!(observer_paths(&prefix, 9), [observer]);
+        drop(file_of_observer);
+        assert!(observer_paths(&prefix, 9).is_empty());
         assert_eq!(paths(&prefix), [running]);
         drop(file);
         assert!(paths(&prefix).is_empty());

@@ -79,6 +79,22 @@ impl GroupRecord {
     }
 }
 
+/// What concerns one observer. Times are as in [`EngineRecord`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct ObserverRecord {
+    /// Process id, as the observer gives it.
+    pub process: u32,
+    pub group: u32,
+    /// Batches received.
+    pub batches: u64,
+    /// When it received the last one.
+    pub last_batch: u64,
+    /// Batches that it held then, including that one.
+    pub held: u32,
+    pub padding: u32,
+}
+
 /// Nanoseconds of CLOCK_MONOTONIC, which is the same in all processes of a host; at least 1.
 pub(crate) fn now() -> u64 {
     let time = clock_gettime(ClockId::Monotonic);

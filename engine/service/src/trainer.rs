@@ -24,6 +24,7 @@ use crate::specification::ServiceSpecification;
 use crate::status;
 use crate::wait::{LIVENESS_INTERVAL, wait};
 
+mod episodes;
 mod transfers;
 
 /// How long a trainer whose engine has ended waits for the namespace's lock, to find out whether another engine has replaced it.

@@ -1,9 +1,10 @@
 """Checkpoints: the state from which a run resumes, and the agent for evaluation.
 
 ```python
-agent = checkpoint.load("runs/mine").agent         # the last checkpoint of a run, or a checkpoint file
-memory = agent.initial_memory(num_envs)
-output = agent.act(observation, memory)
+from endless_gym.agents import checkpoint
+
+loaded = checkpoint.load("runs/mine")    # the last checkpoint of a run, or a checkpoint file
+agent, steps = loaded.agent, loaded.steps
 ```
 """
 

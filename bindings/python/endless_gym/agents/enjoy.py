@@ -24,7 +24,7 @@ from endless_gym.agents.agent import Agent, observation_shapes
 from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.evaluate import EVALUATION_SEEDS
 from endless_gym.agents.train import choose_device
-from endless_gym.specs import spec
+from endless_gym.specs import ObservationName, spec
 from endless_gym.vector import EndlessVectorEnv, make_vec
 
 
@@ -75,7 +75,7 @@ class EpisodeRecorder:
         settings = self.agent.settings
         generator = torch.Generator(self.agent.device).manual_seed(self.action_seed)
         # The video shows rgb frames even if the agent observes features.
-        shown = "rgb" if settings.environment.observation == "rgb" else "rgb+features"
+        shown: ObservationName = "rgb" if settings.environment.observation == "rgb" else "rgb+features"
         options = settings.options()
         for seed in seeds:
             # Like the original, an environment keeps some state between episodes; a new one gives the same video for a seed.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from endless_gym.agents.recovery import RecoverableEngine
 from endless_gym.agents.settings import TRAINING_SEEDS, Settings
 from endless_gym.engine import serve
+from endless_gym.episodes import EpisodeOptions
 from endless_gym.specs import Spec, spec
 from endless_gym.vector import EndlessVectorEnv, make_vec
 
@@ -48,12 +49,23 @@ class Environments:
         per_group: Environments in each group.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, episode_options: EpisodeOptions | None = None) -> None:
         """Make the environments, in this process or in an engine process.
 
+        Args:
+            settings: The settings of the run.
+            episode_options: Chooses the options of each episode, as for `make_vec`; only with environments in this process, since
+                an engine that replaces a failed one plays the same steps again.
+
         Raises:
-            ValueError: A reset parameter is unknown or out of its range, or the engine cannot start.
+            ValueError: A reset parameter is unknown or out of its range, the engine cannot start, or `episode_options` is given
+                with an engine process.
         """
+        if episode_options is not None and settings.environment.engine != "thread":
+            raise ValueError(
+                "episode_options needs environments in this process: --environment.engine must be thread, "
+                f"got {settings.environment.engine}"
+            )
         wanted = settings.environment
         self.spec: Spec = spec(settings.env)
         self.groups, self.per_group = wanted.groups, wanted.num_envs // wanted.groups
@@ -68,7 +80,8 @@ class Environments:
             "autoreset": "same_step",
             "observation": wanted.observation,
         }
-        make, start = partial(make_vec, settings.env, **arguments), partial(serve, settings.env, **arguments)
+        make = partial(make_vec, settings.env, **arguments, episode_options=episode_options)
+        start = partial(serve, settings.env, **arguments)
         self._engine: RecoverableEngine | None = None
         try:
             if not in_process:

@@ -42,6 +42,11 @@ def is_finite(env: str) -> bool:
     return env not in METRICS
 
 
+def counts_failures(env: str) -> tuple[str, ...]:
+    """Names of the final infos that count a failed last command as executed, as the original does."""
+    return ("success", "commands_completed") if is_finite(env) and env.startswith("MortarMayhem") else ()
+
+
 def path_length(view: NDArray[np.uint8]) -> int:
     """Number of tiles of a path, with its goal and without its origin.
 

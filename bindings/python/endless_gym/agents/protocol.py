@@ -149,7 +149,10 @@ def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment
 
 
 def table(experiment: Experiment) -> Table:
-    """A table with all metrics of the last checkpoint, and the metric of the paper of the earlier ones."""
+    """A table with all metrics of the last checkpoint, and the metric of the paper of the earlier ones.
+
+    Final infos that count failures as successes are marked, and the caption says which metric to trust.
+    """
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())
     first, _ = metrics.metric(experiment.env)
     rows = [(first, *row) for row in experiment.summaries(first)]
@@ -159,7 +162,15 @@ def table(experiment: Experiment) -> Table:
         result.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]
+    doubtful = set(metrics.counts_failures(experiment.env)).intersection(others)
+    if doubtful:
+        result.caption = (
+            f"Trust {first}. * as the original reports it: a last command that failed counts as executed, so that an agent "
+            "that fails can reach 1.0."
+        )
+        result.caption_justify = "left"
     for name, step, summary, _ in rows:
+        name = f"{name} *" if name in doubtful else name
         interval = f"{summary.low:.4f} {summary.high:.4f}"
         result.add_row(f"{step:,}", name, f"{summary.mean:.4f}", f"{summary.std:.4f}", f"{summary.iqm:.4f}", interval)
     return result

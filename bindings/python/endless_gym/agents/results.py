@@ -26,6 +26,7 @@ _PER_RUN = (
     "keep_checkpoints",
     "time_limit",
     "target_reward",
+    "stop_when_learnt",
     "wandb",
 )
 

@@ -205,11 +205,11 @@ class Trials:
 
         choices = {name: trial.suggest_categorical(name, listed) for name, listed in self.space.items()}
         run = self.run_folder(trial.number, trial.user_attrs)
-        settings = replace(with_choices(self.arguments.settings, choices), run=str(run))
+        settings = replace(with_choices(self.arguments.settings, choices), run=str(run), stop_when_learnt=False)
         changed = self.changed(choices)
         self.console.print(f"[bold]trial {trial.number}[/]: {changed or 'initial settings'}", soft_wrap=True)
         try:
-            settings.validated()
+            settings = settings.validated()
         except ValueError as error:
             self.console.print(f"trial {trial.number} is invalid: {error}", soft_wrap=True)
             raise optuna.TrialPruned from error

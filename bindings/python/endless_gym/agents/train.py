@@ -2,7 +2,7 @@
 
 ```console
 endless-train --env Endless-MortarMayhem-v0 --agent gru
-endless-train --env MortarMayhem-Grid-v0 --environment.option command_count=[1] --agent trxl --preset quick
+endless-train --env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --agent trxl --preset quick
 ```
 """
 
@@ -26,18 +26,26 @@ from endless_gym.agents import checkpoint, command
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
+from endless_gym.agents.learnt import learnt
 from endless_gym.agents.logs import Episodes, Logger
-from endless_gym.agents.ppo import learn
+from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
+from endless_gym.episodes import EpisodeOptions
 
 
-def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | None = None) -> Path:
+def train(
+    settings: Settings,
+    watch: Callable[[int, dict[str, float]], bool] | None = None,
+    episode_options: EpisodeOptions | None = None,
+) -> Path:
     """Train an agent: a new run, or from the last checkpoint of a run.
 
     Args:
         settings: Settings of the run.
         watch: Called after each update with its number and the means of the last 100 episodes; the run stops if it returns true.
+        episode_options: Chooses the options of each episode, as for `make_vec`: a curriculum. Only with environments in this
+            process. A checkpoint does not contain its state.
 
     Returns:
         The folder of the run, with `settings.json`, `progress.jsonl`, the TensorBoard files and `checkpoints`.
@@ -67,6 +75,8 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
     device = choose_device(settings.device)
     if settings.threads:
         torch.set_num_threads(settings.threads)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32
     torch.manual_seed(settings.seed)
     generators = {
         "actions": torch.Generator(device).manual_seed(settings.seed),
@@ -74,11 +84,11 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
     }
 
     ppo, started, stop = settings.ppo, time.monotonic(), Interrupt()
-    with Environments(settings) as environments, stop:
+    with Environments(settings, episode_options) as environments, stop:
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()
-        optimizer = torch.optim.AdamW(agent.parameters(), lr=ppo.learning_rate)
+        optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"])
         episodes, update, steps = Episodes(), 0, 0
         if resumed is not None:
@@ -112,6 +122,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {device}, in {run}; Ctrl-C stops the run"
         )
 
+        success: str | None = None
         clock = Clock((lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None)
         while update < ppo.updates and not stop.requested:
             start = time.perf_counter()
@@ -133,12 +144,17 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             reward, target = means.get("episode/reward"), settings.target_reward
             if reward is not None and target is not None and episodes.is_full() and reward >= target:
                 stop.requested = True
+            if settings.stop_when_learnt and target is None and episodes.is_full():
+                success = learnt(environments.spec, settings.options(), means)
+                stop.requested = stop.requested or success is not None
             if environments.failure is not None:
                 stop.requested = True
             if watch is not None and watch(update, means):
                 stop.requested = True
             if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
                 save()
+        if success is not None:
+            logger.print(f"the task is learnt: {success}; train longer with --no-stop-when-learnt")
         logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
         logger.close()
         if environments.failure is not None:

@@ -38,4 +38,6 @@ pub(crate) use view::BatchMut;
 ///
 /// Version 4: the specification's key `epoch` became `incarnation`, the message headers have new type names, and a reset with a
 /// seed counts the environments of all groups.
-pub const LAYOUT_VERSION: u32 = 5;
+///
+/// Version 6: the requests that set the options of next episodes, and that ask what the running episodes follow from.
+pub const LAYOUT_VERSION: u32 = 6;

@@ -236,13 +236,13 @@ section_table! {
     Action action: i32, Vector, required,
         "for a step, one number for each branch of the action space";
     Reset reset: u8, Scalar, required,
-        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`";
+        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`; for a question about running episodes: 0 leaves the environment out";
     Seed seed: u64, Scalar, required,
         "for a reset of some environments: the seed where `reset` is 2";
     Options options: u8, Bytes(OPTIONS_BYTES), required,
         "for a reset with other reset parameters: one JSON text stored across all rows, at least [`OPTIONS_BYTES`] in all";
     Snapshot snapshot: u8, Bytes(SNAPSHOT_BYTES), required,
-        "for restoring an environment: its snapshot, one byte string stored across all rows, at least [`SNAPSHOT_BYTES`] in all";
+        "for restoring an environment: its snapshot; for setting the options of next episodes: their JSON text; one byte string stored across all rows, at least [`SNAPSHOT_BYTES`] in all";
 }
 
 /// Which optional sections a batch has.
@@ -265,7 +265,7 @@ impl BatchSection {
             BatchSection::Observation => contents.frames.map(Frames::shape),
             BatchSection::VectorObservation => columns(spec.vector_observation),
             BatchSection::Features => columns(spec.features.len()).filter(|_| contents.features),
-            BatchSection::GroundTruth => columns(spec.ground_truth),
+            BatchSection::GroundTruth => columns(spec.ground_truth.len()),
             BatchSection::Reward
             | BatchSection::Terminated
             | BatchSection::Truncated

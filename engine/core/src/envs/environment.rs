@@ -69,6 +69,9 @@ pub trait Environment: Send + Sync {
     /// The state changes where the original advances an animation with every view.
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
+    /// Sets these animations to where they are when the view was drawn once after the reset and after each step before this one.
+    fn align_ground_truth(&mut self) {}
+
     /// Writes the vector observation; an environment without one writes nothing.
     fn vector_observation(&self, _out: &mut [f32]) {}
 

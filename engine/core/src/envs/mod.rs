@@ -3,6 +3,7 @@
 mod action_space;
 mod character;
 mod character_sprites;
+mod controls;
 mod environment;
 mod expert;
 mod family;
@@ -26,4 +27,4 @@ pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
 pub use progress::Progress;
 pub use registry::{DEFAULT_ENV_ID, UnknownEnvironment, expert, spec, specs};
 pub use screen::{FRAME_BYTES, Frame, SCREEN};
-pub use spec::{Column, EnvSpec, InfoColumn};
+pub use spec::{ActionBranch, Choice, Column, EnvSpec, InfoColumn};

@@ -6,7 +6,25 @@ use super::action_space::ActionSpace;
 use super::family::Family;
 use super::parameters::Parameter;
 
-/// A column of the feature observation (float32).
+/// One branch of an action.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct ActionBranch {
+    /// Name, unique within the environment.
+    pub name: &'static str,
+    /// What each number means, from 0 on.
+    pub choices: &'static [Choice],
+}
+
+/// A value of a branch of an action.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Choice {
+    /// Name, unique within the branch.
+    pub name: &'static str,
+    /// What the agent does.
+    pub description: &'static str,
+}
+
+/// A column of the feature observation (float32) or of the ground truth (float64).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Column {
     /// Name, unique within the environment.
@@ -38,10 +56,12 @@ pub struct EnvSpec {
     pub family: Family,
     /// The original's action space.
     pub action_space: ActionSpace,
+    /// What the numbers of an action mean, in the order of its branches.
+    pub actions: &'static [ActionBranch],
     /// Numbers in the vector observation (float32 in 0..=1), 0 if there is none.
     pub vector_observation: usize,
-    /// Numbers in the ground truth (float64 in 0..=1), 0 if there is none.
-    pub ground_truth: usize,
+    /// Columns of the ground truth (float64 in 0..=1), none if there is none.
+    pub ground_truth: &'static [Column],
     /// Columns of the final info in addition to `reward` and `length`.
     pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32), which the original does not have.

@@ -43,6 +43,12 @@ pub struct PoolConfig {
     pub final_observation: bool,
     /// Source of the episodes' seeds.
     pub seeding: Seeding,
+    /// Whether an episode depends on its seed and its reset parameters alone. Otherwise, as in the original, some environments show
+    /// what an earlier episode left (the character of Endless Mortar Mayhem, the lit circles and the background of Searing
+    /// Spotlights), and with [`Seeding::Continue`] an episode continues the generator that the one before has drawn from. With this,
+    /// every episode starts as in a new environment, and [`Seeding::Continue`] draws a seed for each later episode: from
+    /// `SeedSequence(seed, spawn_key=(0,))`, where `seed` is the one that the environment was last given. Resets allocate memory.
+    pub independent_episodes: bool,
     /// Format of the frames; `None` omits them, and nothing is drawn.
     pub frames: Option<Frames>,
     /// Whether the batch has the feature observation.
@@ -67,6 +73,7 @@ impl PoolConfig {
             autoreset: Autoreset::default(),
             final_observation: false,
             seeding: Seeding::Continue { seed: None },
+            independent_episodes: false,
             frames: Some(Frames::default()),
             features: false,
             check_drawing: false,

@@ -15,7 +15,7 @@ use crate::raster::PixelFormat;
 /// An environment with its generator, its seeds, and what is counted of its episode.
 pub(super) struct EnvSlot<E: Environment> {
     pub env: E,
-    /// The assets for the next episode.
+    /// The assets for the next episode, unless there is `next`.
     pub assets: Arc<E::Assets>,
     pub random: Generator,
     pub seeds: Seeds,
@@ -24,14 +24,30 @@ pub(super) struct EnvSlot<E: Environment> {
     pub frame_stack: FrameStack<E::Scene>,
     /// Whether the last step ended the episode, so that in next-step autoreset the next one starts another.
     pub ended: bool,
+    /// Whether an episode starts as in a new environment.
+    independent_episodes: bool,
     /// The reset parameters as they were given, which `assets` were made from.
     pub options: Arc<OptionMap>,
+    /// Other assets and options from the next episode on.
+    pub next: Option<OptionSet<E>>,
+    /// The seed that the running episode started with, unless it continued the generator.
+    pub episode_seed: Option<u64>,
 }
+
+/// Reset parameters as they were given, and the assets made from them.
+pub(super) type OptionSet<E> = (Arc<<E as Environment>::Assets>, Arc<OptionMap>);
 
 impl<E: Environment> EnvSlot<E> {
     /// An environment that has not been reset yet, for observations of `stack` frames. `random` is its generator until an episode
     /// is seeded.
-    pub fn new(assets: Arc<E::Assets>, options: Arc<OptionMap>, seeds: Seeds, random: Generator, stack: usize) -> Self {
+    pub fn new(
+        assets: Arc<E::Assets>,
+        options: Arc<OptionMap>,
+        seeds: Seeds,
+        random: Generator,
+        stack: usize,
+        independent_episodes: bool,
+    ) -> Self {
         EnvSlot {
             env: E::new(&assets),
             assets,
@@ -41,7 +57,10 @@ impl<E: Environment> EnvSlot<E> {
             episode_length: 0,
             frame_stack: FrameStack::new(stack),
             ended: false,
+            independent_episodes,
             options,
+            next: None,
+            episode_seed: None,
         }
     }
 
@@ -50,8 +69,15 @@ impl<E: Environment> EnvSlot<E> {
         if let Some(seed) = seed {
             self.seeds.restart(seed);
         }
-        if let Some(seed) = seed.or_else(|| self.seeds.next()) {
+        self.episode_seed = seed.or_else(|| self.seeds.next());
+        if let Some(seed) = self.episode_seed {
             self.random = Generator::from_seed(seed);
+        }
+        if let Some(next) = self.next.take() {
+            (self.assets, self.options) = next;
+        }
+        if self.independent_episodes {
+            self.env = E::new(&self.assets);
         }
         self.env.reset(&self.assets, &mut self.random);
         self.frame_stack.restart(|| self.env.scene());

@@ -10,7 +10,8 @@ use super::autoreset::Autoreset;
 use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 use super::division::EnvRange;
 use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame};
-use super::env_slot::EnvSlot;
+use super::env_slot::{EnvSlot, OptionSet};
+use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
 use super::seeding::{Seeding, Seeds, Unseeded};
 use super::snapshot::{Saved, SnapshotError};
@@ -47,8 +48,14 @@ pub(super) trait EnvSlots: Send + Sync {
         out: BatchMut<'_>,
     ) -> Result<(), WrongFrame>;
 
-    /// Sets other reset parameters for the environments that `request` resets, from their next episode on.
-    fn set_options(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError>;
+    /// Sets other reset parameters for environments, from their next episode on. Their numbers must be in range.
+    fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError>;
+
+    /// As [`set_options`](Self::set_options), for the environments that `request` resets.
+    fn set_options_of(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError>;
+
+    /// What an environment's running episode follows from.
+    fn running_episode(&self, env: usize) -> RunningEpisode;
 
     /// The whole state of one environment.
     fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError>;
@@ -68,6 +75,9 @@ pub(super) trait EnvSlots: Send + Sync {
 
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
+
+    /// Sets the animations of that view to the current step.
+    fn align_ground_truth_view(&mut self, env: usize);
 }
 
 /// The environments of a pool, all of one family.
@@ -115,8 +125,11 @@ pub(super) fn family_slots<E: Environment>(
     let stack = config.frames.unwrap_or_default().stack;
     let slots = made.into_iter().enumerate().map(|(env, (options, assets))| {
         let number = config.first_env + env;
-        let seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
-        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack)
+        let mut seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        if config.independent_episodes {
+            seeds = seeds.independent(number, unseeded);
+        }
+        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack, config.independent_episodes)
     });
     Ok(FamilySlots { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
 }
@@ -150,9 +163,14 @@ impl<E: Environment> FamilySlots<E> {
     }
 
     /// The assets for these options: those of an environment that has the same, or new ones.
-    fn with_options(&self, options: &OptionMap) -> Result<(Arc<E::Assets>, Arc<OptionMap>), ParameterError> {
-        if let Some(slot) = self.slots.iter().find(|slot| *slot.options == *options) {
-            return Ok((Arc::clone(&slot.assets), Arc::clone(&slot.options)));
+    fn with_options(&self, options: &OptionMap) -> Result<OptionSet<E>, ParameterError> {
+        for slot in &self.slots {
+            if *slot.options == *options {
+                return Ok((Arc::clone(&slot.assets), Arc::clone(&slot.options)));
+            }
+            if let Some((assets, known)) = slot.next.as_ref().filter(|(_, known)| **known == *options) {
+                return Ok((Arc::clone(assets), Arc::clone(known)));
+            }
         }
         let parameters = ResetParameters::new(self.spec.id, self.spec.parameters, options)?;
         Ok((Arc::new(E::assets(self.variant, &parameters)), Arc::new(options.clone())))
@@ -193,15 +211,30 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
         })
     }
 
-    fn set_options(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError> {
-        let (assets, options) = self.with_options(options)?;
-        for (env, slot) in self.slots.iter_mut().enumerate() {
-            if request.resets(env) {
-                slot.assets = Arc::clone(&assets);
-                slot.options = Arc::clone(&options);
+    fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError> {
+        // All of them are made before the first is set, so that an error changes no environment.
+        let made: Vec<_> = sets.iter().map(|set| self.with_options(&set.options)).collect::<Result<_, _>>()?;
+        for (set, (assets, options)) in sets.iter().zip(made) {
+            for env in &set.envs {
+                self.slots[*env].next = Some((Arc::clone(&assets), Arc::clone(&options)));
             }
         }
         Ok(())
+    }
+
+    fn set_options_of(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError> {
+        let (assets, options) = self.with_options(options)?;
+        for (env, slot) in self.slots.iter_mut().enumerate() {
+            if request.resets(env) {
+                slot.next = Some((Arc::clone(&assets), Arc::clone(&options)));
+            }
+        }
+        Ok(())
+    }
+
+    fn running_episode(&self, env: usize) -> RunningEpisode {
+        let slot = &self.slots[env];
+        RunningEpisode { env, seed: slot.episode_seed, options: OptionMap::clone(&slot.options), ended: slot.ended }
     }
 
     fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
@@ -209,7 +242,9 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
         // The state is borrowed when it is saved and owned when it is restored; its encoding is the same.
         Saved {
             id: self.spec.id.to_owned(),
-            options: Json::from(OptionMap::clone(&slot.options)).to_string(),
+            options: text(&slot.options),
+            next_options: slot.next.as_ref().map(|(_, options)| text(options)),
+            episode_seed: slot.episode_seed,
             random: slot.random.clone(),
             seeds: slot.seeds.save(),
             episode_return: slot.episode_return,
@@ -225,14 +260,20 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
         if saved.id != self.spec.id {
             return Err(SnapshotError::OtherEnvironment { given: saved.id, expected: self.spec.id });
         }
-        let options: OptionMap =
-            serde_json::from_str(&saved.options).map_err(|error| SnapshotError::Content(error.to_string()))?;
-        let (assets, options) = self.with_options(&options)?;
+        let made = |text: String| -> Result<_, SnapshotError> {
+            let options: OptionMap =
+                serde_json::from_str(&text).map_err(|error| SnapshotError::Content(error.to_string()))?;
+            Ok(self.with_options(&options)?)
+        };
+        let (assets, options) = made(saved.options)?;
+        let next = saved.next_options.map(made).transpose()?;
         let slot = &mut self.slots[env];
         slot.env.restore(&assets, saved.state)?;
         slot.frame_stack.restart(|| slot.env.scene());
         slot.assets = assets;
         slot.options = options;
+        slot.next = next;
+        slot.episode_seed = saved.episode_seed;
         slot.random = saved.random;
         slot.seeds.restore(saved.seeds);
         slot.episode_return = saved.episode_return;
@@ -266,4 +307,13 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
         view::ground_truth_view(&mut self.slots[env].env, out);
     }
+
+    fn align_ground_truth_view(&mut self, env: usize) {
+        self.slots[env].env.align_ground_truth();
+    }
+}
+
+/// Reset parameters as JSON text.
+fn text(options: &OptionMap) -> String {
+    Json::from(options.clone()).to_string()
 }

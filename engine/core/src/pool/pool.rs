@@ -4,6 +4,7 @@ use super::autoreset::Autoreset;
 use super::buffers::Buffers;
 use super::config::{OptionMap, PoolConfig, ResetRequest};
 use super::drawn_scene::{DrawSettings, WrongFrame};
+use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
 use super::family_slots::{EnvSlots, WriteContext, family_slots};
 use super::seeding::Unseeded;
@@ -134,7 +135,7 @@ impl Pool {
         self.check_batch(batch)?;
         if let Some(options) = options {
             // After all other checks, so that an error changes no environment.
-            self.slots.set_options(request, options)?;
+            self.slots.set_options_of(request, options)?;
         }
         self.write(batch, |slots, context, out| slots.reset(context, request, out))?;
         self.was_reset = true;
@@ -177,6 +178,49 @@ impl Pool {
         write(&mut *self.slots, context, out)?;
         self.buffers.finish(buffer, &self.layout, batch);
         Ok(())
+    }
+
+    /// Sets the reset parameters of environments' next episodes and all later ones, however these begin. Running episodes do not
+    /// change. An environment that several items name gets the options of the last.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NoSuchEnv`], or [`PoolError::Parameters`] if an option is not valid. No environment has changed then.
+    ///
+    /// ```
+    /// use endless_gym_core::batch::zeroed;
+    /// use endless_gym_core::pool::{NextOptions, Pool, PoolConfig, ResetRequest, Threads};
+    ///
+    /// let mut pool = Pool::new(&PoolConfig::new("MortarMayhem-Grid-v0", 4), &Threads::new(1)?)?;
+    /// let mut blocks = zeroed(pool.layout().blocks());
+    /// let options = serde_json::from_str(r#"{"command_count": [1]}"#)?;
+    /// pool.set_options(&[NextOptions { options, envs: vec![0, 3] }])?;
+    /// pool.reset(ResetRequest::Seed(7), &mut blocks)?;
+    /// assert_eq!(pool.running_episode(3)?.options["command_count"][0], 1);
+    /// assert!(pool.running_episode(1)?.options.is_empty());
+    /// assert_eq!(pool.running_episode(1)?.seed, Some(8));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        if let Some(given) = sets.iter().flat_map(|set| &set.envs).find(|env| **env >= num_envs) {
+            return Err(PoolError::NoSuchEnv { given: *given, num_envs });
+        }
+        Ok(self.slots.set_options(sets)?)
+    }
+
+    /// What the running episode of an environment follows from.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NoSuchEnv`] or [`PoolError::NotReset`].
+    pub fn running_episode(&self, env: usize) -> Result<RunningEpisode, PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if env >= num_envs => Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ if !self.was_reset => Err(PoolError::NotReset),
+            _ => Ok(self.slots.running_episode(env)),
+        }
     }
 
     /// Writes every environment's row without starting an episode: the current observation, a reward of 0, no flag.
@@ -320,6 +364,23 @@ impl Pool {
             _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
             _ if out.len() != VIEW_BYTES => return Err(PoolError::ViewSize { given: out.len() }),
             _ => self.slots.ground_truth_view(env, out),
+        }
+        Ok(())
+    }
+
+    /// Sets the animations of an environment's ground-truth view to where they are when [`ground_truth_view`](Self::ground_truth_view)
+    /// was called once for each observation of the episode before the current one. The next view is then the current step's,
+    /// whatever was viewed before. Observations do not depend on it.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
+    pub fn align_ground_truth_view(&mut self, env: usize) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            _ if !self.was_reset => return Err(PoolError::NotReset),
+            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            _ => self.slots.align_ground_truth_view(env),
         }
         Ok(())
     }

@@ -92,6 +92,11 @@ pub(super) enum Seeds {
         count: i64,
         draws: Generator,
     },
+    /// The seeds of [`Continue`](Self::Continue) with [`PoolConfig::independent_episodes`](super::PoolConfig::independent_episodes).
+    Independent {
+        first: Option<u64>,
+        draws: Generator,
+    },
     /// The indices are below the length of the list.
     List {
         seeds: std::sync::Arc<[u64]>,
@@ -130,10 +135,22 @@ impl Seeds {
         }
     }
 
+    /// The seeds of environment number `env` if no episode may continue the generator of the one before.
+    pub(super) fn independent(self, env: usize, unseeded: Unseeded) -> Self {
+        match self {
+            Seeds::Continue { first } => {
+                let draws = first.map_or_else(|| unseeded.seeds(env), later_seeds);
+                Seeds::Independent { first, draws }
+            }
+            seeded => seeded,
+        }
+    }
+
     /// The next episode's seed; `None` continues the environment's generator.
     pub(super) fn next(&mut self) -> Option<u64> {
         match self {
             Seeds::Continue { first } => first.take(),
+            Seeds::Independent { first, draws } => first.take().or_else(|| Some(draws.integers(0, i64::MAX) as u64)),
             Seeds::Range { start, step, count, draws } => Some(*start + *step * draws.integers(0, *count) as u64),
             Seeds::List { seeds, next, stride, .. } => {
                 let seed = seeds[*next];
@@ -147,8 +164,10 @@ impl Seeds {
     pub(super) fn restart(&mut self, seed: u64) {
         match self {
             Seeds::Continue { first } => *first = None,
-            Seeds::Range { draws, .. } => {
-                *draws = Generator::from_seed_sequence(&SeedSequence::new(seed).with_spawn_key(&[0]));
+            Seeds::Range { draws, .. } => *draws = later_seeds(seed),
+            Seeds::Independent { first, draws } => {
+                *first = None;
+                *draws = later_seeds(seed);
             }
             Seeds::List { first, next, .. } => *next = *first,
         }
@@ -159,6 +178,7 @@ impl Seeds {
         match self {
             Seeds::Continue { first } => SavedSeeds::Continue { first: *first },
             Seeds::Range { draws, .. } => SavedSeeds::Range { draws: draws.clone() },
+            Seeds::Independent { first, draws } => SavedSeeds::Independent { first: *first, draws: draws.clone() },
             Seeds::List { next, .. } => SavedSeeds::List { next: *next },
         }
     }
@@ -168,10 +188,19 @@ impl Seeds {
         match (self, saved) {
             (Seeds::Continue { first }, SavedSeeds::Continue { first: saved }) => *first = saved,
             (Seeds::Range { draws, .. }, SavedSeeds::Range { draws: saved }) => *draws = saved,
+            (Seeds::Independent { first, draws }, SavedSeeds::Independent { first: saved, draws: drawn }) => {
+                *first = saved;
+                *draws = drawn;
+            }
             (Seeds::List { seeds, next, .. }, SavedSeeds::List { next: saved }) => *next = saved % seeds.len(),
             _ => {}
         }
     }
+}
+
+/// The generator that draws the seeds of the episodes after the one with that seed.
+fn later_seeds(seed: u64) -> Generator {
+    Generator::from_seed_sequence(&SeedSequence::new(seed).with_spawn_key(&[0]))
 }
 
 /// The position of an environment in its sequence of seeds.
@@ -180,4 +209,5 @@ pub(super) enum SavedSeeds {
     Continue { first: Option<u64> },
     Range { draws: Generator },
     List { next: usize },
+    Independent { first: Option<u64>, draws: Generator },
 }

@@ -1,7 +1,7 @@
 //! The whole state of one environment as bytes.
 //!
 //! A snapshot is `EGYM`, the format's version (u32), the CRC-32 of what follows (u32), both little-endian, and then the
-//! environment in [postcard](https://postcard.jamesmunns.com)'s encoding: id, reset parameters as JSON, generator, seeding,
+//! environment in [postcard](https://postcard.jamesmunns.com)'s encoding: id, reset parameters as JSON, seed, generator, seeding,
 //! sums of the running episode, and the family's state.
 
 use serde::de::DeserializeOwned;
@@ -16,7 +16,7 @@ const MAGIC: [u8; 4] = *b"EGYM";
 const HEAD: usize = 12;
 
 /// Version of the snapshot format. It changes with every change to the content.
-pub const SNAPSHOT_VERSION: u32 = 1;
+pub const SNAPSHOT_VERSION: u32 = 2;
 
 /// The content of a snapshot.
 #[derive(Debug, Serialize, Deserialize)]
@@ -24,6 +24,10 @@ pub(super) struct Saved<S> {
     pub id: String,
     /// The reset parameters that were given, as a JSON object.
     pub options: String,
+    /// Those of the next episode, if they are others.
+    pub next_options: Option<String>,
+    /// The seed that the running episode started with.
+    pub episode_seed: Option<u64>,
     pub random: Generator,
     pub seeds: SavedSeeds,
     pub episode_return: f64,

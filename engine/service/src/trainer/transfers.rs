@@ -84,8 +84,8 @@ impl Trainer {
         Ok(steps.chunks_exact(size_of::<u64>()).map(bytemuck::pod_read_unaligned).collect())
     }
 
-    /// Sends a request about a snapshot, unless the same request is pending, and waits for the answer.
-    fn transfer(
+    /// Sends a request whose answer is not a batch, unless the same request is pending, and waits for the answer.
+    pub(super) fn transfer(
         &mut self,
         group: usize,
         request: Request,

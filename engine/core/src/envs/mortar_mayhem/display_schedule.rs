@@ -27,6 +27,16 @@ impl DisplaySchedule {
             && (self.frames == 0 || self.duration + self.delay > 0)
     }
 
+    /// Index in the sequence of the first command to show.
+    pub fn first(&self) -> usize {
+        self.first
+    }
+
+    /// The schedule as it was `frames` frames ago.
+    pub fn before(self, frames: usize) -> Self {
+        DisplaySchedule { frame: self.frame.saturating_sub(frames), ..self }
+    }
+
     /// Whether everything has been shown.
     pub fn is_over(&self) -> bool {
         self.frame >= self.frames

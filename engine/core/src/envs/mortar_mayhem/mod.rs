@@ -89,6 +89,10 @@ impl Environment for MortarMayhem {
         self.assets.draw_ground_truth(&mut self.state, &self.earlier_sprites, canvas);
     }
 
+    fn align_ground_truth(&mut self) {
+        self.state.align_view_display();
+    }
+
     fn vector_observation(&self, out: &mut [f32]) {
         out.fill(0.0);
         for (one_hot, command) in out.chunks_exact_mut(COMMANDS).zip(&self.state.commands) {

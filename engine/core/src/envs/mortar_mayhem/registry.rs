@@ -7,9 +7,10 @@ use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
 use crate::envs::action_space::ActionSpace;
+use crate::envs::controls::{MOVE, TURN_AND_WALK};
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
-use crate::envs::spec::{EnvSpec, InfoColumn};
+use crate::envs::spec::{Column, EnvSpec, InfoColumn};
 
 const AGENT_SCALE: Parameter = Parameter::float(
     "agent_scale",
@@ -149,6 +150,14 @@ const ENDLESS_INFO: &[InfoColumn] = &[
     },
 ];
 
+const GROUND_TRUTH: &[Column] = &[
+    Column {
+        name: "target_x",
+        description: "column of the tile that the current command leads to, from the left, divided by 5",
+    },
+    Column { name: "target_y", description: "row of that tile, from the top, divided by 5" },
+];
+
 /// The five ids of the family.
 pub const SPECS: &[EnvSpec] = &[
     EnvSpec {
@@ -161,8 +170,9 @@ pub const SPECS: &[EnvSpec] = &[
             start_offset: false,
         }),
         action_space: ActionSpace::multi_discrete(&[3, 3]),
+        actions: MOVE,
         vector_observation: 0,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FEATURES,
         parameters: MORTAR_MAYHEM,
@@ -178,8 +188,9 @@ pub const SPECS: &[EnvSpec] = &[
             start_offset: false,
         }),
         action_space: ActionSpace::Discrete(4),
+        actions: TURN_AND_WALK,
         vector_observation: 0,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FEATURES,
         parameters: MORTAR_MAYHEM_GRID,
@@ -195,8 +206,9 @@ pub const SPECS: &[EnvSpec] = &[
             start_offset: true,
         }),
         action_space: ActionSpace::multi_discrete(&[3, 3]),
+        actions: MOVE,
         vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FEATURES,
         parameters: MORTAR_MAYHEM_B,
@@ -212,8 +224,9 @@ pub const SPECS: &[EnvSpec] = &[
             start_offset: false,
         }),
         action_space: ActionSpace::Discrete(4),
+        actions: TURN_AND_WALK,
         vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FEATURES,
         parameters: MORTAR_MAYHEM_B_GRID,
@@ -229,8 +242,9 @@ pub const SPECS: &[EnvSpec] = &[
             start_offset: true,
         }),
         action_space: ActionSpace::multi_discrete(&[3, 3]),
+        actions: MOVE,
         vector_observation: 0,
-        ground_truth: 2,
+        ground_truth: GROUND_TRUTH,
         info: ENDLESS_INFO,
         features: FEATURES,
         parameters: ENDLESS_MORTAR_MAYHEM,

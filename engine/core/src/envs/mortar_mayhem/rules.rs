@@ -101,6 +101,13 @@ impl State {
         self.view_display = self.display;
     }
 
+    /// Sets the view's schedule to where it is when every frame of the episode was viewed once.
+    pub(super) fn align_view_display(&mut self) {
+        // A schedule that starts with the episode shows its first frame at once, a later one in the step after.
+        let starts_with_episode = self.display.first() == 0;
+        self.view_display = self.display.before(usize::from(starts_with_episode));
+    }
+
     fn show_next_command(&mut self) {
         self.shown_command = self.display.next_frame().and_then(|index| self.commands.get(index).copied());
     }

@@ -6,10 +6,11 @@
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
 use crate::envs::action_space::ActionSpace;
+use crate::envs::controls::{FOLLOW, MOVE, TURN_AND_WALK};
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
 use crate::envs::screen::SCREEN;
-use crate::envs::spec::{EnvSpec, InfoColumn};
+use crate::envs::spec::{Column, EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
     Parameter::int(
@@ -127,6 +128,15 @@ const ENDLESS_INFO: &[InfoColumn] = &[
     },
 ];
 
+const GROUND_TRUTH: &[Column] = &[
+    Column {
+        name: "right",
+        description: "1 if the path's next tile is to the right of the last one that the agent was on, otherwise 0. Where the path leads back to the left, the last direction remains",
+    },
+    Column { name: "up", description: "1 if the next tile is above it, otherwise 0" },
+    Column { name: "down", description: "1 if the next tile is below it, otherwise 0" },
+];
+
 /// The three ids of the family.
 pub const SPECS: &[EnvSpec] = &[
     EnvSpec {
@@ -134,8 +144,9 @@ pub const SPECS: &[EnvSpec] = &[
         summary: "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
         family: Family::MysteryPath(Variant::Free),
         action_space: ActionSpace::multi_discrete(&[3, 3]),
+        actions: MOVE,
         vector_observation: 0,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FINITE_FEATURES,
         parameters: MYSTERY_PATH,
@@ -146,8 +157,9 @@ pub const SPECS: &[EnvSpec] = &[
         summary: "Mystery Path with turning and walking from tile to tile",
         family: Family::MysteryPath(Variant::Grid),
         action_space: ActionSpace::Discrete(4),
+        actions: TURN_AND_WALK,
         vector_observation: 0,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FINITE_FEATURES,
         parameters: MYSTERY_PATH_GRID,
@@ -158,8 +170,9 @@ pub const SPECS: &[EnvSpec] = &[
         summary: "An invisible path without end; falling off before the farthest point, or twice at one tile, ends it",
         family: Family::MysteryPath(Variant::Endless),
         action_space: ActionSpace::Discrete(4),
+        actions: FOLLOW,
         vector_observation: 0,
-        ground_truth: 3,
+        ground_truth: GROUND_TRUTH,
         info: ENDLESS_INFO,
         features: ENDLESS_FEATURES,
         parameters: ENDLESS_MYSTERY_PATH,

@@ -6,9 +6,10 @@
 use super::features::FEATURES;
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use crate::envs::action_space::ActionSpace;
+use crate::envs::controls::MOVE;
 use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
-use crate::envs::spec::{EnvSpec, InfoColumn};
+use crate::envs::spec::{Column, EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
     const ANY: (i64, i64) = (i64::MIN, i64::MAX);
@@ -212,6 +213,19 @@ const ENDLESS_INFO: &[InfoColumn] = &[
     InfoColumn { name: "coins_collected", is_integer: true, description: "coins collected in the episode" },
 ];
 
+const GROUND_TRUTH: &[Column] = &[
+    Column { name: "agent_x", description: "x of the agent's centre, as a share of the screen's width" },
+    Column { name: "agent_y", description: "y of the agent's centre, as a share of the screen's height" },
+    Column {
+        name: "coin_x",
+        description: "x of the coin's centre, as a share of the screen's width; 0 without a coin",
+    },
+    Column {
+        name: "coin_y",
+        description: "y of the coin's centre, as a share of the screen's height; 0 without a coin",
+    },
+];
+
 /// The two ids of the family.
 pub const SPECS: &[EnvSpec] = &[
     EnvSpec {
@@ -219,8 +233,9 @@ pub const SPECS: &[EnvSpec] = &[
         summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
         family: Family::SearingSpotlights(Variant { endless: false }),
         action_space: ActionSpace::multi_discrete(&[3, 3]),
+        actions: MOVE,
         vector_observation: 0,
-        ground_truth: 0,
+        ground_truth: &[],
         info: FINITE_INFO,
         features: FEATURES,
         parameters: SEARING_SPOTLIGHTS,
@@ -231,8 +246,9 @@ pub const SPECS: &[EnvSpec] = &[
         summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
         family: Family::SearingSpotlights(Variant { endless: true }),
         action_space: ActionSpace::multi_discrete(&[3, 3]),
+        actions: MOVE,
         vector_observation: 0,
-        ground_truth: 4,
+        ground_truth: GROUND_TRUTH,
         info: ENDLESS_INFO,
         features: FEATURES,
         parameters: ENDLESS_SEARING_SPOTLIGHTS,

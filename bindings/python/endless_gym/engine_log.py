@@ -1,0 +1,63 @@
+"""What an engine in a child process writes to its standard error: logs, which go to `logging`, and the message of its end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import subprocess
+import threading
+from collections import deque
+
+_logger = logging.getLogger("endless_gym.engine")
+
+#: A line as the program logs it: time, level, target and text.
+_LINE = re.compile(r"\S+Z +(ERROR|WARN|INFO|DEBUG|TRACE) (.*)")
+_LEVELS = {"ERROR": 40, "WARN": 30, "INFO": 20, "DEBUG": 10, "TRACE": 5}
+
+#: Lines that are kept of what is no log.
+_KEPT = 100
+
+
+def level() -> list[str]:
+    """The arguments by which the program logs what `endless_gym.engine` shows now, unless `ENDLESS_GYM_LOG` says it."""
+    if os.environ.get("ENDLESS_GYM_LOG"):
+        return []
+    effective = _logger.getEffectiveLevel()
+    names = ((10, "debug"), (20, "info"), (30, "warn"), (40, "error"))
+    return [f"--log={next((name for number, name in names if effective <= number), 'off')}"]
+
+
+class EngineLog:
+    """Reads the standard error of an engine to its end, in a thread: the engine must not wait for a reader."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+        self._other: deque[str] = deque(maxlen=_KEPT)
+        self._thread = threading.Thread(target=self._read, name=f"log of engine {process.pid}", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        stream = self._process.stderr
+        if stream is None:
+            return
+        for raw in stream:
+            line = raw.decode(errors="replace").rstrip()
+            if found := _LINE.fullmatch(line):
+                _logger.log(_LEVELS[found[1]], "engine %d: %s", self._process.pid, found[2])
+            else:
+                self._other.append(line)
+
+    def message(self) -> str:
+        """What the engine, which has ended, gave as its reason; empty if it gave none."""
+        self._thread.join(10)
+        text = "\n" + "\n".join(self._other)
+        return text.rpartition("\nendless: ")[2].strip()
+
+    def close(self) -> None:
+        """Log the reason of an engine, which has ended, with an error status."""
+        if self._process.returncode and (message := self.message()):
+            _logger.error("engine %d: %s", self._process.pid, message)
+        self._thread.join(10)
+        if self._process.stderr is not None and not self._thread.is_alive():
+            self._process.stderr.close()

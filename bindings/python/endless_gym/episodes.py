@@ -1,0 +1,201 @@
+"""Who chooses the options of each episode, and what `info` says about the running ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endless_gym.arguments import mapping
+from endless_gym.backends import Backend
+from endless_gym.configuration import AutoresetMode
+from endless_gym.next_options import NextOptions, Options
+
+#: Chooses the options of an environment's next episode. It is called with the number of the environment over all groups, the
+#: number of the episode in this environment, from 0, and the final infos of the environment's last episode: `reward`, `length`,
+#: ..., and as `options` what was returned for it; `None` for the first episode and after one that a reset cut short. It returns
+#: options that override those given at creation, or `None`. With same-step auto-reset an episode begins in the step that ends the
+#: one before, so its options are chosen one episode ahead, with the infos of the last episode that has ended by then.
+EpisodeOptions = Callable[[int, int, dict[str, Any] | None], "Options | None"]
+
+
+def checked_choice(given: Any) -> EpisodeOptions | None:
+    """The argument `episode_options`.
+
+    Raises:
+        TypeError: It cannot be called.
+    """
+    if given is not None and not callable(given):
+        raise TypeError(
+            f"episode_options must be a function of environment, episode and final infos, or None, got {given!r}"
+        )
+    return given  # type: ignore[no-any-return]
+
+
+class RunningEpisode(NamedTuple):
+    """What the running episode of an environment follows from."""
+
+    #: The seed that the episode started with; `None` if it continues the generator of the episode before.
+    seed: int | None
+    #: The reset parameters that were given for the episode, those given at creation included; the others have their defaults.
+    options: dict[str, Any]
+    #: Whether the last step ended it, so that with next-step auto-reset the next step starts another.
+    ended: bool
+
+
+def running_episodes(backend: Backend, group: int, envs: Iterable[int]) -> dict[int, RunningEpisode]:
+    """What the running episodes of environments follow from."""
+    found = backend.running_episodes(group, list(envs))
+    return {env: RunningEpisode(seed, json.loads(options), ended) for env, seed, options, ended in found}
+
+
+class EpisodeTracker:
+    """Follows the beginnings and ends of the episodes of one group.
+
+    It lets `choose` choose their options, and if `has_info` adds to `info` what the running ones follow from.
+    """
+
+    def __init__(
+        self,
+        group: int,
+        num_envs: int,
+        backend: Backend,
+        options: NextOptions,
+        autoreset: AutoresetMode,
+        choose: EpisodeOptions | None,
+        has_info: bool,
+        copy: bool,
+    ) -> None:
+        self._group, self._first = group, group * num_envs
+        self._backend, self._options, self._choose, self._has_info = backend, options, choose, has_info
+        self._next_step = autoreset is AutoresetMode.NEXT_STEP
+        self._same_step = autoreset is AutoresetMode.SAME_STEP
+        # For each environment, the number of its next episode.
+        self._numbers = [0] * num_envs
+        # The environments whose next episode may begin in the next step, and has no options.
+        self._due: set[int] = set()
+        # What `choose` returned for the next episode, and for the running one.
+        self._next: dict[int, Options] = {}
+        self._running: dict[int, Options] = {}
+        # The final infos of the last episode of each environment, until the options of the next are chosen.
+        self._final: dict[int, dict[str, Any]] = {}
+        # The environments of a reset whose result has not been received.
+        self._reset_envs: Sequence[int] | None = None
+        # With next-step auto-reset, the environments whose next episode begins in the next step.
+        self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._copy = copy
+        # What `info` has. The arrays are read-only and replaced, not changed, since the caller may keep them.
+        self._seeds = np.zeros(num_envs, dtype=np.uint64)
+        self._has_seed = np.zeros(num_envs, dtype=np.bool_)
+        self._played = np.full(num_envs, None, dtype=object)
+        self._all = np.ones(num_envs, dtype=np.bool_)
+
+    def before_reset(self, envs: Sequence[int]) -> None:
+        """Called before these environments are reset."""
+        self._choose_for([env for env in envs if env not in self._next])
+
+    def after_reset(self, envs: Sequence[int], info: dict[str, Any]) -> None:
+        """Called after it."""
+        self._begin(envs)
+        for env in envs:
+            self._final.pop(env, None)
+        self._ended[envs] = False
+        if self._has_info:
+            self._keep(running_episodes(self._backend, self._group, envs))
+            self._add(info)
+
+    def sent_reset(self, envs: Sequence[int]) -> None:
+        """Called after a reset of these environments was sent, whose result is received as that of a step."""
+        self._reset_envs = envs
+
+    def before_step(self) -> None:
+        """Called before the group is stepped."""
+        if self._due:
+            self._choose_for(sorted(self._due))
+
+    def after_step(self, terminated: NDArray[np.bool_], info: dict[str, Any]) -> None:
+        """Called with the result of the step, or of a reset that was sent."""
+        if self._reset_envs is not None:
+            envs, self._reset_envs = self._reset_envs, None
+            self.after_reset(envs, info)
+            return
+        ended = np.flatnonzero(terminated).tolist()
+        if self._next_step:
+            began = np.flatnonzero(self._ended).tolist()
+            self._ended = terminated.copy()
+        else:
+            began = ended if self._same_step else []
+        if self._choose is not None and ended:
+            self._keep_final(ended, info)
+        self._begin(began)
+        if self._choose is not None and self._next_step:
+            self._due.update(env for env in ended if env not in self._next)
+        if self._has_info:
+            if "final_info" in info:
+                self._add(info["final_info"])
+            if began:
+                self._keep(running_episodes(self._backend, self._group, began))
+            self._add(info)
+
+    def after_restore(self, envs: Sequence[int], info: dict[str, Any]) -> None:
+        """Called when these environments continue other episodes."""
+        running = running_episodes(self._backend, self._group, envs)
+        for env, episode in running.items():
+            self._final.pop(env, None)
+            # The snapshot's options replace what was chosen.
+            self._next.pop(env, None)
+            self._running.pop(env, None)
+            self._due.discard(env)
+            self._ended[env] = self._next_step and episode.ended
+            if self._choose is not None and (self._same_step or self._ended[env]):
+                self._due.add(env)
+        if self._has_info:
+            self._keep(running)
+            self._add(info)
+
+    def _choose_for(self, envs: Sequence[int]) -> None:
+        if self._choose is None or not envs:
+            return
+        chosen: dict[int, Options] = {}
+        for env in envs:
+            given = self._choose(self._first + env, self._numbers[env], self._final.get(env))
+            chosen[env] = mapping("the result of episode_options", given)
+        # After all calls, so that the same ones are called again if one raises.
+        self._options.set(self._group, chosen)
+        self._next.update(chosen)
+        for env in envs:
+            self._final.pop(env, None)
+            self._due.discard(env)
+
+    def _begin(self, envs: Iterable[int]) -> None:
+        for env in envs:
+            self._numbers[env] += 1
+            self._running[env] = self._next.pop(env, {})
+            self._due.discard(env)
+            if self._same_step and self._choose is not None:
+                # The episode after this one begins in the step that ends it.
+                self._due.add(env)
+
+    def _keep_final(self, ended: Iterable[int], info: dict[str, Any]) -> None:
+        final = info["final_info"] if self._same_step else info
+        names = [name for name in final if f"_{name}" in final and name not in ("ground_truth", "episode")]
+        for env in ended:
+            self._final[env] = {name: final[name][env].item() for name in names}
+            self._final[env]["options"] = self._running.get(env, {})
+
+    def _keep(self, running: dict[int, RunningEpisode]) -> None:
+        envs = list(running)
+        self._seeds, self._has_seed, self._played = self._seeds.copy(), self._has_seed.copy(), self._played.copy()
+        self._seeds[envs] = np.array([episode.seed or 0 for episode in running.values()], dtype=np.uint64)
+        self._has_seed[envs] = [episode.seed is not None for episode in running.values()]
+        for env, episode in running.items():
+            self._played[env] = episode.options
+
+    def _add(self, info: dict[str, Any]) -> None:
+        arrays = {"seed": self._seeds, "_seed": self._has_seed, "options": self._played, "_options": self._all}
+        for name, array in arrays.items():
+            array.flags.writeable = False
+            info[name] = array.copy() if self._copy else array

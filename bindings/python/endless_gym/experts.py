@@ -1,0 +1,81 @@
+"""The scripted experts, for environments in any vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endless_gym import _native
+from endless_gym.arguments import integer
+from endless_gym.specs import Spec, spec
+
+
+class Experts:
+    """One scripted expert for each of n environments: it reads the features, and remembers what an agent must remember.
+
+    ```python
+    envs = endless_gym.make_vec("MortarMayhem-v0", 8, observation="features")
+    experts = endless_gym.Experts("MortarMayhem-v0", 8)
+    observation, info = envs.reset(seed=0)
+    episode_start = np.ones(8, dtype=bool)
+    for _ in range(100):
+        observation, reward, terminated, truncated, info = envs.step(experts.act(observation, episode_start))
+        # With next-step auto-reset, the observation after the last one of an episode starts another.
+        episode_start, ended = ended, terminated | truncated
+    ```
+
+    Args:
+        id: Environment id, such as `Endless-MortarMayhem-v0`.
+        num_envs: Number of environments.
+
+    Raises:
+        TypeError: `num_envs` is not an integer.
+        ValueError: There is no such id, or `num_envs` is out of its range.
+    """
+
+    def __init__(self, id: str, num_envs: int = 1) -> None:
+        self._spec: Spec = spec(id)
+        self.num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
+        self._native = _native.Experts(self._spec.id, self.num_envs)
+
+    def act(self, observation: Any, episode_start: Any, active: Any = None) -> NDArray[np.int64]:
+        """Choose the actions. Call it once for each observation, also for the first of an episode.
+
+        Args:
+            observation: `features`, float32 (n, f); or a dict with `features` and, for the ids with `MortarMayhemB`,
+                `vector_observation`, float32 (n, 180), as a vector environment with `observation="features"` or `"rgb+features"`
+                returns it.
+            episode_start: Whether the observation is the first of an episode, bool (n,).
+            active: The environments that need an action, bool (n,); the others' actions are 0. `None` for all.
+
+        Returns:
+            Actions int64 in the shape of a vector environment: (n,) for Discrete, (n, branches) for MultiDiscrete.
+
+        Raises:
+            ValueError: An array has another shape, or `features` or `vector_observation` is missing.
+        """
+        parts = observation if isinstance(observation, Mapping) else {"features": observation}
+        needed = ["features", *(["vector_observation"] if self._spec.vector_observation else [])]
+        if any(name not in parts for name in needed):
+            raise ValueError(f"observation must have {' and '.join(needed)}, got {', '.join(parts)}")
+        arrays = [np.ascontiguousarray(parts[name], dtype=np.float32) for name in needed]
+        turn = np.where(self._flags("episode_start", episode_start), np.uint8(2), np.uint8(1))
+        if active is not None:
+            turn[~self._flags("active", active)] = 0
+        for name, array in zip(needed, arrays, strict=True):
+            columns = len(self._spec.features) if name == "features" else self._spec.vector_observation
+            if array.shape != (self.num_envs, columns):
+                raise ValueError(f"{name} must have the shape ({self.num_envs}, {columns}), got {array.shape}")
+        vector = arrays[1] if len(arrays) > 1 else None
+        return self._spec.batched_actions(self._native.act(arrays[0], vector, turn))
+
+    def _flags(self, name: str, given: Any) -> NDArray[np.bool_]:
+        flags = np.asarray(given)
+        if flags.dtype != np.bool_ or flags.shape != (self.num_envs,):
+            raise ValueError(
+                f"{name} must be a bool array of shape ({self.num_envs},), got {flags.dtype} {flags.shape}"
+            )
+        return flags

@@ -1,0 +1,142 @@
+"""The reset parameters of the episodes that environments play next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from endless_gym.arguments import mapping
+from endless_gym.backends import Backend
+from endless_gym.specs import options_text
+
+Options = Mapping[str, Any]
+
+_NONE: Options = {}
+#: The text of options that are not known, such as those of a snapshot.
+_UNKNOWN = ""
+
+
+class NextOptions:
+    """The options of each environment's next episode.
+
+    Those given at creation are overridden by those of `set`, and these by those of the last reset. It knows what the backend's
+    environments have, so that only what differs is sent.
+    """
+
+    def __init__(self, backend: Backend, num_envs: int, created: Sequence[Options], is_known: bool) -> None:
+        """Prepare for a backend.
+
+        `created` has one mapping for all environments, or one for each of all groups; `is_known` tells whether the backend's
+        environments have these.
+        """
+        self._backend = backend
+        self._num_envs = num_envs
+        self._created = [dict(each) for each in created]
+        self._texts = [options_text(each) for each in self._created]
+        # By group and environment, what differs from the options given at creation.
+        self._set: list[dict[int, Options]] = [{} for _ in range(backend.groups)]
+        self._reset: list[dict[int, Options]] = [{} for _ in range(backend.groups)]
+        self._sent: list[dict[int, str]] = [{} for _ in range(backend.groups)]
+        if not is_known:
+            for group in range(backend.groups):
+                self.forget(group, range(num_envs))
+
+    def forget(self, group: int, envs: Iterable[int]) -> None:
+        """The environments may have other options than these, until their next reset."""
+        self._sent[group].update(dict.fromkeys(envs, _UNKNOWN))
+
+    def set_all(self, groups: Sequence[int], envs: Sequence[int], options: Any) -> None:
+        """Sets the options of these environments of groups, from one mapping or from a sequence, as `set_options` describes."""
+        count = self._num_envs * len(groups)
+        # As for seeds: one for each environment of every group, or of all groups.
+        repeats = len(groups) if isinstance(options, Sequence) and len(options) == self._num_envs else 1
+        each = _one_for_each(options, count // repeats) * repeats
+        for place, group in enumerate(groups):
+            own = each[place * self._num_envs :][: self._num_envs]
+            self.set(group, {env: given for env in envs if (given := own[env]) is not None})
+
+    def set(self, group: int, chosen: Mapping[int, Options]) -> None:
+        """Sets the options of environments' next episodes, over those given at creation."""
+        self._send(group, self._changes(group, {env: (given, _NONE) for env, given in chosen.items()}))
+        for env, given in chosen.items():
+            self._reset[group].pop(env, None)
+            if given:
+                self._set[group][env] = given
+            else:
+                self._set[group].pop(env, None)
+
+    def prepare(self, group: int, envs: Sequence[int], given: Options) -> str | None:
+        """Called before a reset of these environments with these options. Returns the text that the reset must have, if any."""
+        chosen, sent = self._set[group], self._sent[group]
+        if not (given or chosen or sent):
+            return None
+        wanted = {env: (chosen.get(env, _NONE), given) for env in envs}
+        changes = self._changes(group, wanted)
+        if len(changes) == 1:
+            ((text, changed),) = changes.items()
+            if len(changed) == len(envs):
+                return text
+        self._send(group, changes)
+        return None
+
+    def started(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:
+        """Called after that reset."""
+        if text is not None:
+            self._note(group, envs, text)
+        if given:
+            self._reset[group].update(dict.fromkeys(envs, given))
+        elif self._reset[group]:
+            for env in envs:
+                self._reset[group].pop(env, None)
+
+    def _changes(self, group: int, wanted: Mapping[int, tuple[Options, Options]]) -> dict[str, list[int]]:
+        """The environments whose options differ from what the backend has, by the text of the options."""
+        # Most environments share their mappings.
+        texts: dict[tuple[int, int, int], str] = {}
+        changes: dict[str, list[int]] = {}
+        for env, (chosen, given) in wanted.items():
+            number = self._number(group, env)
+            key = number, id(chosen), id(given)
+            text = texts.get(key)
+            if text is None:
+                text = texts[key] = options_text({**self._created[number], **chosen, **given})
+            if text != self._sent[group].get(env, self._texts[number]):
+                changes.setdefault(text, []).append(env)
+        return changes
+
+    def _send(self, group: int, changes: Mapping[str, list[int]]) -> None:
+        if not changes:
+            return
+        items = [f'{{"options": {text}, "envs": {envs}}}' for text, envs in changes.items()]
+        self._backend.set_options(group, f"[{', '.join(items)}]")
+        for text, envs in changes.items():
+            self._note(group, envs, text)
+
+    def _note(self, group: int, envs: Iterable[int], text: str) -> None:
+        """The backend's environments have the options of that text."""
+        sent = self._sent[group]
+        for env in envs:
+            if text == self._texts[self._number(group, env)]:
+                sent.pop(env, None)
+            else:
+                sent[env] = text
+
+    def _number(self, group: int, env: int) -> int:
+        return 0 if len(self._created) == 1 else group * self._num_envs + env
+
+
+def _one_for_each(given: Any, count: int) -> list[Options | None]:
+    """The options of `count` environments, from one mapping for all or a sequence with one, or `None`, for each.
+
+    Raises:
+        TypeError: It is neither.
+        ValueError: The sequence has another length.
+    """
+    if isinstance(given, Mapping):
+        shared = dict(given)
+        return [shared] * count
+    if not isinstance(given, Sequence) or isinstance(given, (str, bytes)):
+        raise TypeError(f"options must be a mapping, or a sequence of mappings, got {given!r}")
+    if len(given) != count:
+        raise ValueError(f"options must have one mapping for each of {count} environments, got {len(given)}")
+    return [None if each is None else mapping("options", each) for each in given]

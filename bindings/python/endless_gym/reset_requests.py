@@ -1,0 +1,63 @@
+"""Which environments of a vector environment a reset starts, and with which seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endless_gym import _native
+from endless_gym.arguments import MAX_U64, integer
+
+Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
+
+
+class ResetRequests:
+    """The resets of a vector environment in the native module's format."""
+
+    def __init__(self, num_envs: int, num_groups: int) -> None:
+        self._num_envs, self._num_groups = num_envs, num_groups
+
+    def envs(self, mask: Any, name: str = "reset_mask") -> Sequence[int]:
+        """The numbers of the environments of a mask; all for `None`."""
+        return range(self._num_envs) if mask is None else np.flatnonzero(self._mask(mask, name)).tolist()
+
+    def request(self, seed: Seeds, mask: Any, group: int) -> _native.Reset | None:
+        """A reset of a group."""
+        if mask is None and not _has_items(seed):
+            return None if seed is None else integer("seed", seed)
+        chosen = np.ones(self._num_envs, dtype=np.bool_) if mask is None else self._mask(mask, "reset_mask")
+        seeds = self._seeds(seed, group)
+        reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
+        return reset, [given or 0 for given in seeds]
+
+    def _mask(self, given: Any, name: str) -> NDArray[np.bool_]:
+        mask = np.asarray(given)
+        if mask.dtype != np.bool_ or mask.shape != (self._num_envs,):
+            raise ValueError(f"{name} must be a bool array of shape ({self._num_envs},), got {mask.dtype} {mask.shape}")
+        return mask
+
+    def _seeds(self, seed: Seeds, group: int) -> list[int | None]:
+        """One seed for each environment of a group."""
+        if seed is None:
+            return [None] * self._num_envs
+        if not _has_items(seed):
+            # Sums wrap, as in the engine.
+            first = integer("seed", seed) + group * self._num_envs
+            return [(first + env) & MAX_U64 for env in range(self._num_envs)]
+        given: list[Any] = list(seed)
+        if len(given) == self._num_envs * self._num_groups:
+            given = given[group * self._num_envs :][: self._num_envs] if self._num_groups > 1 else given
+        elif len(given) != self._num_envs:
+            allowed = f"{self._num_envs} items, one for each environment"
+            if self._num_groups > 1:
+                allowed += f" of a group, or {self._num_envs * self._num_groups} for all groups"
+            raise ValueError(f"seed must have {allowed}, got {len(given)}")
+        return [None if each is None else integer("seed", each) for each in given]
+
+
+def _has_items(seed: Seeds) -> TypeGuard[Sequence[int | None]]:
+    """Whether there is a seed for each environment, instead of one for all."""
+    return isinstance(seed, Sequence) or (isinstance(seed, np.ndarray) and seed.ndim > 0)

@@ -1,0 +1,168 @@
+"""Watches the batches of an engine that another process trains with."""
+
+from __future__ import annotations
+
+import json
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endless_gym import _native
+from endless_gym.arguments import integer
+from endless_gym.arguments import timeout as checked_timeout
+from endless_gym.backends import Backend
+from endless_gym.configuration import MODES
+from endless_gym.specs import Frames, spec
+from endless_gym.vector import EndlessVectorEnv
+
+
+class WatchedBatch(NamedTuple):
+    """What one step or reset of a group of n environments returned to the trainer."""
+
+    #: As `EndlessVectorEnv.step` returns it: uint8 (n, 84, 84, 3) by default, or a dict of arrays.
+    observation: Any
+    #: float64 (n,); 0 after a reset.
+    reward: NDArray[np.float64]
+    #: bool (n,).
+    terminated: NDArray[np.bool_]
+    #: bool (n,).
+    truncated: NDArray[np.bool_]
+    #: As `EndlessVectorEnv.step` returns it.
+    info: dict[str, Any]
+    #: Number of the batch: those that the group has returned since the engine started, this one included.
+    step: int
+    #: Number of the group.
+    group: int
+    #: Batches of the group between the one that was watched before and this one.
+    missed: int
+
+
+class Watch:
+    """The batches of a running engine, as an iterator that ends with the engine. `watch` makes it.
+
+    Iterating waits for the next batch. It never makes the trainer wait: whoever is slower than the trainer misses batches.
+
+    Attributes:
+        id: Environment id.
+        num_envs: Environments in each group.
+        num_groups: Groups of the engine.
+        observation_space: Space of a batch's observation.
+        action_space: Space of a batch's actions.
+        missed: Batches that were missed so far.
+    """
+
+    def __init__(self, service: str, group: int | None, timeout: float | None, copy: bool) -> None:
+        """Called by `watch`."""
+        self._timeout = None if timeout is None else checked_timeout(timeout)
+        group = None if group is None else integer("group", group)
+        # As for a timeout of iceoryx2's calls, a year is for ever.
+        observer = _native.Observer(service, group, 3e7 if self._timeout is None else self._timeout)
+        specification = json.loads(observer.specification())
+        self._backend = _Observed(observer, specification["groups"])
+        # Names the arrays of a batch as for a trainer.
+        self._envs = EndlessVectorEnv(
+            self._backend,
+            described=spec(specification["id"]),
+            num_envs=specification["num_envs"],
+            frames=Frames.from_specification(specification["frames"]),
+            sections=[section["name"] for section in specification["batch"]["sections"]],
+            autoreset=MODES[specification["autoreset"]],
+            copy=copy,
+        )
+        self.id: str = specification["id"]
+        self.num_envs, self.num_groups = self._envs.num_envs, self._envs.num_groups
+        self.observation_space, self.action_space = self._envs.observation_space, self._envs.action_space
+        self.missed = 0
+
+    def __iter__(self) -> Watch:
+        return self
+
+    def __next__(self) -> WatchedBatch:
+        """Wait for the next batch.
+
+        Raises:
+            StopIteration: The engine has ended, or `close` was called.
+            TimeoutError: There was no batch in time. The next call waits again.
+            TooManyBatchesHeld: Arrays of as many batches as the engine lends are referenced; delete them, or use `copy=True`.
+        """
+        try:
+            self._backend.wait(self._timeout)
+        except _native.EngineLost:
+            self.close()
+        if self._backend.is_closed:
+            raise StopIteration
+        step, missed = self._backend.step_number, self._backend.missed
+        self.missed += missed
+        observation, reward, terminated, truncated, info = self._envs.recv()
+        return WatchedBatch(observation, reward, terminated, truncated, info, step, info.pop("group"), missed)
+
+    def close(self) -> None:
+        """Disconnect. Arrays remain valid."""
+        self._backend.close()
+
+    def __enter__(self) -> Watch:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class _Observed(Backend):
+    """An observer in the place of a trainer's connection."""
+
+    def __init__(self, observer: _native.Observer, groups: int) -> None:
+        self._observer: _native.Observer | None = observer
+        self.groups = groups
+        self.step_number, self.missed = 0, 0
+        self._received: tuple[int, _native.Arrays] | None = None
+
+    @property
+    def is_closed(self) -> bool:
+        return self._observer is None
+
+    def wait(self, timeout: float | None) -> None:
+        """Wait for a batch, which `receive` then returns."""
+        if self._observer is not None:
+            group, self.step_number, self.missed, arrays = self._observer.next(timeout)
+            self._received = group, arrays
+
+    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
+        if self._received is None:
+            raise RuntimeError("a watch has no trainer's methods; iterate over it")
+        # Not kept, since the engine lends a limited number of batches.
+        received, self._received = self._received, None
+        return received
+
+    def close(self) -> None:
+        self._observer = None
+
+
+def watch(service: str, *, group: int | None = None, timeout: float | None = 30.0, copy: bool = False) -> Watch:
+    """Watch the batches of a running engine, beside its trainer and without slowing it.
+
+    ```python
+    with endless_gym.watch("mortar") as batches:
+        for batch in batches:
+            print(batch.step, batch.reward.mean(), batch.missed)
+    ```
+
+    The arrays are read-only views of the memory that the engine wrote. It does not write to it again while an array of the batch
+    exists; it lends as many batches of a group to an observer as to its trainer (`batches_held`). A loop holds up to two.
+
+    Args:
+        service: The engine's name.
+        group: Number of the group to watch; `None` for all.
+        timeout: Seconds to wait for the engine to start, and then for each batch; `None` to wait for ever. A `TimeoutError` does
+            not end the watch: iterating again waits again.
+        copy: Yield writable copies instead of read-only views of shared memory.
+
+    Raises:
+        ConnectionError: There is no such engine, or it has as many observers as it accepts.
+        RuntimeError: There is not enough shared memory for the batches that the observer may hold.
+        ValueError: There is no such group, or the timeout is negative or not finite.
+    """
+    return Watch(service, group, timeout, copy)

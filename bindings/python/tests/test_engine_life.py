@@ -1,0 +1,146 @@
+"""Engines that `serve` started and nobody closed: they end when nothing refers to them, and with their process."""
+
+import gc
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import endless_gym
+
+ID = "Endless-MortarMayhem-v0"
+ACTIONS = np.zeros((4, 2), dtype=np.int64)
+
+
+@pytest.fixture
+def no_collector() -> Iterator[None]:
+    """Without Python's cyclic garbage collector, so that an engine in a reference cycle runs on."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def play(envs: endless_gym.EndlessVectorEnv) -> np.ndarray:
+    envs.reset(seed=1)
+    envs.send(ACTIONS)
+    envs.recv()
+    envs.restore({0: envs.snapshot(1)})
+    return envs.step(ACTIONS)[0]
+
+
+def pid(envs: endless_gym.EndlessVectorEnv) -> int:
+    return envs._backend._engine.pid
+
+
+def test_an_engine_ends_when_its_name_is_assigned_again(no_collector: None) -> None:
+    observations = []
+    for _ in range(3):
+        envs = endless_gym.serve(ID, 4)
+        observations.append(play(envs))
+        assert endless_gym.running_engines() == [envs._backend._engine.service]
+    last, process = observations[-1].copy(), pid(envs)
+    del envs
+    assert endless_gym.running_engines() == []
+    assert not Path(f"/proc/{process}").exists()
+    np.testing.assert_array_equal(observations[-1], last)
+
+
+def test_an_engine_ends_with_the_wrappers_around_it(no_collector: None) -> None:
+    envs = gymnasium.wrappers.vector.TransformReward(endless_gym.serve(ID, 4), abs)
+    envs.reset()
+    del envs
+    assert endless_gym.running_engines() == []
+
+
+def test_an_engine_ends_with_an_exception_that_nobody_keeps(no_collector: None) -> None:
+    def fails() -> None:
+        envs = endless_gym.serve(ID, 4)
+        envs.step(ACTIONS)
+
+    with pytest.raises(RuntimeError, match="reset"):
+        fails()
+    assert endless_gym.running_engines() == []
+
+
+@pytest.mark.parametrize(
+    ("library", "name", "autoreset"), [("sb3", "EndlessVecEnv", "same_step"), ("torchrl", "EndlessEnv", "disabled")]
+)
+def test_an_engine_ends_with_the_adapter_around_it(library: str, name: str, autoreset: str) -> None:
+    adapter = getattr(importlib.import_module(f"endless_gym.{library}"), name)
+    envs = adapter(endless_gym.serve(ID, 4, autoreset=autoreset))
+    envs.reset()
+    assert len(endless_gym.running_engines()) == 1
+    del envs
+    gc.collect()
+    assert endless_gym.running_engines() == []
+
+
+@pytest.mark.parametrize("end", ["", "raise SystemExit(3)", "undefined_name"])
+def test_an_engine_ends_before_its_interpreter_does(end: str) -> None:
+    text = (
+        f"import endless_gym; envs = endless_gym.serve({ID!r}, 4); print(envs._backend._engine.pid, flush=True); {end}"
+    )
+    ended = subprocess.run([sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=60)
+    assert not Path(f"/proc/{int(ended.stdout)}").exists()
+    assert endless_gym.running_engines() == []
+
+
+def test_engines_end_with_the_kernel_of_a_notebook() -> None:
+    """An interactive interpreter, as a kernel is one, runs three cells and is killed."""
+    kernel = subprocess.Popen([sys.executable, "-i", "-q"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        kernel.stdin.write("import endless_gym\n")
+        for _ in range(3):
+            kernel.stdin.write(f"envs = endless_gym.serve({ID!r}, 4)\n")
+            kernel.stdin.write("print(len(endless_gym.running_engines()))\n")
+            kernel.stdin.flush()
+            assert kernel.stdout.readline() == "1\n"
+    finally:
+        kernel.kill()
+        kernel.communicate()
+    end = time.monotonic() + 10
+    while endless_gym.running_engines() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert endless_gym.running_engines() == []
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_child_does_not_end_the_engine_of_its_parent() -> None:
+    envs = endless_gym.serve(ID, 4)
+    envs.reset()
+    child = os.fork()
+    if child == 0:
+        del envs
+        gc.collect()
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    envs.step(ACTIONS)
+    envs.close()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_close_ends_the_engine_while_a_forked_child_lives() -> None:
+    envs = endless_gym.serve(ID, 4)
+    envs.reset()
+    child = os.fork()
+    if child == 0:
+        signal.pause()
+        os._exit(0)
+    try:
+        process = envs._backend._engine._process
+        envs.close()
+        # Not killed after the time that an engine gets to end.
+        assert process.returncode == 0
+        envs.close()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)

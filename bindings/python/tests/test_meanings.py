@@ -1,0 +1,71 @@
+"""What the numbers of actions, ground truth and features mean: the same table wherever a user looks."""
+
+import json
+import pydoc
+import subprocess
+import sys
+
+import gymnasium
+import pytest
+
+import endless_gym
+from endless_gym.program import program
+
+SPECS = list(endless_gym.all_specs().values())
+IDS = [spec.id for spec in SPECS]
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_every_number_has_a_name_and_a_meaning(id: str) -> None:
+    spec = endless_gym.spec(id)
+    assert tuple(len(branch.choices) for branch in spec.actions) == spec.branches
+    assert len(spec.ground_truth_columns) == spec.ground_truth
+    assert tuple(column.name for column in spec.feature_columns) == spec.features
+    env = gymnasium.make(f"EndlessGym/{id}")
+    with endless_gym.make_vec(id, 1) as envs:
+        for metadata in (env.metadata, envs.metadata):
+            assert [len(names) for names in metadata["actions"].values()] == list(spec.branches)
+            assert len(metadata["ground_truth"]) == spec.ground_truth
+            assert len(metadata["features"]) == len(spec.features)
+            json.dumps([metadata[name] for name in ("actions", "ground_truth", "features")])
+
+
+def test_the_meanings_are_those_of_the_original() -> None:
+    grid = endless_gym.Env("MortarMayhem-Grid-v0").metadata["actions"]
+    assert grid == {"move": ["nothing", "left", "right", "ahead"]}
+    free = endless_gym.Env("Endless-MortarMayhem-v0").metadata
+    assert free["actions"] == {"horizontal": ["nothing", "left", "right"], "vertical": ["nothing", "up", "down"]}
+    assert list(free["ground_truth"]) == ["target_x", "target_y"]
+    assert endless_gym.Env("Endless-MysteryPath-v0").metadata["actions"] == {"move": ["nothing", "right", "up", "down"]}
+
+
+@pytest.mark.parametrize("shown", [endless_gym.Env, endless_gym.Env(IDS[0]), endless_gym.EndlessVectorEnv])
+def test_help_shows_them(shown: object) -> None:
+    page = pydoc.plain(pydoc.render_doc(shown))
+    assert "action[0], horizontal: 0 nothing, 1 left, 2 right" in page
+    assert "action: 0 nothing, 1 left, 2 right, 3 ahead" in page
+    assert 'info["ground_truth"][0], target_x: column of the tile' in page
+    assert all(id in page for id in IDS)
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=IDS)
+def test_the_program_lists_them(spec) -> None:
+    listed = subprocess.run(
+        [*program(), "list", spec.id, "--picture", "never"], capture_output=True, text=True, check=True
+    )
+    for branch in spec.actions:
+        choices = ", ".join(f"{value} {choice.name}" for value, choice in enumerate(branch.choices))
+        assert f"{branch.name}: {choices}" in listed.stdout
+    words = listed.stdout.split()
+    assert {column.name for column in (*spec.ground_truth_columns, *spec.feature_columns)} <= set(words)
+    as_json = json.loads(
+        subprocess.run([*program(), "list", spec.id, "--json"], capture_output=True, text=True, check=True).stdout
+    )
+    assert [branch["name"] for branch in as_json["actions"]] == [branch.name for branch in spec.actions]
+    assert [tuple(each.values()) for each in as_json["ground_truth"]] == list(spec.ground_truth_columns)
+
+
+def test_a_package_without_docstrings_can_be_imported() -> None:
+    text = "import endless_gym; endless_gym.Env('MysteryPath-v0'); print(endless_gym.Env.__doc__)"
+    ran = subprocess.run([sys.executable, "-OO", "-c", text], capture_output=True, text=True)
+    assert ran.stdout == "None\n", ran.stderr

@@ -1,0 +1,286 @@
+"""Observers beside a trainer: `endless_gym.watch` and `endless watch`."""
+
+import gc
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import endless_gym
+from endless_gym.program import program
+
+ID = "Endless-MortarMayhem-v0"
+NUM_ENVS = 4
+
+# A trainer in a process of its own. It plays in time with its standard input, or on its own until that closes.
+TRAINER = f"""
+import sys, threading, endless_gym
+envs = endless_gym.serve({ID!r}, {NUM_ENVS}, groups=int(sys.argv[1]), seed=0)
+envs.action_space.seed(0)
+envs.reset(seed=0)
+print(envs._backend._engine.service, flush=True)
+def play():
+    for group in range(envs.num_groups):
+        envs.send(envs.action_space.sample(), group)
+        envs.recv(group)
+if sys.argv[2] == "steps":
+    for line in sys.stdin:
+        play()
+        print("played", flush=True)
+else:
+    closed = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), closed.set()), daemon=True).start()
+    while not closed.is_set():
+        play()
+    print("trained", flush=True)
+envs.close()
+"""
+
+
+class Trainer:
+    """A trainer's process."""
+
+    def __init__(self, groups: int, pace: str) -> None:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen([sys.executable, "-c", TRAINER, str(groups), pace], **pipes)
+        self.service = self.process.stdout.readline().strip()
+        assert self.service
+
+    def step(self) -> None:
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        assert self.process.stdout.readline() == "played\n"
+
+    def end(self) -> str:
+        """Ends it, and returns what it printed."""
+        return self.process.communicate(timeout=60)[0]
+
+
+@pytest.fixture
+def trainer(request: pytest.FixtureRequest) -> Iterator[Trainer]:
+    groups, pace = getattr(request, "param", (1, "steps"))
+    started = Trainer(groups, pace)
+    yield started
+    if started.process.poll() is None:
+        started.end()
+    gc.collect()
+    assert started.process.returncode == 0
+
+
+def watch_command(*arguments: str) -> list[str]:
+    return [*program(), "watch", *arguments]
+
+
+def test_a_watched_batch_is_the_trainers(trainer: Trainer) -> None:
+    with endless_gym.make_vec(ID, NUM_ENVS, seed=0) as envs, endless_gym.watch(trainer.service) as batches:
+        assert (batches.id, batches.num_envs, batches.num_groups) == (ID, NUM_ENVS, 1)
+        assert batches.observation_space == envs.observation_space
+        envs.action_space.seed(0)
+        envs.reset(seed=0)
+        ends = 0
+        for step in range(2, 62):
+            trainer.step()
+            batch = next(batches)
+            observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+            # The reset was the first.
+            assert (batch.step, batch.group, batch.missed) == (step, 0, 0)
+            np.testing.assert_array_equal(batch.observation, observation)
+            np.testing.assert_array_equal(batch.reward, reward)
+            np.testing.assert_array_equal(batch.terminated, terminated)
+            np.testing.assert_array_equal(batch.truncated, truncated)
+            assert batch.info.keys() == info.keys()
+            np.testing.assert_array_equal(batch.info["ground_truth"], info["ground_truth"])
+            if terminated.any():
+                ends += 1
+                np.testing.assert_array_equal(batch.info["reward"], info["reward"])
+        assert ends, "no episode ended"
+        with pytest.raises(ValueError, match="read-only"):
+            batch.observation[0] = 0
+    # Arrays outlive the watch.
+    np.testing.assert_array_equal(batch.observation, observation)
+
+
+def test_missed_batches_are_counted(trainer: Trainer) -> None:
+    with endless_gym.watch(trainer.service) as batches:
+        trainer.step()
+        assert next(batches).missed == 0
+        for _ in range(5):
+            trainer.step()
+        batch = next(batches)
+        assert (batch.step, batch.missed, batches.missed) == (7, 4, 4)
+
+
+@pytest.mark.parametrize("trainer", [(3, "steps")], indirect=True)
+def test_all_groups_are_watched_or_one(trainer: Trainer) -> None:
+    with (
+        endless_gym.watch(trainer.service) as batches,
+        endless_gym.watch(trainer.service, group=1, copy=True) as one,
+    ):
+        for _ in range(3):
+            trainer.step()
+            watched = [next(batches) for _ in range(3)]
+            assert sorted(batch.group for batch in watched) == [0, 1, 2]
+            assert all(batch.missed == 0 for batch in watched)
+            batch = next(one)
+            assert (batch.group, batch.missed) == (1, 0)
+            (same,) = [other for other in watched if other.group == 1]
+            np.testing.assert_array_equal(batch.observation, same.observation)
+            batch.observation[:] = 0
+            del watched, same
+    with pytest.raises(ValueError, match="group"):
+        endless_gym.watch(trainer.service, group=3)
+
+
+def test_a_timeout_does_not_end_the_watch(trainer: Trainer) -> None:
+    with endless_gym.watch(trainer.service, timeout=0.2) as batches:
+        with pytest.raises(TimeoutError):
+            next(batches)
+        trainer.step()
+        assert next(batches).step == 2
+
+
+def test_a_watch_ends_with_its_engine(trainer: Trainer) -> None:
+    with endless_gym.watch(trainer.service, timeout=None) as batches:
+        trainer.step()
+        steps = []
+        for batch in batches:
+            steps.append(batch.step)
+            trainer.process.stdin.close()
+            trainer.process.wait(60)
+        assert steps == [2]
+        assert list(batches) == []
+    with pytest.raises(ConnectionError, match="no engine"):
+        endless_gym.watch(trainer.service, timeout=0.1)
+
+
+def test_a_closed_watch_yields_nothing(trainer: Trainer) -> None:
+    batches = endless_gym.watch(trainer.service)
+    trainer.step()
+    batches.close()
+    assert list(batches) == []
+
+
+@pytest.mark.parametrize("trainer", [(1, "alone")], indirect=True)
+def test_a_watch_that_hoards_harms_only_itself(trainer: Trainer) -> None:
+    with endless_gym.watch(trainer.service) as batches:
+        held = []
+        with pytest.raises(endless_gym.TooManyBatchesHeld):
+            for batch in batches:
+                held.append(batch)
+        contents = [batch.observation.copy() for batch in held]
+        with endless_gym.watch(trainer.service, copy=True) as others:
+            before = next(others).step
+            while next(others).step < before + 500:
+                pass
+        for batch, content in zip(held, contents, strict=True):
+            np.testing.assert_array_equal(batch.observation, content)
+        held.clear()
+        del batch
+        assert next(batches).missed > 0
+    assert trainer.end() == "trained\n"
+
+
+def test_ctrl_c_reaches_python_while_it_watches(trainer: Trainer) -> None:
+    code = f"""
+import endless_gym, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+with endless_gym.watch({trainer.service!r}, timeout=None) as batches:
+    print("waiting", flush=True)
+    try:
+        next(batches)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "waiting\n"
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60)[0] == "interrupted\n"
+    trainer.step()
+
+
+def test_a_forked_child_does_not_use_the_watch(trainer: Trainer) -> None:
+    with endless_gym.watch(trainer.service) as batches:
+        child = os.fork()
+        if child == 0:
+            try:
+                next(batches)
+            except RuntimeError as error:
+                os._exit(0 if "forked" in str(error) else 2)
+            os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        trainer.step()
+        assert next(batches).step == 2
+
+
+@pytest.mark.parametrize("trainer", [(2, "alone")], indirect=True)
+def test_the_program_prints_json_lines_until_the_engine_ends(trainer: Trainer) -> None:
+    watching = watch_command(trainer.service, "--json", "--interval", "0.1")
+    process = subprocess.Popen(watching, stdout=subprocess.PIPE, text=True)
+    lines = [json.loads(process.stdout.readline()) for _ in range(10)]
+    assert trainer.end() == "trained\n"
+    rest, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    lines += [json.loads(line) for line in rest.splitlines()]
+    assert [line["ended"] for line in lines] == [False] * (len(lines) - 1) + [True]
+    last = lines[-1]
+    assert (last["service"], last["environment"]) == (trainer.service, ID)
+    assert 0 <= last["missed"] < last["batches"]
+    assert max(line["steps_per_second"] for line in lines) > 0
+    assert last["episodes"] > 0
+    assert last["mean_length"] > 1
+    assert last["mean_return"] >= 0
+
+
+@pytest.mark.parametrize("trainer", [(1, "alone")], indirect=True)
+def test_the_program_prints_lines_until_ctrl_c(trainer: Trainer) -> None:
+    process = subprocess.Popen(
+        watch_command(trainer.service, "--interval", "0.1"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    line = process.stdout.readline()
+    assert re.fullmatch(
+        rf"{trainer.service} {ID}: [\d,]+ steps/s, [\d,]+ episodes.*, [\d,]+ of [\d,]+ batches missed\n", line
+    )
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert "ended" not in output
+    assert trainer.end() == "trained\n"
+
+
+@pytest.mark.parametrize("trainer", [(1, "alone")], indirect=True)
+def test_the_program_updates_one_line_of_a_terminal(trainer: Trainer) -> None:
+    leader, follower = pty.openpty()
+    process = subprocess.Popen(watch_command(trainer.service), stdout=follower, stderr=follower)
+    os.close(follower)
+    text = b""
+    while text.count(b"steps/s") < 3:
+        text += os.read(leader, 4096)
+    assert trainer.end() == "trained\n"
+    try:
+        while part := os.read(leader, 4096):
+            text += part
+    except OSError:
+        # The end of a terminal.
+        pass
+    assert process.wait(60) == 0
+    os.close(leader)
+    live, *others = text.decode().replace("\r\n", "\n").split("\n")
+    assert live.count("\r\x1b[2K") >= 3
+    assert others == ["the engine has ended", ""]
+
+
+def test_the_program_names_the_running_engines_if_there_is_none(trainer: Trainer) -> None:
+    ran = subprocess.run(watch_command("absent", "--timeout", "0.1"), capture_output=True, text=True, timeout=60)
+    assert ran.returncode == 1
+    assert len(ran.stderr.splitlines()) == 1
+    assert "absent" in ran.stderr
+    assert trainer.service in ran.stderr

@@ -1,0 +1,194 @@
+//! `endless watch`: what an observer sees of a training, as one line.
+
+use std::collections::VecDeque;
+use std::io::{self, IsTerminal};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use endless_gym_core::batch::Batch;
+use endless_gym_service::{ConnectConfig, Observed, Observers, ServiceError};
+use serde_json::json;
+
+use super::failure::Failure;
+use super::options::seconds;
+use super::output::{end_line, grouped, print, replace_line};
+use super::stop;
+
+/// Time between two updates of the line in a terminal, and between two lines elsewhere, unless `--interval` gives another.
+const LIVE_INTERVAL: f64 = 0.25;
+const LINE_INTERVAL: f64 = 1.0;
+
+/// Longest wait between two looks at the stop flag.
+const SLICE: Duration = Duration::from_millis(50);
+
+/// The mean return and length are those of this number of episodes.
+const WINDOW: usize = 1000;
+
+/// Arguments of `endless watch`.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Name of the engine.
+    #[arg(default_value = "endless")]
+    service: String,
+    /// Watch this group only [default: all].
+    #[arg(long)]
+    group: Option<usize>,
+    /// Seconds between two lines [default: 1; 0.25 for the line that is updated in a terminal].
+    #[arg(long, value_name = "SECONDS")]
+    interval: Option<f64>,
+    /// How long to wait for the engine to start, in seconds.
+    #[arg(long, value_name = "SECONDS", default_value_t = 1.0)]
+    timeout: f64,
+    /// Print one JSON document in each line [default: text].
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was observed so far.
+struct Statistics {
+    num_envs: u64,
+    /// Batches of all groups, those that were missed included, without the first of each group.
+    batches: u64,
+    missed: u64,
+    episodes: u64,
+    /// Returns and lengths of the last episodes.
+    recent: VecDeque<(f64, i32)>,
+    /// The time of the last batch.
+    last: Instant,
+    /// When the rate was last computed, and the batches then.
+    since: (Instant, u64),
+}
+
+impl Statistics {
+    fn new(num_envs: usize) -> Self {
+        let now = Instant::now();
+        Statistics {
+            num_envs: num_envs as u64,
+            batches: 0,
+            missed: 0,
+            episodes: 0,
+            recent: VecDeque::with_capacity(WINDOW),
+            last: now,
+            since: (now, 0),
+        }
+    }
+
+    fn add(&mut self, observed: &Observed) {
+        self.batches += observed.missed.saturating_add(1);
+        self.missed += observed.missed;
+        self.last = Instant::now();
+        self.add_episodes(&observed.lease.batch());
+    }
+
+    fn add_episodes(&mut self, batch: &Batch<'_>) {
+        let ended =
+            batch.terminated().iter().zip(batch.truncated()).map(|(terminated, truncated)| terminated | truncated);
+        let ends = batch.episode_return().iter().zip(batch.episode_length());
+        for (_, (total, length)) in ended.zip(ends).filter(|(ended, _)| *ended != 0) {
+            self.episodes += 1;
+            if self.recent.len() == WINDOW {
+                self.recent.pop_front();
+            }
+            self.recent.push_back((*total, *length));
+        }
+    }
+
+    /// Environment steps per second since the last call.
+    fn rate(&mut self) -> f64 {
+        let (moment, before) = std::mem::replace(&mut self.since, (Instant::now(), self.batches));
+        ((self.batches - before) * self.num_envs) as f64 / moment.elapsed().as_secs_f64().max(1e-3)
+    }
+
+    /// The mean return and the mean length of the last episodes.
+    fn means(&self) -> Option<(f64, f64)> {
+        let count = self.recent.len() as f64;
+        let sum = |value: fn(&(f64, i32)) -> f64| self.recent.iter().map(value).sum::<f64>();
+        (count > 0.0).then(|| (sum(|recent| recent.0) / count, sum(|recent| f64::from(recent.1)) / count))
+    }
+}
+
+/// Runs `endless watch`.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let is_live = !args.json && io::stdout().is_terminal();
+    let interval = seconds("--interval", args.interval.unwrap_or(if is_live { LIVE_INTERVAL } else { LINE_INTERVAL }))?;
+    let timeout = seconds("--timeout", args.timeout)?;
+    let stop = stop::on_signal()?;
+    let Some(mut observers) = connect(args, timeout, stop)? else { return Ok(()) };
+    let mut statistics = Statistics::new(observers.specification().num_envs);
+    let id = observers.specification().id.clone();
+    let mut shown = Instant::now();
+    loop {
+        let is_over = match observers.next(SLICE.min(interval)) {
+            Ok(observed) => {
+                statistics.add(&observed);
+                false
+            }
+            Err(ServiceError::TimedOut { .. }) => false,
+            Err(ServiceError::EngineLost { .. }) => true,
+            Err(error) => {
+                end_line(is_live)?;
+                return Err(error.into());
+            }
+        };
+        let is_stopped = stop.load(Ordering::Relaxed);
+        if is_over || is_stopped || shown.elapsed() >= interval {
+            shown = Instant::now();
+            show(args, is_live, &id, &mut statistics, is_over)?;
+        }
+        if is_over || is_stopped {
+            end_line(is_live)?;
+            return if is_over && !args.json { print("the engine has ended") } else { Ok(()) };
+        }
+    }
+}
+
+/// The observers, or `None` if a signal came while the engine was waited for.
+fn connect(args: &Args, timeout: Duration, stop: &AtomicBool) -> Result<Option<Observers>, Failure> {
+    let start = Instant::now();
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        let config = ConnectConfig { timeout: left.min(SLICE), ..ConnectConfig::new(&args.service) };
+        match Observers::connect(&config, args.group) {
+            Err(
+                ServiceError::UnknownEngine { .. }
+                | ServiceError::EngineUnreachable { .. }
+                | ServiceError::EngineRestarted { .. }
+                | ServiceError::NamespaceLocked { .. },
+            ) if left > SLICE => {}
+            connected => return Ok(Some(connected?)),
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+    }
+}
+
+fn show(args: &Args, is_live: bool, id: &str, statistics: &mut Statistics, is_over: bool) -> Result<(), Failure> {
+    let rate = statistics.rate();
+    let (means, idle) = (statistics.means(), statistics.last.elapsed());
+    if args.json {
+        return print(json!({
+            "service": args.service,
+            "environment": id,
+            "steps_per_second": rate,
+            "batches": statistics.batches,
+            "missed": statistics.missed,
+            "episodes": statistics.episodes,
+            "mean_return": means.map(|(mean, _)| mean),
+            "mean_length": means.map(|(_, mean)| mean),
+            "idle_seconds": idle.as_secs_f64(),
+            "ended": is_over,
+        }));
+    }
+    let mut text = format!("{} {id}: {} steps/s", args.service, grouped(rate));
+    text += &format!(", {} episodes", grouped(statistics.episodes as f64));
+    if let Some((mean_return, mean_length)) = means {
+        text += &format!(", mean return {mean_return:.3}, mean length {mean_length:.1}");
+    }
+    text +=
+        &format!(", {} of {} batches missed", grouped(statistics.missed as f64), grouped(statistics.batches as f64));
+    if idle >= Duration::from_secs(2) {
+        text += &format!(", idle for {} s", idle.as_secs());
+    }
+    if is_live { replace_line(&text) } else { print(text) }
+}

@@ -1,0 +1,28 @@
+//! Reset parameters for the next episodes of single environments, and what the running episodes follow from.
+
+use serde::{Deserialize, Serialize};
+
+use super::config::OptionMap;
+
+/// Reset parameters for the next episodes of some environments.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct NextOptions {
+    /// Reset parameters by the original's names; the rest have their defaults.
+    pub options: OptionMap,
+    /// Numbers of the environments in their pool.
+    pub envs: Vec<usize>,
+}
+
+/// What the running episode of an environment follows from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RunningEpisode {
+    /// Number of the environment in its pool.
+    pub env: usize,
+    /// The seed that the episode started with; `None` if it continued the generator of the episode before, or if the environment was
+    /// seeded from entropy.
+    pub seed: Option<u64>,
+    /// The reset parameters that were given for the episode; the rest have their defaults.
+    pub options: OptionMap,
+    /// Whether the last step ended it, so that in next-step autoreset the next step starts another.
+    pub ended: bool,
+}

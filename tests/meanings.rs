@@ -1,0 +1,208 @@
+//! What the registry says about actions and ground truth is what the rules do.
+
+use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::envs::{self, EnvSpec};
+use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use serde_json::json;
+
+struct Player {
+    pool: Pool,
+    blocks: Vec<Block>,
+}
+
+impl Player {
+    /// One environment at the start of an episode. In Mortar Mayhem the commands have been shown, so that the agent may move.
+    fn new(spec: &EnvSpec, seed: u64, options: serde_json::Value) -> Self {
+        let options = ResetOptions::Shared(options.as_object().unwrap().clone());
+        let config = PoolConfig { options, features: true, ..PoolConfig::new(spec.id, 1) };
+        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
+        let mut player = Player { pool, blocks };
+        while player.any_feature("command_") {
+            player.step(&vec![0; spec.actions.len()]);
+        }
+        player
+    }
+
+    fn step(&mut self, action: &[i32]) {
+        self.pool.step(action, &mut self.blocks).unwrap();
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        Batch::new(self.pool.layout(), &self.blocks)
+    }
+
+    fn feature(&self, name: &str) -> f32 {
+        let place = self.pool.spec().features.iter().position(|column| column.name == name);
+        self.batch().features()[place.unwrap_or_else(|| panic!("no feature {name}"))]
+    }
+
+    fn any_feature(&self, prefix: &str) -> bool {
+        let columns = self.pool.spec().features.iter().zip(self.batch().features());
+        columns.into_iter().any(|(column, value)| column.name.starts_with(prefix) && *value > 0.0)
+    }
+
+    fn truth(&self, name: &str) -> f64 {
+        let place = self.pool.spec().ground_truth.iter().position(|column| column.name == name);
+        self.batch().ground_truth()[place.unwrap_or_else(|| panic!("no ground truth {name}"))]
+    }
+
+    fn heading(&self) -> [f32; 2] {
+        ["heading_x", "heading_y"].map(|name| self.feature(name).round())
+    }
+
+    fn place(&self) -> [f32; 2] {
+        ["agent_x", "agent_y"].map(|name| self.feature(name))
+    }
+}
+
+/// The unit vector that an action of this name moves along.
+fn direction(name: &str) -> [f32; 2] {
+    match name {
+        "nothing" => [0.0, 0.0],
+        "left" => [-1.0, 0.0],
+        "right" => [1.0, 0.0],
+        "up" => [0.0, -1.0],
+        "down" => [0.0, 1.0],
+        other => panic!("an action {other}"),
+    }
+}
+
+#[test]
+fn every_number_has_a_meaning() {
+    for spec in envs::specs() {
+        let choices: Vec<_> = spec.actions.iter().map(|branch| branch.choices.len() as i32).collect();
+        assert_eq!(choices, spec.action_space.branches(), "{}", spec.id);
+        let player = Player::new(spec, 1, json!({}));
+        assert_eq!(spec.ground_truth.len(), player.batch().ground_truth().len(), "{}", spec.id);
+        assert_eq!(spec.features.len(), player.batch().features().len(), "{}", spec.id);
+        let columns = spec.ground_truth.iter().chain(spec.features).map(|column| (column.name, column.description));
+        let choices = spec.actions.iter().flat_map(|branch| branch.choices);
+        for (name, description) in columns.chain(choices.map(|choice| (choice.name, choice.description))) {
+            assert!(!name.is_empty() && description.len() > 5, "{}: {name}", spec.id);
+        }
+    }
+}
+
+#[test]
+fn actions_move_the_agent_as_their_names_say() {
+    for spec in envs::specs() {
+        let is_grid = spec.actions.iter().any(|branch| branch.choices.iter().any(|choice| choice.name == "ahead"));
+        let follows_a_path = spec.id == "Endless-MysteryPath-v0";
+        let mut moved = 0;
+        for (number, branch) in spec.actions.iter().enumerate().filter(|_| !is_grid) {
+            for (value, choice) in branch.choices.iter().enumerate() {
+                for seed in 0..20 {
+                    let mut player = Player::new(spec, seed, json!({}));
+                    let (place, heading) = (player.place(), player.heading());
+                    let mut action = vec![0; spec.actions.len()];
+                    action[number] = value as i32;
+                    player.step(&action);
+                    let [x, y] = direction(choice.name);
+                    let named = format!("{}, {} {value}, seed {seed}", spec.id, branch.name);
+                    assert_eq!(player.heading(), if choice.name == "nothing" { heading } else { [x, y] }, "{named}");
+                    let [dx, dy] = [player.place()[0] - place[0], player.place()[1] - place[1]];
+                    // The border stops the agent, or it returns on the other side; the screen scrolls along the endless path.
+                    let jumped = dx.abs() > 0.5 || dy.abs() > 0.5;
+                    if !(jumped || follows_a_path && choice.name == "right") {
+                        assert!(dx * x >= 0.0 && dy * y >= 0.0, "{named}: {dx} {dy}");
+                        assert!((x != 0.0 || dx == 0.0) && (y != 0.0 || dy == 0.0), "{named}: {dx} {dy}");
+                        moved += usize::from(dx != 0.0 || dy != 0.0);
+                    }
+                }
+            }
+        }
+        assert!(is_grid || moved > 20, "{}: {moved}", spec.id);
+    }
+}
+
+#[test]
+fn on_a_grid_actions_turn_and_walk() {
+    let mut walked = 0;
+    for spec in envs::specs().filter(|spec| spec.id.contains("Grid")) {
+        let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
+        assert_eq!(names, ["nothing", "left", "right", "ahead"]);
+        for seed in 0..20 {
+            for turns in 0..4 {
+                let mut player = Player::new(spec, seed, json!({}));
+                let start = player.place();
+                let mut heading = player.heading();
+                for turn in 0..turns {
+                    let [x, y] = heading;
+                    // The second coordinate grows downwards.
+                    let (value, turned) = if turn % 2 == 0 { (2, [-y, x]) } else { (1, [y, -x]) };
+                    let (value, turned) = if seed % 2 == 0 { (value, turned) } else { (1, [y, -x]) };
+                    player.step(&[value]);
+                    heading = turned.map(|part| part + 0.0);
+                    assert_eq!(player.heading().map(|part| part + 0.0), heading, "{}, seed {seed}", spec.id);
+                    assert_eq!(player.place(), start, "a turn does not move");
+                }
+                player.step(&[0]);
+                assert_eq!((player.place(), player.heading().map(|part| part + 0.0)), (start, heading));
+                player.step(&[3]);
+                let [dx, dy] = [player.place()[0] - start[0], player.place()[1] - start[1]];
+                assert_eq!(
+                    dx.abs() + dy.abs() > 0.0,
+                    dx * heading[0] + dy * heading[1] > 0.0,
+                    "ahead, or at the border"
+                );
+                walked += usize::from(dx != 0.0 || dy != 0.0);
+            }
+        }
+    }
+    assert!(walked > 100, "{walked}");
+}
+
+#[test]
+fn the_ground_truth_of_endless_mortar_mayhem_is_the_tile_that_does_not_burn() {
+    let spec = envs::spec("Endless-MortarMayhem-v0").unwrap();
+    let mut burnt = 0;
+    for seed in 0..20 {
+        let mut player = Player::new(spec, seed, json!({}));
+        for _ in 0..60 {
+            player.step(&[0, 0]);
+            if player.feature("burning") == 1.0 {
+                burnt += 1;
+                for (truth, feature) in [("target_x", "safe_x"), ("target_y", "safe_y")] {
+                    assert!((player.truth(truth) - f64::from(player.feature(feature))).abs() < 1e-6, "{truth}");
+                }
+            }
+        }
+    }
+    assert!(burnt > 20, "{burnt}");
+}
+
+#[test]
+fn the_ground_truth_of_endless_searing_spotlights_is_where_agent_and_coin_are() {
+    let spec = envs::spec("Endless-SearingSpotlights-v0").unwrap();
+    let pairs = [("agent_x", "agent_x"), ("agent_y", "agent_y"), ("coin_x", "coin_0_x"), ("coin_y", "coin_0_y")];
+    let mut player = Player::new(spec, 3, json!({"agent_visible": true, "coins_visible": true}));
+    for step in 0..40 {
+        player.step(&[step % 3, (step / 3) % 3]);
+        for (truth, feature) in pairs {
+            assert!((player.truth(truth) - f64::from(player.feature(feature))).abs() < 1e-6, "{truth}, step {step}");
+        }
+    }
+    let without_coin = Player::new(spec, 3, json!({"coin_enabled": false}));
+    assert_eq!(["coin_x", "coin_y"].map(|name| without_coin.truth(name)), [0.0, 0.0]);
+}
+
+#[test]
+fn the_ground_truth_of_endless_mystery_path_leads_along_it() {
+    let spec = envs::spec("Endless-MysteryPath-v0").unwrap();
+    let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
+    for seed in 0..10 {
+        let mut player = Player::new(spec, seed, json!({"agent_speed": 12.0}));
+        let mut turns = 0;
+        for step in 0..30 {
+            let ones: Vec<_> = spec.ground_truth.iter().filter(|column| player.truth(column.name) == 1.0).collect();
+            let [next] = ones[..] else { panic!("{ones:?}") };
+            let action = names.iter().position(|name| *name == next.name).unwrap() as i32;
+            turns += usize::from(next.name != "right");
+            player.step(&[action]);
+            assert_eq!(player.feature("fallen"), 0.0, "seed {seed}, step {step}, {}", next.name);
+        }
+        assert!(turns > 0, "seed {seed}");
+    }
+}
