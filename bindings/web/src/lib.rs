@@ -57,7 +57,7 @@ pub extern "C" fn call() -> u32 {
 /// Opens the trace in the input, replays it, and makes it the game. Returns as [`call`] does.
 #[unsafe(no_mangle)]
 pub extern "C" fn open() -> u32 {
-    reply(|app, input| request::open(app, input))
+    reply(request::open)
 }
 
 /// The answer to the last call, or after a trap what the engine said.

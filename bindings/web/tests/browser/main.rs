@@ -288,8 +288,8 @@ fn nothing_jumps_while_loading_and_nothing_is_cut_off() {
                   observer.observe({ type: 'layout-shift', buffered: true }); setTimeout(() => done(sum), 300) })";
     for (width, height, phone) in [(1440, 900, false), (1024, 700, false), (390, 844, true), (320, 640, true)] {
         browser.resize(width, height, phone);
-        // The longest text, the shortest, the most numbers, commands.
-        for id in ["Endless-MysteryPath-v0", "SearingSpotlights-v0", "MortarMayhemB-v0"] {
+        // The longest texts, the shortest, the most numbers, commands.
+        for id in ["Endless-MysteryPath-v0", "MortarMayhem-Grid-v0", "SearingSpotlights-v0", "MortarMayhemB-v0"] {
             visit(&mut browser, &server, &format!("env={id}&seed=1"));
             let shifted = browser.value(shifts).as_f64().unwrap();
             assert!(shifted < 0.02, "{id} at {width}x{height}: {shifted}");
@@ -366,13 +366,18 @@ fn measure_steps_per_second() {
     for spec in specs() {
         let wall = json!({"wall": {"groups": [{"id": spec.id, "num_envs": 64, "options": {}}], "columns": 8,
             "expert": false, "seed": "1"}});
+        // Rounds of a few milliseconds: where others use the processor too, some of them are not interrupted.
         let measure = format!(
             "(() => {{ endless.engine.request({wall}); endless.engine.stepWall(200); const rates = []; \
-             for (let round = 0; round < 7; round += 1) {{ const start = performance.now(); endless.engine.stepWall(500); \
-             rates.push(Math.round(64 * 500 / (performance.now() - start))) }} \
-             return rates.sort((a, b) => a - b) }})()"
+             for (let round = 0; round < 100; round += 1) {{ const start = performance.now(); endless.engine.stepWall(60); \
+             rates.push(Math.round(64 * 60 / (performance.now() - start))) }} \
+             rates.sort((a, b) => a - b); return [rates[50], rates[90], rates[99]] }})()"
         );
-        println!("{:30} thousand steps a second, 7 rounds sorted: {}", spec.id, browser.value(&measure));
+        let rates = browser.value(&measure);
+        println!(
+            "{:30} thousand steps a second: {} (median), {} (9th decile), {} (best)",
+            spec.id, rates[0], rates[1], rates[2]
+        );
     }
 }
 
