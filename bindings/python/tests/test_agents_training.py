@@ -25,6 +25,7 @@ from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.evaluate import evaluate, mean
+from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import check_resumable, main, parse, restore_generator, train
@@ -61,13 +62,14 @@ def same(one: Any, two: Any) -> bool:
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
-def test_forward_equals_the_rollout_before_the_first_optimizer_step(agent: str, tmp_path: Path) -> None:
-    """Log-probabilities and values of two segments are those of the rollout."""
+def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: Path) -> None:
+    """Log-probabilities and values of two segments are those of the rollout; between them the agent learns."""
     given = small(agent, tmp_path)
     with Environments(given) as environments:
         torch.manual_seed(1)
         made = make_agent(given, environments.spec)
         collector = RolloutCollector(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+        optimizer, shuffle = make_optimizer(made, 0.01), torch.Generator().manual_seed(1)
         for _ in range(2):
             segment, _ = collector.collect(Clock())
             flat, states = segment.flat(), [memory.state for memory in collector.memories]
@@ -76,6 +78,9 @@ def test_forward_equals_the_rollout_before_the_first_optimizer_step(agent: str, 
                 log_prob = output.log_prob(flat.action[minibatch.indices])
                 torch.testing.assert_close(log_prob, flat.log_prob[minibatch.indices], rtol=1e-5, atol=1e-5)
                 torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
+            before = {name: weight.clone() for name, weight in made.named_parameters()}
+            learn(made, optimizer, segment, states, 0, replace(given.ppo, learning_rate=0.01), shuffle)
+            assert all(not torch.equal(weight, before[name]) for name, weight in made.named_parameters())
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])

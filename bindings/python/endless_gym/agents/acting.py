@@ -1,8 +1,8 @@
 """The dense layers of the agent for acting, with weights in the form that needs the fewest operations.
 
 While acting, batches are small and the cost of a step is the number of operations. The layers here are single `addmm` calls on
-transposed views of the agent's parameters; the policy and the value head are computed together. An optimizer changes the
-parameters in place, which their version counters record, so `ActingWeights` are made again when they are out of date.
+transposed views of the agent's parameters; the policy and the value head are computed together. `Agent.refresh` says when
+`ActingWeights` are made again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def linear_relu(x: Tensor, layer: Affine) -> Tensor:
 
 
 def weights_version(parameters: Sequence[Tensor]) -> int:
-    """A number that rises with each change of the parameters in place, such as a step of an optimizer."""
+    """A number that rises with each change of the parameters in place, except by the kernels of fused optimizers."""
     return sum(map(_version, parameters))
 
 

@@ -315,8 +315,16 @@ class Agent(nn.Module):
         drawn = torch.empty((*shape, len(self.branches), max(self.branches)), device=self.device)
         return drawn.exponential_(generator=generator).log_().neg_()
 
+    def refresh(self) -> None:
+        """Make the weights for acting again at the next step.
+
+        That happens by itself after `forward` with gradients, and after changes of the parameters that PyTorch records, which the
+        step of a fused optimizer is not. A call is needed after a change that is neither.
+        """
+        self._weights = None
+
     def acting_weights(self) -> ActingWeights:
-        """The weights for acting; made again if the parameters have changed."""
+        """The weights for acting; made again if the parameters have changed, see `refresh`."""
         if not self._watched:
             self._watched = list(self.parameters())
         version = weights_version(self._watched)
@@ -335,6 +343,8 @@ class Agent(nn.Module):
             observation: Transformed observations of the steps `minibatch.indices`, tensors (M, ...) on the agent's device.
             minibatch: A minibatch that `memory.minibatches` returned.
         """
+        if torch.is_grad_enabled():
+            self.refresh()
         with self._autocast():
             memory_output = self.memory(self.encoder(observation), minibatch)
             hidden = self.body(memory_output)
@@ -406,7 +416,8 @@ class Agent(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Agent:
         # The parameters move, for example to another device.
-        self._weights, self._watched = None, []
+        self.refresh()
+        self._watched = []
         super()._apply(fn, recurse)
         return self
 

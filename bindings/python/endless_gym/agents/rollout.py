@@ -138,6 +138,7 @@ class RolloutCollector:
             The segment, whose tensors the next call overwrites, and the final infos of the episodes that ended.
         """
         episodes: list[dict[str, float]] = []
+        self.agent.refresh()
         noise = self.agent.noise(self._action.shape[:2], self.generator)
         for group, memory in enumerate(self.memories):
             self.agent.memory.begin_segment(memory.state, self.steps)

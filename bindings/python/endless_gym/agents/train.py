@@ -123,7 +123,7 @@ def train(
         )
 
         success: str | None = None
-        clock = Clock((lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None)
+        clock = Clock()
         while update < ppo.updates and not stop.requested:
             start = time.perf_counter()
             environments.mark(logger.print)
