@@ -9,6 +9,7 @@ the data without a copy. Run as a program, this trains on the device and on the 
 import contextlib
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -48,6 +49,12 @@ class Device(TorchDispatchMode):
         return computed(operation, args, kwargs or {})
 
 
+#: Operations whose result, or its shape, is needed on the host. On CUDA the host waits for them.
+WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "unique_dim"}
+#: Number of operations for which CUDA would wait: copies to the CPU, and those of `WAITING`.
+waits: Counter[str] = Counter()
+
+
 def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name = operation.overloadpacket.__name__
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
@@ -57,6 +64,10 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if there and here and name not in ("_to_copy", "copy_"):
         shapes = [[tuple(tensor.shape) for tensor in some] for some in (there, here)]
         raise RuntimeError(f"{name}: tensors on two devices, of shapes {shapes[0]} and {shapes[1]}")
+    to_cpu = name == "copy_" and bool(here) and here[0] is args[0]
+    to_cpu |= name == "_to_copy" and torch.device(kwargs.get("device") or NAME).type == "cpu"
+    if there and (to_cpu or name in WAITING):
+        waits[name] += 1
     asked = kwargs.get("device")
     if asked is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}

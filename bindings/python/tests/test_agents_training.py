@@ -25,6 +25,7 @@ from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.evaluate import evaluate, mean
+from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import check_resumable, main, parse, restore_generator, train
@@ -61,13 +62,14 @@ def same(one: Any, two: Any) -> bool:
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
-def test_forward_equals_the_rollout_before_the_first_optimizer_step(agent: str, tmp_path: Path) -> None:
-    """Log-probabilities and values of two segments are those of the rollout."""
+def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: Path) -> None:
+    """Log-probabilities and values of two segments are those of the rollout; between them the agent learns."""
     given = small(agent, tmp_path)
     with Environments(given) as environments:
         torch.manual_seed(1)
         made = make_agent(given, environments.spec)
         collector = RolloutCollector(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+        optimizer, shuffle = make_optimizer(made, 0.01), torch.Generator().manual_seed(1)
         for _ in range(2):
             segment, _ = collector.collect(Clock())
             flat, states = segment.flat(), [memory.state for memory in collector.memories]
@@ -76,6 +78,9 @@ def test_forward_equals_the_rollout_before_the_first_optimizer_step(agent: str, 
                 log_prob = output.log_prob(flat.action[minibatch.indices])
                 torch.testing.assert_close(log_prob, flat.log_prob[minibatch.indices], rtol=1e-5, atol=1e-5)
                 torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
+            before = {name: weight.clone() for name, weight in made.named_parameters()}
+            learn(made, optimizer, segment, states, 0, replace(given.ppo, learning_rate=0.01), shuffle)
+            assert all(not torch.equal(weight, before[name]) for name, weight in made.named_parameters())
 
 
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
@@ -238,7 +243,8 @@ def test_target_reward_needs_a_hundred_episodes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("engine", ["thread", "process"])
 def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: Path) -> None:
-    """Four segments, against environments with the same seeds that are stepped in a plain loop."""
+    """Eight segments, against environments with the same seeds that are stepped in a plain loop."""
+    torch.manual_seed(1)
     given = small("none", tmp_path, engine=engine)
     ppo = replace(given.ppo, ground_truth_coefficient=0.1)
     given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))
@@ -251,7 +257,7 @@ def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: P
         collector = RolloutCollector(
             make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1)
         )
-        for _ in range(4):
+        for _ in range(8):
             segment, episodes = collector.collect(Clock())
             ended = []
             for step in range(16):
@@ -383,11 +389,16 @@ def one_command(agent: str, run: Path, **changes: Any) -> Settings:
 
 
 @pytest.mark.timeout(600)
-def test_memory_matters(tmp_path: Path) -> None:
-    """One command that is shown and then hidden: the GRU learns to execute it; an agent without memory cannot."""
-    gru = checkpoint.load(train(one_command("gru", tmp_path / "gru")))
-    assert mean(evaluate(gru.agent, num_threads=1)) >= 0.085
-    updates = gru.update
+@pytest.mark.parametrize("agent", ["gru", "trxl"])
+def test_memory_matters(agent: str, tmp_path: Path) -> None:
+    """One command that is shown and then hidden: an agent with memory learns to execute it."""
+    trained = checkpoint.load(train(one_command(agent, tmp_path / agent)))
+    assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085
+
+
+@pytest.mark.timeout(600)
+def test_without_memory_the_task_is_not_learned(tmp_path: Path) -> None:
+    """The task of `test_memory_matters`, with as many updates as those agents need."""
     given = one_command("none", tmp_path / "none")
-    none = checkpoint.load(train(replace(given, ppo=replace(given.ppo, updates=updates))))
+    none = checkpoint.load(train(replace(given, ppo=replace(given.ppo, updates=70))))
     assert mean(evaluate(none.agent, num_threads=1)) < 0.04

@@ -7,12 +7,16 @@ while playing:
     observation, done = step(output.action)
     memory.reset(done)                              # where an episode has ended
 ```
+
+`act` is `observe`, `decide` and `remember`. A rollout sends the actions after `decide`, so that the environments step while
+`remember` updates the memory.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -22,6 +26,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from endless_gym.agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
 from endless_gym.agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
 from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym.agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
@@ -51,6 +56,10 @@ class AgentMemory:
     reset_mask: Tensor
     transform_state: TransformState
     state: MemoryState
+
+    def __post_init__(self) -> None:
+        """Make the mask of a step at which no episode starts."""
+        self.no_reset = torch.zeros_like(self.reset_mask)
 
     def reset(self, done: Tensor | NDArray[np.bool_]) -> None:
         """Mark the next observation as the first of an episode where `done`, bool (n,), is true."""
@@ -88,6 +97,21 @@ class ActOutput:
     log_prob: Tensor
     value: Tensor
     observation: Observation
+
+
+@dataclass
+class Decision:
+    """What `Agent.decide` returns for one step of n environments.
+
+    Attributes:
+        action: int64 (n, branches).
+        outputs: Logits and value, float32 (n, outputs); see `ActingWeights.heads`.
+        memory_update: What `Agent.remember` writes into the memory.
+    """
+
+    action: Tensor
+    outputs: Tensor
+    memory_update: Any
 
 
 @dataclass
@@ -146,6 +170,7 @@ class Agent(nn.Module):
         self.settings, self.device = settings, torch.device(device)
         self.branches = tuple(branches)
         self.transform = make_observation_transform(settings, shapes, self.device)
+        self._only_key = next(key for key in self.transform.shapes if key != POSITION)
         self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
         self.memory: AnyMemory
         if settings.agent == "gru" or settings.agent == "lstm":
@@ -177,6 +202,8 @@ class Agent(nn.Module):
                     "use an endless environment or the coefficient 0"
                 )
             self.ground_truth = GroundTruthHead(self.memory.width, settings.model.head_width, ground_truth)
+        self._weights: ActingWeights | None = None
+        self._watched: list[nn.Parameter] = []
         self.to(self.device)
         self.to(memory_format=torch.channels_last)
 
@@ -222,32 +249,79 @@ class Agent(nn.Module):
             generator: Generator that samples the actions, on the agent's device; None for PyTorch's default generator.
             greedy: Take the most likely choice of each branch instead of sampling.
         """
-        observed, transform_update = self.transform.apply(
-            self.to_tensors(observation), memory.transform_state, memory.reset_mask
-        )
+        observed, transform_update = self.observe(self.to_tensors(observation), memory)
+        noise = None if greedy else self.noise((len(memory.reset_mask),), generator)
+        decision = self.decide(observed, memory, noise)
+        self.remember(memory, decision, transform_update)
+        weights = self.acting_weights()
+        log_prob = weights.log_prob(decision.outputs, decision.action)
+        return ActOutput(decision.action, log_prob, decision.outputs[:, -1], observed)
+
+    def observe(self, observation: Observation, memory: AgentMemory) -> tuple[Observation, dict[str, Tensor]]:
+        """Transform an observation of n environments, tensors on the agent's device, without updating the memory.
+
+        Returns:
+            The observation that the network takes, and the update of the transform for `remember`.
+        """
+        return self.transform.apply(observation, memory.transform_state, memory.reset_mask)
+
+    @torch.no_grad()
+    def decide(self, observed: Observation, memory: AgentMemory, noise: Tensor | None) -> Decision:
+        """Choose actions, without updating the memory.
+
+        Args:
+            observed: What `observe` returned.
+            memory: Memory of the same n environments.
+            noise: Gumbel noise, float32 (n, branches, choices), as `noise` returns it; None for the most likely choices.
+        """
+        weights = self.acting_weights()
         with self._autocast():
-            hidden, memory_update = self.memory.step(self.encoder(observed), memory.state, memory.reset_mask)
-            self.memory.update_state(memory.state, memory_update)
-            hidden = self.body(hidden)
-            logits, value = self.policy(hidden), self.value(hidden)
+            hidden, memory_update = self.memory.step(self._encode(observed, weights), memory.state, memory.reset_mask)
+            outputs = weights.heads(hidden)
+        logits = weights.logits(outputs)
+        # The Gumbel-max trick: the largest of the logits with independent Gumbel noise is a sample of the policy.
+        action = (logits if noise is None else logits + noise).argmax(-1)
+        return Decision(action, outputs, memory_update)
+
+    @torch.no_grad()
+    def remember(self, memory: AgentMemory, decision: Decision, transform_update: dict[str, Tensor]) -> None:
+        """Update the memory after `decide`; the next observation continues the episodes until `AgentMemory.reset`."""
+        with self._autocast():
+            self.memory.update_state(memory.state, decision.memory_update)
         self.transform.update_state(memory.transform_state, transform_update)
-        memory.reset_mask = torch.zeros_like(memory.reset_mask)
-        actions, log_probs = [], []
-        for branch in logits:
-            branch = branch.log_softmax(-1)
-            action = branch.argmax(-1, keepdim=True) if greedy else self._sample(branch, generator)
-            actions.append(action)
-            log_probs.append(branch.gather(1, action))
-        return ActOutput(torch.cat(actions, 1), torch.cat(log_probs, 1), value, observed)
+        memory.reset_mask = memory.no_reset
 
     @torch.no_grad()
     def bootstrap_value(self, observation: RawObservation, memory: AgentMemory) -> Tensor:
         """Value estimates float32 (n,) of an observation, without updating the memory; arguments as for `act`."""
-        observed, _ = self.transform.apply(self.to_tensors(observation), memory.transform_state, memory.reset_mask)
-        with self._autocast():
-            hidden, _ = self.memory.step(self.encoder(observed), memory.state, memory.reset_mask)
-            value: Tensor = self.value(self.body(hidden))
-        return value
+        observed, _ = self.observe(self.to_tensors(observation), memory)
+        return self.decide(observed, memory, None).outputs[:, -1]
+
+    def noise(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
+        """Gumbel noise for `decide`, float32 (*shape, branches, choices)."""
+        drawn = torch.empty((*shape, len(self.branches), max(self.branches)), device=self.device)
+        return drawn.exponential_(generator=generator).log_().neg_()
+
+    def refresh(self) -> None:
+        """Make the weights for acting again at the next step.
+
+        That happens by itself after `forward` with gradients, and after changes of the parameters that PyTorch records; the step of
+        a fused optimizer is not recorded. A call is needed after a change that is neither.
+        """
+        self._weights = None
+
+    def acting_weights(self) -> ActingWeights:
+        """The weights for acting; made again if the parameters have changed, see `refresh`."""
+        if not self._watched:
+            self._watched = list(self.parameters())
+        version = weights_version(self._watched)
+        if self._weights is None or self._weights.version != version:
+            dtype = torch.bfloat16 if self.settings.bf16 else torch.float32
+            with torch.no_grad():
+                layers = (self.encoder.vector, self.body, self.policy, self.value)
+                self._weights = acting_weights(version, dtype, *layers)
+                self.memory.refresh(dtype)
+        return self._weights
 
     def forward(self, observation: Observation, minibatch: Minibatch) -> AgentOutput:
         """Compute the network's outputs for a minibatch, with gradients.
@@ -256,6 +330,8 @@ class Agent(nn.Module):
             observation: Transformed observations of the steps `minibatch.indices`, tensors (M, ...) on the agent's device.
             minibatch: A minibatch that `memory.minibatches` returned.
         """
+        if torch.is_grad_enabled():
+            self.refresh()
         with self._autocast():
             memory_output = self.memory(self.encoder(observation), minibatch)
             hidden = self.body(memory_output)
@@ -266,23 +342,40 @@ class Agent(nn.Module):
 
     def to_tensors(self, observation: RawObservation) -> Observation:
         """Convert a vector environment's observation to tensors on the agent's device; frames stay uint8."""
-        if not isinstance(observation, Mapping):
-            key = next(key for key in self.transform.shapes if key != POSITION)
-            observation = {key: observation}
         return {
             key: (value if isinstance(value, Tensor) else unchecked_torch_view(value)).to(
                 self.device, non_blocking=True
             )
-            for key, value in observation.items()
+            for key, value in self.as_mapping(observation).items()
         }
 
-    def _sample(self, log_probs: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Sample one choice for each row of log-probabilities (n, choices) with the Gumbel-max trick: int64 (n, 1)."""
-        noise = torch.empty_like(log_probs).exponential_(generator=generator).log_()
-        return (log_probs - noise).argmax(-1, keepdim=True)
+    def as_mapping(self, observation: RawObservation) -> Mapping[str, Any]:
+        """A vector environment's observation by key, whether its observation space is a dict or not."""
+        if isinstance(observation, Mapping):
+            return observation
+        return {self._only_key: observation}
 
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16)
+    def _encode(self, observed: Observation, weights: ActingWeights) -> Tensor:
+        """As `encoder`, with the weights for acting."""
+        if weights.vector is None:
+            encoded: Tensor = self.encoder(observed)
+            return encoded
+        vectors = self.encoder.vectors
+        joined = observed[vectors[0]] if len(vectors) == 1 else torch.cat([observed[key] for key in vectors], dim=-1)
+        vector = linear_relu(joined, weights.vector)
+        return vector if self.encoder.frames is None else torch.cat([self.encoder.frames(observed[FRAME]), vector], -1)
+
+    def _autocast(self) -> contextlib.AbstractContextManager[Any]:
+        if not self.settings.bf16:
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Agent:
+        # The parameters move, for example to another device.
+        self.refresh()
+        self._watched = []
+        super()._apply(fn, recurse)
+        return self
 
 
 def observation_shapes(spec: Spec, observation: str) -> dict[str, tuple[int, ...]]:

@@ -29,14 +29,12 @@ def generalised_advantages(
     Returns:
         The advantages, (T, N). The returns, targets of the value function, are the advantages plus `values`.
     """
-    advantages = torch.empty_like(rewards)
-    next_value, advantage = last_value, torch.zeros_like(last_value)
     not_done = (~dones).to(rewards.dtype)
-    for t in range(rewards.shape[0] - 1, -1, -1):
-        delta = rewards[t] + gamma * next_value * not_done[t] - values[t]
-        advantage = delta + gamma * gae_lambda * not_done[t] * advantage
-        advantages[t] = advantage
-        next_value = values[t]
+    advantages = rewards + gamma * torch.cat([values[1:], last_value.unsqueeze(0)]) * not_done - values  # the TD errors
+    # One operation for each step: its advantage is its TD error and the decayed advantage of the next step.
+    rows, decays = advantages.unbind(), (gamma * gae_lambda * not_done).unbind()
+    for t in range(len(rows) - 2, -1, -1):
+        rows[t].addcmul_(decays[t], rows[t + 1])
     return advantages
 
 
@@ -91,7 +89,7 @@ def ground_truth_loss(estimates: Tensor, truth: Tensor) -> Tensor:
     return (estimates - truth).square().mean()
 
 
-def explained_variance(values: Tensor, returns: Tensor) -> float:
+def explained_variance(values: Tensor, returns: Tensor) -> Tensor:
     """Fraction of the variance of `returns` that `values` explain, of equal shape; NaN if the returns have no variance."""
     variance = returns.var()
-    return float("nan") if variance == 0 else float(1.0 - (returns - values).var() / variance)
+    return (1.0 - (returns - values).var() / variance).masked_fill(variance == 0, float("nan"))

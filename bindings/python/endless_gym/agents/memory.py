@@ -14,9 +14,9 @@ With the same weights both give the same outputs.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar, overload
 
 import torch
 from torch import Tensor, nn
@@ -66,7 +66,10 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
 
     @abstractmethod
     def begin_segment(self, state: StateT, steps: int) -> None:
-        """Prepare the state for recording a segment of `steps` steps. The weights may have changed since the previous one."""
+        """Prepare the state for recording a segment of `steps` steps."""
+
+    def refresh(self, dtype: torch.dtype) -> None:
+        """Prepare the weights for `step`, to compute in `dtype`; called first, and when the weights have changed."""
 
     @abstractmethod
     def step(self, x: Tensor, state: StateT, reset_mask: Tensor) -> tuple[Tensor, UpdateT]:
@@ -132,6 +135,28 @@ def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Genera
     middle = size.cumsum(0) - size / 2
     part = (middle * num_parts / size.sum()).long()
     return [order[part == number] for number in range(num_parts) if bool((part == number).any())]
+
+
+class LazyMinibatches(Sequence[MinibatchT]):
+    """Minibatches that are made when they are needed, so that the memory of one is used at a time."""
+
+    def __init__(self, parts: Sequence[Tensor], make: Callable[[Tensor], MinibatchT]) -> None:
+        """Make the sequence; minibatch i is `make(parts[i])`."""
+        self._parts, self._make = parts, make
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    @overload
+    def __getitem__(self, index: int) -> MinibatchT: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[MinibatchT]: ...
+
+    def __getitem__(self, index: int | slice) -> MinibatchT | Sequence[MinibatchT]:
+        if isinstance(index, slice):
+            return LazyMinibatches(self._parts[index], self._make)
+        return self._make(self._parts[index])
 
 
 class NoState(MemoryState):

@@ -21,6 +21,12 @@ def linear_decay(initial: float, final: float, update: int, decay_updates: int) 
     return final + (initial - final) * max(0.0, 1.0 - update / decay_updates)
 
 
+def make_optimizer(agent: Agent, learning_rate: float) -> torch.optim.AdamW:
+    """AdamW with PyTorch's default coefficients, as one operation for all parameters where PyTorch has it."""
+    fused = agent.device.type in ("cpu", "cuda")
+    return torch.optim.AdamW(agent.parameters(), lr=learning_rate, fused=fused)
+
+
 def minibatch_loss(
     agent: Agent,
     segment: Segment,
@@ -107,10 +113,8 @@ def learn(
     returns = (advantages + segment.value).flatten()
     advantages = advantages.flatten()
     metrics = {
-        "learning_rate": learning_rate,
-        "entropy_coefficient": entropy_coefficient,
-        "value": float(segment.value.mean()),
-        "advantage": float(advantages.mean()),
+        "value": segment.value.mean(),
+        "advantage": advantages.mean(),
         "explained_variance": losses.explained_variance(segment.value.flatten(), returns),
     }
     if settings.advantage_normalisation == "batch":
@@ -128,4 +132,8 @@ def learn(
             for name, part in parts.items():
                 sums[name] += part
             count += 1
-    return metrics | {name: float(total / count) for name, total in sums.items()}
+    metrics |= {name: total / count for name, total in sums.items()}
+    # One copy to the host for all metrics.
+    numbers = torch.stack(list(metrics.values())).cpu().tolist()
+    rates = {"learning_rate": learning_rate, "entropy_coefficient": entropy_coefficient}
+    return rates | dict(zip(metrics, numbers, strict=True))

@@ -7,6 +7,7 @@ packed (`PackedSequence`): no step is padded, and the number of sequential steps
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
+from endless_gym.agents.acting import Affine, linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
 from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split
 from endless_gym.agents.settings import Recurrence
@@ -97,6 +99,9 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             else:
                 nn.init.zeros_(parameter)
 
+        self._embedding: Affine | None = None
+        self._cells: list[list[Tensor]] = []
+
     def initial_state(self, num_envs: int) -> RecurrentState:
         shape = (self.parts, self.settings.layers, num_envs, self.width)
         return RecurrentState(torch.zeros(shape, device=self.device))
@@ -104,19 +109,34 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
     def begin_segment(self, state: RecurrentState, steps: int) -> None:
         state.stored, state.time, state.steps = [], 0, steps
 
+    def refresh(self, dtype: torch.dtype) -> None:
+        self._embedding = None if self.embedding is None else transposed(self.embedding[0], dtype)
+        self._cells = [[weight.detach() for weight in layer] for layer in self.recurrent.all_weights]
+
     def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor) -> tuple[Tensor, Tensor]:
-        hidden = state.hidden.masked_fill(reset_mask[:, None], 0.0)
-        x = self._embed(x).float()
+        hidden = state.hidden.masked_fill(reset_mask.unsqueeze(-1), 0.0)
+        x = x.float() if self._embedding is None else linear_relu(x, self._embedding).float()
+        y = x
+        after: list[tuple[Tensor, ...]] = []
         with self._float32():
-            y, next_hidden = self.recurrent(x.unsqueeze(0), self._split(hidden))
-        y = y.squeeze(0)
-        return y + x if self.settings.residual else y, self._join(next_hidden)
+            for cell, *parts in zip(self._cells, *(part.unbind() for part in hidden.unbind()), strict=True):
+                if self.parts == 1:
+                    y = torch.gru_cell(y, parts[0], *cell)
+                    after.append((y,))
+                else:
+                    after.append(torch.lstm_cell(y, parts, *cell))
+                    y = after[-1][0]
+        if len(after) == 1 and self.parts == 1:
+            next_hidden = y[None, None]
+        else:
+            next_hidden = torch.stack([torch.stack(part) for part in zip(*after, strict=True)])
+        return y + x if self.settings.residual else y, next_hidden
 
     def update_state(self, state: RecurrentState, update: Tensor) -> None:
         if state.time < state.steps and state.time % self.settings.sequence_length == 0:
             state.stored.append(state.hidden)
         # Hidden states are replaced and never written in place, so the stored ones stay valid without a copy.
-        state.hidden, state.time = update.float(), state.time + 1
+        state.hidden, state.time = update, state.time + 1
 
     def minibatches(
         self, states: Sequence[RecurrentState], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
@@ -151,8 +171,10 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         y: Tensor = packed.data
         return y + x if self.settings.residual else y
 
-    def _float32(self) -> torch.autocast:
+    def _float32(self) -> contextlib.AbstractContextManager[Any]:
         """Disables autocast, which would run cuDNN's recurrent layers in float16 where bfloat16 is requested."""
+        if not torch.is_autocast_enabled(self.device.type):
+            return contextlib.nullcontext()
         return torch.autocast(self.device.type, enabled=False)
 
     def _embed(self, x: Tensor) -> Tensor:
@@ -163,7 +185,3 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
     def _split(self, hidden: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Convert (parts, layers, n, hidden size) to what `nn.GRU` or `nn.LSTM` takes."""
         return hidden[0] if self.parts == 1 else (hidden[0], hidden[1])
-
-    def _join(self, hidden: Tensor | tuple[Tensor, Tensor]) -> Tensor:
-        """The inverse of `_split`."""
-        return hidden.unsqueeze(0) if isinstance(hidden, Tensor) else torch.stack(hidden)

@@ -2,23 +2,27 @@
 
 The environments are divided into groups. While the agent computes the actions of one group, the other groups are stepped. A
 segment continues the episodes of the previous one.
+
+Between an observation and the actions is only what the actions need: the observation is copied to its place in the segment, the
+network reads it there, and the copy of the actions is the only operation that waits for the device. The memory is updated while
+the environments step; log-probabilities and values are computed from the stored outputs at the end of the segment.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from endless_gym.agents.agent import Agent, AgentMemory
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.encoders import FRAME, Observation
 from endless_gym.agents.environments import Environments, StepResult
-from endless_gym.interop import unchecked_torch_view
+from endless_gym.agents.host import HostCopy, Outcome, Upload
+from endless_gym.agents.naive import Identity
 
 
 @dataclass
@@ -66,13 +70,31 @@ class Segment:
         )
 
 
+@dataclass
+class Columns:
+    """The part of a segment that belongs to one group of n environments: for each step a view of the tensors.
+
+    Attributes:
+        observation: Transformed observations by key.
+        action: int64 (n, branches).
+        outputs: Logits and value, float32 (n, outputs).
+        outcome: Rewards and ends of episodes, float32 (2, n).
+        ground_truth: float32 (n, entries); empty if the agent does not estimate it.
+    """
+
+    observation: list[Observation]
+    action: Sequence[Tensor]
+    outputs: Sequence[Tensor]
+    outcome: Sequence[Tensor]
+    ground_truth: Sequence[Tensor]
+
+
 class RolloutCollector:
-    """Collects consecutive segments with an agent, in one preallocated `Segment`.
+    """Collects consecutive segments with an agent, in preallocated tensors.
 
     Attributes:
         memories: The agent's memory of each group of environments.
         current: The latest result of each group.
-        segment: The segment, overwritten by each `collect`.
     """
 
     def __init__(self, agent: Agent, environments: Environments, steps: int, generator: torch.Generator) -> None:
@@ -85,29 +107,26 @@ class RolloutCollector:
             generator: Generator that samples the actions, on the agent's device.
         """
         self.agent, self.environments, self.steps, self.generator = agent, environments, steps, generator
-        groups, per_group = environments.groups, environments.per_group
+        groups, per_group, device = environments.groups, environments.per_group, agent.device
         self.memories: list[AgentMemory] = [agent.initial_memory(per_group) for _ in range(groups)]
         self.current: list[StepResult] = [environments.reset(group) for group in range(groups)]
-        shape = (steps, groups * per_group)
-
-        def empty(*more: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros((*shape, *more), dtype=dtype, device=agent.device)
-
-        branches = len(agent.branches)
-        self.segment = Segment(
-            observation={
-                key: empty(*part, dtype=torch.uint8 if key == FRAME else torch.float32)
-                for key, part in agent.transform.shapes.items()
-            },
-            reset_mask=empty(dtype=torch.bool),
-            action=empty(branches, dtype=torch.long),
-            log_prob=empty(branches),
-            value=empty(),
-            reward=empty(),
-            done=empty(dtype=torch.bool),
-            ground_truth=empty(environments.spec.ground_truth) if agent.ground_truth is not None else None,
-            last_value=torch.zeros(shape[1], device=agent.device),
-        )
+        shape, branches = (steps, groups * per_group), len(agent.branches)
+        self._observation = {
+            key: torch.zeros((*shape, *part), dtype=torch.uint8 if key == FRAME else torch.float32, device=device)
+            for key, part in agent.transform.shapes.items()
+        }
+        self._action = torch.zeros((*shape, branches), dtype=torch.long, device=device)
+        self._outputs = torch.zeros((*shape, branches * max(agent.branches) + 1), device=device)
+        self._outcome = torch.zeros((steps, 2, shape[1]), device=device)
+        self._last_value = torch.zeros(shape[1], device=device)
+        self._first = torch.ones(shape[1], dtype=torch.bool, device=device)
+        self._ground_truth: Tensor | None = None
+        if agent.ground_truth is not None:
+            self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
+        self._parts = [self._columns(self._slice(group)) for group in range(groups)]
+        self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]
+        self._outcomes = [Outcome(per_group, device) for _ in range(groups)]
+        self._uploads = [Upload(device) for _ in range(groups)]
 
     def collect(self, clock: Clock) -> tuple[Segment, list[dict[str, float]]]:
         """Collect one segment.
@@ -116,27 +135,28 @@ class RolloutCollector:
             clock: Measures the phases `stepping` and `inference`.
 
         Returns:
-            The segment, which the next call overwrites, and the final infos of the episodes that ended.
+            The segment, whose tensors the next call overwrites, and the final infos of the episodes that ended.
         """
         episodes: list[dict[str, float]] = []
-        for memory in self.memories:
+        self.agent.refresh()
+        noise = self.agent.noise(self._action.shape[:2], self.generator)
+        for group, memory in enumerate(self.memories):
             self.agent.memory.begin_segment(memory.state, self.steps)
+            self._first[self._slice(group)] = memory.reset_mask
+        noises = [noise[:, self._slice(group)].unbind() for group in range(self.environments.groups)]
         for step in range(self.steps):
             for group in range(self.environments.groups):
                 if step:
                     with clock.measure("stepping"):
                         episodes += self._receive(group, step - 1)
-                with clock.measure("inference"):
-                    action = self._act(group, step)
-                with clock.measure("stepping"):
-                    self.environments.send(action, group)
+                self._act(group, step, noises[group][step], clock)
         for group, memory in enumerate(self.memories):
             with clock.measure("stepping"):
                 episodes += self._receive(group, self.steps - 1)
             with clock.measure("inference"):
                 value = self.agent.bootstrap_value(self.current[group].observation, memory)
-                self.segment.last_value[self._columns(group)] = value
-        return self.segment, episodes
+                self._last_value[self._slice(group)] = value
+        return self._segment(), episodes
 
     def state_dict(self) -> dict[str, Any]:
         """The memories and snapshots of the environments, for a checkpoint between two segments."""
@@ -151,33 +171,68 @@ class RolloutCollector:
         for memory, memory_state in zip(self.memories, state_dict["memories"], strict=True):
             memory.load_state_dict(memory_state)
 
-    def _act(self, group: int, step: int) -> NDArray[np.int64]:
-        columns, memory, current, segment = (
-            self._columns(group),
-            self.memories[group],
-            self.current[group],
-            self.segment,
-        )
-        segment.reset_mask[step, columns] = memory.reset_mask
-        if segment.ground_truth is not None and current.ground_truth is not None:
-            segment.ground_truth[step, columns] = unchecked_torch_view(current.ground_truth)
-        output = self.agent.act(current.observation, memory, self.generator)
-        for key, part in output.observation.items():
-            segment.observation[key][step, columns] = part
-        segment.action[step, columns] = output.action
-        segment.log_prob[step, columns] = output.log_prob
-        segment.value[step, columns] = output.value
-        action: NDArray[np.int64] = output.action.cpu().numpy()
-        return action
+    def _act(self, group: int, step: int, noise: Tensor, clock: Clock) -> None:
+        memory, current, part, agent = self.memories[group], self.current[group], self._parts[group], self.agent
+        with clock.measure("inference"):
+            slots, update = part.observation[step], dict[str, Tensor]()
+            if isinstance(agent.transform, Identity):
+                # Straight into the segment, where the network reads it.
+                for key, value in agent.as_mapping(current.observation).items():
+                    self._uploads[group].copy(key, value, slots[key])
+                observed = slots
+            else:
+                observed, update = agent.observe(agent.to_tensors(current.observation), memory)
+            decision = agent.decide(observed, memory, noise)
+            actions = self._actions[group]
+            actions.start(decision.action)
+            actions.wait()
+        with clock.measure("stepping"):
+            self.environments.send(actions.array, group)
+        with clock.measure("inference"):
+            # From here on the environments step.
+            agent.remember(memory, decision, update)
+            if observed is not slots:
+                for key, value in observed.items():
+                    slots[key].copy_(value)
+            part.action[step].copy_(decision.action)
+            part.outputs[step].copy_(decision.outputs)
+            if part.ground_truth and current.ground_truth is not None:
+                self._uploads[group].copy("ground truth", current.ground_truth, part.ground_truth[step])
 
     def _receive(self, group: int, step: int) -> list[dict[str, float]]:
-        columns, result = self._columns(group), self.environments.receive(group)
+        result = self.environments.receive(group)
         self.current[group] = result
-        self.segment.reward[step, columns] = unchecked_torch_view(result.reward)
-        done = torch.from_numpy(result.done).to(self.agent.device)
-        self.segment.done[step, columns] = done
-        self.memories[group].reset(done)
+        outcome = self._parts[group].outcome[step]
+        self._outcomes[group].copy_to(outcome, result.reward, result.done)
+        self.memories[group].reset_mask = outcome[1].bool()
         return result.episodes
 
-    def _columns(self, group: int) -> slice:
+    @torch.no_grad()
+    def _segment(self) -> Segment:
+        """The collected segment, with what is computed from the outputs of all its steps."""
+        done = self._outcome[:, 1].bool()
+        return Segment(
+            observation=self._observation,
+            reset_mask=torch.cat([self._first.unsqueeze(0), done[:-1]]),
+            action=self._action,
+            log_prob=self.agent.acting_weights().log_prob(self._outputs, self._action),
+            value=self._outputs[..., -1].contiguous(),
+            reward=self._outcome[:, 0].contiguous(),
+            done=done,
+            ground_truth=self._ground_truth,
+            last_value=self._last_value,
+        )
+
+    def _slice(self, group: int) -> slice:
         return slice(group * self.environments.per_group, (group + 1) * self.environments.per_group)
+
+    def _columns(self, columns: slice) -> Columns:
+        """The views of a group; made once, since making a view costs as much as a small operation."""
+        parts = {key: part[:, columns].unbind() for key, part in self._observation.items()}
+        return Columns(
+            observation=[{key: part[step] for key, part in parts.items()} for step in range(self.steps)],
+            action=self._action[:, columns].unbind(),
+            outputs=self._outputs[:, columns].unbind(),
+            outcome=self._outcome[:, :, columns].unbind(),
+            ground_truth=() if self._ground_truth is None else self._ground_truth[:, columns].unbind(),
+        )

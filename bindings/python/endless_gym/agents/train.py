@@ -27,7 +27,7 @@ from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.logs import Episodes, Logger
-from endless_gym.agents.ppo import learn
+from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
 
@@ -78,7 +78,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()
-        optimizer = torch.optim.AdamW(agent.parameters(), lr=ppo.learning_rate)
+        optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"])
         episodes, update, steps = Episodes(), 0, 0
         if resumed is not None:

@@ -7,12 +7,14 @@ layer with ReLU, residual connection or gate.
 
 Keys and values are projected once for each token, not once for each window that contains it:
 
-* Acting: a KV cache holds the keys and values of the window. Each step projects the newest token only. The cache is recomputed
-  when a segment begins, since the weights may have changed.
+* Acting: a KV cache holds the keys and values of the window, in a ring of fixed size (`transformer_cache`). Each step projects
+  the newest token only, for all blocks at once. The cache is recomputed when the weights have changed.
 * Learning: a sequence of C steps is processed at once with the tokens of the sequence and of the `window - 1` steps before it. A
   band mask (causal, as wide as the window, and within one episode) says which query attends to which token.
 
-At the first step of an episode there is no token to attend to, and the attention output before the final projection is 0.
+A query attends to the token of an earlier step if the distance in steps is at most `window - 1`, and at most the query's position
+in its episode. At the first step of an episode there is no token to attend to, and the attention output before the final
+projection is 0.
 """
 
 from __future__ import annotations
@@ -25,12 +27,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from endless_gym.agents.acting import Affine, linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
-from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split
+from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, balanced_split
 from endless_gym.agents.settings import Transformer
+from endless_gym.agents.transformer_cache import Projection, RingCache, ring_ages
 
 #: Columns of the cache beyond the window while no segment is recorded. When they are full, the window moves to the front.
 SPARE_COLUMNS = 64
+#: What is added to the score of a token that a query does not attend to. Finite, so that the softmax of a fully masked row and
+#: its gradient are finite with every attention kernel; the output of such a row is set to 0.
+MASKED = -1e30
 
 
 def sinusoids(positions: Tensor, width: int) -> Tensor:
@@ -76,39 +83,36 @@ class Attention(nn.Module):
         projected: Tensor = layer(x.unflatten(-1, split)) if shared else layer(x).unflatten(-1, split)
         return projected.transpose(-3, -2)
 
-    def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor, distance: Tensor) -> Tensor:
+    def forward(self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, distance: Tensor) -> Tensor:
         """Scaled dot-product attention.
 
         Args:
             x: Inputs of the queries, float (n, queries, width).
             keys: float (n, heads, tokens, head size).
             values: float (n, heads, tokens, head size).
-            mask: Attention mask, bool (n, queries, tokens); true where the query attends to the token.
+            bias: Attention mask, float32 (n, 1, queries, tokens); 0 where the query attends to the token, else `MASKED`.
+            first: Whether the query attends to no token, bool (n, queries, 1).
             distance: Steps from the token to the query, int64 (queries, tokens); used by the relative encoding.
 
         Returns:
             float (n, queries, width).
         """
         queries = self.project(self.queries, x)
-        # The softmax of a fully masked row, and its gradient, differ between attention kernels. Such a row attends to all tokens
-        # here, and its output is set to 0 below.
-        fully_masked = ~mask.any(-1, keepdim=True)
-        allowed = (mask | fully_masked).unsqueeze(1)
-        if not self.relative:
-            summed = functional.scaled_dot_product_attention(queries, keys, values, allowed, scale=self.scale)
-        else:
+        if self.relative:
             # Relative encoding of Dai et al., 2019: a content term and a distance term, each with a learned bias. A distance is
             # at most the number of tokens.
-            table = sinusoids(torch.arange(keys.shape[-2] + 1, device=x.device), x.shape[-1]).to(x.dtype)
-            encoded = self.project(self.distances, table)  # (heads, distances, size)
+            encoded = self.encoded_distances(torch.arange(keys.shape[-2] + 1, device=x.device), x.dtype)
             scores = (queries + self.distance_bias) @ encoded.transpose(-2, -1)  # (n, heads, queries, distances)
             chosen = distance.clamp(min=0).expand(*scores.shape[:2], *distance.shape)
-            bias = (scores.gather(-1, chosen) * self.scale).masked_fill(~allowed, float("-inf"))
-            content = queries + self.content_bias
-            summed = functional.scaled_dot_product_attention(content, keys, values, bias, scale=self.scale)
-        summed = summed.masked_fill(fully_masked.unsqueeze(1), 0.0)
-        out: Tensor = self.fc_out(summed.transpose(1, 2).flatten(-2))
+            bias = scores.gather(-1, chosen) * self.scale + bias
+            queries = queries + self.content_bias
+        summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
+        out: Tensor = self.fc_out(summed.transpose(1, 2).flatten(-2).masked_fill(first, 0.0))
         return out
+
+    def encoded_distances(self, distances: Tensor, dtype: torch.dtype) -> Tensor:
+        """Projected encodings of distances int64 (k,), float (heads, k, head size); only with the relative encoding."""
+        return self.project(self.distances, sinusoids(distances, self.heads * self.size).to(dtype))
 
 
 class Gate(nn.Module):
@@ -162,9 +166,9 @@ class Block(nn.Module):
         attention = self.attention
         return attention.project(attention.keys, tokens), attention.project(attention.values, tokens)
 
-    def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor, distance: Tensor) -> Tensor:
+    def forward(self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, distance: Tensor) -> Tensor:
         """The block's output, float (n, queries, width); arguments as for `Attention.forward`."""
-        attended: Tensor = self.attention(self.norm_query(x), keys, values, mask, distance)
+        attended: Tensor = self.attention(self.norm_query(x), keys, values, bias, first, distance)
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
         added: Tensor = self.fc(self.norm_fc(x)).relu()
         out: Tensor = x + added if self.gate_fc is None else self.gate_fc(x, added)
@@ -187,6 +191,53 @@ class Block(nn.Module):
                     layer.weight.mul_(0.67 * layers**-0.25)
 
 
+class ActingBlock:
+    """A block for one step of n environments, with few operations; see `acting`."""
+
+    def __init__(self, block: Block, dtype: torch.dtype) -> None:
+        """Prepare the weights of `block`, to compute in `dtype`."""
+        attention = block.attention
+        self.heads, self.size, self.scale = attention.heads, attention.size, attention.scale
+        self.rows = attention.queries.in_features  # a head's slice, or the whole vector
+        self.queries = attention.queries.weight.detach().t().to(dtype)
+        self.fc_out, self.fc = transposed(attention.fc_out, dtype), transposed(block.fc, dtype)
+        self.norm_query, self.norm_fc = (
+            (norm.normalized_shape, norm.weight.detach(), norm.bias.detach())
+            for norm in (block.norm_query, block.norm_fc)
+        )
+        self.gate_attention, self.gate_fc = block.gate_attention, block.gate_fc
+        self.content_bias = attention.content_bias.detach() if attention.relative else None
+        self.distance_bias = attention.distance_bias.detach() if attention.relative else None
+
+    def __call__(
+        self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, encoded: Tensor | None
+    ) -> Tensor:
+        """The block's output, float (n, width).
+
+        Args:
+            x: float (n, width).
+            keys: float (n, heads, tokens, head size).
+            values: float (n, heads, tokens, head size).
+            bias: Attention mask, float (n, 1, 1, tokens); 0 or `MASKED`.
+            first: Whether the query attends to no token, bool (n, 1).
+            encoded: Projected encodings of the distances of the tokens, float (heads, tokens, head size); None without relative
+                encoding.
+        """
+        normal = functional.layer_norm(x, *self.norm_query)
+        queries = torch.mm(normal.view(-1, self.rows), self.queries).view(-1, self.heads, 1, self.size)
+        if encoded is not None:
+            assert self.content_bias is not None and self.distance_bias is not None
+            bias = torch.add(bias, (queries + self.distance_bias) @ encoded.transpose(-2, -1), alpha=self.scale)
+            queries = queries + self.content_bias
+        summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
+        summed = summed.transpose(1, 2).reshape(x.shape).masked_fill_(first, 0.0)
+        attended = torch.addmm(self.fc_out[0], summed, self.fc_out[1])
+        x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
+        added = linear_relu(functional.layer_norm(x, *self.norm_fc), self.fc)
+        out: Tensor = x + added if self.gate_fc is None else self.gate_fc(x, added)
+        return out
+
+
 class TransformerState(MemoryState):
     """The tokens of n environments in lockstep, with the KV cache.
 
@@ -195,14 +246,10 @@ class TransformerState(MemoryState):
 
     Attributes:
         inputs: Tokens: the input of each block at each step, float32 (layers, n, columns, width).
-        keys: KV cache: keys of the tokens with the current weights, float32 (layers, n, heads, columns, head size); None while
-            the cache is invalid.
-        values: As `keys`.
         position: Step number within its episode, int64 (n, columns).
-        episode: Number of the episode in its environment, int64 (n, columns); -1 in columns without a step.
-        current_episode: Number of the current episode, int64 (n,).
         next_position: Position of the next step unless it starts an episode, int64 (n,).
         fill: Number of columns in use.
+        cache: Keys and values of the window; None while they are to be computed.
     """
 
     def __init__(self, settings: Transformer, num_envs: int, device: torch.device) -> None:
@@ -212,47 +259,35 @@ class TransformerState(MemoryState):
         columns = self.past + SPARE_COLUMNS
         self.inputs = torch.zeros(settings.layers, num_envs, columns, settings.width, device=device)
         self.position = torch.zeros(num_envs, columns, dtype=torch.long, device=device)
-        self.episode = torch.full((num_envs, columns), -1, device=device)
-        self.current_episode = torch.zeros(num_envs, dtype=torch.long, device=device)
         self.next_position = torch.zeros(num_envs, dtype=torch.long, device=device)
-        self.keys: Tensor | None = None
-        self.values: Tensor | None = None
+        self.cache: RingCache | None = None
 
     def compact(self, spare_columns: int) -> None:
-        """Keep only the last `window - 1` columns, add `spare_columns` free columns, and invalidate the KV cache."""
+        """Keep only the last `window - 1` columns, and add `spare_columns` free columns."""
         columns, start = self.past + spare_columns, self.fill - self.past
 
-        def moved(tensor: Tensor, dim: int, empty: int) -> Tensor:
-            kept = tensor.narrow(dim, start, self.past)
-            shape = (*tensor.shape[:dim], columns, *tensor.shape[dim + 1 :])
-            fresh = tensor.new_full(shape, empty)
-            fresh.narrow(dim, 0, self.past).copy_(kept)
+        def moved(tensor: Tensor, dim: int) -> Tensor:
+            fresh = tensor.new_zeros((*tensor.shape[:dim], columns, *tensor.shape[dim + 1 :]))
+            fresh.narrow(dim, 0, self.past).copy_(tensor.narrow(dim, start, self.past))
             return fresh
 
-        self.inputs = moved(self.inputs, 2, 0)
-        self.position, self.episode = moved(self.position, 1, 0), moved(self.episode, 1, -1)
-        self.keys = self.values = None
+        self.inputs, self.position = moved(self.inputs, 2), moved(self.position, 1)
         self.fill = self.past
 
     def state_dict(self) -> dict[str, Any]:
-        # The keys are those of the checkpoint format.
         return {
             "fill": self.fill,
             "inputs": self.inputs,
             "position": self.position,
-            "episode": self.episode,
-            "running": self.current_episode,
             "next_position": self.next_position,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         device = self.inputs.device
         self.fill = state_dict["fill"]
-        self.inputs = state_dict["inputs"].to(device)
-        self.position, self.episode = state_dict["position"].to(device), state_dict["episode"].to(device)
-        self.current_episode = state_dict["running"].to(device)
+        self.inputs, self.position = state_dict["inputs"].to(device), state_dict["position"].to(device)
         self.next_position = state_dict["next_position"].to(device)
-        self.keys = self.values = None
+        self.cache = None
 
 
 @dataclass
@@ -260,13 +295,11 @@ class TransformerUpdate:
     """The newest column of a `TransformerState`.
 
     Attributes:
-        inputs: The input of each block, float (layers, n, 1, width).
-        episode: int64 (n,).
+        inputs: The input of each block, list of float (n, width).
         position: int64 (n,).
     """
 
-    inputs: Tensor
-    episode: Tensor
+    inputs: list[Tensor]
     position: Tensor
 
 
@@ -277,13 +310,15 @@ class TransformerMinibatch(Minibatch):
     Attributes:
         tokens: The cached inputs of each block, float32 (layers, sequences, P + C, width).
         position: Position of each token in its episode, int64 (sequences, P + C).
-        mask: Attention mask, bool (sequences, C, P + C); true where the query attends to the token.
+        bias: Attention mask, float32 (sequences, 1, C, P + C); 0 where the query attends to the token, else `MASKED`.
+        first: Whether the query is the first step of an episode, bool (sequences, C, 1).
         distance: Steps from each token to each query, int64 (C, P + C).
     """
 
     tokens: Tensor
     position: Tensor
-    mask: Tensor
+    bias: Tensor
+    first: Tensor
     distance: Tensor
 
 
@@ -315,6 +350,11 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             self.table = nn.Parameter(torch.randn(positions, settings.width))
         else:
             self.register_buffer("table", None)
+        self._dtype, self._generation = torch.float32, 0
+        self._embedding: Affine | None = None
+        self._acting: list[ActingBlock] = []
+        self._ages = ring_ages(settings.window, device)
+        self._attended, self._masked = torch.zeros((), device=device), torch.full((), MASKED, device=device)
 
     @property
     def blocks(self) -> list[Block]:
@@ -326,34 +366,43 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
 
     def begin_segment(self, state: TransformerState, steps: int) -> None:
         state.compact(steps)
+        state.cache = None
+
+    def refresh(self, dtype: torch.dtype) -> None:
+        self._dtype, self._generation = dtype, self._generation + 1
+        self._embedding = transposed(self.embedding[0], dtype)
+        self._acting = [ActingBlock(block, dtype) for block in self.blocks]
 
     def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor) -> tuple[Tensor, TransformerUpdate]:
-        keys, values = self._kv_cache(state)
-        episode = state.current_episode + reset_mask.long()
+        assert self._embedding is not None, "refresh was not called"
+        cache = self._cache(state)
         position = state.next_position.masked_fill(reset_mask, 0)
-        past = self._past_length(position)
-        window = slice(state.fill - past, state.fill)
-        mask = (state.episode[:, window] == episode.unsqueeze(1)).unsqueeze(1)  # (n, 1, past)
-        distance = torch.arange(past, 0, -1, device=self.device).unsqueeze(0)
-        x = self.embedding(x).unsqueeze(1)
+        # On the CPU the largest position is known without waiting for a device, and the attention is as short as the episodes.
+        past = self.past if self.device.type != "cpu" else min(self.past, max(1, int(position.numpy().max())))
+        start, length = cache.span(past)
+        offset = self.settings.window - cache.slot + start
+        attends = self._ages[offset : offset + length] <= position.unsqueeze(-1)
+        bias = torch.where(attends, self._attended, self._masked)[:, None, None].to(self._dtype)
+        first = (position == 0).unsqueeze(-1)
+        keys, values = cache.keys_and_values(start, length)
+        encoding = self._encoding(position) if self.settings.query_encoding else None
+        x = linear_relu(x, self._embedding)
         inputs = []
-        for layer, block in enumerate(self.blocks):
+        for layer, block in enumerate(self._acting):
             inputs.append(x)
-            x = self._query_input(x, position.unsqueeze(1))
-            x = block(x, keys[layer, :, :, window], values[layer, :, :, window], mask, distance)
-        return x.squeeze(1), TransformerUpdate(torch.stack(inputs), episode, position)
+            x = x if encoding is None else x + encoding
+            distances = cache.distances[layer][:, offset : offset + length] if cache.distances else None
+            x = block(x, keys[layer], values[layer], bias, first, distances)
+        return x, TransformerUpdate(inputs, position)
 
     def update_state(self, state: TransformerState, update: TransformerUpdate) -> None:
         if state.fill == state.inputs.shape[2]:
             state.compact(SPARE_COLUMNS)
-        keys, values = self._kv_cache(state)
-        column, inputs = state.fill, update.inputs.float()
-        state.inputs[:, :, column] = inputs.squeeze(2)
-        state.episode[:, column], state.position[:, column] = update.episode, update.position
-        state.current_episode, state.next_position = update.episode, update.position + 1
-        for layer, block in enumerate(self.blocks):
-            key, value = block.keys_and_values(self._add_positions(inputs[layer], update.position.unsqueeze(1)))
-            keys[layer, :, :, column], values[layer, :, :, column] = key.squeeze(2), value.squeeze(2)
+        cache, inputs = self._cache(state), torch.stack(update.inputs).float()
+        state.inputs.select(2, state.fill).copy_(inputs)
+        state.position.select(1, state.fill).copy_(update.position)
+        state.next_position = update.position + 1
+        cache.append(inputs if self.table is None else inputs + self._encoding(update.position))
         state.fill += 1
 
     def minibatches(
@@ -361,67 +410,69 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
     ) -> Sequence[TransformerMinibatch]:
         steps, envs = reset_mask.shape
         length = min(self.settings.sequence_length, steps)
-        position = torch.cat([state.position for state in states])
-        past = self._past_length(position[:, self.past :])
-        span, skipped = past + length, self.past - past
+        longest = torch.stack([state.position[:, self.past :].max() for state in states]).max()
+        past = max(1, min(self.past, int(longest)))
+        span, skipped, sequences = past + length, self.past - past, steps // length
         # Columns that no query attends to are skipped. Then column c is step c - past, and sequence s of an environment spans the
-        # columns from s * length to s * length + span.
-        position = position[:, skipped:].unfold(1, span, length)
-        inputs = torch.cat([state.inputs[:, :, skipped:] for state in states], dim=1).unfold(2, span, length)
-        episode = torch.cat([state.episode[:, skipped:] for state in states]).unfold(1, span, length)
-        sequences = steps // length
+        # columns from s * length to s * length + span. These are views: only the tokens of a minibatch are copied.
+        inputs = [state.inputs[:, :, skipped:].unfold(2, span, length) for state in states]
+        position = torch.cat([state.position[:, skipped:].unfold(1, span, length) for state in states])
         distance = torch.arange(past, span, device=self.device).unsqueeze(1) - torch.arange(span, device=self.device)
-        band = (distance > 0) & (distance < self.settings.window)
-        minibatches = []
-        for chosen in balanced_split([length] * (envs * sequences), num_minibatches, generator):
+        outside = (distance < 1) | (distance > self.past)
+        per_group = envs // len(states)
+
+        def minibatch(chosen: Tensor) -> TransformerMinibatch:
+            chosen = chosen.sort().values
             env, sequence = chosen // sequences, chosen % sequences
             time = (sequence * length).unsqueeze(1) + torch.arange(length)
+            counts = torch.bincount(env // per_group, minlength=len(states)).tolist()
             env_, sequence_ = env.to(self.device), sequence.to(self.device)
-            episodes = episode[env_, sequence_]
-            mask = band & (episodes[:, past:, None] == episodes[:, None, :])
-            minibatches.append(
-                TransformerMinibatch(
-                    indices=(time * envs + env.unsqueeze(1)).flatten().to(self.device),
-                    tokens=inputs[:, env_, sequence_].transpose(2, 3),
-                    position=position[env_, sequence_],
-                    mask=mask,
-                    distance=distance,
-                )
+            tokens = [
+                group[:, rows % per_group, columns]
+                for group, rows, columns in zip(inputs, env_.split(counts), sequence_.split(counts), strict=True)
+            ]
+            positions = position[env_, sequence_]
+            queries = positions[:, past:].unsqueeze(-1)
+            bias = torch.zeros(len(chosen), length, span, device=self.device)
+            return TransformerMinibatch(
+                indices=(time * envs + env.unsqueeze(1)).flatten().to(self.device),
+                tokens=torch.cat(tokens, dim=1).transpose(2, 3),
+                position=positions,
+                bias=bias.masked_fill_(outside | (distance > queries), MASKED).unsqueeze(1),
+                first=queries == 0,
+                distance=distance,
             )
-        return minibatches
+
+        return LazyMinibatches(balanced_split([length] * (envs * sequences), num_minibatches, generator), minibatch)
 
     def forward(self, x: Tensor, minibatch: TransformerMinibatch) -> Tensor:
         length, span = minibatch.distance.shape
         x = self.embedding(x).unflatten(0, (-1, length))
-        position = minibatch.position[:, span - length :]
+        encoding = None if self.table is None else self._encoding(minibatch.position)
+        queries = encoding[:, span - length :] if encoding is not None and self.settings.query_encoding else None
         for block, tokens in zip(self.blocks, minibatch.tokens, strict=True):
-            keys, values = block.keys_and_values(self._add_positions(tokens, minibatch.position))
-            x = block(self._query_input(x, position), keys, values, minibatch.mask, minibatch.distance)
+            keys, values = block.keys_and_values(tokens if encoding is None else tokens + encoding)
+            x = x if queries is None else x + queries
+            x = block(x, keys, values, minibatch.bias, minibatch.first, minibatch.distance)
         return x.flatten(0, 1)
 
-    def _past_length(self, position: Tensor) -> int:
-        """The largest number of past steps that a query at one of these positions can attend to; 1 or more."""
-        return max(1, min(self.past, int(position.max())))
+    def _encoding(self, position: Tensor) -> Tensor:
+        """Encodings of positions int64 (...,), float32 (..., width). Positions beyond the table share its last row."""
+        assert self.table is not None
+        return functional.embedding(position.clamp(max=self.positions - 1), self.table)
 
-    def _add_positions(self, tokens: Tensor, position: Tensor) -> Tensor:
-        """Add the encodings of positions int64 (...,) to tokens (..., width). Positions beyond the table share its last row."""
-        if self.table is None:
-            return tokens
-        return tokens + self.table[position.clamp(max=self.positions - 1)]
-
-    def _query_input(self, x: Tensor, position: Tensor) -> Tensor:
-        return self._add_positions(x, position) if self.settings.query_encoding else x
-
-    def _kv_cache(self, state: TransformerState) -> tuple[Tensor, Tensor]:
-        """The keys and values of the state's tokens; computed with the current weights if the cache is invalid."""
-        if state.keys is not None and state.values is not None:
-            return state.keys, state.values
-        used = slice(0, state.fill)
-        shape = (len(self.blocks), state.inputs.shape[1], self.settings.heads, state.inputs.shape[2])
-        size = self.width // self.settings.heads
-        state.keys, state.values = (state.inputs.new_zeros(*shape, size) for _ in range(2))
-        for layer, block in enumerate(self.blocks):
-            tokens = self._add_positions(state.inputs[layer, :, used], state.position[:, used])
-            keys, values = block.keys_and_values(tokens)
-            state.keys[layer, :, :, used], state.values[layer, :, :, used] = keys.float(), values.float()
-        return state.keys, state.values
+    def _cache(self, state: TransformerState) -> RingCache:
+        """The keys and values of the state's tokens; computed with the current weights if there are none of these weights."""
+        if state.cache is None or state.cache.generation != self._generation:
+            window = slice(state.fill - self.past, state.fill)
+            tokens = state.inputs[:, :, window]
+            if self.table is not None:
+                tokens = tokens + self._encoding(state.position[:, window])
+            blocks = self.blocks
+            projection = Projection([block.norm_tokens for block in blocks], [block.attention for block in blocks])
+            distances = None
+            if blocks[0].attention.relative:
+                ages = torch.arange(2 * self.settings.window, device=self.device).neg() % self.settings.window
+                distances = [block.attention.encoded_distances(ages, self._dtype) for block in blocks]
+            state.cache = RingCache(projection, tokens, self._generation, self._dtype, distances)
+        return state.cache

@@ -1,0 +1,83 @@
+"""Copies between the host and the agent's device, of which only one waits: that of the actions.
+
+On the CPU the copies are cheap and nothing waits. On CUDA they go through page-locked memory and are asynchronous.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from endless_gym.interop import unchecked_torch_view
+
+
+class HostCopy:
+    """A tensor of the device on the host: `start` begins the copy, and `wait` waits for it.
+
+    Attributes:
+        array: The tensor on the host, valid after `wait` and until the next `start`.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> None:
+        """Allocate the memory on the host, page-locked for CUDA."""
+        self._cuda = device.type == "cuda"
+        self._tensor = torch.empty(shape, dtype=dtype, pin_memory=self._cuda)
+        self._done = torch.cuda.Event() if self._cuda else None
+        self.array: NDArray[Any] = self._tensor.numpy()
+
+    def start(self, tensor: Tensor) -> None:
+        """Begin to copy `tensor`; on CUDA, later operations on the same stream do not delay the copy."""
+        self._tensor.copy_(tensor, non_blocking=True)
+        if self._done is not None:
+            self._done.record()
+
+    def wait(self) -> None:
+        """Wait until the copy is complete."""
+        if self._done is not None:
+            self._done.synchronize()
+
+
+class Outcome:
+    """Rewards and ends of episodes of n environments, which go to the device in one copy."""
+
+    def __init__(self, num_envs: int, device: torch.device) -> None:
+        """Allocate the memory on the host, page-locked for CUDA."""
+        self._tensor = torch.empty(2, num_envs, pin_memory=device.type == "cuda")
+        self._array: NDArray[np.float32] = self._tensor.numpy()
+
+    def copy_to(self, target: Tensor, reward: NDArray[np.float64], done: NDArray[np.bool_]) -> None:
+        """Copy rewards and ends of episodes, (n,) each, to float32 (2, n) on the device.
+
+        The copy before must be complete; it is when the actions of a later step have arrived, since copies are in order.
+        """
+        self._array[0], self._array[1] = reward, done
+        target.copy_(self._tensor, non_blocking=True)
+
+
+class Upload:
+    """Copies arrays of the host, by name, to tensors of the device.
+
+    For CUDA the array is first copied to page-locked memory of this process. An engine's shared memory is not page-locked itself:
+    it is unmapped when the engine fails, and CUDA would go on reading the pages of the failed one.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        """Make the copies to `device`."""
+        self._cuda = device.type == "cuda"
+        self._staged: dict[str, Tensor] = {}
+
+    def copy(self, name: str, array: NDArray[Any], target: Tensor) -> None:
+        """Begin to copy `array` to `target`, of equal shape; the array may change afterwards.
+
+        The copy before under this name must be complete; see `Outcome.copy_to`.
+        """
+        source = unchecked_torch_view(array)
+        if self._cuda:
+            if name not in self._staged:
+                self._staged[name] = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)
+            source = self._staged[name].copy_(source)
+        target.copy_(source, non_blocking=True)

@@ -1,0 +1,64 @@
+"""Counts the operations that PyTorch dispatches, and those that wait for a device."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from other_device import WAITING
+from torch.utils._python_dispatch import TorchDispatchMode
+
+#: Operations that only make a view: they compute nothing on a device.
+VIEWS = {
+    *(
+        "alias",
+        "as_strided",
+        "detach",
+        "diagonal",
+        "expand",
+        "narrow",
+        "permute",
+        "_reshape_alias",
+        "select",
+        "slice",
+        "split",
+    ),
+    *(
+        "split_with_sizes",
+        "squeeze",
+        "t",
+        "transpose",
+        "unbind",
+        "unfold",
+        "unsafe_split",
+        "_unsafe_view",
+        "unsqueeze",
+        "view",
+    ),
+}
+
+
+class Operations(TorchDispatchMode):
+    """Context that counts operations.
+
+    Attributes:
+        calls: Number of calls by name of the operation.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: Counter[str] = Counter()
+
+    @property
+    def computed(self) -> int:
+        """Number of operations that compute something."""
+        return sum(number for name, number in self.calls.items() if name not in VIEWS)
+
+    @property
+    def waiting(self) -> int:
+        """Number of operations that wait for a device."""
+        return sum(number for name, number in self.calls.items() if name in WAITING)
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.calls[operation.overloadpacket.__name__] += 1
+        return operation(*args, **(kwargs or {}))

@@ -1,0 +1,110 @@
+"""Budgets of the operations and of the waits for the device of an `act` and of an update.
+
+The speed of tiny networks and small minibatches is limited by the number of operations, on the CPU and on a GPU. Operations that
+only make a view are not counted.
+"""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from agents_helpers import settings
+from operations import Operations
+
+from endless_gym.agents.agent import make_agent
+from endless_gym.agents.clock import Clock
+from endless_gym.agents.environments import Environments
+from endless_gym.agents.ppo import learn, make_optimizer
+from endless_gym.agents.rollout import RolloutCollector
+from endless_gym.agents.settings import Settings
+
+STEPS, GROUPS = 16, 2
+
+#: Operations of one step of one group, and of one minibatch, each with its share of what is done once for a segment or an
+#: update. The Transformer-XL has two blocks, and the actions two branches. A change that needs more must say why.
+BUDGETS = {"none": (16, 200), "gru": (32, 510), "lstm": (36, 505), "trxl": (56, 315), "gtrxl": (116, 465)}
+
+
+def small(agent: str) -> Settings:
+    given = settings(agent, env="Endless-MortarMayhem-v0", threads=1)
+    return replace(
+        given,
+        environment=replace(given.environment, num_envs=8, groups=GROUPS, num_threads=1),
+        ppo=replace(given.ppo, steps=STEPS, epochs=2, minibatches=2),
+    )
+
+
+def counted(agent: str, device: str = "cpu") -> dict[str, float]:
+    """Operations of the second segment and update; the first one makes what is made once."""
+    given = small(agent)
+    with Environments(given) as environments:
+        made = make_agent(given, environments.spec, device)
+        collector = RolloutCollector(made, environments, STEPS, torch.Generator(device).manual_seed(1))
+        optimizer = make_optimizer(made, 1e-3)
+        counts = {}
+        for _ in range(2):
+            with Operations() as rollout:
+                segment, _ = collector.collect(Clock())
+            with Operations() as update:
+                states = [memory.state for memory in collector.memories]
+                learn(made, optimizer, segment, states, 1, given.ppo, torch.Generator().manual_seed(0))
+            minibatches = given.ppo.epochs * given.ppo.minibatches
+            counts = {
+                "act": rollout.computed / (STEPS * GROUPS),
+                "update": update.computed / minibatches,
+                "waiting": rollout.waiting,
+            }
+    return counts
+
+
+@pytest.mark.parametrize("agent", BUDGETS)
+def test_operations_are_within_the_budget(agent: str) -> None:
+    act, update = BUDGETS[agent]
+    counts = counted(agent)
+    assert counts["waiting"] == 0
+    assert counts["act"] <= act
+    assert counts["update"] <= update
+
+
+def test_act_waits_only_for_the_actions() -> None:
+    """Counted on a stand-in for a CUDA device; in a subprocess, since a registered device cannot be removed."""
+    program = f"""
+import sys
+
+sys.path.append({str(Path(__file__).parent)!r})
+import json
+import other_device
+import test_agents_operations
+from endless_gym.agents import ppo, rollout
+
+other_device.register()
+found = {{}}
+collect, learn = rollout.RolloutCollector.collect, ppo.learn
+
+def counting(name, function):
+    def run(*args):
+        other_device.waits.clear()
+        result = function(*args)
+        found[name] = dict(other_device.waits)
+        return result
+    return run
+
+rollout.RolloutCollector.collect = counting("collect", collect)
+test_agents_operations.learn = counting("learn", learn)
+for agent in ("gru", "trxl", "stack"):
+    with other_device.device():
+        test_agents_operations.counted(agent, other_device.NAME)
+    print(json.dumps(found))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for line in done.stdout.splitlines():
+        found = json.loads(line)
+        # Each action is copied to the CPU, and nothing else waits.
+        assert found["collect"] == {"copy_": STEPS * GROUPS}, line
+        # The reset mask and the metrics; the Transformer-XL also needs the length of the longest episode, in each of two epochs.
+        assert sum(found["learn"].values()) <= 2 + 2, line
