@@ -9,6 +9,7 @@ import torch
 from agents_helpers import BRANCHES, make, settings, transformer
 
 from endless_gym import spec
+from endless_gym.agents import curves
 from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
 from endless_gym.agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
@@ -95,6 +96,29 @@ def test_window_and_positions_follow_the_longest_episode(
     assert (fixed.window(), fixed.positions()) == (9, 11)
 
 
+def test_run_lengths_are_those_of_the_published_curves() -> None:
+    """A published curve has a point every 500 updates, the first one before training."""
+    agents = {"16stack": "stack", "4stack": "stack", "ppo": "none", "pos_enc": "position"}
+    for env, runs in curves._published()["curves"].items():
+        for run, scores in runs.items():
+            agent = agents.get(run, run.split("_")[0])
+            given = replace(PAPER, env=env, agent=agent).validated()
+            assert given.ppo.updates == 500 * (len(scores[0]) - 1), (env, run)
+            assert given.ppo.decay_updates == 10_000
+    fewer = replace(PAPER, environment=replace(PAPER.environment, num_envs=8)).validated()
+    assert fewer.ppo.updates == 4 * PAPER.validated().ppo.updates
+    assert replace(PAPER, ppo=replace(PAPER.ppo, updates=7)).validated().ppo.updates == 7
+
+
+def test_preset_throughput_512_keeps_the_steps_of_the_paper() -> None:
+    given = PRESETS["throughput-512"].validated()
+    assert (given.environment.num_envs, given.ppo.steps, given.recurrence.sequence_length) == (128, 512, 512)
+    batch, paper = 128 * 512, 32 * 512
+    assert batch / given.ppo.minibatches == paper / PAPER.ppo.minibatches
+    assert batch * given.ppo.updates == paper * PAPER.validated().ppo.updates
+    assert batch * given.ppo.decay_updates == paper * PAPER.ppo.decay_updates
+
+
 def test_preset_throughput_has_more_environments_and_equal_steps_per_update() -> None:
     given = PRESETS["throughput"]
     assert (given.environment.num_envs, given.ppo.steps) == (512, 32)
@@ -122,7 +146,8 @@ def test_preset_old_differs_only_in_its_column() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_settings_round_trip_through_dicts(name: str) -> None:
     given = replace(PRESETS[name], environment=replace(PAPER.environment, option=("command_count=[2]",)))
-    assert from_dict(to_dict(given)) == given.validated()
+    assert from_dict(to_dict(given)) == given
+    assert from_dict(to_dict(given.validated())) == given.validated()
 
 
 @pytest.mark.parametrize(
@@ -277,13 +302,12 @@ def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
     [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))],
 )
 def test_uniform_initialisations(kind: str, bound: float) -> None:
-    """The weights of a block are within the bound and close to it; T-Fixup scales three of the matrices."""
+    """The weights of a block are within the bound and close to it; T-Fixup scales the output projection."""
     block = Block(Transformer(layers=3, width=64, heads=4, shared_heads=False, initialisation=kind))
-    scaled = ("values", "fc_out", "fc.")
     for name, weight in block.named_parameters():
         if weight.dim() < 2:
             continue
-        factor = 0.67 * 3**-0.25 if kind == "tfixup" and any(part in name for part in scaled) else 1.0
+        factor = 0.67 * 3**-0.25 if kind == "tfixup" and "fc_out" in name else 1.0
         assert 0.98 * bound * factor < float(weight.abs().max()) <= bound * factor, name
 
 
@@ -291,6 +315,17 @@ def test_orthogonal_initialisation() -> None:
     block = Block(Transformer(width=64, heads=4, shared_heads=False, initialisation="orthogonal"))
     for weight in (block.fc.weight, block.attention.queries.weight):
         torch.testing.assert_close(weight @ weight.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
+
+
+def test_initialisation_of_gates_and_relative_biases() -> None:
+    """The matrices of the gates have the initialisation of the block, each on its own; the biases of the encoding are 0."""
+    changes = {"shared_heads": False, "gating": True, "positional_encoding": "relative"}
+    block = Block(Transformer(width=64, heads=4, initialisation="orthogonal", gate_bias=2.0, **changes))
+    for gate in (block.gate_attention, block.gate_fc):
+        for matrix in (*gate.from_y.weight.chunk(3), *gate.from_x.weight.chunk(2), gate.from_reset.weight):
+            torch.testing.assert_close(matrix @ matrix.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
+        assert torch.equal(gate.bias, torch.full((64,), 2.0))
+    assert not block.attention.content_bias.any() and not block.attention.distance_bias.any()
 
 
 @pytest.mark.parametrize("bias", [0.0, 2.0])

@@ -209,7 +209,7 @@ class Trials:
         changed = self.changed(choices)
         self.console.print(f"[bold]trial {trial.number}[/]: {changed or 'initial settings'}", soft_wrap=True)
         try:
-            settings.validated()
+            settings = settings.validated()
         except ValueError as error:
             self.console.print(f"trial {trial.number} is invalid: {error}", soft_wrap=True)
             raise optuna.TrialPruned from error

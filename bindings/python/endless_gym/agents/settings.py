@@ -15,10 +15,32 @@ from endless_gym.agents.metrics import is_finite
 from endless_gym.specs import DEFAULT_ENV_ID, spec
 
 AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
-PresetName = Literal["paper", "old", "throughput", "quick"]
+PresetName = Literal["paper", "old", "throughput", "throughput-512", "quick"]
 
 #: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
 TRAINING_SEEDS = range(100_000)
+
+
+#: Environment steps of one update in the paper: 32 environments, 512 steps each.
+PAPER_STEPS_PER_UPDATE = 32 * 512
+
+
+def paper_run_length(env: str, agent: str) -> int:
+    """Updates of the paper's runs, as its published curves have them; for what it does not train, those of the closest.
+
+    Args:
+        env: Canonical environment id.
+        agent: Name of the agent.
+    """
+    if env.startswith("Endless"):
+        return 50_000
+    if "Grid" in env:
+        return 10_000
+    if env.startswith("MortarMayhem"):
+        return 30_000
+    if env.startswith("SearingSpotlights") and agent not in ("gru", "trxl"):
+        return 16_000 if agent == "lstm" else 20_000
+    return 25_000
 
 
 @dataclass(frozen=True)
@@ -108,8 +130,10 @@ class Model:
 class PPO:
     """Proximal policy optimisation and loss coefficients."""
 
-    updates: int = 10_000
-    """number of updates of the run; one update uses `num_envs * steps` environment steps"""
+    updates: int = 0
+    """number of updates of the run; one update uses `num_envs * steps` environment steps. 0 for as many environment steps as in
+    the paper: 50,000 of its updates in endless environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and
+    SearingSpotlights, 10,000 in the grids"""
     decay_updates: int = 10_000
     """updates over which learning rate and entropy coefficient decay linearly to their final values"""
     steps: int = 512
@@ -139,7 +163,8 @@ class PPO:
     reconstruction_coefficient: float = 0.0
     """coefficient of the observation reconstruction loss; 0 for no reconstruction head. The paper uses 0.1"""
     ground_truth_coefficient: float = 0.0
-    """coefficient of the ground-truth estimation loss; 0 for no such head. Only for environments with `ground_truth` in `info`"""
+    """coefficient of the ground-truth estimation loss; 0 for no such head. The authors' configurations use 1. Only for
+    environments with `ground_truth` in `info`"""
     max_gradient_norm: float = 0.25
     """gradient clipping: largest global norm of the gradients"""
 
@@ -155,7 +180,9 @@ class Settings:
     frames) or position (encoded step number as an observation)"""
     preset: PresetName = "paper"
     """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
-    throughput: many environments, short rollouts; quick: small networks and feature observations, minutes on two CPU cores"""
+    throughput: many environments and short rollouts, with gradients through 32 steps where the paper's go through 512;
+    throughput-512: many environments with the paper's 512 steps;
+    quick: small networks and feature observations, minutes on two CPU cores"""
     seed: int = 1
     """seed of the initial weights, the episode seeds and all sampling"""
     device: str = "auto"
@@ -221,7 +248,6 @@ class Settings:
         positive = {
             "environment.num-envs": environment.num_envs,
             "environment.groups": environment.groups,
-            "ppo.updates": ppo.updates,
             "ppo.decay-updates": ppo.decay_updates,
             "ppo.steps": ppo.steps,
             "ppo.epochs": ppo.epochs,
@@ -243,6 +269,7 @@ class Settings:
                 raise ValueError(f"--{name} must be 1 or more, got {number}")
         for name, number in {
             "threads": self.threads,
+            "ppo.updates": ppo.updates,
             "environment.num-threads": environment.num_threads,
             "model.body-width": self.model.body_width,
             "transformer.positions": transformer.positions,
@@ -279,7 +306,13 @@ class Settings:
                 "--transformer.query-encoding needs --transformer.positional-encoding absolute or learned, got "
                 f"{transformer.positional_encoding}"
             )
-        return dataclasses.replace(self, env=env_spec.id)
+        settings = dataclasses.replace(self, env=env_spec.id)
+        return _replace(settings, ppo={"updates": ppo.updates or settings.paper_updates()})
+
+    def paper_updates(self) -> int:
+        """Updates with as many environment steps as the paper's run of this agent in this environment."""
+        steps = paper_run_length(self.env, self.agent) * PAPER_STEPS_PER_UPDATE
+        return -(-steps // (self.environment.num_envs * self.ppo.steps))
 
     def positions(self) -> int:
         """Rows of the table of positional encodings, with the default resolved."""
@@ -316,13 +349,20 @@ def _presets() -> dict[str, Settings]:
         },
         recurrence={"embedding": False},
     )
-    # The same number of environment steps per update as `paper`; sequences start from stored states.
+    # The same number of environment steps per update as `paper`; sequences start from stored states. Gradients go back 32 steps
+    # at most, where the paper's go back 512.
     throughput = _replace(
         dataclasses.replace(paper, preset="throughput"),
         environment={"num_envs": 512},
         ppo={"steps": 32},
         recurrence={"sequence_length": 32},
         transformer={"sequence_length": 32},
+    )
+    # Four times the environments of `paper`, minibatches of the same size, and gradients through as many steps.
+    throughput_512 = _replace(
+        dataclasses.replace(paper, preset="throughput-512"),
+        environment={"num_envs": 128},
+        ppo={"minibatches": 32, "decay_updates": 2_500},
     )
     quick = _replace(
         dataclasses.replace(paper, preset="quick", checkpoint_interval=50),
@@ -344,7 +384,7 @@ def _presets() -> dict[str, Settings]:
         transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
         model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
     )
-    return {"paper": paper, "old": old, "throughput": throughput, "quick": quick}
+    return {"paper": paper, "old": old, "throughput": throughput, "throughput-512": throughput_512, "quick": quick}
 
 
 #: Default settings by preset name.

@@ -130,9 +130,6 @@ class Gate(nn.Module):
         self.from_x = nn.Linear(width, 2 * width, bias=False)
         self.from_reset = nn.Linear(width, width, bias=False)
         self.bias = nn.Parameter(torch.full((width,), float(bias)))
-        for layer, parts in ((self.from_y, 3), (self.from_x, 2), (self.from_reset, 1)):
-            for part in layer.weight.chunk(parts):
-                nn.init.xavier_uniform_(part)
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Combine the residual stream x with a sublayer's output y; both and the result float (..., width)."""
@@ -155,10 +152,10 @@ class Block(nn.Module):
         self.norm_query, self.norm_tokens, self.norm_fc = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
         self.attention = Attention(settings)
         self.fc = nn.Linear(width, width)
-        self._initialise(settings.initialisation, settings.layers)
         gate = settings.gate_bias
         self.gate_attention = Gate(width, gate) if settings.gating else None
         self.gate_fc = Gate(width, gate) if settings.gating else None
+        self._initialise(settings.initialisation, settings.layers)
 
     def keys_and_values(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Project tokens with positions added, (n, tokens, width), to keys and values, (n, heads, tokens, head size) each."""
@@ -175,20 +172,23 @@ class Block(nn.Module):
         return out
 
     def _initialise(self, kind: str, layers: int) -> None:
-        for weight in self.parameters():
-            if weight.dim() < 2:
+        """Initialise the matrices, those of the gates among them; the biases of the relative encoding stay 0."""
+        for module in self.modules():
+            if not isinstance(module, nn.Linear):
                 continue
-            if kind == "orthogonal":
-                nn.init.orthogonal_(weight, 2**0.5)
-            elif kind == "kaiming":
-                nn.init.kaiming_uniform_(weight)
-            else:
-                nn.init.xavier_uniform_(weight)
+            # A gate's layers hold a matrix for each of its parts.
+            gates = 1 if module.weight.shape[0] == module.weight.shape[1] else module.out_features // module.in_features
+            for weight in module.weight.chunk(gates):
+                if kind == "orthogonal":
+                    nn.init.orthogonal_(weight, 2**0.5)
+                elif kind == "kaiming":
+                    nn.init.kaiming_uniform_(weight)
+                else:
+                    nn.init.xavier_uniform_(weight)
         if kind == "tfixup":
-            # T-Fixup (Huang et al., 2020) scales the value projection, the output projection and the fully connected layer.
+            # As in the authors' code, which scales the output projection only. T-Fixup (Huang et al., 2020) scales more matrices.
             with torch.no_grad():
-                for layer in (self.attention.values, self.attention.fc_out, self.fc):
-                    layer.weight.mul_(0.67 * layers**-0.25)
+                self.attention.fc_out.weight.mul_(0.67 * layers**-0.25)
 
 
 class ActingBlock:
