@@ -67,6 +67,8 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
     device = choose_device(settings.device)
     if settings.threads:
         torch.set_num_threads(settings.threads)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32
     torch.manual_seed(settings.seed)
     generators = {
         "actions": torch.Generator(device).manual_seed(settings.seed),
