@@ -1,0 +1,143 @@
+"""Records results of the memories in the code of the paper's authors (MarcoMeter/neroRL), for `test_agents_authors.py`.
+
+    python record_authors.py --repository https://github.com/MarcoMeter/neroRL
+
+Needs git, torch, numpy and einops. The authors' code is fetched to a temporary folder; only numbers are kept, in
+`authors.json.gz`: the weights by the authors' names, the inputs, the outputs while acting and while learning, and the gradients
+of `sum(output * factor)`. The positional encodings are those of the authors' main branch: absolute, learned and none.
+"""
+
+import argparse
+import gzip
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+COMMIT = "8dd62bdee66c2825d6fcea6fffefcdeb4f010609"
+DATA = Path(__file__).parent / "authors.json.gz"
+INPUT, WIDTH, SEQUENCES, LENGTH = 5, 8, 3, 4
+#: Window and longest episode of the Transformer-XL, and the step in the episode of each row of the batch. At step 0 the authors'
+#: code attends to an empty window uniformly, where ours attends to nothing.
+WINDOW, LONGEST, STEPS = 5, 12, (1, 2, 4, 6, 9)
+
+
+def fetched(repository: str, folder: Path) -> Path:
+    """The folder with the authors' modules, at `COMMIT`."""
+    git = folder / "git"
+    if Path(repository).exists():
+        git = Path(repository)
+    else:
+        subprocess.run(["git", "clone", "--quiet", "--bare", "--filter=blob:none", repository, git], check=True)
+    command = ["git", f"--git-dir={git}", "archive", COMMIT, "neroRL/__init__.py", "neroRL/nn"]
+    archive = subprocess.run(command, check=True, capture_output=True).stdout
+    subprocess.run(["tar", "x", "-C", folder], input=archive, check=True)
+    return folder
+
+
+def randomised(module: nn.Module) -> nn.Module:
+    """The module with weights as after some training: no bias is zero."""
+    for parameter in module.parameters():
+        parameter.data += 0.3 * torch.randn_like(parameter)
+    return module
+
+
+def recurrent(kind: type[nn.Module], layers: int, residual: bool) -> dict[str, Any]:
+    """Sequences from given hidden states, and one acting step."""
+    module = randomised(kind(INPUT, WIDTH, layers, nn.ReLU(), residual))
+    parts = 2 if kind.__name__ == "LSTM" else 1
+    x, hidden = torch.randn(SEQUENCES * LENGTH, INPUT), torch.randn(parts, SEQUENCES, layers, WIDTH)
+    cell = hidden[0] if parts == 1 else (hidden[0], hidden[1])
+    output, _ = module(x, cell, LENGTH)
+    acted, after = module(x[::LENGTH], cell, 1)
+    return {
+        "layers": layers,
+        "residual": residual,
+        "x": x,
+        "hidden": hidden,
+        "acted": acted,
+        "after": after.unsqueeze(0) if parts == 1 else torch.stack(after),
+    } | gradients(module, output)
+
+
+def transformer(module: type[nn.Module], encoding: str, gate_bias: float | None) -> dict[str, Any]:
+    """One step of several environments with given memories; the authors' code is the same for acting and learning."""
+    config = {
+        "num_blocks": 2,
+        "embed_dim": WIDTH,
+        "num_heads": 2,
+        "max_episode_steps": LONGEST,
+        "positional_encoding": encoding,
+        "add_positional_encoding_to_query": False,
+        "layer_norm": "pre",
+        "gtrxl": gate_bias is not None,
+        "gtrxl_bias": gate_bias or 0.0,
+        "gtrxl_swap": False,
+    }
+    made = randomised(module(config, INPUT, nn.ReLU()))
+    x, memories = torch.randn(len(STEPS), INPUT), torch.randn(len(STEPS), WINDOW, 2, WIDTH)
+    # As in the authors' trainer: until the window is full it begins with the episode, then it ends with the current step.
+    starts = torch.tensor([max(0, step - WINDOW + 1) for step in STEPS]).unsqueeze(1)
+    indices = starts + torch.arange(WINDOW)
+    mask = torch.tril(torch.ones(WINDOW, WINDOW), diagonal=-1)[torch.tensor(STEPS).clamp(max=WINDOW - 1)]
+    output, inputs = made(x, memories, mask, indices)
+    return {"gate_bias": gate_bias, "x": x, "memories": memories, "steps": list(STEPS), "inputs": inputs} | gradients(
+        made, output
+    )
+
+
+def gradients(module: nn.Module, output: Tensor) -> dict[str, Any]:
+    """The output, and the gradients of its sum weighted with a drawn factor."""
+    factor = torch.randn_like(output)
+    (output * factor).sum().backward()
+    return {
+        "output": output,
+        "factor": factor,
+        "weights": dict(module.named_parameters()),
+        "gradients": {name: parameter.grad for name, parameter in module.named_parameters()},
+    }
+
+
+def numbers(value: Any) -> Any:
+    """Tensors as lists of numbers, rounded to nine digits: exact for float32."""
+    if isinstance(value, Tensor):
+        return numbers(value.tolist())
+    if isinstance(value, dict):
+        return {key: numbers(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [numbers(each) for each in value]
+    return float(f"{value:.9g}") if isinstance(value, float) else value
+
+
+def main() -> None:
+    """Record all cases."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repository", default="https://github.com/MarcoMeter/neroRL", help="URL or a git directory")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        sys.path.insert(0, str(fetched(args.repository, Path(folder))))
+        from neroRL.nn.recurrent import GRU, LSTM
+        from neroRL.nn.transformer import Transformer
+
+        torch.manual_seed(1)
+        cases = {
+            "gru": recurrent(GRU, 1, False),
+            "gru, two layers, residual": recurrent(GRU, 2, True),
+            "lstm": recurrent(LSTM, 1, False),
+            "trxl, absolute": transformer(Transformer, "absolute", None),
+            "trxl, learned": transformer(Transformer, "learned", None),
+            "trxl, none": transformer(Transformer, "", None),
+            "gtrxl, bias 0": transformer(Transformer, "absolute", 0.0),
+            "gtrxl, bias 2": transformer(Transformer, "absolute", 2.0),
+        }
+    data = json.dumps({"source": "MarcoMeter/neroRL", "commit": COMMIT, "cases": numbers(cases)})
+    DATA.write_bytes(gzip.compress(data.encode(), mtime=0))
+
+
+if __name__ == "__main__":
+    main()
