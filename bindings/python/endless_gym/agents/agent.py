@@ -305,8 +305,8 @@ class Agent(nn.Module):
     def refresh(self) -> None:
         """Make the weights for acting again at the next step.
 
-        That happens by itself after `forward` with gradients, and after changes of the parameters that PyTorch records; the step of
-        a fused optimizer is not recorded. A call is needed after a change that is neither.
+        That happens by itself after `forward` with gradients, and after changes of the parameters that PyTorch records, which the
+        step of a fused optimizer is not. A call is needed after a change that is neither.
         """
         self._weights = None
 

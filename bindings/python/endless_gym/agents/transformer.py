@@ -469,10 +469,16 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             if self.table is not None:
                 tokens = tokens + self._encoding(state.position[:, window])
             blocks = self.blocks
-            projection = Projection([block.norm_tokens for block in blocks], [block.attention for block in blocks])
+            attentions = [block.attention for block in blocks]
+            projection = Projection(
+                [block.norm_tokens for block in blocks],
+                [attention.keys for attention in attentions],
+                [attention.values for attention in attentions],
+                self.settings.heads,
+            )
             distances = None
-            if blocks[0].attention.relative:
+            if attentions[0].relative:
                 ages = torch.arange(2 * self.settings.window, device=self.device).neg() % self.settings.window
-                distances = [block.attention.encoded_distances(ages, self._dtype) for block in blocks]
+                distances = [attention.encoded_distances(ages, self._dtype) for attention in attentions]
             state.cache = RingCache(projection, tokens, self._generation, self._dtype, distances)
         return state.cache

@@ -7,14 +7,10 @@ constant. The ring has as many slots as the window; the slot of the current step
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-if TYPE_CHECKING:
-    from endless_gym.agents.transformer import Attention
 
 
 def ring_ages(slots: int, device: torch.device) -> Tensor:
@@ -29,20 +25,23 @@ def ring_ages(slots: int, device: torch.device) -> Tensor:
 class Projection:
     """Projects the tokens of all blocks to keys and values at once."""
 
-    def __init__(self, norms: Sequence[nn.LayerNorm], attentions: Sequence[Attention]) -> None:
+    def __init__(
+        self, norms: Sequence[nn.LayerNorm], keys: Sequence[nn.Linear], values: Sequence[nn.Linear], heads: int
+    ) -> None:
         """Stack the weights of the blocks; they do not follow later changes.
 
         Args:
             norms: The layer normalisation of the tokens of each block.
-            attentions: The attention of each block.
+            keys: The key projection of each block, of a whole token or of each head's slice of it.
+            values: As `keys`.
+            heads: Number of heads.
         """
-        first = attentions[0]
-        self.heads, self.size, self.rows = first.heads, first.size, first.keys.in_features
+        self.heads, self.size, self.rows = heads, norms[0].normalized_shape[0] // heads, keys[0].in_features
         self.scale = torch.stack([norm.weight.detach() for norm in norms]).unsqueeze(1)
         self.shift = torch.stack([norm.bias.detach() for norm in norms]).unsqueeze(1)
         matrices = []
-        for attention in attentions:
-            parts = [part.weight.detach().view(-1, self.size, self.rows) for part in (attention.keys, attention.values)]
+        for pair in zip(keys, values, strict=True):
+            parts = [layer.weight.detach().view(-1, self.size, self.rows) for layer in pair]
             # For each head its key, then its value; with shared heads there is one matrix for all.
             matrices.append(torch.cat(parts, dim=1).flatten(0, 1).t())
         self.matrices = torch.stack(matrices)  # (layers, rows, outputs)
