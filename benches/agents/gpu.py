@@ -164,7 +164,7 @@ def training(settings: Settings, device: torch.device, updates: int) -> dict[str
         agent = make_agent(settings, environments.spec, device)
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, torch.Generator(device).manual_seed(1))
-        clock, shuffle = Clock((lambda: torch.cuda.synchronize(device)) if cuda else None), torch.Generator()
+        clock, shuffle = Clock(), torch.Generator()
         start = time.perf_counter()
         for update in range(updates + 1):
             if update == 1:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 class Clock:
     """Accumulates the seconds of named phases.
 
-    GPU kernels run asynchronously. `synchronise` is called at the end of each phase, so that their time counts for the phase that
-    launched them.
+    The time is that of the host. GPU kernels run asynchronously, and count for the phase that waits for them: those of a rollout
+    for `inference`, which waits for the actions, and those of an update for `learning`, which ends with a copy of the metrics.
 
     Attributes:
         seconds: Accumulated seconds by phase.
     """
 
-    def __init__(self, synchronise: Callable[[], None] | None = None) -> None:
-        """Make a clock; `synchronise` waits for the device, as `torch.cuda.synchronize` does. None on the CPU."""
-        self._synchronise = synchronise or (lambda: None)
+    def __init__(self) -> None:
+        """Make a clock without seconds."""
         self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
@@ -30,7 +29,6 @@ class Clock:
         try:
             yield
         finally:
-            self._synchronise()
             self.seconds[name] += time.perf_counter() - start
 
     def take(self) -> dict[str, float]:

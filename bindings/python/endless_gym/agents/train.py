@@ -114,7 +114,7 @@ def train(settings: Settings, watch: Callable[[int, dict[str, float]], bool] | N
             f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {device}, in {run}; Ctrl-C stops the run"
         )
 
-        clock = Clock((lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None)
+        clock = Clock()
         while update < ppo.updates and not stop.requested:
             start = time.perf_counter()
             environments.mark(logger.print)
