@@ -2,8 +2,8 @@
 
     python gpu.py --json gpu.json --markdown gpu.md
 
-* Equality: each agent computes a rollout's log-probabilities and values, and a minibatch's loss and gradients, on the CPU and on the
-  device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
+* Equality: each agent computes a rollout's log-probabilities and values, and a minibatch's loss and gradients, on the CPU and on
+  the device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
 * Copies: frames of a group from pageable and from page-locked memory to the device.
 * Graphs: the acting network of the GRU agent as a CUDA graph, beside the same operations without one.
 * Training: steps per second with a breakdown, and peak memory, with the networks, frames, environments and steps of the preset
@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-
 from endless_gym.agents import losses
 from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.clock import Clock
@@ -31,7 +30,7 @@ from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.ppo import learn, make_optimizer, minibatch_loss
 from endless_gym.agents.rollout import RolloutCollector, Segment
-from endless_gym.agents.settings import PRESETS, PPO, Model, Recurrence, Settings, Transformer
+from endless_gym.agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
 
 AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
 TOLERANCE = 1e-3
@@ -207,13 +206,13 @@ def markdown(report: dict[str, Any]) -> str:
         "",
         "## Training",
         "",
-        "| agent | environments × steps | steps per second | share of time | peak memory |",
+        "| agent | environments x steps | steps per second | share of time | peak memory |",
     ]
     lines += ["| --- | --- | --- | --- | --- |"]
     for row in report["training"]:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in row["shares_of_time"].items())
         memory = "" if row["peak_gigabytes"] is None else f"{row['peak_gigabytes']:.1f} GB"
-        batch = f"{row['num_envs']} × {row['steps']}"
+        batch = f"{row['num_envs']} x {row['steps']}"
         lines.append(f"| {row['agent']} | {batch} | {row['steps_per_second']:,.0f} | {shares} | {memory} |")
     for left_out in report["left_out"]:
         lines += ["", f"Not measured, since the time was up: {left_out}."]
@@ -254,12 +253,12 @@ def main() -> int:
                 ppo=replace(settings.ppo, steps=steps),
             )
             if (time.monotonic() - started) / 60 > args.minutes:
-                report["left_out"].append(f"{agent}, {num_envs} × {steps}")
+                report["left_out"].append(f"{agent}, {num_envs} x {steps}")
                 continue
             try:
                 report["training"].append(training(settings, device, args.updates))
             except torch.cuda.OutOfMemoryError:
-                report["left_out"].append(f"{agent}, {num_envs} × {steps} (out of memory)")
+                report["left_out"].append(f"{agent}, {num_envs} x {steps} (out of memory)")
     text = markdown(report)
     print(text)
     if args.json:
