@@ -13,7 +13,12 @@ struct Player {
 impl Player {
     /// One environment at the start of an episode. In Mortar Mayhem the commands have been shown, so that the agent may move.
     fn new(spec: &EnvSpec, seed: u64, options: serde_json::Value) -> Self {
-        let options = ResetOptions::Shared(options.as_object().unwrap().clone());
+        let mut options = options.as_object().unwrap().clone();
+        if spec.parameters.iter().any(|parameter| parameter.name == "command_show_delay") {
+            // Without frames between the commands, the first frame without one is after the last.
+            options.insert("command_show_delay".to_owned(), json!([0]));
+        }
+        let options = ResetOptions::Shared(options);
         let config = PoolConfig { options, features: true, ..PoolConfig::new(spec.id, 1) };
         let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
@@ -95,8 +100,10 @@ fn actions_move_the_agent_as_their_names_say() {
             for (value, choice) in branch.choices.iter().enumerate() {
                 for seed in 0..20 {
                     let mut player = Player::new(spec, seed, json!({}));
-                    let (place, heading) = (player.place(), player.heading());
                     let mut action = vec![0; spec.actions.len()];
+                    // The first frame may show the agent a pixel beside its place, as the original's does.
+                    player.step(&action);
+                    let (place, heading) = (player.place(), player.heading());
                     action[number] = value as i32;
                     player.step(&action);
                     let [x, y] = direction(choice.name);

@@ -195,7 +195,7 @@ fn two_directories_of_one_path_share_nothing() {
     play(&mut trainer, 0, 1);
     // Older than anything that a clock could call fresh.
     for segment in segments(place.namespace().prefix()) {
-        File::options().write(true).open(segment).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        File::open(segment).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
     }
     let before = segments(place.namespace().prefix());
     let root = place.namespace().root().display().to_string();

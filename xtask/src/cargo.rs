@@ -12,7 +12,10 @@ const PROPERTY_SEED: &str = "20251122";
 /// Runs cargo as the tests do.
 pub fn run(arguments: &[&str]) -> Result<(), String> {
     println!("==> cargo {}", arguments.join(" "));
-    execute(with_original(arguments)?.env("PROPTEST_RNG_SEED", PROPERTY_SEED).env("RUSTDOCFLAGS", "--deny warnings"))
+    let mut cargo = with_original(arguments)?;
+    cargo.env("PROPTEST_RNG_SEED", PROPERTY_SEED).env("RUSTDOCFLAGS", "--deny warnings");
+    // `cargo test` of the workspace builds the examples.
+    execute(cargo.env("ENDLESS_EXAMPLES_BUILT", "1"))
 }
 
 /// Runs one test that is ignored where the machine does not permit it.

@@ -17,10 +17,13 @@ class Experts:
     """One scripted expert for each of n environments: it reads the features, and remembers what an agent must remember.
 
     ```python
+    import endless_gym
+    import numpy as np
+
     envs = endless_gym.make_vec("MortarMayhem-v0", 8, observation="features")
     experts = endless_gym.Experts("MortarMayhem-v0", 8)
     observation, info = envs.reset(seed=0)
-    episode_start = np.ones(8, dtype=bool)
+    episode_start, ended = np.ones(8, dtype=bool), np.zeros(8, dtype=bool)
     for _ in range(100):
         observation, reward, terminated, truncated, info = envs.step(experts.act(observation, episode_start))
         # With next-step auto-reset, the observation after the last one of an episode starts another.
