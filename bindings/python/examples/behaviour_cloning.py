@@ -83,7 +83,7 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     generator = np.random.default_rng(args.seed)
     dataset = minari.load_dataset(args.dataset)
-    id, options = dataset.env_spec.kwargs["id"], dataset.env_spec.kwargs.get("options", {})
+    id, options = dataset.env_spec.kwargs["env_id"], dataset.env_spec.kwargs.get("options", {})
     # The last observation of an episode has no action.
     episodes = [
         (torch.tensor(episode.observations[:-1]), torch.tensor(episode.actions).reshape(len(episode.actions), -1))
