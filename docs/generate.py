@@ -74,7 +74,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             raise PluginError(f"docs/{path} describes no environment; there are {', '.join(ENVIRONMENTS)}")
         if kind == "picture":
             return picture(path.stem, files) + "\n\n" + play([path.stem], "..")
-        return tables.PARTS[kind](ENVIRONMENTS[path.stem])
+        return tables.PARTS[found[1]](ENVIRONMENTS[path.stem])
 
     return re.sub(r"<!-- generated: (.+?) -->", part, markdown)
 
