@@ -71,6 +71,7 @@ def test_operations_are_within_the_budget(agent: str) -> None:
     assert counts["update"] <= update
 
 
+@pytest.mark.slow
 def test_act_waits_only_for_the_actions() -> None:
     """Counted on a stand-in for a CUDA device; in a subprocess, since a registered device cannot be removed."""
     program = f"""

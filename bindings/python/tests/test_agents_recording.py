@@ -79,6 +79,7 @@ def test_sampled_actions_follow_from_the_seed_alone() -> None:
     assert actions("third", 2, 2) != first
 
 
+@pytest.mark.slow
 def test_the_command_records_a_checkpoint(tmp_path: Path, root: Path) -> None:
     made = make("gru", max_steps=20)
     state = {"settings": to_dict(made.settings), "update": 1, "steps": 64, "model": made.state_dict()}

@@ -151,6 +151,7 @@ def test_a_resumed_run_recovers(undisturbed: Path, tmp_path: Path, monkeypatch: 
     compare(run, undisturbed)
 
 
+@pytest.mark.slow
 def test_an_engine_that_does_not_answer_is_replaced() -> None:
     """A stopped process is alive, and no signal but SIGKILL ends it."""
     arguments = {"num_envs": 2, "groups": 2, "seed": 1, "autoreset": "same_step"}

@@ -24,6 +24,7 @@ DOCTESTS = ROOT / "README.md"
 LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in PROGRAMS])
 def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], set[str]]) -> None:
     for is_shell, part in groupby(program, lambda block: block.language in SHELL):
