@@ -37,6 +37,9 @@ def replay(
     """Play an episode again, exactly.
 
     ```python
+    import endless_gym
+
+    actions = [[0, 0]] * 40  # those of the episode
     steps = endless_gym.replay("MortarMayhem-v0", seed=7, options={"command_count": [2]}, actions=actions)
     print(sum(step.reward for step in steps))
     ```

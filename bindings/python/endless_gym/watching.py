@@ -145,6 +145,8 @@ def watch(service: str, *, group: int | None = None, timeout: float | None = 30.
     """Watch the batches of a running engine, beside its trainer and without slowing it.
 
     ```python
+    import endless_gym
+
     with endless_gym.watch("mortar") as batches:
         for batch in batches:
             print(batch.step, batch.reward.mean(), batch.missed)
