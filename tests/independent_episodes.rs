@@ -159,7 +159,8 @@ fn later_episodes_depend_on_the_seed_and_not_on_what_was_played() {
         assert!(all[1..].iter().any(|start| *start != all[0]), "{}: not the same again", spec.id);
         assert!(all == starts(&seeded(true, Some(5)), 2, None), "{}: other actions", spec.id);
         assert!(all == starts(&seeded(true, None), 3, Some(5)), "{}: the seed of a reset", spec.id);
-        assert!(all != starts(&seeded(true, None), 1, None), "{}: entropy", spec.id);
+        // Some ids have few first frames, so that different seeds may show the same ones.
+        assert!((0..32).any(|_| all != starts(&seeded(true, None), 1, None)), "{}: entropy", spec.id);
         // The first episode is the one of the original.
         assert!(all[0] == starts(&seeded(false, Some(5)), 1, None)[0], "{}: the seed's own episode", spec.id);
     }
