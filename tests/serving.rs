@@ -410,7 +410,7 @@ fn logs_follow_the_option_and_the_variable() {
 #[test]
 fn a_second_signal_ends_the_program_at_once() {
     let room = Room::new("twice");
-    // A fifo without a reader: the last checkpoint cannot be written, and the engine waits for ever.
+    // A fifo without a reader: the last checkpoint cannot be written, and the engine never ends by itself.
     let fifo: PathBuf = room.root.join("state.new");
     let mut engine = serve(&room, &[&format!("--checkpoint={}", room.root.join("state").display())]);
     Twin::new().reset(&mut room.connect("gym"));

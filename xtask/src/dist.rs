@@ -9,6 +9,8 @@ use crate::interpreters;
 use crate::python::run;
 use crate::requirements::Requirement;
 use crate::venv::{Install, target, venv, workspace};
+use crate::wasm::Toolchain;
+use crate::web;
 
 const TOOLS: [&str; 5] = ["auditwheel==6.8.2", "maturin==1.16.0", "uv==0.13.9", "wheel==0.48.0", "ziglang==0.17.1"];
 
@@ -16,7 +18,8 @@ const TOOLS: [&str; 5] = ["auditwheel==6.8.2", "maturin==1.16.0", "uv==0.13.9", 
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, in the order in which they depend on each other.
-const CRATES: [&str; 4] = ["endless-gym-core", "endless-gym-service", "endless-gym-cli", "endless-gym"];
+const CRATES: [&str; 5] =
+    ["endless-gym-core", "endless-gym-service", "endless-gym-page", "endless-gym-cli", "endless-gym"];
 
 const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
 
@@ -24,6 +27,10 @@ const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
 pub fn build() -> Result<(), String> {
     let folder = folder()?;
     let tools = tools()?;
+    match Toolchain::find() {
+        Some(_) => web::build()?,
+        None => println!("The program will not contain the page, since there is no compiler for WebAssembly."),
+    }
     recreate(&folder)?;
     let source = source_distribution(&tools, &folder)?;
     wheel(&tools, &source, &folder)?;
@@ -145,24 +152,54 @@ fn check_tag(tools: &Path, wheel: &Path) -> Result<(), String> {
 
 /// Packages the crates and builds each from its package, against the packages of the others.
 fn crates(folder: &Path) -> Result<(), String> {
+    let build = target()?.join("packaged");
+    remove_earlier(&build)?;
     let mut cargo = cargo();
-    cargo.args(["package", "--locked", "--allow-dirty", "--target-dir"]).arg(target()?);
+    cargo.args(["package", "--locked", "--allow-dirty", "--target-dir"]).arg(&build);
     for name in CRATES {
         cargo.args(["--package", name]);
     }
     run("cargo package", &mut cargo)?;
     for name in CRATES {
         let version = env!("CARGO_PKG_VERSION");
-        let package = target()?.join("package").join(format!("{name}-{version}.crate"));
+        let package = build.join("package").join(format!("{name}-{version}.crate"));
         check_files(name, &package)?;
         fs::copy(&package, folder.join(format!("{name}-{version}.crate")))
             .map_err(|error| describe(&package, &error))?;
     }
     // The tests of the core read recorded cases, which its package must contain.
-    let manifest = target()?.join(format!("package/endless-gym-core-{}/Cargo.toml", env!("CARGO_PKG_VERSION")));
+    let manifest = build.join(format!("package/endless-gym-core-{}/Cargo.toml", env!("CARGO_PKG_VERSION")));
     let mut check = self::cargo();
     check.args(["check", "--quiet", "--tests", "--manifest-path"]).arg(manifest);
-    run("cargo check --tests, packaged core", check.arg("--target-dir").arg(target()?))
+    run("cargo check --tests, packaged core", check.arg("--target-dir").arg(&build))
+}
+
+/// Removes what earlier runs unpacked and built of these crates. Cargo packages a workspace by way of a temporary registry in the
+/// target directory, and what comes from a registry never changes for it as long as the version is the same.
+fn remove_earlier(build: &Path) -> Result<(), String> {
+    let sources = cargo_home()?.join("registry/src");
+    // The folders of other registries begin with their host.
+    let registries = entries(&sources)?.into_iter().filter(|(name, _)| name.starts_with('-'));
+    let mut parents: Vec<PathBuf> = registries.map(|(_, path)| path).collect();
+    parents.push(build.join("debug/.fingerprint"));
+    for parent in parents {
+        for (name, path) in entries(&parent)? {
+            if name.starts_with("endless-gym") {
+                fs::remove_dir_all(&path).map_err(|error| describe(&path, &error))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Names and paths of what is in a folder; none if there is no such folder.
+fn entries(folder: &Path) -> Result<Vec<(String, PathBuf)>, String> {
+    if !folder.exists() {
+        return Ok(Vec::new());
+    }
+    let named = |entry: fs::DirEntry| (entry.file_name().to_string_lossy().into_owned(), entry.path());
+    let entries = fs::read_dir(folder).and_then(|entries| entries.map(|entry| entry.map(named)).collect());
+    entries.map_err(|error| describe(folder, &error))
 }
 
 /// Fails if a crate's package lacks a licence, or holds a file that no build, test or reader of it needs.
@@ -190,7 +227,8 @@ fn check_files(name: &str, package: &Path) -> Result<(), String> {
         let kinds = [".rs", ".py", ".json", ".txt"];
         let is_code =
             folders.iter().any(|folder| file.starts_with(folder)) && kinds.iter().any(|kind| file.ends_with(kind));
-        is_code || file.starts_with("tests/reference/")
+        let is_page = name == "endless-gym-page" && (file.starts_with("files/") || file.starts_with("built/"));
+        is_code || is_page || file == "build.rs" || file.starts_with("tests/reference/")
     };
     match files.iter().find(|file| !TOP.contains(file) && !is_source(file)) {
         Some(stray) => Err(format!("the package of {name} contains {stray}; list what it needs in `include`")),

@@ -567,6 +567,19 @@ def make_vec(
     )
 
 
+def specified_envs(backend: Backend, specification: Mapping[str, Any], **arguments: Any) -> EndlessVectorEnv:
+    """The environments of an engine with that specification; further arguments are passed to `EndlessVectorEnv`."""
+    return EndlessVectorEnv(
+        backend,
+        described=spec(specification["id"]),
+        num_envs=specification["num_envs"],
+        frames=Frames.from_specification(specification["frames"]),
+        sections=[section["name"] for section in specification["batch"]["sections"]],
+        autoreset=MODES[specification["autoreset"]],
+        **arguments,
+    )
+
+
 def connect(
     service: str,
     *,
@@ -600,13 +613,9 @@ def connect(
     checked_view(render_mode, view, VECTOR_MODES)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
-    return EndlessVectorEnv(
+    return specified_envs(
         Remote(connection, specification["groups"], timeout, engine),
-        described=spec(specification["id"]),
-        num_envs=specification["num_envs"],
-        frames=Frames.from_specification(specification["frames"]),
-        sections=[section["name"] for section in specification["batch"]["sections"]],
-        autoreset=MODES[specification["autoreset"]],
+        specification,
         copy=copy,
         options=specification["options"],
         # An earlier trainer may have changed them, or a checkpoint.

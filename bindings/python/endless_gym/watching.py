@@ -13,9 +13,7 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.backends import Backend
-from endless_gym.configuration import MODES
-from endless_gym.specs import Frames, spec
-from endless_gym.vector import EndlessVectorEnv
+from endless_gym.vector import specified_envs
 
 
 class WatchedBatch(NamedTuple):
@@ -42,7 +40,7 @@ class WatchedBatch(NamedTuple):
 class Watch:
     """The batches of a running engine, as an iterator that ends with the engine. `watch` makes it.
 
-    Iterating waits for the next batch. It never makes the trainer wait: whoever is slower than the trainer misses batches.
+    Iterating waits for the next batch. It never makes the trainer wait: a watch that is slower than the trainer misses batches.
 
     Attributes:
         id: Environment id.
@@ -57,20 +55,12 @@ class Watch:
         """Called by `watch`."""
         self._timeout = None if timeout is None else checked_timeout(timeout)
         group = None if group is None else integer("group", group)
-        # As for a timeout of iceoryx2's calls, a year is for ever.
+        # As for a timeout of iceoryx2's calls, a year counts as no limit.
         observer = _native.Observer(service, group, 3e7 if self._timeout is None else self._timeout)
         specification = json.loads(observer.specification())
         self._backend = _Observed(observer, specification["groups"])
         # Names the arrays of a batch as for a trainer.
-        self._envs = EndlessVectorEnv(
-            self._backend,
-            described=spec(specification["id"]),
-            num_envs=specification["num_envs"],
-            frames=Frames.from_specification(specification["frames"]),
-            sections=[section["name"] for section in specification["batch"]["sections"]],
-            autoreset=MODES[specification["autoreset"]],
-            copy=copy,
-        )
+        self._envs = specified_envs(self._backend, specification, copy=copy)
         self.id: str = specification["id"]
         self.num_envs, self.num_groups = self._envs.num_envs, self._envs.num_groups
         self.observation_space, self.action_space = self._envs.observation_space, self._envs.action_space
@@ -158,8 +148,8 @@ def watch(service: str, *, group: int | None = None, timeout: float | None = 30.
     Args:
         service: The engine's name.
         group: Number of the group to watch; `None` for all.
-        timeout: Seconds to wait for the engine to start, and then for each batch; `None` to wait for ever. A `TimeoutError` does
-            not end the watch: iterating again waits again.
+        timeout: Seconds to wait for the engine to start, and then for each batch; `None` to wait without a limit. A
+            `TimeoutError` does not end the watch: iterating again waits again.
         copy: Yield writable copies instead of read-only views of shared memory.
 
     Raises:

@@ -2,12 +2,10 @@
 
 use std::fs::{self, File, TryLockError};
 use std::io::{Read, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::OFlags;
-
 use crate::checkpoint_config::CheckpointError;
+use crate::locked_file;
 
 /// An engine's right to save to a checkpoint file: an `flock` on `FILE.lock`, since `FILE` itself is replaced by every save. The kernel
 /// releases it when the process dies; the file that then stays is taken over by the next engine.
@@ -28,11 +26,8 @@ impl CheckpointLock {
             path: checkpoint.to_owned(),
             reason: format!("{}: {e}", path.display()),
         };
-        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed();
-        let mut options = File::options();
-        options.read(true).write(true).create(true).truncate(false).mode(0o600).custom_flags(flags);
         loop {
-            let mut file = options.open(&path).map_err(failed)?;
+            let mut file = locked_file::open(&path, true).map_err(failed)?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::Error(e)) => return Err(failed(e)),
@@ -43,7 +38,7 @@ impl CheckpointLock {
                 }
             }
             // Otherwise an engine that ended has removed it in the meantime.
-            if is_same(&file, &path) {
+            if locked_file::is_same(&file, &path) {
                 let process = std::process::id();
                 file.set_len(0).and_then(|()| writeln!(file, "{process}")).map_err(failed)?;
                 return Ok(CheckpointLock { file, path, process });
@@ -60,15 +55,6 @@ impl Drop for CheckpointLock {
             // Closing the file is not enough: a forked child shares the lock.
             let _ = self.file.unlock();
         }
-    }
-}
-
-/// Whether the file still has that path.
-fn is_same(file: &File, path: &Path) -> bool {
-    let at = |data: fs::Metadata| (data.dev(), data.ino());
-    match (file.metadata(), fs::symlink_metadata(path)) {
-        (Ok(open), Ok(named)) => at(open) == at(named),
-        _ => false,
     }
 }
 

@@ -103,6 +103,7 @@ mod identity;
 mod inspect;
 mod lease;
 mod lock;
+mod locked_file;
 mod members;
 mod memory;
 mod message;

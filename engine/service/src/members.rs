@@ -5,13 +5,11 @@
 
 use std::fs::{self, File};
 use std::io::Write;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
-
-use rustix::fs::OFlags;
 
 use crate::error::ServiceError;
 use crate::lock::NamespaceLock;
+use crate::locked_file::{is_same, open};
 use crate::namespace::{MAX_PREFIX, Namespace};
 
 const SEGMENTS: &str = "/dev/shm";
@@ -82,20 +80,6 @@ pub(crate) fn is_used(prefix: &str) -> bool {
 
 fn file_of(prefix: &str) -> PathBuf {
     Path::new(SEGMENTS).join(format!("{prefix}{SUFFIX}"))
-}
-
-fn open(path: &Path, create: bool) -> std::io::Result<File> {
-    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed();
-    File::options().read(true).write(true).create(create).mode(0o600).custom_flags(flags).open(path)
-}
-
-/// Whether the file still has that path.
-fn is_same(file: &File, path: &Path) -> bool {
-    let at = |data: fs::Metadata| (data.dev(), data.ino());
-    match (file.metadata(), fs::symlink_metadata(path)) {
-        (Ok(open), Ok(named)) => at(open) == at(named),
-        _ => false,
-    }
 }
 
 #[cfg(test)]

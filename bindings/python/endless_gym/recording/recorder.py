@@ -23,7 +23,7 @@ from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
 from endless_gym.specs import Frames, ObservationName, Spec, contents, spec
 from endless_gym.vector import make_vec
 
-#: Steps after which episodes are truncated in environments without a step limit, in which an expert may play for ever.
+#: Steps after which episodes are truncated in environments without a step limit, in which an expert may never stop.
 DEFAULT_MAX_STEPS = 1000
 
 #: Episodes that a thread plays at the same time. It does not depend on the number of threads, nor do an agent's actions then.

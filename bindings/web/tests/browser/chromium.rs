@@ -34,7 +34,7 @@ impl Chromium {
         // Commands come from descriptor 3, and answers go to descriptor 4.
         let mut command = Command::new("sh");
         command.args(["-c", r#"exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null"#, &program()]);
-        // It only loads the page of this test, and its sandbox is not to be had in every container.
+        // It only loads the page of this test, and not every container permits its sandbox.
         command.args(["--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu", "--no-first-run"]);
         command.args(["--disable-background-networking", "--disable-dev-shm-usage", "--disable-extensions"]);
         command.arg(format!("--user-data-dir={}", folder.join("profile").display()));

@@ -215,12 +215,8 @@ impl Pool {
     ///
     /// [`PoolError::NoSuchEnv`] or [`PoolError::NotReset`].
     pub fn running_episode(&self, env: usize) -> Result<RunningEpisode, PoolError> {
-        let num_envs = self.layout.num_envs();
-        match () {
-            _ if env >= num_envs => Err(PoolError::NoSuchEnv { given: env, num_envs }),
-            _ if !self.was_reset => Err(PoolError::NotReset),
-            _ => Ok(self.slots.running_episode(env)),
-        }
+        self.check_running(env)?;
+        Ok(self.slots.running_episode(env))
     }
 
     /// Writes every environment's row without starting an episode: the current observation, a reward of 0, no flag.
@@ -332,6 +328,15 @@ impl Pool {
         self.format.shape(SCREEN, SCREEN).iter().product()
     }
 
+    fn check_running(&self, env: usize) -> Result<(), PoolError> {
+        let num_envs = self.layout.num_envs();
+        match () {
+            () if env >= num_envs => Err(PoolError::NoSuchEnv { given: env, num_envs }),
+            () if !self.was_reset => Err(PoolError::NotReset),
+            () => Ok(()),
+        }
+    }
+
     fn check_env(&self, env: usize) -> Result<(), SnapshotError> {
         let num_envs = self.layout.num_envs();
         if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnv { given: env, num_envs }) }
@@ -343,12 +348,8 @@ impl Pool {
     ///
     /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
     pub fn progress(&self, env: usize) -> Result<Vec<Progress>, PoolError> {
-        let num_envs = self.layout.num_envs();
-        match () {
-            _ if !self.was_reset => Err(PoolError::NotReset),
-            _ if env >= num_envs => Err(PoolError::NoSuchEnv { given: env, num_envs }),
-            _ => Ok(self.slots.progress(env)),
-        }
+        self.check_running(env)?;
+        Ok(self.slots.progress(env))
     }
 
     /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,
@@ -358,13 +359,11 @@ impl Pool {
     ///
     /// [`PoolError::NotReset`], [`PoolError::NoSuchEnv`] or [`PoolError::ViewSize`].
     pub fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) -> Result<(), PoolError> {
-        let num_envs = self.layout.num_envs();
-        match () {
-            _ if !self.was_reset => return Err(PoolError::NotReset),
-            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
-            _ if out.len() != VIEW_BYTES => return Err(PoolError::ViewSize { given: out.len() }),
-            _ => self.slots.ground_truth_view(env, out),
+        self.check_running(env)?;
+        if out.len() != VIEW_BYTES {
+            return Err(PoolError::ViewSize { given: out.len() });
         }
+        self.slots.ground_truth_view(env, out);
         Ok(())
     }
 
@@ -376,12 +375,8 @@ impl Pool {
     ///
     /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
     pub fn align_ground_truth_view(&mut self, env: usize) -> Result<(), PoolError> {
-        let num_envs = self.layout.num_envs();
-        match () {
-            _ if !self.was_reset => return Err(PoolError::NotReset),
-            _ if env >= num_envs => return Err(PoolError::NoSuchEnv { given: env, num_envs }),
-            _ => self.slots.align_ground_truth_view(env),
-        }
+        self.check_running(env)?;
+        self.slots.align_ground_truth_view(env);
         Ok(())
     }
 }

@@ -86,7 +86,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
         options: ResetOptions::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
         check_drawing: true,
-        // Only for a first episode without a seed, whose own is unknown. Entropy is not to be had everywhere.
+        // Only for a first episode without a seed, whose own is unknown. Not every platform has a source of entropy.
         seeding: Seeding::Continue { seed: Some(0) },
         ..PoolConfig::new(&trace.env, 1)
     };

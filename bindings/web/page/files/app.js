@@ -175,7 +175,7 @@ class App {
       await navigator.clipboard.writeText(location.href);
       say("The link to this episode is in the clipboard.", true);
     } catch {
-      say(`The clipboard is not to be had; the link is ${location.href}`);
+      say(`The browser refuses access to the clipboard; the link is ${location.href}`);
     }
   }
 }

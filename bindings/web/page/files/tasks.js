@@ -15,7 +15,7 @@ export const TASKS = {
     `Carry out the listed commands in order and be on the right tile each time the others turn red. ${GRID}`,
   "Endless-MortarMayhem-v0":
     "Remember the command that is shown and carry out all commands so far, from the first; each round adds one. " +
-    "The arena has no border: whoever leaves it on one side enters on the other.",
+    "The arena has no border: leaving it on one side means entering on the other.",
   "MysteryPath-v0":
     "Find the invisible path to the goal on the opposite side. A step off the path leads back to the start, so remember where it was.",
   "MysteryPath-Grid-v0":

@@ -1,0 +1,26 @@
+//! Lists the files for `include_bytes!`: those of the built page, or the sources where it has not been built.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::{env, fs, io};
+
+fn main() -> io::Result<()> {
+    let package = PathBuf::from(variable("CARGO_MANIFEST_DIR")?);
+    let built = package.join("built");
+    println!("cargo::rerun-if-changed=.");
+    let folder = if built.join("engine.wasm").exists() { built } else { package.join("files") };
+    let mut paths: Vec<PathBuf> = fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>()?;
+    paths.sort();
+    let mut list = String::from("&[\n");
+    for path in &paths {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        // Formatting into a string does not fail.
+        let _ = writeln!(list, "    ({name:?}, include_bytes!({path:?})),");
+    }
+    list.push_str("]\n");
+    fs::write(Path::new(&variable("OUT_DIR")?).join("files.rs"), list)
+}
+
+fn variable(name: &str) -> io::Result<String> {
+    env::var(name).map_err(|error| io::Error::other(format!("{name}: {error}")))
+}
