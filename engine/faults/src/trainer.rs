@@ -90,9 +90,7 @@ pub fn run(work: &Work) -> Result<(), String> {
             }
             std::thread::sleep(Duration::from_micros(draws.integers(0, 2 * work.think + 1) as u64));
         }
-        let requested =
-            play.groups.iter().map(|group| Requested { step: group.step, is_pending: group.pending.is_some() });
-        last = Some((connected, requested.collect()));
+        last = Some((connected, play.groups.iter().map(Group::requested).collect()));
     }
     drop(last);
     Event::End.report();
@@ -164,6 +162,12 @@ struct Group {
     step: Option<u64>,
 }
 
+impl Group {
+    fn requested(&self) -> Requested {
+        Requested { step: self.step, is_pending: self.pending.is_some() }
+    }
+}
+
 /// The call that failed, and why.
 type Failed = Box<(&'static str, ServiceError)>;
 
@@ -204,7 +208,11 @@ impl<'a> Play<'a> {
         if draws.integers(0, 200) == 0 {
             let found = trainer.reconnect(PATIENCE).map_err(failed("reconnect"))?;
             if found.restarted {
-                // The engine was replaced at this moment.
+                // The engine was replaced at this moment. What becomes of the new one concerns none of these requests.
+                for (index, (group, found)) in self.groups.iter_mut().zip(&found.groups).enumerate() {
+                    check_fate(index, &group.requested(), found);
+                    (group.step, group.pending) = (None, None);
+                }
                 return Ok(false);
             }
             for (index, group) in found.groups.iter().enumerate() {

@@ -11,6 +11,7 @@ use crate::connect::{ConnectConfig, connect_to_engine};
 use crate::descriptors;
 use crate::error::ServiceError;
 use crate::lease::ResponsePort;
+use crate::memory;
 use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
 use crate::ports::{self, EngineServices, OpenMode, PortError, RequestPublisher, ServiceNames};
@@ -114,6 +115,8 @@ fn create<T>(
     let start = Instant::now();
     loop {
         let creating = services.node.creating()?;
+        // Observers reserve memory, but not while other ports are being created.
+        memory::check_free(memory::MARGIN)?;
         match ports() {
             Ok(ports) => return Ok(ports),
             Err(PortError::Other(e)) => return Err(e),

@@ -33,6 +33,9 @@ const IDLE_TIMEOUT: Duration = Duration::from_millis(100);
 /// How often an idle engine looks for dead processes.
 const CLEANUP_INTERVAL: Duration = Duration::from_millis(500);
 
+/// How long an engine that stops looks whether its trainer ends, too.
+const LAST_CLEANUP: Duration = Duration::from_millis(100);
+
 /// How often an engine checks that it can still be found.
 const CHECK_INTERVAL: Duration = Duration::from_millis(500);
 
@@ -201,7 +204,7 @@ impl Engine {
         (0..self.groups.len()).map(|group| self.status.step(group)).collect()
     }
 
-    /// Serves requests until `stop` is set. Returns within a tenth of a second after that, or when the last checkpoint is saved.
+    /// Serves requests until `stop` is set. Returns within two tenths of a second after that, or when the last checkpoint is saved.
     ///
     /// # Errors
     ///
@@ -256,6 +259,7 @@ impl Engine {
         if let Some(checkpointer) = &mut self.checkpointer {
             checkpointer.stop(&self.groups, &mut self.status)?;
         }
+        self.remove_ending_trainer();
         let summary = self.status.summary();
         tracing::info!(service = &*self.specification.service, batches = summary.batches, "engine stopped");
         Ok(summary)
@@ -340,6 +344,22 @@ impl Engine {
         self.groups[0].forget_frames(payload);
         bytemuck::cast_slice_mut(payload)[..steps.len()].copy_from_slice(&steps);
         Ok(Outcome::Snapshot { bytes: size_of_val(&*steps) })
+    }
+}
+
+impl Engine {
+    /// Removes the resources of a trainer that ends together with the engine: often the engine stops since its trainer was killed,
+    /// and no process remains that would find what that has left.
+    fn remove_ending_trainer(&self) {
+        let ServiceSpecification { service, incarnation, groups, .. } = &self.specification;
+        let names = ServiceNames::new(service, *incarnation);
+        let services = EngineServices { node: &self.node, names, mode: OpenMode::Open };
+        let has_trainer = |group| services.requests(group).is_ok_and(|port| ports::publisher_node(&port).is_some());
+        let start = Instant::now();
+        while start.elapsed() < LAST_CLEANUP && (0..*groups).any(has_trainer) {
+            self.node.remove_dead_nodes();
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 }
 

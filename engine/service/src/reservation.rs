@@ -9,6 +9,7 @@
 
 use std::fs::File;
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::MetadataExt;
 
 use endless_gym_core::batch::BLOCK_BYTES;
 use iceoryx2::prelude::{CallbackProgression, PortFactory, SemanticString};
@@ -52,6 +53,9 @@ pub(crate) fn reserve_for_observer(
     let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
     let failed = |e: std::io::Error| ServiceError::middleware("cannot reserve shared memory")(e.to_string());
     let bytes = segment.metadata().map_err(failed)?.len().saturating_sub(chunk * unused as u64).max(1);
+    // What is allocated already, in the file system's blocks of 512 bytes. The observer's own port needs memory, too.
+    let allocated = segment.metadata().map_err(failed)?.blocks().saturating_mul(512);
+    memory::check_free(bytes.saturating_sub(allocated).saturating_add(memory::MARGIN))?;
     match rustix::fs::fallocate(&segment, FallocateFlags::KEEP_SIZE, 0, bytes) {
         Ok(()) => Ok(()),
         Err(Errno::NOSPC | Errno::NOMEM) => Err(memory::too_small(chunk * limits.observer_chunks() as u64)),
