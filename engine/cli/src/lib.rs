@@ -57,7 +57,7 @@ enum Command {
     Status(status::Args),
     /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
     Watch(watch::Args),
-    /// Show the environments of a running engine in a browser, on this machine alone, without slowing the trainer, until Ctrl-C.
+    /// Show the environments of a running engine in a browser, on this machine alone, until Ctrl-C.
     View(view::Args),
     /// Serve the page on which the environments are played, on this machine alone, until Ctrl-C.
     Play(play_page::Args),
