@@ -18,8 +18,14 @@ const TOOLS: [&str; 5] = ["auditwheel==6.8.2", "maturin==1.16.0", "uv==0.13.9", 
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, in the order in which they depend on each other.
-const CRATES: [&str; 5] =
-    ["endless-gym-core", "endless-gym-service", "endless-gym-page", "endless-gym-cli", "endless-gym"];
+const CRATES: [&str; 6] = [
+    "endless-gym-core",
+    "endless-gym-service",
+    "endless-gym-page",
+    "endless-gym-view",
+    "endless-gym-cli",
+    "endless-gym",
+];
 
 const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
 
@@ -228,7 +234,8 @@ fn check_files(name: &str, package: &Path) -> Result<(), String> {
         let is_code =
             folders.iter().any(|folder| file.starts_with(folder)) && kinds.iter().any(|kind| file.ends_with(kind));
         let is_page = name == "endless-gym-page" && (file.starts_with("files/") || file.starts_with("built/"));
-        is_code || is_page || file == "build.rs" || file.starts_with("tests/reference/")
+        let is_view = name == "endless-gym-view" && file.starts_with("files/");
+        is_code || is_page || is_view || file == "build.rs" || file.starts_with("tests/reference/")
     };
     match files.iter().find(|file| !TOP.contains(file) && !is_source(file)) {
         Some(stray) => Err(format!("the package of {name} contains {stray}; list what it needs in `include`")),

@@ -14,7 +14,7 @@ use crate::venv::workspace;
 /// has one variant without a name. Variants that show another error's message are left out.
 pub fn as_json() -> Result<String, String> {
     let mut types = Vec::new();
-    for name in ["core", "service", "cli"] {
+    for name in ["core", "service", "view", "cli"] {
         collect(&workspace().join("engine").join(name).join("src"), &mut types)?;
     }
     types.sort_by_key(|described| described["type"].to_string());

@@ -57,7 +57,7 @@ fn versions() -> Result<(), String> {
         ("CONTRIBUTING.md", format!("Rust {rust}")),
         ("bindings/python/README.md", format!("Rust {rust}")),
     ];
-    for name in ["core", "service", "cli"] {
+    for name in ["core", "service", "view", "cli"] {
         let line = format!("endless-gym-{name} = {{ path = \"engine/{name}\", version = \"{version}\" }}");
         expected.push(("Cargo.toml", line));
     }

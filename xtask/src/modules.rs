@@ -21,7 +21,7 @@ type Imports = BTreeMap<Module, BTreeSet<Module>>;
 pub fn check() -> Result<(), String> {
     println!("==> import cycles");
     let mut cycles = Vec::new();
-    for name in ["core", "service", "cli", "faults"] {
+    for name in ["core", "service", "view", "cli", "faults"] {
         let crate_root = workspace().join("engine").join(name).join("src");
         let mut files = BTreeMap::new();
         collect(&crate_root, &[], &mut files)?;

@@ -14,6 +14,7 @@ use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
 use super::play::{EpisodeStatistics, ExpertPolicy, Policy, RandomPolicy};
 use super::stop;
+use super::view::Beside;
 
 /// Arguments of `endless demo`.
 #[derive(clap::Args)]
@@ -33,9 +34,15 @@ pub struct Args {
     /// Threads of the engine; 0 for one per core.
     #[arg(long, default_value_t = 0)]
     threads: usize,
-    /// Duration in seconds.
-    #[arg(long, default_value_t = 10.0)]
-    seconds: f64,
+    /// Duration in seconds [default: 10; with `--view` until Ctrl-C].
+    #[arg(long)]
+    seconds: Option<f64>,
+    /// Show the environments in a browser, as `endless view` does: print the address [default: no page].
+    #[arg(long, conflicts_with = "json")]
+    view: bool,
+    /// Open that page in a browser, with `xdg-open` [default: print the address].
+    #[arg(long, requires = "view")]
+    open: bool,
     #[command(flatten)]
     environment: EnvironmentArgs,
     /// Print JSON [default: text].
@@ -56,6 +63,9 @@ impl Default for Args {
     }
 }
 
+/// Duration without `--seconds`.
+const SECONDS: f64 = 10.0;
+
 /// Time between two updates of the progress bar.
 const REFRESH_INTERVAL: Duration = Duration::from_millis(250);
 
@@ -65,7 +75,10 @@ const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 /// Runs `endless demo`.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let spec = envs::spec(&args.id)?;
-    let seconds = options::seconds("--seconds", args.seconds)?;
+    let seconds = match (args.seconds, args.view) {
+        (None, true) => Duration::MAX,
+        (given, _) => options::seconds("--seconds", given.unwrap_or(SECONDS))?,
+    };
     let stop = stop::on_signal()?;
     let num_envs = args.num_envs.unwrap_or(match (spec.family, args.policy) {
         (Family::SearingSpotlights(_), Policy::Expert) => 16,
@@ -84,6 +97,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     arguments.extend(args.environment.arguments());
     let mut engine = EngineProcess::start(&arguments)?;
     let mut trainer = engine.connect(stop)?;
+    let _view = if args.view { Some(Beside::start(engine.service(), args.open)?) } else { None };
 
     let mut random = RandomPolicy::new(spec);
     let mut experts: Vec<_> = (0..args.groups).map(|_| ExpertPolicy::new(spec, num_envs)).collect();
@@ -91,7 +105,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     for group in 0..args.groups {
         trainer.reset(group, ResetRequest::All)?;
     }
-    let bar = progress(args.seconds.ceil() as u64, "{spinner} {pos}/{len} s  {msg}");
+    let template = if seconds == Duration::MAX { "{spinner} {pos} s  {msg}" } else { "{spinner} {pos}/{len} s  {msg}" };
+    let bar = progress(seconds.as_secs_f64().ceil() as u64, template);
     let start = Instant::now();
     let mut refreshed = start;
     while start.elapsed() < seconds && !stop.load(Ordering::Relaxed) {

@@ -69,6 +69,11 @@ impl EngineProcess {
         Ok(EngineProcess { child, stderr, config })
     }
 
+    /// The engine's name.
+    pub fn service(&self) -> &str {
+        &self.config.service
+    }
+
     /// Connects as the engine's trainer, and waits for the engine to start. Setting `stop` ends the wait with an error.
     pub fn connect(&mut self, stop: &AtomicBool) -> Result<Trainer, Failure> {
         self.connect_within(START_TIMEOUT, stop)

@@ -10,15 +10,18 @@ mod frames;
 mod list;
 mod logs;
 mod metrics;
+mod open;
 mod options;
 mod output;
 mod picture;
 mod play;
+mod play_page;
 mod record;
 mod serve;
 mod status;
 mod stop;
 mod verify;
+mod view;
 mod watch;
 
 use std::ffi::OsString;
@@ -54,6 +57,10 @@ enum Command {
     Status(status::Args),
     /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
     Watch(watch::Args),
+    /// Show the environments of a running engine in a browser, on this machine alone, until Ctrl-C.
+    View(view::Args),
+    /// Serve the page on which the environments are played, on this machine alone, until Ctrl-C.
+    Play(play_page::Args),
     /// Record episodes of scripted experts or of random actions as a Minari data set (Python package).
     #[command(disable_help_flag = true)]
     Record(record::Args),
@@ -82,7 +89,7 @@ const FAILURE: u8 = 1;
 ///
 /// The first call of a process that has no subscriber of `tracing` yet installs one that logs to standard error.
 ///
-/// `demo`, `serve`, `watch` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
+/// `demo`, `serve`, `watch`, `view`, `play` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
 /// stops the command, and a second one ends the process at once. Do not run two of them at the
 /// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
@@ -122,6 +129,8 @@ fn run(cli: Cli) -> Result<bool, Failure> {
         Command::Serve(args) => serve::run(&args)?,
         Command::Status(args) => status::run(&args)?,
         Command::Watch(args) => watch::run(&args)?,
+        Command::View(args) => view::run(&args)?,
+        Command::Play(args) => play_page::run(&args)?,
         Command::Record(_) => return Err(record::run()),
         Command::Bench(args) => bench::run(&args)?,
         Command::Frames(args) => frames::run(&args)?,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from endless_gym.agents.recovery import RecoverableEngine
 from endless_gym.agents.settings import TRAINING_SEEDS, Settings
+from endless_gym.agents.view import ViewProcess
 from endless_gym.engine import serve
 from endless_gym.episodes import EpisodeOptions
 from endless_gym.specs import Spec, spec
@@ -81,7 +82,17 @@ class Environments:
             "observation": wanted.observation,
         }
         make = partial(make_vec, settings.env, **arguments, episode_options=episode_options)
-        start = partial(serve, settings.env, **arguments)
+        self._view: ViewProcess | None = None
+
+        def start() -> EndlessVectorEnv:
+            envs = serve(settings.env, **arguments)
+            if settings.view:
+                # Another engine has another name.
+                self._end_view()
+                self._view = ViewProcess(envs)
+                print(f"view the environments at {self._view.url}", flush=True)
+            return envs
+
         self._engine: RecoverableEngine | None = None
         try:
             if not in_process:
@@ -143,6 +154,7 @@ class Environments:
         """Close the environments and end the engine process, if there is one."""
         if self._thread is not None:
             self._thread.shutdown(wait=True)
+        self._end_view()
         self._envs.close()
 
     def __enter__(self) -> Environments:
@@ -150,6 +162,12 @@ class Environments:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _end_view(self) -> None:
+        """End the page that shows the environments, if there is one."""
+        if self._view is not None:
+            self._view.end()
+            self._view = None
 
     def _start(self, observation: Any, info: dict[str, Any]) -> StepResult:
         zeros = np.zeros(self.per_group)

@@ -214,6 +214,8 @@ class Settings:
     success in 90 % of the episodes in the other finite environments. A target reward replaces it. The default of `quick`"""
     wandb: bool = False
     """also log to Weights & Biases, if it is installed"""
+    view: bool = False
+    """show the environments in a browser, and print the address of the page; needs `--environment.engine process`"""
     environment: Environment = field(default_factory=Environment)
     recurrence: Recurrence = field(default_factory=Recurrence)
     transformer: Transformer = field(default_factory=Transformer)
@@ -284,6 +286,11 @@ class Settings:
             raise ValueError(
                 f"--environment.num-envs must be a multiple of --environment.groups, got {environment.num_envs} environments and "
                 f"{environment.groups} groups"
+            )
+        if self.view and environment.engine != "process":
+            raise ValueError(
+                "--view needs environments in an engine process, got --environment.engine "
+                f"{environment.engine}; add --environment.engine process"
             )
         if transformer.window == 1:
             raise ValueError(

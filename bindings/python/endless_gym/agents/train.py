@@ -269,7 +269,7 @@ def parse(arguments: list[str]) -> Settings:
     first.add_argument("--resume", default="")
     chosen = first.parse_known_args(arguments)[0]
     if chosen.resume:
-        defaults = dataclasses.replace(checkpoint.read_settings(chosen.resume), time_limit=0.0)
+        defaults = dataclasses.replace(checkpoint.read_settings(chosen.resume), time_limit=0.0, view=False)
     else:
         # tyro reports an unknown preset.
         defaults = PRESETS.get(chosen.preset, PRESETS["paper"])

@@ -1,0 +1,59 @@
+"""A page in the browser that shows the environments of a training run: `endless view` as a child process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+from endless_gym.program import program
+from endless_gym.vector import EndlessVectorEnv
+
+#: In a process group of its own, so that Ctrl-C reaches the training alone, which then ends the page.
+_OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
+
+
+class ViewProcess:
+    """The server of a page that shows one engine. It ends with `end` and with this process.
+
+    Attributes:
+        url: The address of the page, with its token.
+    """
+
+    def __init__(self, envs: EndlessVectorEnv) -> None:
+        """Start the server.
+
+        Args:
+            envs: Environments of `serve`.
+
+        Raises:
+            RuntimeError: The server cannot start.
+        """
+        backend: Any = envs._backend
+        self._process = subprocess.Popen(
+            [*program(), "view", backend._engine.service, f"--child={os.getpid()}"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            **_OWN_GROUP,
+        )
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if "http://" not in line:
+            self.end()
+            raise RuntimeError(
+                f"the page cannot be served: `endless view` ended with status {self._process.returncode}"
+            )
+        self.url = line.split()[-1]
+
+    def end(self) -> None:
+        """End the server, and wait for its end."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()

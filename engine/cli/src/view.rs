@@ -1,0 +1,92 @@
+//! `endless view`: a page that shows a running engine, served on this machine.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+
+use endless_gym_service::Namespace;
+use endless_gym_view::ViewServer;
+
+use super::failure::Failure;
+use super::open;
+use super::output::{print, print_error};
+use super::stop;
+
+/// Arguments of `endless view`.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Name of the engine, which need not run yet [default: the page lists those that are running].
+    service: Option<String>,
+    #[command(flatten)]
+    page: PageArgs,
+    /// Stop when standard input closes or gives a byte: for a server that is a child process. With the id of the parent process,
+    /// also stop when that process ends.
+    #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
+    #[expect(clippy::option_option, reason = "clap's form of an option with an optional value")]
+    child: Option<Option<u32>>,
+}
+
+/// Where a page is.
+#[derive(clap::Args)]
+pub struct PageArgs {
+    /// Port on 127.0.0.1; 0 takes any that is free.
+    #[arg(long, default_value_t = 0)]
+    port: u16,
+    /// Open the page in a browser, with `xdg-open` [default: print the address].
+    #[arg(long)]
+    open: bool,
+}
+
+/// Runs `endless view`, until a signal stops it.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let stop = stop::on_signal()?;
+    if let Some(parent) = args.child {
+        stop::with_parent(stop, parent);
+    }
+    let server = announce(args.service.as_deref(), args.page.port, args.page.open)?;
+    if args.child.is_none() {
+        print("stop with Ctrl-C")?;
+    }
+    Ok(server.run(stop)?)
+}
+
+/// Takes the port and prints the address.
+fn announce(service: Option<&str>, port: u16, open: bool) -> Result<ViewServer, Failure> {
+    let server = ViewServer::bind(port, Namespace::default(), service)?;
+    let url = server.url();
+    print(format_args!("view {} at {url}", service.unwrap_or("the running engines")))?;
+    if open {
+        open::in_browser(&url)?;
+    }
+    Ok(server)
+}
+
+/// A page that is served in a thread, beside something else. It ends when this is dropped.
+pub struct Beside {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Beside {
+    /// Shows an engine on any free port, and prints the address.
+    pub fn start(service: &str, open: bool) -> Result<Self, Failure> {
+        let server = announce(Some(service), 0, open)?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&stop);
+        let serve = move || {
+            if let Err(error) = server.run(&flag) {
+                print_error(&error);
+            }
+        };
+        let thread = thread::Builder::new().name("view".to_owned()).spawn(serve)?;
+        Ok(Beside { stop, thread: Some(thread) })
+    }
+}
+
+impl Drop for Beside {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        // A panic of the thread has been printed.
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}

@@ -1,0 +1,242 @@
+// The page: which engine is shown, and what the server says about it.
+
+import { Curves } from "./curves.js";
+import { Table, engines } from "./engines.js";
+import { decode, frameBytes, paint } from "./frames.js";
+import { duration, grouped, megabytes, processes, short } from "./numbers.js";
+
+const $ = (id) => document.getElementById(id);
+const RETRY = 1000;
+
+/** Environments beyond which the grid has no captions. */
+const CAPTIONS = 36;
+
+class View {
+  constructor() {
+    this.service = null;
+    this.socket = null;
+    this.frames = 0;
+    this.about = null;
+    this.newest = null;
+    this.group = 0;
+    this.first = 0;
+    this.large = null;
+    this.curves = new Curves($("curves"));
+    this.table = new Table($("engines"), (service) => this.show(service));
+    this.#listen();
+  }
+
+  /** Shows the engine that the server was started for, or the list. */
+  async start() {
+    const { service } = await this.#list();
+    if (service) this.show(service);
+    setInterval(() => this.#list().catch(() => {}), 2000);
+  }
+
+  /** Shows an engine; the list for an empty name. */
+  show(service) {
+    this.service = service;
+    [this.group, this.first, this.large, this.about, this.newest] = [0, 0, null, null, null];
+    $("large").hidden = true;
+    this.socket?.close();
+    this.curves.clear();
+    $("live").hidden = service === "";
+    $("list").hidden = service !== "";
+    $("grid").replaceChildren();
+    $("engine").value = service;
+    document.title = service === "" ? "Endless Gym: view" : `${service} – Endless Gym`;
+    if (service === "") this.#state("list", "engines");
+    else this.#connect();
+  }
+
+  async #list() {
+    const answer = await engines();
+    const names = answer.engines.map((engine) => engine.service);
+    if (this.service && !names.includes(this.service)) names.push(this.service);
+    const options = [["", "All engines"], ...names.map((name) => [name, name])];
+    const known = [...$("engine").options].map((option) => option.value).join("\n");
+    if (known !== options.map(([value]) => value).join("\n")) {
+      $("engine").replaceChildren(...options.map(([value, textContent]) => Object.assign(document.createElement("option"), { value, textContent })));
+    }
+    $("engine").value = this.service ?? "";
+    this.table.show(answer.engines);
+    $("none").hidden = answer.engines.length > 0;
+    if (this.service === null && !answer.service) this.show("");
+    return answer;
+  }
+
+  #connect() {
+    const service = this.service;
+    const address = new URL(`socket?service=${encodeURIComponent(service)}`, document.baseURI);
+    address.protocol = "ws:";
+    const socket = new WebSocket(address);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    this.#state("waiting", "connecting");
+    socket.addEventListener("open", () => this.#select());
+    socket.addEventListener("message", ({ data }) => {
+      if (socket !== this.socket) return;
+      if (typeof data === "string") this.#points(JSON.parse(data));
+      else this.#received(decode(data));
+    });
+    socket.addEventListener("close", () => {
+      if (socket !== this.socket || service !== this.service) return;
+      this.#state("lost", "the server has ended");
+      setTimeout(() => socket === this.socket && this.#connect(), RETRY);
+    });
+  }
+
+  #points({ anew, points }) {
+    if (anew) this.curves.clear();
+    this.curves.add(points);
+  }
+
+  #received({ about, pixels }) {
+    const words = { live: "live", lost: "lost: waiting for the engine", waiting: "waiting for the engine", refused: about.reason };
+    this.#state(about.state, words[about.state]);
+    if (about.state !== "live") return;
+    const before = this.about;
+    this.about = about;
+    if (before?.num_envs !== about.num_envs || before?.groups !== about.groups) this.#layout(about);
+    if (about.status) this.#numbers(about.status);
+    if (!about.batch || about.batch.group !== this.group) return;
+    this.frames += 1;
+    const { frame, envs } = about.batch;
+    $("no-frames").hidden = Boolean(frame);
+    $("views").hidden = !frame;
+    $("rows").hidden = Boolean(frame);
+    this.newest = frame ? { frame, envs, pixels } : null;
+    if (frame) this.#paint(this.newest);
+    else this.#rows(about.batch);
+  }
+
+  #state(state, text) {
+    $("state").dataset.state = state;
+    $("state").textContent = text;
+    $("live").classList.toggle("lost", state === "lost");
+  }
+
+  #numbers(status) {
+    const values = [
+      ["Environment", status.id],
+      ["Environments", `${status.groups} × ${status.num_envs}`],
+      ["Steps", grouped(status.env_steps)],
+      ["Shared memory", megabytes(status.shared_memory_bytes)],
+      ["Held batches", `${status.held} + ${status.held_by_observers} observed`],
+      ["Trainer", processes(status.trainers)],
+      ["Last request", status.seconds_since_request === null ? "none" : `${duration(status.seconds_since_request)} ago`],
+      ["Up", duration(status.uptime_seconds)],
+    ];
+    const rows = values.map(([term, value]) => {
+      const row = document.createElement("div");
+      row.append(Object.assign(document.createElement("dt"), { textContent: term }), Object.assign(document.createElement("dd"), { textContent: value }));
+      return row;
+    });
+    $("numbers").replaceChildren(...rows);
+  }
+
+  /** The choices, for another engine than before. */
+  #layout(about) {
+    this.group = Math.min(this.group, about.groups - 1);
+    this.first = Math.min(this.first, about.num_envs - 1);
+    const groups = Array.from({ length: about.groups }, (_, group) => Object.assign(document.createElement("option"), { textContent: group }));
+    $("group").replaceChildren(...groups);
+    $("group").value = this.group;
+    $("group-label").hidden = about.groups === 1;
+    this.#select();
+  }
+
+  /** Tells the server which environments are shown. */
+  #select() {
+    const most = this.about?.num_envs ?? Infinity;
+    const count = Number($("count").value);
+    const envs = Array.from({ length: count }, (_, i) => this.first + i).filter((env) => env < most);
+    if (this.about) {
+      $("range").textContent = `${grouped(this.first)} to ${grouped(envs.at(-1))} of ${grouped(most)}`;
+      $("before").disabled = this.first === 0;
+      $("after").disabled = this.first + count >= most;
+    }
+    if (this.large !== null && !envs.includes(this.large)) envs.push(this.large);
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ group: this.group, envs }));
+  }
+
+  #paint({ frame, envs, pixels }) {
+    const bytes = frameBytes(frame);
+    const count = Number($("count").value);
+    const shown = envs.filter(({ env }) => env >= this.first && env < this.first + count);
+    const grid = $("grid");
+    if (grid.children.length !== shown.length) grid.replaceChildren(...shown.map(() => this.#place()));
+    grid.style.setProperty("--columns", Math.ceil(Math.sqrt(shown.length)));
+    grid.toggleAttribute("data-many", shown.length > CAPTIONS);
+    let place = 0;
+    envs.forEach((each, i) => {
+      if (each.env >= this.first && each.env < this.first + count) {
+        const button = grid.children[place++];
+        button.dataset.env = each.env;
+        button.setAttribute("aria-pressed", String(each.env === this.large));
+        button.lastChild.textContent = `${each.env}: ${short(each.return, 2)}`;
+        paint(button.firstChild, frame, pixels, i * bytes);
+      }
+      if (each.env === this.large) {
+        $("caption").textContent = `Environment ${each.env}: step ${each.length}, reward ${short(each.reward, 2)}, return ${short(each.return, 2)}`;
+        paint($("enlarged"), frame, pixels, i * bytes);
+      }
+    });
+  }
+
+  #place() {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.append(document.createElement("canvas"), document.createElement("span"));
+    button.addEventListener("click", () => this.enlarge(Number(button.dataset.env)));
+    return button;
+  }
+
+  /** Shows one environment large; none for `null`, or for the one that is large. */
+  enlarge(env) {
+    this.large = env === this.large ? null : env;
+    $("large").hidden = this.large === null;
+    $("caption").textContent = "";
+    // A trainer that pauses sends nothing new.
+    if (this.newest) this.#paint(this.newest);
+    this.#select();
+  }
+
+  #rows({ envs, features }) {
+    const row = (kind, texts) => {
+      const made = document.createElement("tr");
+      made.append(...texts.map((textContent) => Object.assign(document.createElement(kind), { textContent })));
+      return made;
+    };
+    $("columns").replaceChildren(row("th", ["environment", "step", "reward", "return", ...features]));
+    $("values").replaceChildren(...envs.map((each) => row("td", [each.env, each.length, short(each.reward, 2), short(each.return, 2), ...each.features.map((number) => short(number, 2))])));
+  }
+
+  #listen() {
+    const move = (change) => {
+      change(Number($("count").value));
+      this.#select();
+    };
+    $("engine").addEventListener("change", () => this.show($("engine").value));
+    $("group").addEventListener("change", () => move(() => (this.group = Number($("group").value))));
+    $("count").addEventListener("change", () => move((count) => (this.first -= this.first % count)));
+    $("before").addEventListener("click", () => move((count) => (this.first = Math.max(0, this.first - count))));
+    $("after").addEventListener("click", () => move((count) => (this.first += count)));
+    $("smaller").addEventListener("click", () => this.enlarge(null));
+    $("theme").addEventListener("click", () => {
+      const root = document.documentElement;
+      const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+      root.dataset.theme = dark ? "light" : "dark";
+    });
+  }
+}
+
+const view = new View();
+// For tests, and for the curious.
+globalThis.endless = view;
+try {
+  await view.start();
+} catch (error) {
+  $("message").textContent = error.message;
+  $("message").hidden = false;
+}

@@ -1,0 +1,36 @@
+//! What the page says about engines, from the status that each publishes.
+
+use endless_gym_service::{EngineStatus, GroupStatus, Namespace};
+use serde_json::{Value as Json, json};
+
+/// The running engines, sorted by name.
+pub(crate) fn list(namespace: &Namespace) -> Vec<Json> {
+    EngineStatus::all(namespace).iter().map(|status| describe(status, namespace)).collect()
+}
+
+/// One engine: what it has done, and who uses it.
+pub(crate) fn describe(status: &EngineStatus, namespace: &Namespace) -> Json {
+    // Saturating: the numbers come from another process.
+    let sum = |field: fn(&GroupStatus) -> u64| status.groups.iter().map(field).fold(0, u64::saturating_add);
+    let processes = status.processes(namespace);
+    let last_request = status.groups.iter().filter_map(|group| group.last_request).min();
+    json!({
+        "service": status.service,
+        "id": status.id,
+        "process": status.process,
+        // Not every reader of JSON keeps 64 bits.
+        "incarnation": format!("{:016x}", status.incarnation),
+        "groups": status.groups.len(),
+        "num_envs": status.num_envs,
+        "uptime_seconds": status.uptime.as_secs_f64(),
+        "env_steps": sum(|group| group.env_steps),
+        "episodes": sum(|group| group.episodes),
+        "held": sum(|group| u64::from(group.held)),
+        "held_by_observers": sum(|group| group.observers.iter().map(|observer| u64::from(observer.held)).sum()),
+        "trainers": processes.trainers,
+        "observers": processes.observers,
+        "shared_memory_bytes": status.shared_memory(namespace),
+        "recoveries": status.recoveries,
+        "seconds_since_request": last_request.map(|since| since.as_secs_f64()),
+    })
+}

@@ -1,0 +1,25 @@
+//! Errors of the servers.
+
+/// Why a page is not served.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewError {
+    /// The port cannot be used.
+    #[error("cannot listen on 127.0.0.1:{port}: {reason}; give another --port, or 0 for any that is free")]
+    Port {
+        /// The port that was given.
+        port: u16,
+        /// The reason of the operating system.
+        reason: std::io::Error,
+    },
+    /// The page on which the environments are played is not part of this program.
+    #[error(
+        "this program was built without the page that plays the environments: run `cargo xtask web`, then build it again"
+    )]
+    PageNotBuilt,
+    /// The server cannot run.
+    #[error("the web server cannot run: {reason}")]
+    Server {
+        /// The reason of the operating system.
+        reason: std::io::Error,
+    },
+}

@@ -1,0 +1,101 @@
+//! A message to a browser: what is known of an engine as JSON, and the pixels of the environments that it shows.
+//!
+//! The length of the JSON text as a little-endian `u32`, the text, and the newest frame of each environment as it is in
+//! the batch.
+
+use endless_gym_core::batch::{Batch, BatchSection, Frames, Section};
+use endless_gym_core::envs::SCREEN;
+use endless_gym_service::{BatchLease, ServiceSpecification};
+use serde::Deserialize;
+use serde_json::{Value as Json, json};
+
+/// Environments that one browser may show at a time.
+pub(crate) const MAX_SHOWN: usize = 144;
+
+/// Which environments a browser shows.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Selection {
+    /// Their group.
+    pub group: usize,
+    /// Their numbers in the group. Those that do not exist are left out, and so are those after the first [`MAX_SHOWN`].
+    pub envs: Vec<usize>,
+}
+
+impl Default for Selection {
+    fn default() -> Self {
+        Selection { group: 0, envs: (0..16).collect() }
+    }
+}
+
+impl Selection {
+    /// The environments of the selection that the engine has.
+    fn existing(&self, num_envs: usize) -> Vec<usize> {
+        self.envs.iter().copied().filter(|env| *env < num_envs).take(MAX_SHOWN).collect()
+    }
+}
+
+/// Where a frame's numbers lie: bytes between neighbours. A grayscale frame has one channel.
+fn describe(frames: Frames) -> Json {
+    let (format, side) = (frames.format, SCREEN);
+    let channels = if format.grayscale { 1 } else { 3 };
+    let (pixel, channel) = if format.channels_first { (1, side * side) } else { (channels, 1) };
+    let (x, y) = if format.row_major { (pixel, pixel * side) } else { (pixel * side, pixel) };
+    json!({"width": side, "height": side, "channels": channels, "x": x, "y": y, "channel": channel, "stack": frames.stack})
+}
+
+/// The message, with `about` as the JSON and with what a batch says about the selected environments.
+pub(crate) fn encode(
+    mut about: Json,
+    specification: Option<&ServiceSpecification>,
+    selection: &Selection,
+    lease: Option<&BatchLease>,
+) -> Vec<u8> {
+    let mut pixels = Vec::new();
+    if let (Some(specification), Some(lease)) = (specification, lease) {
+        let (batch, envs) = (lease.batch(), selection.existing(specification.num_envs));
+        about["batch"] = rows(specification, &batch, &envs);
+        about["batch"]["step"] = json!(lease.step());
+        about["batch"]["group"] = json!(lease.group());
+        if let Some(frames) = specification.frames {
+            about["batch"]["frame"] = describe(frames);
+            pixels = newest_frames(specification, frames, &batch, &envs);
+        }
+    }
+    let text = about.to_string();
+    let mut message = Vec::with_capacity(4 + text.len() + pixels.len());
+    message.extend_from_slice(&u32::try_from(text.len()).unwrap_or_default().to_le_bytes());
+    message.extend_from_slice(text.as_bytes());
+    message.extend_from_slice(&pixels);
+    message
+}
+
+/// The newest frame of each environment's observation.
+fn newest_frames(specification: &ServiceSpecification, frames: Frames, batch: &Batch<'_>, envs: &[usize]) -> Vec<u8> {
+    let width = specification.batch.section(BatchSection::Observation).map_or(0, Section::width);
+    // The stack is the first index, oldest first.
+    let length = width / frames.stack.max(1);
+    let rows = envs.iter().filter_map(|env| batch.observation().get(env * width..(env + 1) * width));
+    rows.flat_map(|row| &row[width - length..]).copied().collect()
+}
+
+/// The numbers of each environment.
+fn rows(specification: &ServiceSpecification, batch: &Batch<'_>, envs: &[usize]) -> Json {
+    let features = specification.features.len();
+    let names = if specification.frames.is_none() { &specification.features[..] } else { &[] };
+    let values: Vec<Json> = envs
+        .iter()
+        .map(|env| {
+            let row = batch.features().get(env * features..(env + 1) * features).unwrap_or_default();
+            json!({
+                "env": env,
+                "reward": batch.reward().get(*env),
+                "return": batch.episode_return().get(*env),
+                "length": batch.episode_length().get(*env),
+                "ended": batch.terminated().get(*env).is_some_and(|flag| *flag != 0),
+                "features": if names.is_empty() { &[] } else { row },
+            })
+        })
+        .collect();
+    json!({"envs": values, "features": names})
+}

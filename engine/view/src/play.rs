@@ -1,0 +1,133 @@
+//! The server of the page on which the environments are played.
+
+use std::sync::atomic::AtomicBool;
+
+use axum::Router;
+use axum::http::{Method, StatusCode, Uri};
+use axum::response::{IntoResponse, Response};
+use form_urlencoded::Serializer;
+use serde_json::{Map, Value as Json};
+
+use crate::error::ViewError;
+use crate::local::{self, LocalPort};
+
+/// A service worker without effect, which replaces one that was installed at this address. The page's own keeps a copy of the
+/// page for use without a network, which this server makes needless, and which would outlive the program.
+const WORKER: &str = "addEventListener('install', () => skipWaiting());\n\
+                      addEventListener('activate', () => registration.unregister());\n";
+
+/// Serves the page on which the environments are played, on 127.0.0.1.
+///
+/// ```no_run
+/// use std::sync::atomic::AtomicBool;
+///
+/// use endless_gym_view::PlayServer;
+///
+/// let server = PlayServer::bind(0)?;
+/// println!("{}", server.url("MysteryPath-v0", &serde_json::Map::new(), Some(7)));
+/// server.run(&AtomicBool::new(false))?;
+/// # Ok::<(), endless_gym_view::ViewError>(())
+/// ```
+#[derive(Debug)]
+pub struct PlayServer {
+    port: LocalPort,
+}
+
+impl PlayServer {
+    /// Takes the port; 0 for any that is free.
+    ///
+    /// # Errors
+    ///
+    /// [`ViewError::PageNotBuilt`] if this program was built without the page, and [`ViewError::Port`] if the port is taken.
+    pub fn bind(port: u16) -> Result<Self, ViewError> {
+        if !endless_gym_page::is_built() {
+            return Err(ViewError::PageNotBuilt);
+        }
+        Ok(PlayServer { port: LocalPort::bind(port)? })
+    }
+
+    /// The address of an episode: an environment with reset parameters and a seed, or a random seed for `None`.
+    pub fn url(&self, id: &str, options: &Map<String, Json>, seed: Option<u64>) -> String {
+        format!("{}#{}", self.port.url(), link(id, options, seed))
+    }
+
+    /// Serves until the flag is set.
+    ///
+    /// # Errors
+    ///
+    /// [`ViewError::Server`] if the operating system refuses threads or descriptors.
+    pub fn run(self, stop: &AtomicBool) -> Result<(), ViewError> {
+        self.port.serve(Router::new().fallback(answer), stop)
+    }
+}
+
+async fn answer(method: Method, address: Uri) -> Response {
+    if !local::reads(&method) {
+        return (StatusCode::METHOD_NOT_ALLOWED, "the page is read with GET\n").into_response();
+    }
+    match address.path() {
+        "/" => found("index.html"),
+        "/worker.js" => local::file("worker.js", WORKER.as_bytes()),
+        path => found(path.strip_prefix('/').unwrap_or_default()),
+    }
+}
+
+fn found(name: &str) -> Response {
+    endless_gym_page::file(name).map_or_else(local::not_found, |bytes| local::file(name, bytes))
+}
+
+/// What stands behind `#` in the address of an episode, as `link.js` of the page reads it. Reset parameters are JSON; text that
+/// would not be read as anything else stands for itself.
+fn link(id: &str, options: &Map<String, Json>, seed: Option<u64>) -> String {
+    let mut fields = Serializer::new(String::new());
+    fields.append_pair("env", id);
+    if let Some(seed) = seed {
+        fields.append_pair("seed", &seed.to_string());
+    }
+    for (name, value) in options {
+        let plain = value.as_str().filter(|text| serde_json::from_str::<Json>(text).is_err());
+        fields.append_pair(name, plain.unwrap_or(&value.to_string()));
+    }
+    fields.finish()
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn answered(method: Method, path: &str) -> Response {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        runtime.block_on(answer(method, path.parse().unwrap()))
+    }
+
+    #[test]
+    fn the_pages_files_are_served_and_nothing_else() {
+        let kind = |response: &Response| response.headers()["content-type"].to_str().unwrap().to_owned();
+        for (name, _) in endless_gym_page::FILES {
+            assert_eq!(answered(Method::GET, &format!("/{name}")).status(), StatusCode::OK, "{name}");
+        }
+        assert_eq!(kind(&answered(Method::GET, "/")), "text/html; charset=utf-8");
+        assert_eq!(kind(&answered(Method::HEAD, "/app.js")), "text/javascript; charset=utf-8");
+        assert_eq!(kind(&local::file("engine.wasm", b"")), "application/wasm");
+        for path in
+            ["/../Cargo.toml", "/files/../index.html", "/%2e%2e/Cargo.toml", "//index.html", "/index.html/", "/x"]
+        {
+            assert_eq!(answered(Method::GET, path).status(), StatusCode::NOT_FOUND, "{path}");
+        }
+        assert_eq!(answered(Method::POST, "/").status(), StatusCode::METHOD_NOT_ALLOWED);
+    }
+
+    #[test]
+    fn a_link_is_what_the_page_reads() {
+        let Json::Object(options) = json!({"num_coins": [3], "agent_visible": true, "name": "a b", "digits": "7"})
+        else {
+            panic!("an object")
+        };
+        let found = link("SearingSpotlights-v0", &options, Some(u64::MAX));
+        let start = "env=SearingSpotlights-v0&seed=18446744073709551615&";
+        assert_eq!(found, format!("{start}num_coins=%5B3%5D&agent_visible=true&name=a+b&digits=%227%22"));
+        assert_eq!(link("MysteryPath-v0", &Map::new(), None), "env=MysteryPath-v0");
+    }
+}

@@ -1,0 +1,96 @@
+//! Episodes and speed of an engine over time.
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use endless_gym_core::batch::Batch;
+use endless_gym_service::EngineStatus;
+use serde::Serialize;
+
+/// The mean return and length are those of this number of episodes.
+const WINDOW: usize = 1000;
+
+/// Points that are kept, one a second.
+const MAX_POINTS: usize = 3600;
+
+/// What an engine did up to a moment.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub(crate) struct Point {
+    /// Seconds since the engine started.
+    pub seconds: f64,
+    /// Environment steps per second since the point before.
+    pub steps_per_second: f64,
+    /// Episodes that have ended since the engine started.
+    pub episodes: u64,
+    /// Means of the last episodes that were seen; `None` before the first.
+    pub mean_return: Option<f64>,
+    pub mean_length: Option<f64>,
+}
+
+/// The points of one run of an engine.
+#[derive(Debug, Default)]
+pub(crate) struct History {
+    /// The run of the engine.
+    pub incarnation: u64,
+    /// Points that were dropped from the front.
+    dropped: u64,
+    points: VecDeque<Point>,
+    /// When steps were last counted, and how many there were.
+    counted: Option<(Instant, u64)>,
+    /// Returns and lengths of the last episodes.
+    recent: VecDeque<(f64, i32)>,
+}
+
+impl History {
+    /// Starts anew if it is another run of the engine.
+    pub fn begin(&mut self, incarnation: u64) {
+        if self.incarnation != incarnation {
+            *self = History { incarnation, ..History::default() };
+        }
+        // A time without observation is not part of a rate.
+        self.counted = None;
+    }
+
+    /// Takes the episodes that have ended in a batch.
+    pub fn add(&mut self, batch: &Batch<'_>) {
+        let ended = batch.terminated().iter().zip(batch.truncated()).map(|(a, b)| a | b);
+        let results = batch.episode_return().iter().zip(batch.episode_length());
+        for (_, (total, length)) in ended.zip(results).filter(|(ended, _)| *ended != 0) {
+            if self.recent.len() == WINDOW {
+                self.recent.pop_front();
+            }
+            self.recent.push_back((*total, *length));
+        }
+    }
+
+    /// Adds a point, from the second status on.
+    pub fn point(&mut self, status: &EngineStatus) {
+        // Saturating: the numbers come from another process.
+        let sum = |field: fn(&endless_gym_service::GroupStatus) -> u64| {
+            status.groups.iter().map(field).fold(0, u64::saturating_add)
+        };
+        let (now, steps) = (Instant::now(), sum(|group| group.env_steps));
+        let Some((moment, before)) = self.counted.replace((now, steps)) else { return };
+        let count = self.recent.len() as f64;
+        let mean =
+            |value: fn(&(f64, i32)) -> f64| (count > 0.0).then(|| self.recent.iter().map(value).sum::<f64>() / count);
+        let point = Point {
+            seconds: status.uptime.as_secs_f64(),
+            steps_per_second: steps.saturating_sub(before) as f64 / (now - moment).as_secs_f64().max(1e-3),
+            episodes: sum(|group| group.episodes),
+            mean_return: mean(|episode| episode.0),
+            mean_length: mean(|episode| f64::from(episode.1)),
+        };
+        if self.points.len() == MAX_POINTS {
+            self.points.pop_front();
+            self.dropped += 1;
+        }
+        self.points.push_back(point);
+    }
+
+    /// The points from number `from` on, and the number after the last.
+    pub fn since(&self, from: u64) -> (Vec<Point>, u64) {
+        let skipped = usize::try_from(from.saturating_sub(self.dropped)).unwrap_or(usize::MAX);
+        (self.points.iter().skip(skipped).copied().collect(), self.dropped + self.points.len() as u64)
+    }
+}
