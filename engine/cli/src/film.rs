@@ -2,17 +2,16 @@
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym_core::pool::{Experts, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym_core::raster::PixelFormat;
 
 use super::failure::Failure;
-use super::play::ExpertPolicy;
 
 /// One environment that its scripted expert plays.
 pub struct Film {
     pool: Pool,
     blocks: Vec<Block>,
-    expert: ExpertPolicy,
+    expert: Experts,
     actions: Vec<i32>,
 }
 
@@ -27,7 +26,7 @@ impl Film {
         pool.reset(ResetRequest::All, &mut blocks)?;
         let spec = pool.spec();
         let actions = vec![0; spec.action_space.branches().len()];
-        Ok(Film { expert: ExpertPolicy::new(spec, 1), pool, blocks, actions })
+        Ok(Film { expert: Experts::new(spec, 1, config.autoreset), pool, blocks, actions })
     }
 
     fn batch(&self) -> Batch<'_> {
@@ -53,7 +52,7 @@ impl Film {
         if batch.terminated()[0] == 1 {
             return Ok(false);
         }
-        self.expert.act(&batch, &mut self.actions);
+        self.expert.act(&batch, &mut self.actions)?;
         self.pool.step(&self.actions, &mut self.blocks)?;
         Ok(true)
     }
