@@ -85,7 +85,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let mut engine = EngineProcess::start(&arguments)?;
     let mut trainer = engine.connect(stop)?;
 
-    let mut random = RandomPolicy::new(spec);
+    let mut random = RandomPolicy::new(spec, 0);
     let mut experts: Vec<_> = (0..args.groups).map(|_| Experts::new(spec, num_envs, Autoreset::NextStep)).collect();
     let mut statistics = EpisodeStatistics::new(spec);
     for group in 0..args.groups {

@@ -6,6 +6,8 @@ mod demo;
 mod engine_process;
 mod failure;
 mod film;
+mod film_file;
+mod film_picture;
 mod frames;
 mod list;
 mod logs;
@@ -54,7 +56,7 @@ enum Command {
     Status(status::Args),
     /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
     Watch(watch::Args),
-    /// Record episodes of scripted experts or of random actions as a Minari data set (Python package).
+    /// Record episodes of scripted experts or of random actions: a film, or a Minari data set (Python package).
     #[command(disable_help_flag = true)]
     Record(record::Args),
     /// Measure steps per second, in process and through shared memory.
@@ -94,20 +96,24 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsStrin
             return FAILURE;
         }
     };
-    let result = match Cli::try_parse_from(arguments) {
-        Ok(cli) => run(cli),
-        Err(usage) if usage.use_stderr() => {
-            // Without standard error, the exit status is the only remaining way to report.
-            let _ = usage.print();
-            return u8::try_from(usage.exit_code()).unwrap_or(FAILURE);
-        }
-        Err(help) => output::print_help(&help).map(|()| true),
-    };
-    match result {
+    match Cli::try_parse_from(arguments).map_err(Failure::from).and_then(run) {
         Ok(true) => 0,
         Ok(false) => FAILURE,
-        Err(error) => {
-            output::print_error(&*error);
+        Err(error) => report(&*error),
+    }
+}
+
+/// Prints an error, a usage or a help, and returns the exit status.
+fn report(error: &(dyn std::error::Error + 'static)) -> u8 {
+    match error.downcast_ref::<clap::Error>() {
+        Some(usage) if usage.use_stderr() => {
+            // Without standard error, the exit status is the only remaining way to report.
+            let _ = usage.print();
+            u8::try_from(usage.exit_code()).unwrap_or(FAILURE)
+        }
+        Some(help) => output::print_help(help).map_or_else(|error| report(&*error), |()| 0),
+        None => {
+            output::print_error(error);
             FAILURE
         }
     }
@@ -122,7 +128,7 @@ fn run(cli: Cli) -> Result<bool, Failure> {
         Command::Serve(args) => serve::run(&args)?,
         Command::Status(args) => status::run(&args)?,
         Command::Watch(args) => watch::run(&args)?,
-        Command::Record(_) => return Err(record::run()),
+        Command::Record(args) => record::run(&args)?,
         Command::Bench(args) => bench::run(&args)?,
         Command::Frames(args) => frames::run(&args)?,
         Command::Verify(args) => return verify::run(&args),

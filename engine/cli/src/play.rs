@@ -15,7 +15,7 @@ pub enum Policy {
     Random,
 }
 
-/// Uniformly random actions from a fixed seed.
+/// Uniformly random actions from a seed.
 pub struct RandomPolicy {
     branches: Vec<i32>,
     random: SmallRng,
@@ -23,8 +23,8 @@ pub struct RandomPolicy {
 
 impl RandomPolicy {
     /// A policy for the action space of `spec`.
-    pub fn new(spec: &EnvSpec) -> Self {
-        RandomPolicy { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(0) }
+    pub fn new(spec: &EnvSpec, seed: u64) -> Self {
+        RandomPolicy { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(seed) }
     }
 
     /// Fills `actions`: one row per environment, one number per branch of the action space.
