@@ -20,6 +20,7 @@ mod record;
 mod serve;
 mod status;
 mod stop;
+mod terminal;
 mod verify;
 mod watch;
 
@@ -56,6 +57,10 @@ enum Command {
     Status(status::Args),
     /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
     Watch(watch::Args),
+    /// Play an environment with the keyboard, in the terminal.
+    Play(terminal::play::Args),
+    /// Watch the environments of a running engine, in the terminal, without slowing the training.
+    View(terminal::view::Args),
     /// Record episodes of scripted experts or of random actions: a film, or a Minari data set (Python package).
     #[command(disable_help_flag = true)]
     Record(record::Args),
@@ -84,7 +89,7 @@ const FAILURE: u8 = 1;
 ///
 /// The first call of a process that has no subscriber of `tracing` yet installs one that logs to standard error.
 ///
-/// `demo`, `serve`, `watch` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
+/// `demo`, `serve`, `watch`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
 /// stops the command, and a second one ends the process at once. Do not run two of them at the
 /// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
@@ -128,6 +133,8 @@ fn run(cli: Cli) -> Result<bool, Failure> {
         Command::Serve(args) => serve::run(&args)?,
         Command::Status(args) => status::run(&args)?,
         Command::Watch(args) => watch::run(&args)?,
+        Command::Play(args) => terminal::play::run(&args)?,
+        Command::View(args) => terminal::view::run(&args)?,
         Command::Record(args) => record::run(&args)?,
         Command::Bench(args) => bench::run(&args)?,
         Command::Frames(args) => frames::run(&args)?,
