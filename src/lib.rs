@@ -32,9 +32,9 @@ pub mod envs {
 /// Many environments in this process, stepped in lockstep.
 pub mod pool {
     pub use endless_gym_core::pool::{
-        Autoreset, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError, ResetOptions,
-        ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError, Threads,
-        UnknownAutoreset, WrongFrame,
+        Autoreset, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError,
+        ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError,
+        Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }

@@ -10,7 +10,7 @@ use rustix::process::Signal;
 #[test]
 fn the_page_opens_at_an_episode() {
     let room = Room::new("play");
-    let arguments = ["play", "SearingSpotlights-v0", "--seed", "9", "--env-options", r#"{"num_coins": [3]}"#];
+    let arguments = ["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]"];
     if !endless_gym_page::is_built() {
         // `cargo xtask test` builds the program before the page.
         let output = room.run(&arguments);
@@ -47,8 +47,8 @@ fn what_cannot_be_played_is_said_before_the_page_is_served() {
     let room = Room::new("errors");
     for (arguments, message) in [
         (&["play", "Pong-v0"][..], "no environment `Pong-v0`"),
-        (&["play", "MysteryPath-v0", "--env-options", "{"], "--env-options {: EOF"),
-        (&["play", "MysteryPath-v0", "--env-options", r#"{"speed": 1}"#], "no reset parameter `speed`"),
+        (&["play", "MysteryPath-v0", "--option", "speed"], "--option speed: expected NAME=VALUE"),
+        (&["play", "MysteryPath-v0", "--option", "speed=1"], "no reset parameter `speed`"),
     ] {
         let output = room.run(arguments);
         assert_eq!(output.status.code(), Some(1));

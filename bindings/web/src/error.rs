@@ -1,7 +1,7 @@
 //! The errors of the page's engine. Those of reset parameters, actions and traces are the core's, unchanged.
 
 use endless_gym_core::envs::UnknownEnvironment;
-use endless_gym_core::pool::PoolError;
+use endless_gym_core::pool::{ExpertsError, PoolError};
 use endless_gym_core::trace::TraceError;
 use thiserror::Error;
 
@@ -41,6 +41,9 @@ pub enum WebError {
     /// The engine refuses.
     #[error(transparent)]
     Pool(#[from] PoolError),
+    /// The experts refuse.
+    #[error(transparent)]
+    Experts(#[from] ExpertsError),
     /// The file is no trace.
     #[error(transparent)]
     Trace(#[from] TraceError),

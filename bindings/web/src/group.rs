@@ -1,16 +1,15 @@
 //! Environments of one id that play by themselves.
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
-use endless_gym_core::envs::{self, Expert};
-use endless_gym_core::pool::{OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::envs;
+use endless_gym_core::pool::{Experts, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;
 
 enum Policy {
-    /// One expert for each environment, and whether its next observation is an episode's first.
-    Experts(Vec<(Box<dyn Expert>, bool)>),
+    Experts(Experts),
     Random(Generator),
 }
 
@@ -37,7 +36,7 @@ impl Group {
         pool.reset(ResetRequest::All, &mut blocks)?;
         let spec = pool.spec();
         let policy = match expert {
-            true => Policy::Experts((0..num_envs).map(|_| (envs::expert(spec), true)).collect()),
+            true => Policy::Experts(Experts::new(spec, num_envs, config.autoreset)),
             false => Policy::Random(Generator::from_seed(seed)),
         };
         let actions = vec![0; num_envs * spec.action_space.branches().len()];
@@ -46,28 +45,17 @@ impl Group {
 
     /// Steps every environment. An ended episode is followed by the next one in the step after.
     pub fn step(&mut self) -> Result<(), WebError> {
-        let spec = self.pool.spec();
-        let branches = spec.action_space.branches();
+        let branches = self.pool.spec().action_space.branches();
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        let rows = self.actions.chunks_exact_mut(branches.len());
         match &mut self.policy {
             Policy::Random(random) => {
-                for row in rows {
+                for row in self.actions.chunks_exact_mut(branches.len()) {
                     for (number, choices) in row.iter_mut().zip(branches) {
                         *number = random.integers(0, i64::from(*choices)) as i32;
                     }
                 }
             }
-            Policy::Experts(experts) => {
-                let features = batch.features().chunks_exact(spec.features.len());
-                for (env, ((row, (expert, first)), features)) in rows.zip(experts).zip(features).enumerate() {
-                    if std::mem::replace(first, batch.terminated()[env] == 1) {
-                        expert.reset();
-                    }
-                    let width = spec.vector_observation;
-                    expert.act(features, &batch.vector_observation()[env * width..][..width], row);
-                }
-            }
+            Policy::Experts(experts) => experts.act(&batch, &mut self.actions)?,
         }
         self.pool.step(&self.actions, &mut self.blocks)?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);

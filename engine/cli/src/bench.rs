@@ -246,7 +246,7 @@ impl Actions {
     fn new(spec: &EnvSpec, num_envs: usize) -> Self {
         let branches = spec.action_space.branches().len();
         let mut numbers = vec![0; (num_envs + Self::STEPS) * branches];
-        RandomPolicy::new(spec).act(&mut numbers);
+        RandomPolicy::new(spec, 0).act(&mut numbers);
         Actions { numbers, branches, length: num_envs * branches, step: 0 }
     }
 

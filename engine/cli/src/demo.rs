@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use endless_gym_core::envs::{self, EnvSpec, Family};
-use endless_gym_core::pool::ResetRequest;
+use endless_gym_core::pool::{Autoreset, Experts, ResetRequest};
 use serde_json::{Map, Value as Json, json};
 
 use super::engine_process::EngineProcess;
 use super::failure::Failure;
 use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
-use super::play::{EpisodeStatistics, ExpertPolicy, Policy, RandomPolicy};
+use super::play::{EpisodeStatistics, Policy, RandomPolicy};
 use super::stop;
 use super::view::Beside;
 
@@ -99,8 +99,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let mut trainer = engine.connect(stop)?;
     let _view = if args.view { Some(Beside::start(engine.service(), args.open)?) } else { None };
 
-    let mut random = RandomPolicy::new(spec);
-    let mut experts: Vec<_> = (0..args.groups).map(|_| ExpertPolicy::new(spec, num_envs)).collect();
+    let mut random = RandomPolicy::new(spec, 0);
+    let mut experts: Vec<_> = (0..args.groups).map(|_| Experts::new(spec, num_envs, Autoreset::NextStep)).collect();
     let mut statistics = EpisodeStatistics::new(spec);
     for group in 0..args.groups {
         trainer.reset(group, ResetRequest::All)?;
@@ -114,10 +114,12 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             let received = trainer.receive(group, STEP_TIMEOUT)?;
             let batch = received.batch();
             statistics.add(&batch);
+            let mut acted = Ok(());
             trainer.send_with(group, |actions| match args.policy {
-                Policy::Expert => experts.act(&batch, actions),
+                Policy::Expert => acted = experts.act(&batch, actions),
                 Policy::Random => random.act(actions),
             })?;
+            acted?;
         }
         if refreshed.elapsed() >= REFRESH_INTERVAL {
             refreshed = Instant::now();

@@ -1,24 +1,35 @@
-//! An episode of a scripted expert, frame by frame.
+//! An episode that a policy plays, frame by frame.
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym_core::pool::{Experts, Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym_core::raster::PixelFormat;
 
 use super::failure::Failure;
-use super::play::ExpertPolicy;
+use super::play::{Policy, RandomPolicy};
 
-/// One environment that its scripted expert plays.
+/// Who plays.
+enum Player {
+    Expert(Experts),
+    Random(RandomPolicy),
+}
+
+/// One environment that a policy plays.
 pub struct Film {
     pool: Pool,
     blocks: Vec<Block>,
-    expert: ExpertPolicy,
+    player: Player,
     actions: Vec<i32>,
 }
 
 impl Film {
-    /// Starts the first episode of the environment that `config` describes.
+    /// Starts the first episode of the environment that `config` describes, which its scripted expert plays.
     pub fn new(config: &PoolConfig) -> Result<Self, Failure> {
+        Film::played_by(config, Policy::Expert, 0)
+    }
+
+    /// As [`new`](Film::new), with another policy. `action_seed` is the seed of the random actions.
+    pub fn played_by(config: &PoolConfig, policy: Policy, action_seed: u64) -> Result<Self, Failure> {
         let format = PixelFormat { row_major: true, ..PixelFormat::default() };
         let frames = Some(Frames { format, stack: 1 });
         let config = PoolConfig { num_envs: 1, total_envs: 1, features: true, frames, ..config.clone() };
@@ -27,7 +38,11 @@ impl Film {
         pool.reset(ResetRequest::All, &mut blocks)?;
         let spec = pool.spec();
         let actions = vec![0; spec.action_space.branches().len()];
-        Ok(Film { expert: ExpertPolicy::new(spec, 1), pool, blocks, actions })
+        let player = match policy {
+            Policy::Expert => Player::Expert(Experts::new(spec, 1, config.autoreset)),
+            Policy::Random => Player::Random(RandomPolicy::new(spec, action_seed)),
+        };
+        Ok(Film { player, pool, blocks, actions })
     }
 
     fn batch(&self) -> Batch<'_> {
@@ -47,13 +62,21 @@ impl Film {
         Ok(view)
     }
 
+    /// Return and length of the episode so far.
+    pub fn episode(&self) -> (f64, i32) {
+        (self.batch().episode_return()[0], self.batch().episode_length()[0])
+    }
+
     /// Plays one step, unless the episode has ended. Returns whether there was a step.
     pub fn step(&mut self) -> Result<bool, Failure> {
         let batch = Batch::new(self.pool.layout(), &self.blocks);
         if batch.terminated()[0] == 1 {
             return Ok(false);
         }
-        self.expert.act(&batch, &mut self.actions);
+        match &mut self.player {
+            Player::Expert(experts) => experts.act(&batch, &mut self.actions)?,
+            Player::Random(random) => random.act(&mut self.actions),
+        }
         self.pool.step(&self.actions, &mut self.blocks)?;
         Ok(true)
     }

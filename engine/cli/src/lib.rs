@@ -6,6 +6,8 @@ mod demo;
 mod engine_process;
 mod failure;
 mod film;
+mod film_file;
+mod film_picture;
 mod frames;
 mod list;
 mod logs;
@@ -15,11 +17,13 @@ mod options;
 mod output;
 mod picture;
 mod play;
+mod play_command;
 mod play_page;
 mod record;
 mod serve;
 mod status;
 mod stop;
+mod terminal;
 mod verify;
 mod view;
 mod watch;
@@ -57,11 +61,11 @@ enum Command {
     Status(status::Args),
     /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
     Watch(watch::Args),
-    /// Show the environments of a running engine in a browser, on this machine alone, until Ctrl-C.
+    /// Show the environments of a running engine, in a browser on this machine or in the terminal, without slowing the training.
     View(view::Args),
-    /// Serve the page on which the environments are played, on this machine alone, until Ctrl-C.
-    Play(play_page::Args),
-    /// Record episodes of scripted experts or of random actions as a Minari data set (Python package).
+    /// Play an environment, in a browser on this machine or in the terminal.
+    Play(play_command::Args),
+    /// Record episodes of scripted experts or of random actions: a film, or a Minari data set (Python package).
     #[command(disable_help_flag = true)]
     Record(record::Args),
     /// Measure steps per second, in process and through shared memory.
@@ -89,7 +93,7 @@ const FAILURE: u8 = 1;
 ///
 /// The first call of a process that has no subscriber of `tracing` yet installs one that logs to standard error.
 ///
-/// `demo`, `serve`, `watch`, `view`, `play` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
+/// `demo`, `serve`, `watch`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
 /// stops the command, and a second one ends the process at once. Do not run two of them at the
 /// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
@@ -101,20 +105,24 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsStrin
             return FAILURE;
         }
     };
-    let result = match Cli::try_parse_from(arguments) {
-        Ok(cli) => run(cli),
-        Err(usage) if usage.use_stderr() => {
-            // Without standard error, the exit status is the only remaining way to report.
-            let _ = usage.print();
-            return u8::try_from(usage.exit_code()).unwrap_or(FAILURE);
-        }
-        Err(help) => output::print_help(&help).map(|()| true),
-    };
-    match result {
+    match Cli::try_parse_from(arguments).map_err(Failure::from).and_then(run) {
         Ok(true) => 0,
         Ok(false) => FAILURE,
-        Err(error) => {
-            output::print_error(&*error);
+        Err(error) => report(&*error),
+    }
+}
+
+/// Prints an error, a usage or a help, and returns the exit status.
+fn report(error: &(dyn std::error::Error + 'static)) -> u8 {
+    match error.downcast_ref::<clap::Error>() {
+        Some(usage) if usage.use_stderr() => {
+            // Without standard error, the exit status is the only remaining way to report.
+            let _ = usage.print();
+            u8::try_from(usage.exit_code()).unwrap_or(FAILURE)
+        }
+        Some(help) => output::print_help(help).map_or_else(|error| report(&*error), |()| 0),
+        None => {
+            output::print_error(error);
             FAILURE
         }
     }
@@ -130,8 +138,8 @@ fn run(cli: Cli) -> Result<bool, Failure> {
         Command::Status(args) => status::run(&args)?,
         Command::Watch(args) => watch::run(&args)?,
         Command::View(args) => view::run(&args)?,
-        Command::Play(args) => play_page::run(&args)?,
-        Command::Record(_) => return Err(record::run()),
+        Command::Play(args) => play_command::run(&args)?,
+        Command::Record(args) => record::run(&args)?,
         Command::Bench(args) => bench::run(&args)?,
         Command::Frames(args) => frames::run(&args)?,
         Command::Verify(args) => return verify::run(&args),

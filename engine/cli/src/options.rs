@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use endless_gym_core::batch::Frames;
-use endless_gym_core::pool::{Autoreset, PoolConfig, ResetOptions, Seeding};
+use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::raster::PixelFormat;
 use serde_json::{Map, Value as Json};
 
@@ -102,15 +102,7 @@ impl EnvironmentArgs {
 
     /// The configuration of a pool with these arguments.
     pub fn configure(&self, id: &str, num_envs: usize) -> Result<PoolConfig, Failure> {
-        let mut options = Map::new();
-        for option in &self.options {
-            let (name, value) = option
-                .split_once('=')
-                .ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
-            // Text that is not JSON is passed on as a string; the parameter's own check then reports the allowed values.
-            let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
-            options.insert(name.to_owned(), value);
-        }
+        let options = parameters(&self.options)?;
         let each = self.env_options.iter().map(|options| {
             serde_json::from_str(options)
                 .map_err(|error| format!("--env-options {options}: expected a JSON object: {error}"))
@@ -125,6 +117,20 @@ impl EnvironmentArgs {
         let independent_episodes = self.independent_episodes;
         Ok(PoolConfig { options, seeding, independent_episodes, ..PoolConfig::new(id, num_envs) })
     }
+}
+
+/// The reset parameters of the arguments `--option NAME=VALUE`.
+pub fn parameters(given: &[String]) -> Result<OptionMap, Failure> {
+    let mut options = Map::new();
+    for option in given {
+        let (name, value) = option
+            .split_once('=')
+            .ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
+        // Text that is not JSON is passed on as a string; the parameter's own check then reports the allowed values.
+        let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
+        options.insert(name.to_owned(), value);
+    }
+    Ok(options)
 }
 
 /// The duration that the argument `name` gives in seconds.

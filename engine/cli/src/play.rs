@@ -2,7 +2,7 @@
 
 use clap::ValueEnum;
 use endless_gym_core::batch::Batch;
-use endless_gym_core::envs::{EnvSpec, Expert, expert};
+use endless_gym_core::envs::EnvSpec;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
@@ -15,7 +15,7 @@ pub enum Policy {
     Random,
 }
 
-/// Uniformly random actions from a fixed seed.
+/// Uniformly random actions from a seed.
 pub struct RandomPolicy {
     branches: Vec<i32>,
     random: SmallRng,
@@ -23,8 +23,8 @@ pub struct RandomPolicy {
 
 impl RandomPolicy {
     /// A policy for the action space of `spec`.
-    pub fn new(spec: &EnvSpec) -> Self {
-        RandomPolicy { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(0) }
+    pub fn new(spec: &EnvSpec, seed: u64) -> Self {
+        RandomPolicy { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(seed) }
     }
 
     /// Fills `actions`: one row per environment, one number per branch of the action space.
@@ -33,43 +33,6 @@ impl RandomPolicy {
             for (number, choices) in action.iter_mut().zip(&self.branches) {
                 *number = self.random.random_range(0..*choices);
             }
-        }
-    }
-}
-
-/// The scripted policies of a group of environments, for next-step auto-reset.
-pub struct ExpertPolicy {
-    experts: Vec<Box<dyn Expert>>,
-    /// Whether the last step ended the episode, so that the next step starts another.
-    ended: Vec<bool>,
-    features: usize,
-    vector_observation: usize,
-    branches: usize,
-}
-
-impl ExpertPolicy {
-    /// Policies for `num_envs` environments.
-    pub fn new(spec: &EnvSpec, num_envs: usize) -> Self {
-        ExpertPolicy {
-            experts: (0..num_envs).map(|_| expert(spec)).collect(),
-            ended: vec![true; num_envs],
-            features: spec.features.len(),
-            vector_observation: spec.vector_observation,
-            branches: spec.action_space.branches().len(),
-        }
-    }
-
-    /// Fills `actions` for the observations of `batch`.
-    pub fn act(&mut self, batch: &Batch<'_>, actions: &mut [i32]) {
-        let (features, vectors) = (batch.features(), batch.vector_observation());
-        let terminated = batch.terminated();
-        let rows = self.experts.iter_mut().zip(&mut self.ended).zip(actions.chunks_exact_mut(self.branches));
-        for (env, ((expert, ended), action)) in rows.enumerate() {
-            if std::mem::replace(ended, terminated[env] == 1) {
-                expert.reset();
-            }
-            let vector = &vectors[env * self.vector_observation..][..self.vector_observation];
-            expert.act(&features[env * self.features..][..self.features], vector, action);
         }
     }
 }

@@ -1,19 +1,145 @@
-//! `endless record`. The Python package's program runs it itself, since Python's libraries write the data sets.
+//! `endless record`: films. The Python package's program records data sets itself, since Python's libraries write them.
 
 use std::ffi::OsString;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+use clap::Parser;
+use endless_gym_core::envs::{self, EnvSpec};
+use endless_gym_core::pool::{PoolConfig, ResetOptions, Seeding};
 
 use super::failure::Failure;
+use super::film::Film;
+use super::film_file::{FilmFile, Format, Shape};
+use super::film_picture::View;
+use super::options::parameters;
+use super::output::print;
+use super::play::Policy;
+use super::stop;
 
-/// Arguments of `endless record`, which Python reads.
+/// Arguments of `endless record`: those of a film, or those of a data set, which Python reads.
 #[derive(clap::Args)]
 pub struct Args {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
-    _arguments: Vec<OsString>,
+    arguments: Vec<OsString>,
 }
 
-/// Says how to run `endless record`.
-pub fn run() -> Failure {
-    "`record` is a command of the Python package's program `endless`, and its first argument: \
-     pip install './bindings/python[minari]', or the wheel file with `[minari]` appended"
-        .into()
+/// Record a film of scripted experts or of random actions.
+///
+/// Each episode is played in an environment of its own, so that it follows from its seed and its reset parameters. Without --film,
+/// the Python package's program `endless record` writes a Minari data set.
+#[derive(Parser)]
+#[command(name = "endless record", max_term_width = 110)]
+struct FilmArgs {
+    /// Environment id; `endless list` lists them.
+    #[arg(value_name = "ID")]
+    id: String,
+    /// File of the film: .gif (256 colours for each picture), .png (animated, without loss) or .mp4 (needs ffmpeg).
+    #[arg(long, value_name = "FILE")]
+    film: PathBuf,
+    /// Number of episodes, which are shown in order.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    episodes: u64,
+    /// Number of steps after which an episode is cut off.
+    #[arg(long, value_name = "N", default_value_t = 1000)]
+    max_steps: u32,
+    /// Policy that chooses the actions.
+    #[arg(long, value_enum, default_value = "expert")]
+    policy: Policy,
+    /// Seed: episode i has the seed SEED + i.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Seed of the random actions.
+    #[arg(long, value_name = "SEED", default_value_t = 0)]
+    action_seed: u64,
+    /// Reset parameter, such as `arena_size=6`; may be repeated [default: the environment's own, which `endless list ID` shows].
+    #[arg(long = "option", value_name = "NAME=VALUE")]
+    options: Vec<String>,
+    /// What the film shows.
+    #[arg(long, value_enum, default_value = "both")]
+    view: View,
+    /// Pictures per second, 1 to 100 [default: the environment's].
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=100))]
+    fps: Option<u16>,
+    /// Pixels of the film for each pixel of a frame in each direction, 1 to 16.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=16))]
+    scale: u8,
+}
+
+/// Runs `endless record`.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let is = |argument: &OsString, name: &str| {
+        argument.to_str().is_some_and(|given| {
+            given.strip_prefix(name).is_some_and(|rest| matches!(rest.as_bytes(), [] | [b'=', ..]))
+        })
+    };
+    let is_film =
+        args.arguments.iter().any(|argument| ["--film", "--help", "-h"].iter().any(|name| is(argument, name)));
+    if !is_film {
+        return Err("a data set is recorded by the Python package's program `endless`, with `record` as its first argument: \
+             pip install './bindings/python[minari]', or the wheel file with `[minari]` appended; a film needs `--film FILE`"
+            .into());
+    }
+    let arguments = std::iter::once("endless record".into()).chain(args.arguments.iter().cloned());
+    film(&FilmArgs::try_parse_from(arguments)?)
+}
+
+impl FilmArgs {
+    /// The start of an episode.
+    fn start(&self, episode: u64) -> Result<Film, Failure> {
+        let config = PoolConfig {
+            options: ResetOptions::Shared(parameters(&self.options)?),
+            seeding: Seeding::Continue { seed: Some(self.seed.wrapping_add(episode)) },
+            ..PoolConfig::new(&self.id, 1)
+        };
+        Film::played_by(&config, self.policy, self.action_seed.wrapping_add(episode))
+    }
+
+    /// Pictures of all episodes.
+    fn count(&self) -> Result<u32, Failure> {
+        let mut count: u32 = 0;
+        for episode in 0..self.episodes {
+            let mut film = self.start(episode)?;
+            let mut steps = 0;
+            while steps < self.max_steps && film.step()? {
+                steps += 1;
+            }
+            count = count.checked_add(steps + 1).ok_or("the film has too many pictures; record fewer episodes")?;
+        }
+        Ok(count)
+    }
+}
+
+/// Records the film, and prints the return and the length of each episode.
+fn film(args: &FilmArgs) -> Result<(), Failure> {
+    let spec: &EnvSpec = envs::spec(&args.id)?;
+    // Played twice: the header of the file has the number of pictures.
+    let pictures = if Format::of(&args.film)? == Format::Png { args.count()? } else { 0 };
+    let fps = args.fps.unwrap_or(u16::try_from(spec.render_fps)?);
+    let shape = Shape { size: args.view.size(), scale: usize::from(args.scale), fps, pictures };
+    let stop = stop::on_signal()?;
+    // The environment first: what is wrong with its options is to be said before a file exists.
+    let mut next = Some(args.start(0)?);
+    let mut file = FilmFile::create(&args.film, shape)?;
+    let mut played = Vec::new();
+    for episode in 0..args.episodes {
+        let mut film = next.take().map_or_else(|| args.start(episode), Ok)?;
+        for step in 0..=args.max_steps {
+            if stop.load(Ordering::Relaxed) {
+                return Err("stopped, and wrote nothing".into());
+            }
+            let picture = args.view.picture(&mut film)?;
+            let is_last = step == args.max_steps || !film.step()?;
+            // An episode's last picture is shown for one second longer.
+            file.add(&picture, if is_last { 1 + fps } else { 1 })?;
+            if is_last {
+                break;
+            }
+        }
+        let (total, length) = film.episode();
+        played.push(format!("seed {}: return {total:.3} in {length} steps", args.seed.wrapping_add(episode)));
+    }
+    file.finish()?;
+    played.into_iter().try_for_each(print)?;
+    print(args.film.display())
 }

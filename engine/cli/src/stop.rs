@@ -17,6 +17,9 @@ static STOP: AtomicBool = AtomicBool::new(false);
 /// When the first signal came since the flag was cleared.
 static FIRST_SIGNAL: Mutex<Option<Instant>> = Mutex::new(None);
 
+/// What the process does before a second signal ends it.
+static BEFORE_EXIT: Mutex<Option<fn()>> = Mutex::new(None);
+
 /// Signals within this time of the first count as one: a terminal that closes sends several.
 const SAME_SIGNAL: Duration = Duration::from_millis(200);
 
@@ -35,6 +38,9 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
         STOP.store(true, Ordering::Relaxed);
         let mut first = FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner);
         if first.get_or_insert_with(Instant::now).elapsed() >= SAME_SIGNAL {
+            if let Some(action) = BEFORE_EXIT.lock().unwrap_or_else(PoisonError::into_inner).take() {
+                action();
+            }
             std::process::exit(INTERRUPTED);
         }
     };
@@ -43,6 +49,11 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     *FIRST_SIGNAL.lock().unwrap_or_else(PoisonError::into_inner) = None;
     STOP.store(false, Ordering::Relaxed);
     Ok(&STOP)
+}
+
+/// Has `action` run before a second signal ends the process.
+pub fn before_exit(action: fn()) {
+    *BEFORE_EXIT.lock().unwrap_or_else(PoisonError::into_inner) = Some(action);
 }
 
 /// Waits up to `time` for the flag, and returns whether it is set.

@@ -1,4 +1,4 @@
-//! `endless view`: a page that shows a running engine, served on this machine.
+//! `endless view`: a page that shows a running engine, served on this machine; or the same in the terminal.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,15 +10,23 @@ use endless_gym_view::ViewServer;
 use super::failure::Failure;
 use super::open;
 use super::output::{print, print_error};
-use super::stop;
+use super::{stop, terminal};
+
+/// The engine that is shown in the terminal by default.
+const DEFAULT_SERVICE: &str = "endless";
 
 /// Arguments of `endless view`.
+///
+/// The view is an observer: it does not slow the training. Ctrl-C ends it; in the terminal, Q and Esc do, too.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Name of the engine, which need not run yet [default: the page lists those that are running].
+    /// Name of the engine, which need not run yet for the page [default: the page lists those that are running; in the terminal
+    /// `endless`].
     service: Option<String>,
     #[command(flatten)]
     page: PageArgs,
+    #[command(flatten)]
+    terminal: terminal::view::Args,
     /// Stop when standard input closes or gives a byte: for a server that is a child process. With the id of the parent process,
     /// also stop when that process ends.
     #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
@@ -30,15 +38,18 @@ pub struct Args {
 #[derive(clap::Args)]
 pub struct PageArgs {
     /// Port on 127.0.0.1; 0 takes any that is free.
-    #[arg(long, default_value_t = 0)]
-    port: u16,
+    #[arg(long, default_value_t = 0, conflicts_with = "terminal")]
+    pub port: u16,
     /// Open the page in a browser, with `xdg-open` [default: print the address].
-    #[arg(long)]
-    open: bool,
+    #[arg(long, conflicts_with = "terminal")]
+    pub open: bool,
 }
 
 /// Runs `endless view`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
+    if args.terminal.terminal {
+        return terminal::view::run(args.service.as_deref().unwrap_or(DEFAULT_SERVICE), &args.terminal);
+    }
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {
         stop::with_parent(stop, parent);

@@ -45,12 +45,13 @@ pub struct Args {
 }
 
 /// What was observed so far.
-struct Statistics {
+pub struct Statistics {
     num_envs: u64,
     /// Batches of all groups, those that were missed included, without the first of each group.
     batches: u64,
     missed: u64,
-    episodes: u64,
+    /// Episodes that have ended.
+    pub episodes: u64,
     /// Returns and lengths of the last episodes.
     recent: VecDeque<(f64, i32)>,
     /// The time of the last batch.
@@ -60,7 +61,8 @@ struct Statistics {
 }
 
 impl Statistics {
-    fn new(num_envs: usize) -> Self {
+    /// Nothing observed yet, of groups with that number of environments.
+    pub fn new(num_envs: usize) -> Self {
         let now = Instant::now();
         Statistics {
             num_envs: num_envs as u64,
@@ -73,7 +75,8 @@ impl Statistics {
         }
     }
 
-    fn add(&mut self, observed: &Observed) {
+    /// Adds a batch.
+    pub fn add(&mut self, observed: &Observed) {
         self.batches += observed.missed.saturating_add(1);
         self.missed += observed.missed;
         self.last = Instant::now();
@@ -94,13 +97,13 @@ impl Statistics {
     }
 
     /// Environment steps per second since the last call.
-    fn rate(&mut self) -> f64 {
+    pub fn rate(&mut self) -> f64 {
         let (moment, before) = std::mem::replace(&mut self.since, (Instant::now(), self.batches));
         ((self.batches - before) * self.num_envs) as f64 / moment.elapsed().as_secs_f64().max(1e-3)
     }
 
     /// The mean return and the mean length of the last episodes.
-    fn means(&self) -> Option<(f64, f64)> {
+    pub fn means(&self) -> Option<(f64, f64)> {
         let count = self.recent.len() as f64;
         let sum = |value: fn(&(f64, i32)) -> f64| self.recent.iter().map(value).sum::<f64>();
         (count > 0.0).then(|| (sum(|recent| recent.0) / count, sum(|recent| f64::from(recent.1)) / count))
@@ -113,7 +116,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let interval = seconds("--interval", args.interval.unwrap_or(if is_live { LIVE_INTERVAL } else { LINE_INTERVAL }))?;
     let timeout = seconds("--timeout", args.timeout)?;
     let stop = stop::on_signal()?;
-    let Some(mut observers) = connect(args, timeout, stop)? else { return Ok(()) };
+    let Some(mut observers) = connect(&args.service, args.group, timeout, stop)? else { return Ok(()) };
     let mut statistics = Statistics::new(observers.specification().num_envs);
     let id = observers.specification().id.clone();
     let mut shown = Instant::now();
@@ -143,12 +146,17 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 }
 
 /// The observers, or `None` if a signal came while the engine was waited for.
-fn connect(args: &Args, timeout: Duration, stop: &AtomicBool) -> Result<Option<Observers>, Failure> {
+pub fn connect(
+    service: &str,
+    group: Option<usize>,
+    timeout: Duration,
+    stop: &AtomicBool,
+) -> Result<Option<Observers>, Failure> {
     let start = Instant::now();
     loop {
         let left = timeout.saturating_sub(start.elapsed());
-        let config = ConnectConfig { timeout: left.min(SLICE), ..ConnectConfig::new(&args.service) };
-        match Observers::connect(&config, args.group) {
+        let config = ConnectConfig { timeout: left.min(SLICE), ..ConnectConfig::new(service) };
+        match Observers::connect(&config, group) {
             Err(
                 ServiceError::UnknownEngine { .. }
                 | ServiceError::EngineUnreachable { .. }

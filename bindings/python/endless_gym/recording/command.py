@@ -152,6 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="endless record", description=__doc__.partition(": ")[2], allow_abbrev=False)
     add = parser.add_argument
     add("id", metavar="ID", help="environment id; `endless list` lists them")
+    add("--film", metavar="FILE", help="write a film instead; `endless record --film FILE --help` lists its options")
     add("--episodes", type=int, default=1000, metavar="N", help="number of episodes [default: 1000]")
     add("--policy", choices=("expert", "random"), default="expert", help="who plays [default: expert]")
     add(

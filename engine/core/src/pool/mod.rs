@@ -11,6 +11,7 @@ mod drawn_scene;
 mod env_slot;
 mod episodes;
 mod error;
+mod experts;
 mod family_slots;
 mod frame_stack;
 #[expect(clippy::module_inception, reason = "the file of the type `Pool`")]
@@ -26,6 +27,7 @@ pub use config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 pub use drawn_scene::WrongFrame;
 pub use episodes::{NextOptions, RunningEpisode};
 pub use error::PoolError;
+pub use experts::{Experts, ExpertsError};
 pub use pool::Pool;
 pub use seeding::Seeding;
 pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};

@@ -1,0 +1,75 @@
+//! The pictures of a film.
+
+use clap::ValueEnum;
+use endless_gym_core::envs::SCREEN;
+use endless_gym_core::envs::view::VIEW;
+
+use super::failure::Failure;
+use super::film::Film;
+
+/// What a picture shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum View {
+    /// What the agent sees.
+    Agent,
+    /// The original's debug view, which shows what is hidden from the agent.
+    GroundTruth,
+    /// Both, the agent's view on the left.
+    Both,
+}
+
+/// Pixels between the two views.
+const GAP: usize = 2;
+const GAP_COLOUR: [u8; 3] = [24; 3];
+
+/// RGB pixels in rows.
+pub struct Picture {
+    pub width: usize,
+    pub height: usize,
+    pub pixels: Vec<[u8; 3]>,
+}
+
+impl View {
+    /// Width and height of the pictures.
+    pub fn size(self) -> (usize, usize) {
+        (if self == View::Both { 2 * SCREEN + GAP } else { SCREEN }, SCREEN)
+    }
+
+    /// The picture of the film's current step. Call it once a step.
+    pub fn picture(self, film: &mut Film) -> Result<Picture, Failure> {
+        let view = film.ground_truth_view()?;
+        let view = view.as_chunks::<3>().0;
+        let agent = film.observation().as_chunks::<3>().0;
+        // The view is the frame with every pixel magnified.
+        let magnified = VIEW / SCREEN;
+        let mut pixels = Vec::new();
+        for row in 0..SCREEN {
+            let of_agent = || agent[row * SCREEN..][..SCREEN].iter().copied();
+            let of_view = || view[row * magnified * VIEW..][..VIEW].iter().step_by(magnified).copied();
+            match self {
+                View::Agent => pixels.extend(of_agent()),
+                View::GroundTruth => pixels.extend(of_view()),
+                View::Both => pixels.extend(of_agent().chain([GAP_COLOUR; GAP]).chain(of_view())),
+            }
+        }
+        let (width, height) = self.size();
+        Ok(Picture { width, height, pixels })
+    }
+}
+
+/// Magnifies a picture in rows of `width` pixels: each becomes a square with that side.
+pub fn magnified<T: Copy>(pixels: &[T], width: usize, scale: usize) -> Vec<T> {
+    let wide = |row: &[T]| row.iter().flat_map(|pixel| std::iter::repeat_n(*pixel, scale)).collect::<Vec<T>>();
+    pixels.chunks_exact(width).flat_map(|row| wide(row).repeat(scale)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_pixel_becomes_a_square() {
+        assert_eq!(magnified(&[1, 2, 3, 4], 2, 1), [1, 2, 3, 4]);
+        assert_eq!(magnified(&[1, 2, 3, 4], 2, 2), [1, 1, 2, 2, 1, 1, 2, 2, 3, 3, 4, 4, 3, 3, 4, 4]);
+    }
+}

@@ -1,0 +1,42 @@
+//! `endless play`: an environment for a person, on a page or in the terminal.
+
+use super::failure::Failure;
+use super::options::parameters;
+use super::view::PageArgs;
+use super::{play_page, terminal};
+
+/// Arguments of `endless play`.
+///
+/// In the terminal, arrows or W A S D move, Q E Z C move diagonally. Space or P pauses; then N plays one step without a movement, and
+/// a movement one step. R restarts the episode, page up and page down start the one of the next and the previous seed, Esc or Ctrl-C
+/// quits.
+///
+/// Most terminals do not report when a key is released. A key acts in at least one step, and on until HOLD seconds after the terminal
+/// last reported it; while it is down it is reported again and again, after a delay that the system's settings choose. Another direction
+/// replaces it at once; two that are pressed within one step move diagonally. Terminals with the kitty keyboard protocol report
+/// releases, and there a key acts while it is down.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Environment id; `endless list` lists them.
+    #[arg(value_name = "ID", default_value = "MortarMayhem-v0")]
+    id: String,
+    /// Seed of the first episode [default: on the page random, 0 to 99,999; in the terminal 0].
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Reset parameter, such as `arena_size=6`; may be repeated [default: the environment's own, which `endless list ID` shows].
+    #[arg(long = "option", value_name = "NAME=VALUE")]
+    options: Vec<String>,
+    #[command(flatten)]
+    page: PageArgs,
+    #[command(flatten)]
+    terminal: terminal::play::Args,
+}
+
+/// Runs `endless play`.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let options = parameters(&args.options)?;
+    if args.terminal.terminal {
+        return terminal::play::run(&args.id, options, args.seed.unwrap_or(0), &args.terminal);
+    }
+    play_page::run(&args.id, options, args.seed, &args.page)
+}

@@ -1,0 +1,60 @@
+//! The newest frame of an observation, in colours and rows, whatever its format.
+
+use endless_gym_core::batch::Frames;
+use endless_gym_core::envs::SCREEN;
+
+use super::picture::Pixels;
+
+/// The newest frame of one environment's observation in that format. Bytes that are missing are black.
+pub fn newest(observation: &[u8], frames: Frames) -> Pixels {
+    let bytes: usize = frames.format.shape(SCREEN, SCREEN).iter().product();
+    let frame = observation.get((frames.stack - 1) * bytes..).unwrap_or_default();
+    let format = frames.format;
+    let byte = |at: usize| frame.get(at).copied().unwrap_or_default();
+    let pixel = |place: usize| {
+        let (row, column) = (place / SCREEN, place % SCREEN);
+        let at = if format.row_major { place } else { column * SCREEN + row };
+        match (format.grayscale, format.channels_first) {
+            (true, _) => [byte(at); 3],
+            (false, true) => std::array::from_fn(|channel| byte(channel * SCREEN * SCREEN + at)),
+            (false, false) => std::array::from_fn(|channel| byte(at * 3 + channel)),
+        }
+    };
+    Pixels { side: SCREEN, pixels: (0..SCREEN * SCREEN).map(pixel).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::batch::{Batch, zeroed};
+    use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    use endless_gym_core::raster::PixelFormat;
+
+    use super::*;
+
+    fn observed(frames: Frames) -> Pixels {
+        let config = PoolConfig { frames: Some(frames), ..PoolConfig::new("SearingSpotlights-v0", 1) };
+        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::Seed(2), &mut blocks).unwrap();
+        for _ in 0..5 {
+            pool.step(&[1, 2], &mut blocks).unwrap();
+        }
+        newest(Batch::new(pool.layout(), &blocks).observation(), frames)
+    }
+
+    #[test]
+    fn every_format_shows_the_same_frame() {
+        let format = |grayscale, channels_first, row_major| PixelFormat { grayscale, channels_first, row_major };
+        let plain = observed(Frames { format: format(false, false, true), stack: 1 });
+        assert!(plain.pixels.iter().any(|[r, g, b]| r != g || g != b));
+        for stack in [1, 3] {
+            for (channels_first, row_major) in [(false, false), (false, true), (true, false), (true, true)] {
+                let other = observed(Frames { format: format(false, channels_first, row_major), stack });
+                assert!(other.pixels == plain.pixels, "{stack} {channels_first} {row_major}");
+            }
+            let luma =
+                [false, true].map(|row_major| observed(Frames { format: format(true, false, row_major), stack }));
+            assert!(luma[0].pixels == luma[1].pixels && luma[0].pixels.iter().all(|[r, g, b]| r == g && g == b));
+        }
+    }
+}

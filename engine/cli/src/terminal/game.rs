@@ -1,0 +1,94 @@
+//! One environment that a person plays.
+
+use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
+use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+
+use super::super::failure::Failure;
+use super::frame::newest;
+use super::picture::Pixels;
+
+/// An episode, of an environment of its own, so that it follows from its seed and the actions.
+pub struct Game {
+    pool: Pool,
+    blocks: Vec<Block>,
+    options: OptionMap,
+    pub seed: u64,
+}
+
+impl Game {
+    /// Starts an episode.
+    pub fn start(id: &str, options: OptionMap, seed: u64) -> Result<Self, Failure> {
+        let config = PoolConfig {
+            options: ResetOptions::Shared(options.clone()),
+            autoreset: Autoreset::Disabled,
+            seeding: Seeding::Continue { seed: Some(seed) },
+            ..PoolConfig::new(id, 1)
+        };
+        let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::All, &mut blocks)?;
+        Ok(Game { pool, blocks, options, seed })
+    }
+
+    /// Starts another episode, with another seed or the same.
+    pub fn restart(&mut self, seed: u64) -> Result<(), Failure> {
+        *self = Game::start(self.spec().id, std::mem::take(&mut self.options), seed)?;
+        Ok(())
+    }
+
+    pub fn spec(&self) -> &'static EnvSpec {
+        self.pool.spec()
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        Batch::new(self.pool.layout(), &self.blocks)
+    }
+
+    /// Whether the episode has ended.
+    pub fn is_over(&self) -> bool {
+        self.batch().terminated()[0] == 1
+    }
+
+    /// Plays one step, unless the episode has ended.
+    pub fn step(&mut self, action: &[i32]) -> Result<(), Failure> {
+        if !self.is_over() {
+            self.pool.step(action, &mut self.blocks)?;
+        }
+        Ok(())
+    }
+
+    /// What the agent sees.
+    pub fn frame(&self) -> Pixels {
+        newest(self.batch().observation(), Frames::default())
+    }
+
+    /// Seed, steps and rewards.
+    pub fn numbers(&self) -> String {
+        let batch = self.batch();
+        let (length, reward, total) = (batch.episode_length()[0], batch.reward()[0], batch.episode_return()[0]);
+        format!("{}  seed {}  step {length}  reward {reward:.3}  return {total:.3}", self.spec().id, self.seed)
+    }
+
+    /// How far the episode is, and at its end its final infos.
+    pub fn progress(&self) -> Result<String, Failure> {
+        let counted = self.pool.progress(0)?.into_iter().map(|progress| match progress.of {
+            Some(of) => format!("{} {} of {of}", progress.name, progress.value),
+            None => format!("{} {}", progress.name, progress.value),
+        });
+        let batch = self.batch();
+        let info = self.spec().info.iter().zip(batch.info());
+        let info = info.map(|(column, value)| format!("{} {value:.3}", column.name.replace('_', " ")));
+        let parts: Vec<String> = counted.chain(info.filter(|_| self.is_over())).collect();
+        Ok(parts.join("  "))
+    }
+
+    /// The commands that the agent reads in its vector observation, in the order of its one-hot places; empty if there is none.
+    pub fn commands(&self) -> String {
+        const ARROWS: [&str; 9] = ["⊗", "→", "←", "↑", "↓", "↘", "↗", "↙", "↖"];
+        let places = self.batch().vector_observation().chunks_exact(ARROWS.len());
+        let arrows =
+            places.filter_map(|places| places.iter().position(|place| *place == 1.0)).map(|place| ARROWS[place]);
+        arrows.collect::<Vec<_>>().join(" ")
+    }
+}

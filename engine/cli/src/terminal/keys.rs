@@ -1,0 +1,252 @@
+//! From keys to actions.
+//!
+//! Most terminals report that a key was pressed, and while it is down that it was pressed again, but not that it was released. A key
+//! acts in at least one step, and on until a short time after it was last reported. Terminals with the kitty keyboard protocol
+//! report releases; there a key acts while it is down.
+
+use std::time::{Duration, Instant};
+
+use endless_gym_core::envs::EnvSpec;
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+
+/// A direction of movement.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    Left,
+    Right,
+    Up,
+    Down,
+}
+
+use Direction::{Down, Left, Right, Up};
+
+/// What a key stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Command {
+    /// A movement; several are a diagonal one.
+    Move(&'static [Direction]),
+    /// The end of a movement.
+    Stop(&'static [Direction]),
+    Pause,
+    OneStep,
+    Restart,
+    NextSeed,
+    PreviousSeed,
+    Quit,
+}
+
+/// The help on the keys.
+pub const HELP: &str =
+    "arrows or W A S D move, Q E Z C diagonally, Space pauses, N one step, R restarts, PgUp/PgDn seed, Esc quits";
+
+/// The command of a key's event.
+pub fn command(event: KeyEvent) -> Option<Command> {
+    let moved: &[Direction] = match event.code {
+        KeyCode::Char('c') if event.modifiers.contains(KeyModifiers::CONTROL) => return Some(Command::Quit),
+        KeyCode::Left => &[Left],
+        KeyCode::Right => &[Right],
+        KeyCode::Up => &[Up],
+        KeyCode::Down => &[Down],
+        KeyCode::Char(letter) => match letter.to_ascii_lowercase() {
+            'a' => &[Left],
+            'd' => &[Right],
+            'w' => &[Up],
+            's' => &[Down],
+            'q' => &[Left, Up],
+            'e' => &[Right, Up],
+            'z' => &[Left, Down],
+            'c' => &[Right, Down],
+            _ => &[],
+        },
+        _ => &[],
+    };
+    match (event.kind, moved) {
+        (KeyEventKind::Release, []) => return None,
+        (KeyEventKind::Release, moved) => return Some(Command::Stop(moved)),
+        (_, []) => {}
+        (_, moved) => return Some(Command::Move(moved)),
+    }
+    match event.code {
+        KeyCode::Char(' ' | 'p' | 'P') => Some(Command::Pause),
+        KeyCode::Char('n' | 'N') => Some(Command::OneStep),
+        KeyCode::Char('r' | 'R') => Some(Command::Restart),
+        KeyCode::PageUp => Some(Command::NextSeed),
+        KeyCode::PageDown => Some(Command::PreviousSeed),
+        KeyCode::Esc => Some(Command::Quit),
+        _ => None,
+    }
+}
+
+/// A key that is held.
+#[derive(Clone, Copy, Debug)]
+struct Held {
+    direction: Direction,
+    pressed: Instant,
+    /// It has acted in a step since it was last reported.
+    has_acted: bool,
+    is_released: bool,
+}
+
+/// The directions that are held, in the order in which they were pressed.
+#[derive(Debug)]
+pub struct Keys {
+    hold: Duration,
+    held: Vec<Held>,
+    /// The terminal reports releases.
+    has_releases: bool,
+}
+
+impl Keys {
+    /// `hold` is the time for which a key acts after it was last reported.
+    pub fn new(hold: Duration) -> Self {
+        Keys { hold, held: Vec::new(), has_releases: false }
+    }
+
+    /// Directions were pressed at that time. They replace those of earlier steps, unless the terminal says that these are held too.
+    pub fn press(&mut self, directions: &[Direction], now: Instant) {
+        let opposite = |direction| match direction {
+            Left => Right,
+            Right => Left,
+            Up => Down,
+            Down => Up,
+        };
+        let has_releases = self.has_releases;
+        self.held.retain(|held| {
+            let is_replaced = directions.iter().any(|new| held.direction == *new || held.direction == opposite(*new));
+            !is_replaced && (has_releases || !held.has_acted)
+        });
+        let new =
+            |direction: &Direction| Held { direction: *direction, pressed: now, has_acted: false, is_released: false };
+        self.held.extend(directions.iter().map(new));
+    }
+
+    /// Directions were released. A key that has not acted yet acts in the next step.
+    pub fn release(&mut self, directions: &[Direction]) {
+        self.has_releases = true;
+        for held in self.held.iter_mut().filter(|held| directions.contains(&held.direction)) {
+            held.is_released = true;
+        }
+        self.held.retain(|held| !(held.is_released && held.has_acted));
+    }
+
+    /// No key is held.
+    pub fn clear(&mut self) {
+        self.held.clear();
+    }
+
+    /// The action of a step at that time.
+    pub fn action(&mut self, spec: &EnvSpec, now: Instant) -> Vec<i32> {
+        let Keys { hold, has_releases, .. } = *self;
+        self.held.retain(|held| {
+            let is_held = if has_releases { !held.is_released } else { now.duration_since(held.pressed) < hold };
+            !held.has_acted || is_held
+        });
+        self.held.iter_mut().for_each(|held| held.has_acted = true);
+        let directions: Vec<Direction> = self.held.iter().map(|held| held.direction).collect();
+        action(spec, &directions)
+    }
+}
+
+/// The action that moves in these directions. Where only one is possible, the last one counts.
+fn action(spec: &EnvSpec, directions: &[Direction]) -> Vec<i32> {
+    let choice = |branch: &endless_gym_core::envs::ActionBranch, direction: &Direction| {
+        let names: &[&str] = match direction {
+            Left => &["left"],
+            Right => &["right"],
+            Up => &["up", "ahead"],
+            Down => &["down"],
+        };
+        branch.choices.iter().position(|choice| names.contains(&choice.name))
+    };
+    let number = |branch| directions.iter().rev().find_map(|direction| choice(branch, direction)).unwrap_or(0);
+    spec.actions.iter().map(|branch| number(branch) as i32).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::envs::spec;
+
+    use super::*;
+
+    const HOLD: Duration = Duration::from_millis(150);
+
+    fn after(start: Instant, milliseconds: u64) -> Instant {
+        start + Duration::from_millis(milliseconds)
+    }
+
+    #[test]
+    fn directions_are_the_environments_actions() {
+        let act = |id: &str, directions: &[Direction]| action(spec(id).unwrap(), directions);
+        assert_eq!(act("MortarMayhem-v0", &[]), [0, 0]);
+        assert_eq!(act("MortarMayhem-v0", &[Left, Down]), [1, 2]);
+        assert_eq!(act("SearingSpotlights-v0", &[Right, Up]), [2, 1]);
+        assert_eq!(act("MysteryPath-Grid-v0", &[Up]), [3]);
+        assert_eq!(act("MysteryPath-Grid-v0", &[Down]), [0]);
+        assert_eq!(act("Endless-MysteryPath-v0", &[Right, Up]), [2]);
+        assert_eq!(act("Endless-MysteryPath-v0", &[Left]), [0]);
+    }
+
+    #[test]
+    fn a_key_acts_once_and_until_it_is_no_longer_reported() {
+        let (spec, start) = (spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let mut keys = Keys::new(HOLD);
+        keys.press(&[Left], start);
+        assert_eq!(keys.action(spec, after(start, 400)), [1, 0], "a step that comes late");
+        assert_eq!(keys.action(spec, after(start, 440)), [0, 0]);
+        keys.press(&[Left], after(start, 500));
+        keys.press(&[Left], after(start, 530));
+        assert_eq!(keys.action(spec, after(start, 540)), [1, 0]);
+        assert_eq!(keys.action(spec, after(start, 670)), [1, 0]);
+        assert_eq!(keys.action(spec, after(start, 690)), [0, 0]);
+        let mut grid = Keys::new(Duration::ZERO);
+        grid.press(&[Left], start);
+        assert_eq!(grid.action(spec, start), [1, 0]);
+        assert_eq!(grid.action(spec, start), [0, 0]);
+    }
+
+    #[test]
+    fn a_new_direction_replaces_the_old_one_unless_both_come_at_once() {
+        let (spec, start) = (spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let mut keys = Keys::new(HOLD);
+        keys.press(&[Left], start);
+        keys.press(&[Up], start);
+        assert_eq!(keys.action(spec, start), [1, 1]);
+        keys.press(&[Down], after(start, 20));
+        assert_eq!(keys.action(spec, after(start, 30)), [0, 2]);
+        keys.press(&[Right], after(start, 40));
+        assert_eq!(keys.action(spec, after(start, 50)), [2, 0]);
+        keys.press(&[Left, Up], after(start, 60));
+        assert_eq!(keys.action(spec, after(start, 70)), [1, 1]);
+        keys.clear();
+        assert_eq!(keys.action(spec, after(start, 80)), [0, 0]);
+    }
+
+    #[test]
+    fn reported_releases_end_a_movement() {
+        let (spec, start) = (spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let mut keys = Keys::new(HOLD);
+        keys.press(&[Left], start);
+        keys.release(&[Left]);
+        assert_eq!(keys.action(spec, start), [1, 0], "a short press acts once");
+        assert_eq!(keys.action(spec, start), [0, 0]);
+        keys.press(&[Right], start);
+        assert_eq!(keys.action(spec, after(start, 5000)), [2, 0]);
+        keys.press(&[Up], after(start, 5001));
+        assert_eq!(keys.action(spec, after(start, 9000)), [2, 1], "both are down");
+        keys.release(&[Right]);
+        assert_eq!(keys.action(spec, after(start, 9000)), [0, 1]);
+    }
+
+    #[test]
+    fn keys_have_commands() {
+        let press = |code| command(KeyEvent::new(code, KeyModifiers::NONE));
+        assert_eq!(press(KeyCode::Char('W')), Some(Command::Move(&[Up])));
+        assert_eq!(press(KeyCode::Char('c')), Some(Command::Move(&[Right, Down])));
+        assert_eq!(command(KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL)), Some(Command::Quit));
+        assert_eq!(press(KeyCode::PageDown), Some(Command::PreviousSeed));
+        assert_eq!(press(KeyCode::Char('y')), None);
+        let release = |code| command(KeyEvent::new_with_kind(code, KeyModifiers::NONE, KeyEventKind::Release));
+        assert_eq!(release(KeyCode::Left), Some(Command::Stop(&[Left])));
+        assert_eq!(release(KeyCode::Esc), None);
+    }
+}

@@ -1,0 +1,112 @@
+//! Pictures of half blocks: a character shows two pixels, one above the other.
+
+use endless_gym_core::envs::SCREEN;
+use ratatui::buffer::Buffer;
+use ratatui::layout::Rect;
+use ratatui::style::Color;
+use ratatui::widgets::Widget;
+
+/// A square of RGB pixels, in rows.
+#[derive(Clone, Debug)]
+pub struct Pixels {
+    pub side: usize,
+    pub pixels: Vec<[u8; 3]>,
+}
+
+impl Pixels {
+    /// The same picture with another side: magnified, or with averages of the pixels.
+    pub fn resized(&self, side: usize) -> Pixels {
+        let range = |place: usize| place * self.side / side..((place + 1) * self.side).div_ceil(side);
+        let average = |place: usize| {
+            let (rows, columns) = (range(place / side), range(place % side));
+            let count = rows.len() * columns.len();
+            std::array::from_fn(|channel| {
+                let line = |row: usize| self.pixels[row * self.side..][columns.clone()].iter();
+                let sum: usize = rows.clone().flat_map(line).map(|pixel| usize::from(pixel[channel])).sum();
+                (sum / count) as u8
+            })
+        };
+        Pixels { side, pixels: (0..side * side).map(average).collect() }
+    }
+}
+
+impl Widget for &Pixels {
+    fn render(self, area: Rect, buffer: &mut Buffer) {
+        let [rows, columns] = [self.side.div_ceil(2).min(area.height.into()), self.side.min(area.width.into())];
+        for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
+            let colour = |row: usize| {
+                let pixel = (row < self.side).then(|| self.pixels[row * self.side + column]);
+                pixel.map_or(Color::Reset, |[r, g, b]| Color::Rgb(r, g, b))
+            };
+            let cell = &mut buffer[(area.x + column as u16, area.y + row as u16)];
+            cell.set_char('▀').set_fg(colour(2 * row)).set_bg(colour(2 * row + 1));
+        }
+    }
+}
+
+/// The largest side of a frame's picture that fits `columns` and `lines`: a multiple of the frame's own, or less. Even, so that
+/// it ends with a whole character; 0 without room.
+pub fn fitting(columns: u16, lines: u16) -> usize {
+    let room = usize::from(columns).min(2 * usize::from(lines));
+    if room >= SCREEN { room / SCREEN * SCREEN } else { room & !1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::batch::{Batch, Frames, zeroed};
+    use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+
+    use super::super::frame::newest;
+    use super::*;
+
+    /// A frame of an environment, and its pixels as the original's array has them, indexed \[x\]\[y\].
+    fn frame() -> (Pixels, Vec<[u8; 3]>) {
+        let mut pool = Pool::new(&PoolConfig::new("MortarMayhem-v0", 1), &Threads::new(1).unwrap()).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::Seed(4), &mut blocks).unwrap();
+        let observation = Batch::new(pool.layout(), &blocks).observation();
+        (newest(observation, Frames::default()), observation.as_chunks::<3>().0.to_vec())
+    }
+
+    #[test]
+    fn cells_have_the_frames_pixels() {
+        let (picture, original) = frame();
+        let colour = |x: usize, y: usize| Color::from(original[x * SCREEN + y]);
+        assert!((0..SCREEN).any(|x| (0..SCREEN / 2).any(|y| colour(x, 2 * y) != colour(x, 2 * y + 1))));
+        for scale in [1, 2] {
+            let side = (SCREEN * scale) as u16;
+            assert_eq!(fitting(side + 3, side / 2 + 1), usize::from(side));
+            let mut terminal = Terminal::new(TestBackend::new(side + 3, side / 2 + 1)).unwrap();
+            let area = Rect::new(2, 1, side, side / 2);
+            terminal.draw(|frame| frame.render_widget(&picture.resized(side.into()), area)).unwrap();
+            let buffer = terminal.backend().buffer();
+            for (x, row) in (0..side).flat_map(|x| (0..side / 2).map(move |row| (x, row))) {
+                let cell = &buffer[(2 + x, 1 + row)];
+                let pixel = |y: u16| colour(usize::from(x) / scale, usize::from(y) / scale);
+                assert_eq!((cell.symbol(), cell.fg, cell.bg), ("▀", pixel(2 * row), pixel(2 * row + 1)), "{x} {row}");
+            }
+            assert_eq!(buffer[(1, 1)].symbol(), " ");
+        }
+    }
+
+    #[test]
+    fn smaller_pictures_have_averages() {
+        let mut pixels = vec![[0; 3]; SCREEN * SCREEN];
+        pixels[10 * SCREEN + 21] = [0, 200, 40];
+        let half = Pixels { side: SCREEN, pixels }.resized(SCREEN / 2);
+        let mut expected = vec![[0; 3]; SCREEN * SCREEN / 4];
+        expected[5 * SCREEN / 2 + 10] = [0, 50, 10];
+        assert_eq!(half.pixels, expected);
+    }
+
+    #[test]
+    fn a_picture_is_cut_where_the_terminal_ends() {
+        let (picture, _) = frame();
+        let mut buffer = Buffer::empty(Rect::new(0, 0, 5, 2));
+        (&picture).render(Rect::new(0, 0, 5, 2), &mut buffer);
+        assert_eq!(buffer[(4, 1)].symbol(), "▀");
+        assert_eq!([fitting(0, 9), fitting(80, 21), fitting(83, 50), fitting(200, 50)], [0, 42, 82, 84]);
+    }
+}

@@ -1,0 +1,230 @@
+//! `endless play --terminal`.
+
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use endless_gym_core::envs;
+use endless_gym_core::pool::OptionMap;
+use ratatui::Frame;
+use ratatui::crossterm::event::Event;
+use ratatui::layout::Rect;
+
+use super::super::failure::Failure;
+use super::super::stop;
+use super::game::Game;
+use super::keys::{self, Command, Keys};
+use super::picture::fitting;
+use super::screen::{Screen, check};
+use super::status;
+
+/// Longest wait for a key between two looks at the stop flag.
+const SLICE: Duration = Duration::from_millis(50);
+
+/// How long a key acts after it was last reported, and the pace up to which a key is one step instead.
+const HOLD: f64 = 0.15;
+const SLOW_FPS: u32 = 10;
+
+/// Lines below the picture.
+const LINES: u16 = 4;
+
+/// Arguments of `endless play` for the terminal.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Play in the terminal, which must show 24-bit colours, at best with 84 columns and 46 lines.
+    #[arg(long)]
+    pub terminal: bool,
+    /// In the terminal: steps per second, 1 to 100 [default: the original's].
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100), requires = "terminal")]
+    fps: Option<u32>,
+    /// In the terminal: how long a key acts after the terminal last reported it, in seconds; 0 for one step [default: 0.15; 0 at 10
+    /// steps per second or fewer].
+    #[arg(long, value_name = "SECONDS", requires = "terminal")]
+    hold: Option<f64>,
+}
+
+/// A game and what the keys do with it.
+struct Player {
+    game: Game,
+    keys: Keys,
+    is_paused: bool,
+    period: Duration,
+    /// When the next step is played.
+    due: Instant,
+}
+
+/// Plays until a key or a signal ends it.
+pub fn run(id: &str, options: OptionMap, seed: u64, args: &Args) -> Result<(), Failure> {
+    let fps = args.fps.unwrap_or(envs::spec(id)?.render_fps);
+    let hold = args.hold.unwrap_or(if fps > SLOW_FPS { HOLD } else { 0.0 });
+    let hold =
+        Duration::try_from_secs_f64(hold).map_err(|_| format!("--hold must be finite and 0 or more, got {hold}"))?;
+    let game = Game::start(id, options, seed)?;
+    check()?;
+    let stop = stop::on_signal()?;
+    let mut screen = Screen::enter()?;
+    let period = Duration::from_secs(1) / fps;
+    let mut player = Player { game, keys: Keys::new(hold), is_paused: false, period, due: Instant::now() + period };
+    while !stop.load(Ordering::Relaxed) {
+        player.draw(&mut screen)?;
+        loop {
+            let (is_running, now) = (!player.is_paused && !player.game.is_over(), Instant::now());
+            if is_running && now >= player.due {
+                player.step(now)?;
+                break;
+            }
+            let wait = if is_running { (player.due - now).min(SLICE) } else { SLICE };
+            match screen.event(wait)? {
+                Some(Event::Key(event)) => match keys::command(event) {
+                    Some(Command::Quit) => return Ok(()),
+                    Some(command) => player.carry_out(command)?,
+                    None => continue,
+                },
+                Some(Event::Resize(..)) => {}
+                Some(_) => continue,
+                None if stop.load(Ordering::Relaxed) => {}
+                None => continue,
+            }
+            break;
+        }
+    }
+    Ok(())
+}
+
+impl Player {
+    fn step(&mut self, now: Instant) -> Result<(), Failure> {
+        let action = self.keys.action(self.game.spec(), now);
+        self.game.step(&action)?;
+        // After a pause of the process, the game goes on at its pace.
+        self.due = (self.due + self.period).max(now);
+        Ok(())
+    }
+
+    fn carry_out(&mut self, command: Command) -> Result<(), Failure> {
+        let (now, seed) = (Instant::now(), self.game.seed);
+        match command {
+            Command::Move(directions) => {
+                self.keys.press(directions, now);
+                if self.is_paused {
+                    self.step(now)?;
+                    self.keys.clear();
+                }
+            }
+            Command::Stop(directions) => self.keys.release(directions),
+            Command::Pause => {
+                self.is_paused = !self.is_paused;
+                self.keys.clear();
+                self.due = now + self.period;
+            }
+            Command::OneStep => {
+                self.is_paused = true;
+                self.step(now)?;
+                self.keys.clear();
+            }
+            Command::Restart => self.restart(seed)?,
+            Command::NextSeed => self.restart(seed.saturating_add(1))?,
+            Command::PreviousSeed => self.restart(seed.saturating_sub(1))?,
+            Command::Quit => {}
+        }
+        Ok(())
+    }
+
+    fn restart(&mut self, seed: u64) -> Result<(), Failure> {
+        self.keys.clear();
+        self.due = Instant::now() + self.period;
+        self.game.restart(seed)
+    }
+
+    fn draw(&self, screen: &mut Screen) -> Result<(), Failure> {
+        let lines = self.lines()?;
+        screen.draw(|frame| draw(frame, &self.game, &lines))
+    }
+
+    fn lines(&self) -> Result<Vec<String>, Failure> {
+        let state = match () {
+            () if self.game.is_over() => "  the episode is over",
+            () if self.is_paused => "  paused",
+            () => "",
+        };
+        let spec = self.game.spec();
+        let commands = self.game.commands();
+        let task = if commands.is_empty() { spec.summary.to_owned() } else { format!("{commands}  {}", spec.summary) };
+        Ok(vec![self.game.numbers() + state, self.game.progress()?, task, keys::HELP.to_owned()])
+    }
+}
+
+/// Draws the picture in the middle, and the lines below.
+fn draw(frame: &mut Frame<'_>, game: &Game, lines: &[String]) {
+    let (above, below) = status::divide(frame.area(), LINES);
+    let side = fitting(above.width, above.height);
+    if side > 0 {
+        let columns = side as u16;
+        let area = Rect::new(above.x + (above.width - columns) / 2, above.y, columns, columns / 2);
+        frame.render_widget(&game.frame().resized(side), area);
+    }
+    status::draw(frame, below, lines);
+}
+
+#[cfg(test)]
+mod tests {
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+    use ratatui::style::Color;
+
+    use super::super::keys::Direction;
+    use super::*;
+
+    fn player(id: &str) -> Player {
+        let game = Game::start(id, OptionMap::new(), 3).unwrap();
+        let (keys, period) = (Keys::new(Duration::ZERO), Duration::from_millis(1));
+        Player { game, keys, is_paused: false, period, due: Instant::now() }
+    }
+
+    fn length(player: &Player) -> String {
+        player.game.numbers()
+    }
+
+    #[test]
+    fn commands_play_and_restart() {
+        let mut player = player("MysteryPath-Grid-v0");
+        let start = player.game.frame().pixels;
+        player.carry_out(Command::Move(&[Direction::Left])).unwrap();
+        assert!(length(&player).contains("step 0"));
+        player.step(Instant::now()).unwrap();
+        assert!(length(&player).contains("seed 3  step 1"));
+        assert!(player.game.frame().pixels != start, "it has turned");
+        player.carry_out(Command::OneStep).unwrap();
+        player.carry_out(Command::Move(&[Direction::Up])).unwrap();
+        assert!(player.is_paused && length(&player).contains("step 3"), "a paused game plays single steps");
+        player.carry_out(Command::Restart).unwrap();
+        assert!(player.game.frame().pixels == start && length(&player).contains("seed 3  step 0"));
+        player.carry_out(Command::NextSeed).unwrap();
+        assert!(length(&player).contains("seed 4"));
+        (0..6).for_each(|_| player.carry_out(Command::PreviousSeed).unwrap());
+        assert!(length(&player).contains("seed 0"));
+    }
+
+    #[test]
+    fn the_screen_shows_the_frame_and_the_numbers() {
+        let player = player("MortarMayhemB-Grid-v0");
+        let lines = player.lines().unwrap();
+        assert!(lines[1].starts_with("commands 0 of 10"), "{}", lines[1]);
+        assert_eq!(lines[2].split("  ").next().unwrap().split(' ').count(), 10, "{}", lines[2]);
+        let mut terminal = Terminal::new(TestBackend::new(90, 46)).unwrap();
+        terminal.draw(|frame| draw(frame, &player.game, &lines)).unwrap();
+        let buffer = terminal.backend().buffer();
+        let frame = player.game.frame();
+        for (place, pixel) in frame.pixels.iter().enumerate() {
+            let (row, column) = (place / 84, place % 84);
+            let cell = &buffer[(3 + column as u16, row as u16 / 2)];
+            assert_eq!(if row % 2 == 0 { cell.fg } else { cell.bg }, Color::from(*pixel), "{row} {column}");
+        }
+        let line = |row: u16| (0..90).map(|column| buffer[(column, row)].symbol()).collect::<String>();
+        assert!(line(42).starts_with("MortarMayhemB-Grid-v0  seed 3  step 0  reward 0.000  return 0.000"));
+        assert!(line(45).starts_with("arrows or W A S D move"));
+        // Nothing fits, and nothing fails.
+        for (columns, rows) in [(1, 1), (3, 5), (200, 4)] {
+            let mut small = Terminal::new(TestBackend::new(columns, rows)).unwrap();
+            small.draw(|frame| draw(frame, &player.game, &lines)).unwrap();
+        }
+    }
+}

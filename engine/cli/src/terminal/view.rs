@@ -1,0 +1,251 @@
+//! `endless view --terminal`.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use endless_gym_core::batch::Frames;
+use endless_gym_core::envs::SCREEN;
+use endless_gym_service::{Observed, ServiceError};
+use ratatui::Frame;
+use ratatui::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
+use ratatui::layout::Rect;
+
+use super::super::failure::Failure;
+use super::super::options::seconds;
+use super::super::output::{grouped, print};
+use super::super::stop;
+use super::super::watch::{Statistics, connect};
+use super::frame::newest;
+use super::picture::{Pixels, fitting};
+use super::screen::{Screen, check};
+use super::status;
+
+/// Time between two drawings of the screen.
+const INTERVAL: Duration = Duration::from_millis(100);
+
+/// Time over which steps per second are measured.
+const RATE_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Longest wait for a batch before the keys are looked at.
+const SLICE: Duration = Duration::from_millis(20);
+
+/// The smallest side of an environment's picture, unless the terminal is smaller.
+const MIN_SIDE: usize = 28;
+
+/// Lines below the pictures.
+const LINES: u16 = 3;
+
+/// Arguments of `endless view` for the terminal.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Show the environments in the terminal, which must show 24-bit colours.
+    #[arg(long)]
+    pub terminal: bool,
+    /// In the terminal: show this group only [default: all].
+    #[arg(long, requires = "terminal")]
+    group: Option<usize>,
+    /// In the terminal: how long to wait for the engine to start, in seconds.
+    #[arg(long, value_name = "SECONDS", default_value_t = 1.0, requires = "terminal")]
+    timeout: f64,
+}
+
+/// The environments that are shown, by group and number.
+struct Wall {
+    frames: Option<Frames>,
+    num_envs: usize,
+    groups: usize,
+    /// For each group that has been seen its first environments, and when it was last seen.
+    seen: BTreeMap<usize, (Instant, Vec<Pixels>)>,
+    /// Environments that fit the screen.
+    places: usize,
+}
+
+impl Wall {
+    /// Remembers the frames of a batch, not more often than the screen is drawn.
+    fn add(&mut self, observed: &Observed) {
+        let group = observed.lease.group();
+        let is_recent = self.seen.get(&group).is_some_and(|(time, _)| time.elapsed() < INTERVAL);
+        let Some(frames) = self.frames.filter(|_| !is_recent) else { return };
+        let bytes: usize = frames.shape().iter().product();
+        let batch = observed.lease.batch();
+        let pictures = batch.observation().chunks_exact(bytes).take(self.places).map(|rows| newest(rows, frames));
+        self.seen.insert(group, (Instant::now(), pictures.collect()));
+    }
+
+    /// Draws as many environments as fit, and returns their number.
+    fn draw(&self, frame: &mut Frame<'_>, area: Rect) -> usize {
+        let total = self.seen.values().map(|(_, pictures)| pictures.len()).sum();
+        let Grid { side, columns, rows } = Grid::new(area, total);
+        if side == 0 {
+            return 0;
+        }
+        let pictures = self.seen.values().flat_map(|(_, pictures)| pictures).take(columns * rows);
+        let mut drawn = 0;
+        for (number, picture) in pictures.enumerate() {
+            let (x, y) = (number % columns * (side + 1), number / columns * (side / 2 + 1));
+            let place = Rect::new(area.x + x as u16, area.y + y as u16, side as u16, (side / 2) as u16);
+            frame.render_widget(&picture.resized(side), place);
+            drawn += 1;
+        }
+        drawn
+    }
+}
+
+/// Squares in rows, with one character between them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Grid {
+    side: usize,
+    columns: usize,
+    rows: usize,
+}
+
+impl Grid {
+    /// The largest squares of which that number fits; if there are too many, as many as fit of a size that still shows something.
+    fn new(area: Rect, count: usize) -> Self {
+        let largest = fitting(area.width, area.height).min(SCREEN);
+        let grid = |side: usize| {
+            let columns = (usize::from(area.width) + 1) / (side + 1);
+            Grid { side, columns, rows: (usize::from(area.height) + 1) / (side / 2 + 1) }
+        };
+        let smallest = MIN_SIDE.min(largest);
+        let sides = (smallest..=largest).rev().filter(|side| side % 2 == 0);
+        sides.map(grid).find(|grid| grid.columns * grid.rows >= count).unwrap_or_else(|| grid(smallest))
+    }
+}
+
+/// Shows an engine until a key or a signal ends it.
+pub fn run(service: &str, args: &Args) -> Result<(), Failure> {
+    check()?;
+    let timeout = seconds("--timeout", args.timeout)?;
+    let stop = stop::on_signal()?;
+    let Some(mut observers) = connect(service, args.group, timeout, stop)? else { return Ok(()) };
+    let specification = observers.specification().clone();
+    let groups = args.group.map_or(specification.groups, |_| 1);
+    let mut wall = Wall {
+        frames: specification.frames,
+        num_envs: specification.num_envs,
+        groups,
+        seen: BTreeMap::new(),
+        places: specification.num_envs,
+    };
+    let mut statistics = Statistics::new(specification.num_envs);
+    let title = format!("{service} {}", specification.id);
+    let mut screen = Screen::enter()?;
+    let (mut has_ended, mut drawn, mut rate, mut rated) = (false, None::<Instant>, 0.0, Instant::now());
+    while !stop.load(Ordering::Relaxed) && !is_quit(&screen, has_ended)? {
+        if !has_ended {
+            match observers.next(SLICE) {
+                Ok(observed) => {
+                    statistics.add(&observed);
+                    wall.add(&observed);
+                }
+                Err(ServiceError::TimedOut { .. }) => {}
+                Err(ServiceError::EngineLost { .. }) => has_ended = true,
+                Err(error) => return Err(error.into()),
+            }
+        }
+        if rated.elapsed() >= RATE_INTERVAL {
+            (rate, rated) = (statistics.rate(), Instant::now());
+        }
+        if drawn.is_none_or(|time| time.elapsed() >= INTERVAL) {
+            drawn = Some(Instant::now());
+            let lines = lines(&title, &statistics, if has_ended { 0.0 } else { rate }, has_ended);
+            screen.draw(|frame| draw(frame, &mut wall, lines))?;
+        }
+    }
+    drop(screen);
+    if has_ended { print("the engine has ended") } else { Ok(()) }
+}
+
+/// Looks at the keys. Waits for them if nothing else is waited for.
+fn is_quit(screen: &Screen, is_waiting: bool) -> Result<bool, Failure> {
+    let mut timeout = if is_waiting { INTERVAL } else { Duration::ZERO };
+    while let Some(event) = screen.event(timeout)? {
+        timeout = Duration::ZERO;
+        if let Event::Key(KeyEvent { code, modifiers, .. }) = event {
+            match code {
+                KeyCode::Esc | KeyCode::Char('q' | 'Q') => return Ok(true),
+                KeyCode::Char('c') if modifiers.contains(KeyModifiers::CONTROL) => return Ok(true),
+                _ => {}
+            }
+        }
+    }
+    Ok(false)
+}
+
+fn lines(title: &str, statistics: &Statistics, rate: f64, has_ended: bool) -> [String; 2] {
+    let mut first = format!("{title}: {} steps/s, {} episodes", grouped(rate), grouped(statistics.episodes as f64));
+    if let Some((mean_return, mean_length)) = statistics.means() {
+        first += &format!(", mean return {mean_return:.3}, mean length {mean_length:.1}");
+    }
+    let second = if has_ended { "the engine has ended; Q, Esc or Ctrl-C quits" } else { "Q, Esc or Ctrl-C quits" };
+    [first, second.to_owned()]
+}
+
+fn draw(frame: &mut Frame<'_>, wall: &mut Wall, [first, last]: [String; 2]) {
+    let (above, below) = status::divide(frame.area(), LINES);
+    let Grid { columns, rows, .. } = Grid::new(above, usize::MAX);
+    wall.places = (columns * rows).max(1);
+    let shown = wall.draw(frame, above);
+    let total = wall.num_envs * wall.groups;
+    let middle = match wall.frames {
+        None => "the engine draws no frames (--no-frames)".to_owned(),
+        Some(_) if wall.seen.is_empty() => "no trainer has stepped the engine since".to_owned(),
+        Some(_) => format!("{shown} of {total} environments are shown"),
+    };
+    status::draw(frame, below, &[first, middle, last]);
+}
+
+#[cfg(test)]
+mod tests {
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+    use ratatui::style::Color;
+
+    use super::*;
+
+    fn wall(groups: usize, count: u8) -> Wall {
+        let picture =
+            |group: usize, env: u8| Pixels { side: SCREEN, pixels: vec![[group as u8, env, 7]; SCREEN * SCREEN] };
+        let pictures = |group| (0..count).map(|env| picture(group, env)).collect();
+        Wall {
+            frames: Some(Frames::default()),
+            num_envs: count.into(),
+            groups,
+            seen: (0..groups).map(|group| (group, (Instant::now(), pictures(group)))).collect(),
+            places: 0,
+        }
+    }
+
+    #[test]
+    fn grids_are_as_large_as_fits() {
+        let grid = |columns, lines, count| Grid::new(Rect::new(0, 0, columns, lines), count);
+        assert_eq!(grid(200, 60, 1), Grid { side: 84, columns: 2, rows: 1 });
+        assert_eq!(grid(169, 85, 4), Grid { side: 84, columns: 2, rows: 2 });
+        assert_eq!(grid(80, 21, 1).side, 42);
+        assert_eq!(grid(80, 21, 1000), Grid { side: 28, columns: 2, rows: 1 });
+        assert_eq!(grid(10, 3, 1000).side, 6);
+        assert_eq!(grid(0, 3, 1).side, 0);
+    }
+
+    #[test]
+    fn environments_lie_in_rows_by_group_and_number() {
+        let mut wall = wall(2, 3);
+        let mut terminal = Terminal::new(TestBackend::new(86, 32)).unwrap();
+        terminal.draw(|frame| draw(frame, &mut wall, ["first".to_owned(), "last".to_owned()])).unwrap();
+        let buffer = terminal.backend().buffer();
+        // Three columns of 28 with one character between them, and two rows of 14 lines.
+        for (number, (group, env)) in [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)].into_iter().enumerate() {
+            let (x, y) = (number % 3 * 29, number / 3 * 15);
+            for (column, row) in [(x, y), (x + 27, y + 13)] {
+                let cell = &buffer[(column as u16, row as u16)];
+                assert_eq!((cell.fg, cell.bg), (Color::Rgb(group, env, 7), Color::Rgb(group, env, 7)), "{number}");
+            }
+        }
+        assert_eq!(buffer[(28, 0)].symbol(), " ");
+        let line = |row: u16| (0..86).map(|column| buffer[(column, row)].symbol()).collect::<String>();
+        assert_eq!(line(30).trim_end(), "6 of 6 environments are shown");
+        assert_eq!(line(31).trim_end(), "last");
+    }
+}
