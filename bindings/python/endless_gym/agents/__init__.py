@@ -8,7 +8,8 @@ Training, from top to bottom: `train` is the training loop and `settings` its co
 (`memory`, `recurrent`, `transformer`) and `heads`; `checkpoint` saves and loads.
 
 Evaluation: `protocol` is `endless-eval`, with `evaluate`, `metrics`, `statistics` and `results`; `plot` with `curves` is
-`endless-plot`; `enjoy` with `video` is `endless-enjoy`; `search` with `search_space` is `endless-search`.
+`endless-plot`; `enjoy` with `video` is `endless-enjoy`; `search` with `search_space` is `endless-search`;
+`reproduce` with `experiments` is `endless-reproduce`; `probe` is `endless-probe`.
 """
 
 try:
