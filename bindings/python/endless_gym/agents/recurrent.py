@@ -2,7 +2,8 @@
 
 For learning, a segment is cut into sequences at the start of each episode and after every `sequence_length` steps. A sequence
 starts from the hidden state that was stored while acting (there is no burn-in), and gradients stop at its start. Sequences are
-packed (`PackedSequence`): no step is padded, and the number of sequential steps is the length of the longest sequence.
+packed (`PackedSequence`): no step is padded, and the number of sequential steps is the length of the longest sequence. On the CPU
+the layers of `recurrence` learn, and elsewhere those of PyTorch.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torch.nn.utils.rnn import PackedSequence
 from endless_gym.agents.acting import Affine, linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
 from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split
+from endless_gym.agents.recurrence import packed_layers
 from endless_gym.agents.settings import Recurrence
 
 
@@ -166,9 +168,13 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
     def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
         x = self._embed(x).float()
         with self._float32():
-            sequences = PackedSequence(x, minibatch.batch_sizes)
-            packed, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
-        y: Tensor = packed.data
+            if x.device.type == "cpu":
+                sizes, weights = minibatch.batch_sizes.tolist(), self.recurrent.all_weights
+                y = packed_layers(x, weights, minibatch.initial_hidden, sizes)
+            else:
+                sequences = PackedSequence(x, minibatch.batch_sizes)
+                packed, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
+                y = packed.data
         return y + x if self.settings.residual else y
 
     def _float32(self) -> contextlib.AbstractContextManager[Any]:
