@@ -22,6 +22,9 @@ except ImportError as error:
 
 Options = Mapping[str, Any]
 
+#: Largest number of environments of all engines of one trainer together.
+MAX_TOTAL_ENVS = 2**32 - 1
+
 #: The names of the auto-reset modes.
 AutoresetName = Literal["next_step", "same_step", "disabled"]
 
@@ -44,6 +47,8 @@ class Arguments:
     frames: Frames | None
     features: bool
     independent_episodes: bool
+    first_env: int
+    total_envs: int
     #: The configuration of each group, which the engine has checked.
     pools: list[_native.PoolConfig]
 
@@ -60,6 +65,8 @@ def checked_arguments(
     observation: ObservationName,
     frames: Frames | None,
     independent_episodes: bool = False,
+    first_env: int = 0,
+    total_envs: int | None = None,
 ) -> Arguments:
     """Check arguments of `make_vec`.
 
@@ -72,6 +79,9 @@ def checked_arguments(
     groups = integer("groups", groups, 1, _native.MAX_GROUPS)
     threads = integer("num_threads", num_threads or 0, 0, _native.MAX_THREADS)
     seed, seed_range, seed_list = seed_source(seed, seeds)
+    first_env = integer("first_env", first_env, 0, MAX_TOTAL_ENVS)
+    end = first_env + groups * num_envs
+    total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
     frames, features = contents(observation, frames)
     pools = [
         _native.PoolConfig(
@@ -80,8 +90,8 @@ def checked_arguments(
             options=_pool_options(options, group * num_envs, num_envs, groups),
             autoreset=mode.name.lower(),
             # Environments are numbered over all groups.
-            first_env=group * num_envs,
-            total_envs=groups * num_envs,
+            first_env=first_env + group * num_envs,
+            total_envs=total_envs,
             seed=seed,
             seed_range=seed_range,
             seed_list=seed_list,
@@ -104,6 +114,8 @@ def checked_arguments(
         frames=frames,
         features=features,
         independent_episodes=bool(independent_episodes),
+        first_env=first_env,
+        total_envs=total_envs,
         pools=pools,
     )
 

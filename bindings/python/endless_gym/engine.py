@@ -135,6 +135,8 @@ def serve(
     timeout: float = 30.0,
     copy: bool = False,
     independent_episodes: bool = False,
+    first_env: int = 0,
+    total_envs: int | None = None,
     render_mode: str | None = None,
     view: View | None = None,
     episode_options: EpisodeOptions | None = None,
@@ -170,6 +172,8 @@ def serve(
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
         independent_episodes: As for `make_vec`.
+        first_env: As for `make_vec`.
+        total_envs: As for `make_vec`.
         render_mode: As for `make_vec`.
         view: As for `make_vec`.
         episode_options: As for `connect`.
@@ -192,6 +196,8 @@ def serve(
         observation,
         frames,
         independent_episodes,
+        first_env,
+        total_envs,
     )
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, VECTOR_MODES)
@@ -206,6 +212,8 @@ def serve(
             _native.MAX_BATCHES_HELD,
         ),
         "--autoreset": given.autoreset.name.lower(),
+        "--first-env": given.first_env,
+        "--total-envs": given.total_envs,
     }
     if given.seed is not None and given.seed_list is None:
         arguments["--seed"] = given.seed

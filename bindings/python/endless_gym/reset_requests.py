@@ -17,8 +17,8 @@ Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 class ResetRequests:
     """The resets of a vector environment in the native module's format."""
 
-    def __init__(self, num_envs: int, num_groups: int) -> None:
-        self._num_envs, self._num_groups = num_envs, num_groups
+    def __init__(self, num_envs: int, num_groups: int, first_env: int) -> None:
+        self._num_envs, self._num_groups, self._first_env = num_envs, num_groups, first_env
 
     def envs(self, mask: Any, name: str = "reset_mask") -> Sequence[int]:
         """The numbers of the environments of a mask; all for `None`."""
@@ -45,7 +45,7 @@ class ResetRequests:
             return [None] * self._num_envs
         if not _has_items(seed):
             # Sums wrap, as in the engine.
-            first = integer("seed", seed) + group * self._num_envs
+            first = integer("seed", seed) + self._first_env + group * self._num_envs
             return [(first + env) & MAX_U64 for env in range(self._num_envs)]
         given: list[Any] = list(seed)
         if len(given) == self._num_envs * self._num_groups:

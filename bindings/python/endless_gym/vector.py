@@ -63,6 +63,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         view: View | None = None,
         episode_options: EpisodeOptions | None = None,
         episode_info: bool = False,
+        first_env: int = 0,
     ) -> None:
         """Called by `make_vec` and `connect`.
 
@@ -103,7 +104,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._ends = [self._index[name] for name in ("episode_return", "episode_length", "info")]
         self._integers = [is_integer for _, is_integer in described.info]
         self._same_step = autoreset is AutoresetMode.SAME_STEP
-        self._resets = ResetRequests(num_envs, backend.groups)
+        self._resets = ResetRequests(num_envs, backend.groups, first_env)
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.flags.writeable = False
         self._copy = copy
@@ -125,9 +126,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Environment `i` of group `g` is seeded with `seed + g * num_envs + i`. Or a list or an array with a seed or
-                `None` for each environment of a group, or of all groups. Later episodes follow from this seed alone. `None`
-                uses the seeds given at creation for the first reset, and continues the generators afterwards.
+            seed: Environment `i` of group `g` is seeded with `seed + first_env + g * num_envs + i`. Or a list or an array with a
+                seed or `None` for each environment of a group, or of all groups. Later episodes follow from this seed alone.
+                `None` uses the seeds given at creation for the first reset, and continues the generators afterwards.
             options: Reset parameters of the environments that are reset, until their next `reset` or `set_options`; they
                 override those given at creation and by `set_options`. And `reset_mask`, bool (n,), the environments that start
                 an episode. The others go on, and keep their options.
@@ -498,6 +499,8 @@ def make_vec(
     groups: int = 1,
     copy: bool = False,
     independent_episodes: bool = False,
+    first_env: int = 0,
+    total_envs: int | None = None,
     render_mode: str | None = None,
     view: View | None = None,
     episode_options: EpisodeOptions | None = None,
@@ -525,6 +528,9 @@ def make_vec(
             alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
             an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
             the last one's background, and an episode continues the generator that the one before has drawn from.
+        first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
+            for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
+        total_envs: Environments of all of these calls together; `None` for `first_env` and those of this call.
         render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
         view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
         episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between two
@@ -547,6 +553,8 @@ def make_vec(
         observation,
         frames,
         independent_episodes,
+        first_env,
+        total_envs,
     )
     # As in an engine, groups share threads.
     threads = _native.Threads(given.num_threads)
@@ -564,6 +572,7 @@ def make_vec(
         view=view,
         episode_options=episode_options,
         episode_info=episode_info,
+        first_env=first_env,
     )
 
 
@@ -576,6 +585,7 @@ def specified_envs(backend: Backend, specification: Mapping[str, Any], **argumen
         frames=Frames.from_specification(specification["frames"]),
         sections=[section["name"] for section in specification["batch"]["sections"]],
         autoreset=MODES[specification["autoreset"]],
+        first_env=specification["first_env"],
         **arguments,
     )
 

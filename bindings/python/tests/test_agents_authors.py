@@ -89,7 +89,7 @@ def test_recurrent_layers(name: str) -> None:
     # Packed: step by step.
     order = torch.arange(len(x)).view(sequences, length).t().flatten()
     batch_sizes = torch.full((length,), sequences)
-    output = memory(x[order], RecurrentMinibatch(order, batch_sizes, hidden.contiguous()))
+    output = memory(x[order], RecurrentMinibatch(order, order, batch_sizes, hidden.contiguous()))
     assert_close(output, tensors(recorded["output"])[order])
     assert_gradients(memory, output, factor[order], recorded)
 

@@ -224,9 +224,11 @@ def test_reconstruction_is_a_term_of_the_loss() -> None:
     terms = []
     for coefficient in (0.1, 0.0):
         ppo = replace(given.ppo, reconstruction_coefficient=coefficient)
-        loss, parts = minibatch_loss(agent, segment, Minibatch(torch.arange(4)), numbers, numbers, ppo, 0.05)
+        loss, parts = minibatch_loss(
+            agent, segment, Minibatch(torch.arange(4), torch.arange(4)), numbers, numbers, ppo, 0.05
+        )
         terms.append(float(loss))
-    output = agent({FRAME: frames}, Minibatch(torch.arange(4)))
+    output = agent({FRAME: frames}, Minibatch(torch.arange(4), torch.arange(4)))
     p = torch.sigmoid(output.frame.detach().double())
     target = frames.permute(0, 3, 1, 2).double() / 255.0
     entropy = float(-(target * p.log() + (1 - target) * (1 - p).log()).mean())
@@ -284,6 +286,6 @@ def test_loss_does_not_depend_on_the_order_of_steps() -> None:
     agent, segment, _ = played("none")
     flat, numbers = segment.flat(), torch.arange(64)
     arguments = (torch.randn(64), torch.randn(64), PPO(), 0.01)
-    one, _ = minibatch_loss(agent, flat, Minibatch(numbers), *arguments)
-    two, _ = minibatch_loss(agent, flat, Minibatch(numbers.flip(0)), *arguments)
+    one, _ = minibatch_loss(agent, flat, Minibatch(numbers, numbers), *arguments)
+    two, _ = minibatch_loss(agent, flat, Minibatch(numbers.flip(0), numbers), *arguments)
     torch.testing.assert_close(one, two)

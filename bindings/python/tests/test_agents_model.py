@@ -334,7 +334,7 @@ def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
     agent = Agent(given, {"features": (6,)}, BRANCHES, ground_truth=2)
     layers = agent.ground_truth.layers
     assert (layers[0].in_features, layers[2].out_features) == (16, 2)
-    minibatch = Minibatch(torch.arange(3))
+    minibatch = Minibatch(torch.arange(3), torch.arange(3))
     assert make("none")({"features": torch.randn(3, 6)}, minibatch).ground_truth is None
 
 

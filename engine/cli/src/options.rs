@@ -75,6 +75,12 @@ pub struct EnvironmentArgs {
     /// continue its generator].
     #[arg(long)]
     independent_episodes: bool,
+    /// Number of the first environment, for seeds, if several engines share the environments of one trainer.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    first_env: usize,
+    /// Environments of all engines together [default: --first-env and those of this engine].
+    #[arg(long, value_name = "N")]
+    total_envs: Option<usize>,
 }
 
 /// Parses `START..END` or `START..END:STEP`.
@@ -96,6 +102,8 @@ impl EnvironmentArgs {
             let seeds: Vec<String> = self.seed_list.iter().map(u64::to_string).collect();
             arguments.push(format!("--seed-list={}", seeds.join(",")));
         }
+        arguments.push(format!("--first-env={}", self.first_env));
+        arguments.extend(self.total_envs.map(|total| format!("--total-envs={total}")));
         arguments.extend(self.independent_episodes.then(|| "--independent-episodes".to_owned()));
         arguments
     }
@@ -114,8 +122,10 @@ impl EnvironmentArgs {
             (None, []) => Seeding::Continue { seed: self.seed },
             (None, list) => Seeding::List(list.to_vec()),
         };
-        let independent_episodes = self.independent_episodes;
-        Ok(PoolConfig { options, seeding, independent_episodes, ..PoolConfig::new(id, num_envs) })
+        let EnvironmentArgs { independent_episodes, first_env, .. } = *self;
+        let total_envs = self.total_envs.unwrap_or(first_env.saturating_add(num_envs));
+        let new = PoolConfig::new(id, num_envs);
+        Ok(PoolConfig { options, seeding, independent_episodes, first_env, total_envs, ..new })
     }
 }
 
@@ -154,8 +164,16 @@ mod tests {
             #[command(flatten)]
             environment: EnvironmentArgs,
         }
-        let given =
-            ["", "--option=-x=1", "--option=arena_size=6", "--seed=3", "--seed-range=0..9:2", "--independent-episodes"];
+        let given = [
+            "",
+            "--option=-x=1",
+            "--option=arena_size=6",
+            "--seed=3",
+            "--seed-range=0..9:2",
+            "--independent-episodes",
+            "--first-env=4",
+            "--total-envs=9",
+        ];
         let parse = |arguments: &[String]| Arguments::try_parse_from(arguments).map(|parsed| parsed.environment);
         let given = parse(&given.map(str::to_owned)).unwrap();
         let passed = parse(&[vec![String::new()], given.arguments()].concat()).unwrap();

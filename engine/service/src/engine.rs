@@ -375,6 +375,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
         id: spec.id.to_owned(),
         groups: config.groups,
         num_envs: config.pool.num_envs,
+        first_env: config.pool.first_env,
         batch: pool.layout().clone(),
         action: action_layout(spec, config.pool.num_envs)?,
         frames: config.pool.frames,

@@ -22,8 +22,9 @@ pub struct EngineConfig {
     pub service: String,
     /// The namespace in which trainers find the engine.
     pub namespace: Namespace,
-    /// The environments of one group. The engine overrides `first_env` and `total_envs`, which count the environments of all
-    /// groups. [`ResetOptions::Each`] holds the reset parameters of all groups, one group after the other.
+    /// The environments of one group. `first_env` is the number of the first group's first environment. `total_envs` counts the
+    /// environments of all groups and engines; `first_env + num_envs`, the default, stands for those of this engine alone.
+    /// [`ResetOptions::Each`] holds the reset parameters of all groups, one group after the other.
     pub pool: PoolConfig,
     /// Number of groups, 1 to [`MAX_GROUPS`]. Each is stepped when its actions arrive, so that a trainer can work on one group
     /// while the engine steps another.
@@ -75,19 +76,23 @@ impl EngineConfig {
         if !(1..=MAX_ENVS).contains(&num_envs) {
             return Err(PoolError::NumEnvs { given: num_envs });
         }
-        let total_envs = num_envs * self.groups;
+        let here = num_envs * self.groups;
+        let first = self.pool.first_env;
+        let is_alone = first.checked_add(num_envs) == Some(self.pool.total_envs);
+        let total_envs = if is_alone { first.saturating_add(here) } else { self.pool.total_envs };
         (0..self.groups)
             .map(|group| {
-                let first_env = group * num_envs;
+                let first_here = group * num_envs;
                 let options = match &self.pool.options {
                     ResetOptions::Shared(options) => ResetOptions::Shared(options.clone()),
-                    ResetOptions::Each(each) if each.len() == total_envs => {
-                        ResetOptions::Each(each[first_env..first_env + num_envs].to_vec())
+                    ResetOptions::Each(each) if each.len() == here => {
+                        ResetOptions::Each(each[first_here..first_here + num_envs].to_vec())
                     }
                     ResetOptions::Each(each) => {
-                        return Err(PoolError::OptionsCount { given: each.len(), num_envs: total_envs });
+                        return Err(PoolError::OptionsCount { given: each.len(), num_envs: here });
                     }
                 };
+                let first_env = first.saturating_add(first_here);
                 Ok(PoolConfig { options, first_env, total_envs, ..self.pool.clone() })
             })
             .collect()
@@ -122,5 +127,18 @@ mod tests {
         let pools = EngineConfig { groups: 3, ..config() }.pools().unwrap();
         let numbers: Vec<_> = pools.iter().map(|pool| (pool.first_env, pool.num_envs, pool.total_envs)).collect();
         assert_eq!(numbers, [(0, 2, 6), (2, 2, 6), (4, 2, 6)]);
+    }
+
+    #[test]
+    fn environments_are_counted_over_several_engines() {
+        let numbered = |first_env, total_envs| {
+            let pool = PoolConfig { first_env, total_envs, ..config().pool };
+            let pools = EngineConfig { pool, groups: 2, ..config() }.pools().unwrap();
+            pools.iter().map(|pool| (pool.first_env, pool.total_envs)).collect::<Vec<_>>()
+        };
+        assert_eq!(numbered(4, 12), [(4, 12), (6, 12)]);
+        assert_eq!(numbered(4, 6), [(4, 8), (6, 8)]);
+        // Too few in all, which the pools refuse.
+        assert_eq!(numbered(4, 7), [(4, 7), (6, 7)]);
     }
 }

@@ -28,6 +28,9 @@ pub struct ServiceSpecification {
     pub groups: usize,
     /// Environments in each group.
     pub num_envs: usize,
+    /// Number of the first group's first environment among those of all engines, for seeds.
+    #[serde(default)]
+    pub first_env: usize,
     /// Layout of a group's batch.
     pub batch: Layout,
     /// Layout of a request to step or reset a group.
@@ -101,6 +104,7 @@ impl ServiceSpecification {
             ("environment", self.id == other.id),
             ("number of groups", self.groups == other.groups),
             ("number of environments", self.num_envs == other.num_envs),
+            ("number of the first environment", self.first_env == other.first_env),
             ("batch layout", self.batch == other.batch && self.action == other.action && self.frames == other.frames),
             ("action space", self.action_space == other.action_space),
             ("set of columns", self.info == other.info && self.features == other.features),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from endless_gym.agents.ranks import Ranks
 from endless_gym.agents.recovery import RecoverableEngine
 from endless_gym.agents.settings import TRAINING_SEEDS, Settings
 from endless_gym.agents.view import ViewProcess
@@ -50,13 +51,16 @@ class Environments:
         per_group: Environments in each group.
     """
 
-    def __init__(self, settings: Settings, episode_options: EpisodeOptions | None = None) -> None:
+    def __init__(
+        self, settings: Settings, episode_options: EpisodeOptions | None = None, ranks: Ranks | None = None
+    ) -> None:
         """Make the environments, in this process or in an engine process.
 
         Args:
             settings: The settings of the run.
             episode_options: Chooses the options of each episode, as for `make_vec`; only with environments in this process, since
                 an engine that replaces a failed one plays the same steps again.
+            ranks: The ranks of the run, each with a share of the environments; `None` for this process alone.
 
         Raises:
             ValueError: A reset parameter is unknown or out of its range, the engine cannot start, or `episode_options` is given
@@ -67,19 +71,22 @@ class Environments:
                 "episode_options needs environments in this process: --environment.engine must be thread, "
                 f"got {settings.environment.engine}"
             )
-        wanted = settings.environment
+        wanted, ranks = settings.environment, ranks or Ranks()
+        own = ranks.share(wanted.num_envs)
         self.spec: Spec = spec(settings.env)
-        self.groups, self.per_group = wanted.groups, wanted.num_envs // wanted.groups
+        self.groups, self.per_group = wanted.groups, len(own) // wanted.groups
         in_process = wanted.engine == "thread"
         arguments: dict[str, Any] = {
             "num_envs": self.per_group,
-            "num_threads": wanted.num_threads or None,
+            "num_threads": wanted.num_threads or ranks.threads,
             "groups": wanted.groups,
             "seed": settings.seed,
             "seeds": TRAINING_SEEDS,
             "options": settings.options(),
             "autoreset": "same_step",
             "observation": wanted.observation,
+            "first_env": own.start,
+            "total_envs": wanted.num_envs,
         }
         make = partial(make_vec, settings.env, **arguments, episode_options=episode_options)
         self._view: ViewProcess | None = None

@@ -88,6 +88,22 @@ class Logger:
             self._wandb.finish()
 
 
+class SilentLogger(Logger):
+    """The logger of all ranks but the first: writes nothing."""
+
+    def __init__(self) -> None:
+        """Open nothing."""
+
+    def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
+        del metrics, seconds
+
+    def print(self, text: str) -> None:
+        del text
+
+    def close(self) -> None:
+        pass
+
+
 class Episodes:
     """The final infos of the last 100 episodes.
 

@@ -38,9 +38,10 @@ def generalised_advantages(
     return advantages
 
 
-def normalised(advantages: Tensor) -> Tensor:
-    """Scale advantages of any shape to mean 0 and standard deviation 1."""
-    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+def normalised(advantages: Tensor, reference: Tensor | None = None) -> Tensor:
+    """Scale advantages of any shape such that `reference`, by default they themselves, has mean 0 and standard deviation 1."""
+    reference = advantages if reference is None else reference
+    return (advantages - reference.mean()) / (reference.std() + 1e-8)
 
 
 def policy_loss(log_probs: Tensor, old_log_probs: Tensor, advantages: Tensor, clip_range: float) -> Tensor:

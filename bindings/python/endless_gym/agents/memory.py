@@ -24,13 +24,17 @@ from torch import Tensor, nn
 
 @dataclass
 class Minibatch:
-    """M steps of a segment, in the order that `Memory.forward` expects.
+    """M steps of this rank's segment, in the order that `Memory.forward` expects, and the steps that other ranks add to them.
 
     Attributes:
-        indices: Index t * N + n of each step in the flattened segment, int64 (M,), on the memory's device.
+        indices: Index t * n + i of each step in the flattened segment of this rank's n environments, int64 (M,), on the memory's
+            device. A rank may have no step of a minibatch.
+        everywhere: Index t * N + e of each step of all ranks in the flattened segments of all N environments, int64, in any
+            order.
     """
 
     indices: Tensor
+    everywhere: Tensor
 
 
 class MemoryState(ABC):
@@ -90,15 +94,21 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
 
     @abstractmethod
     def minibatches(
-        self, states: Sequence[StateT], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+        self,
+        states: Sequence[StateT],
+        reset_mask: Tensor,
+        num_minibatches: int,
+        generator: torch.Generator,
+        own: range | None = None,
     ) -> Sequence[MinibatchT]:
-        """Shuffle a recorded segment and divide it into minibatches.
+        """Shuffle a recorded segment and divide it into minibatches, of which every rank has the same number.
 
         Args:
             states: The state of each group of environments after the segment, in the order of their columns in the segment.
-            reset_mask: Whether each step is the first of an episode, bool (T, N), on the CPU.
+            reset_mask: Whether each step is the first of an episode, bool (T, N), on the CPU; with the columns of all ranks.
             num_minibatches: Number of minibatches; there are fewer if the segment has fewer sequences.
-            generator: Generator of the shuffle, on the CPU.
+            generator: Generator of the shuffle, on the CPU; in the same state at every rank.
+            own: The columns of this rank's environments; `None` for all.
         """
 
     @abstractmethod
@@ -135,6 +145,11 @@ def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Genera
     middle = size.cumsum(0) - size / 2
     part = (middle * num_parts / size.sum()).long()
     return [order[part == number] for number in range(num_parts) if bool((part == number).any())]
+
+
+def is_own(envs: Tensor, own: range) -> Tensor:
+    """Whether environments are among those of a rank, bool of the shape of `envs`."""
+    return (envs >= own.start) & (envs < own.stop)
 
 
 class LazyMinibatches(Sequence[MinibatchT]):
@@ -193,11 +208,22 @@ class NoMemory(Memory[NoState, None, Minibatch]):
         del state, update
 
     def minibatches(
-        self, states: Sequence[NoState], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+        self,
+        states: Sequence[NoState],
+        reset_mask: Tensor,
+        num_minibatches: int,
+        generator: torch.Generator,
+        own: range | None = None,
     ) -> Sequence[Minibatch]:
         del states
-        order = torch.randperm(reset_mask.numel(), generator=generator)
-        return [Minibatch(indices.to(self.device)) for indices in order.chunk(num_minibatches)]
+        envs = reset_mask.shape[1]
+        own = range(envs) if own is None else own
+        minibatches = []
+        for everywhere in torch.randperm(reset_mask.numel(), generator=generator).chunk(num_minibatches):
+            here = everywhere[is_own(everywhere % envs, own)]
+            indices = here // envs * len(own) + here % envs - own.start
+            minibatches.append(Minibatch(indices.to(self.device), everywhere.to(self.device)))
+        return minibatches
 
     def forward(self, x: Tensor, minibatch: Minibatch) -> Tensor:
         del minibatch

@@ -12,6 +12,7 @@ from endless_gym.agents import losses
 from endless_gym.agents.agent import Agent, AgentOutput
 from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.memory import MemoryState, Minibatch
+from endless_gym.agents.ranks import Ranks
 from endless_gym.agents.rollout import Segment
 from endless_gym.agents.settings import PPO
 
@@ -35,17 +36,20 @@ def minibatch_loss(
     returns: Tensor,
     settings: PPO,
     entropy_coefficient: float,
+    reference: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The total loss of one minibatch.
 
     Args:
         agent: The agent to optimise.
         segment: The flattened segment; see `Segment.flat`.
-        minibatch: The steps of the minibatch.
+        minibatch: The steps of the minibatch, at least one.
         advantages: Advantages of all steps of the segment, float32 (T * N,).
         returns: Returns of all steps of the segment, float32 (T * N,).
         settings: Coefficients and clip range.
         entropy_coefficient: Weight of the entropy bonus in this update.
+        reference: The advantages by which those of the minibatch are normalised, if they are: those of its steps at all ranks,
+            float32 (steps,). `None` for the minibatch's own.
 
     Returns:
         The loss, a scalar with gradient; and scalars without gradient by name: the loss and its terms, the approximate KL
@@ -57,7 +61,7 @@ def minibatch_loss(
     log_prob, old_log_prob = output.log_prob(segment.action[indices]), segment.log_prob[indices]
     advantage = advantages[indices]
     if settings.advantage_normalisation == "minibatch":
-        advantage = losses.normalised(advantage)
+        advantage = losses.normalised(advantage, reference)
     policy = losses.policy_loss(log_prob, old_log_prob, advantage, settings.clip_range)
     value = losses.value_loss(output.value, segment.value[indices], returns[indices], settings.clip_range)
     entropy = output.entropy().mean()
@@ -85,6 +89,7 @@ def learn(
     update: int,
     settings: PPO,
     generator: torch.Generator,
+    ranks: Ranks | None = None,
 ) -> dict[str, float]:
     """Optimise the agent on one segment.
 
@@ -95,7 +100,8 @@ def learn(
         states: The memory state of each group of environments after the segment.
         update: Number of this update, counted from 0; learning rate and entropy coefficient decay with it.
         settings: Hyperparameters.
-        generator: Generator that shuffles the minibatches, on the CPU.
+        generator: Generator that shuffles the minibatches, on the CPU; in the same state at every rank.
+        ranks: The ranks of the run, each with a segment of its own environments; `None` for this process alone.
 
     Returns:
         Metrics of the update by name: losses, gradient norm before clipping and so on, averaged over all minibatches; learning
@@ -107,33 +113,59 @@ def learn(
     )
     for group in optimizer.param_groups:
         group["lr"] = learning_rate
-    advantages = losses.generalised_advantages(
+    ranks = ranks or Ranks()
+    own_advantages = losses.generalised_advantages(
         segment.reward, segment.value, segment.done, segment.last_value, settings.gamma, settings.gae_lambda
     )
-    returns = (advantages + segment.value).flatten()
-    advantages = advantages.flatten()
+    returns, flat = (own_advantages + segment.value).flatten(), segment.flat()
+    # A few numbers for each step, so that every rank knows those of all environments.
+    reset_mask, values = ranks.columns(segment.reset_mask).cpu(), ranks.columns(segment.value).flatten()
+    advantages = ranks.columns(own_advantages).flatten()
+    own = ranks.share(reset_mask.shape[1])
     metrics = {
-        "value": segment.value.mean(),
+        "value": values.mean(),
         "advantage": advantages.mean(),
-        "explained_variance": losses.explained_variance(segment.value.flatten(), returns),
+        "explained_variance": losses.explained_variance(values, advantages + values),
     }
+    own_advantages = own_advantages.flatten()
     if settings.advantage_normalisation == "batch":
-        advantages = losses.normalised(advantages)
-    reset_mask, flat = segment.reset_mask.cpu(), segment.flat()
+        own_advantages = losses.normalised(own_advantages, advantages)
     sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros((), device=agent.device))
     count = 0
     for _ in range(settings.epochs):
-        for minibatch in agent.memory.minibatches(states, reset_mask, settings.minibatches, generator):
-            loss, parts = minibatch_loss(agent, flat, minibatch, advantages, returns, settings, entropy_coefficient)
+        for minibatch in agent.memory.minibatches(states, reset_mask, settings.minibatches, generator, own):
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            parts["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), settings.max_gradient_norm)
+            parts: dict[str, Tensor] = {}
+            if len(minibatch.indices):
+                reference = advantages[minibatch.everywhere]
+                loss, parts = minibatch_loss(
+                    agent, flat, minibatch, own_advantages, returns, settings, entropy_coefficient, reference
+                )
+                loss.backward()
+            share = len(minibatch.indices) / len(minibatch.everywhere)
+            add_gradients(agent, ranks, share)
+            norm = nn.utils.clip_grad_norm_(agent.parameters(), settings.max_gradient_norm)
             optimizer.step()
             for name, part in parts.items():
-                sums[name] += part
+                sums[name] += part * share
+            sums["gradient_norm"] += norm / ranks.size
             count += 1
+    ranks.add(sums[name] for name in sorted(sums))
     metrics |= {name: total / count for name, total in sums.items()}
     # One copy to the host for all metrics.
     numbers = torch.stack(list(metrics.values())).cpu().tolist()
     rates = {"learning_rate": learning_rate, "entropy_coefficient": entropy_coefficient}
     return rates | dict(zip(metrics, numbers, strict=True))
+
+
+def add_gradients(agent: Agent, ranks: Ranks, share: float) -> None:
+    """Add the gradients of all ranks, each of the mean loss of its `share` of a minibatch's steps."""
+    if ranks.size == 1:
+        return
+    gradients = []
+    for parameter in agent.parameters():
+        if parameter.grad is None:
+            # This rank has no step of the minibatch.
+            parameter.grad = torch.zeros_like(parameter)
+        gradients.append(parameter.grad.mul_(share))
+    ranks.add(gradients)

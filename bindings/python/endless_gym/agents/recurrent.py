@@ -19,7 +19,7 @@ from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym.agents.acting import Affine, linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
-from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split
+from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split, is_own
 from endless_gym.agents.recurrence import packed_layers
 from endless_gym.agents.settings import Recurrence
 
@@ -141,12 +141,18 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         state.hidden, state.time = update, state.time + 1
 
     def minibatches(
-        self, states: Sequence[RecurrentState], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+        self,
+        states: Sequence[RecurrentState],
+        reset_mask: Tensor,
+        num_minibatches: int,
+        generator: torch.Generator,
+        own: range | None = None,
     ) -> Sequence[RecurrentMinibatch]:
         length, (steps, envs) = self.settings.sequence_length, reset_mask.shape
+        own = range(envs) if own is None else own
         stored = torch.stack(
             [torch.cat([state.stored[cut] for state in states], dim=2) for cut in range(-(-steps // length))]
-        )  # (cuts, parts, layers, N, hidden size)
+        )  # (cuts, parts, layers, own environments, hidden size)
         # A sequence starts every `length` steps and with each episode. Sequences are ordered by environment, then by step.
         starts = reset_mask.t().clone()
         starts[:, ::length] = True
@@ -155,14 +161,17 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         lengths = torch.cat([start[1:], torch.tensor([envs * steps])]) - start
         minibatches = []
         for chosen in balanced_split(lengths.tolist(), num_minibatches, generator):
+            everywhere = packed(time[chosen], env[chosen], lengths[chosen], envs)[0]
+            chosen = chosen[is_own(env[chosen], own)]
             chosen = chosen[lengths[chosen].argsort(descending=True, stable=True)]
-            n, t, sizes = env[chosen], time[chosen], lengths[chosen]
-            offset = torch.arange(int(sizes[0])).unsqueeze(1)  # (longest, 1)
-            exists = offset < sizes
-            packed = ((t + offset) * envs + n)[exists]
+            n, t = env[chosen] - own.start, time[chosen]
+            indices, batch_sizes = packed(t, n, lengths[chosen], len(own))
             hidden = stored[(t // length).to(stored.device), :, :, n.to(stored.device)]
-            hidden = hidden.permute(1, 2, 0, 3).masked_fill(reset_mask[t, n].to(stored.device)[:, None], 0.0)
-            minibatches.append(RecurrentMinibatch(packed.to(self.device), exists.sum(1), hidden.contiguous()))
+            starts_episode = reset_mask[t, env[chosen]].to(stored.device)[:, None]
+            hidden = hidden.permute(1, 2, 0, 3).masked_fill(starts_episode, 0.0).contiguous()
+            minibatches.append(
+                RecurrentMinibatch(indices.to(self.device), everywhere.to(self.device), batch_sizes, hidden)
+            )
         return minibatches
 
     def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
@@ -173,8 +182,8 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
                 y = packed_layers(x, weights, minibatch.initial_hidden, sizes)
             else:
                 sequences = PackedSequence(x, minibatch.batch_sizes)
-                packed, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
-                y = packed.data
+                output, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
+                y = output.data
         return y + x if self.settings.residual else y
 
     def _float32(self) -> contextlib.AbstractContextManager[Any]:
@@ -191,3 +200,20 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
     def _split(self, hidden: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Convert (parts, layers, n, hidden size) to what `nn.GRU` or `nn.LSTM` takes."""
         return hidden[0] if self.parts == 1 else (hidden[0], hidden[1])
+
+
+def packed(time: Tensor, env: Tensor, lengths: Tensor, envs: int) -> tuple[Tensor, Tensor]:
+    """The steps of sequences in the order of a `PackedSequence`, if the sequences are in decreasing order of length.
+
+    Args:
+        time: First step of each sequence, int64 (sequences,).
+        env: Environment of each sequence, int64 (sequences,).
+        lengths: Steps of each sequence, int64 (sequences,).
+        envs: Number of environments in the segment.
+
+    Returns:
+        The index of each step in the flattened segment, int64, and the number of sequences that have a step t, int64 (longest,).
+    """
+    offset = torch.arange(int(lengths.max()) if len(lengths) else 0).unsqueeze(1)  # (longest, 1)
+    exists = offset < lengths
+    return ((time + offset) * envs + env)[exists], exists.sum(1)

@@ -23,6 +23,7 @@ from endless_gym.agents.encoders import FRAME, Observation
 from endless_gym.agents.environments import Environments, StepResult
 from endless_gym.agents.host import HostCopy, Outcome, Upload
 from endless_gym.agents.naive import Identity
+from endless_gym.agents.ranks import Ranks
 
 
 @dataclass
@@ -97,17 +98,27 @@ class RolloutCollector:
         current: The latest result of each group.
     """
 
-    def __init__(self, agent: Agent, environments: Environments, steps: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        agent: Agent,
+        environments: Environments,
+        steps: int,
+        generator: torch.Generator,
+        ranks: Ranks | None = None,
+    ) -> None:
         """Reset the environments and allocate the segment.
 
         Args:
             agent: The agent that acts.
             environments: The environments.
             steps: Steps of a segment.
-            generator: Generator that samples the actions, on the agent's device.
+            generator: Generator that samples the actions, on the agent's device; in the same state at every rank.
+            ranks: The ranks of the run; `None` for this process alone.
         """
         self.agent, self.environments, self.steps, self.generator = agent, environments, steps, generator
         groups, per_group, device = environments.groups, environments.per_group, agent.device
+        self._envs_everywhere = groups * per_group * (ranks or Ranks()).size
+        self._own = (ranks or Ranks()).share(self._envs_everywhere)
         self.memories: list[AgentMemory] = [agent.initial_memory(per_group) for _ in range(groups)]
         self.current: list[StepResult] = [environments.reset(group) for group in range(groups)]
         shape, branches = (steps, groups * per_group), len(agent.branches)
@@ -139,7 +150,9 @@ class RolloutCollector:
         """
         episodes: list[dict[str, float]] = []
         self.agent.refresh()
-        noise = self.agent.noise(self._action.shape[:2], self.generator)
+        # Drawn for the environments of all ranks, so that actions do not depend on how these are divided.
+        noise = self.agent.noise((self.steps, self._envs_everywhere), self.generator)
+        noise = noise[:, self._own.start : self._own.stop]
         for group, memory in enumerate(self.memories):
             self.agent.memory.begin_segment(memory.state, self.steps)
             self._first[self._slice(group)] = memory.reset_mask
@@ -170,6 +183,19 @@ class RolloutCollector:
         self.current = self.environments.restore(state_dict["environments"])
         for memory, memory_state in zip(self.memories, state_dict["memories"], strict=True):
             memory.load_state_dict(memory_state)
+
+    def start_episodes(self, environments: list[list[list[bytes]]]) -> None:
+        """Start episodes after those of another number of ranks.
+
+        Args:
+            environments: The snapshots of each rank, by group.
+        """
+        # In the order of the environments' numbers.
+        snapshots = [snapshot for rank in environments for group in rank for snapshot in group]
+        own = snapshots[self._own.start : self._own.stop]
+        groups, per_group = self.environments.groups, self.environments.per_group
+        self.environments.restore([own[group * per_group :][:per_group] for group in range(groups)])
+        self.current = [self.environments.reset(group) for group in range(groups)]
 
     def _act(self, group: int, step: int, noise: Tensor, clock: Clock) -> None:
         memory, current, part, agent = self.memories[group], self.current[group], self._parts[group], self.agent

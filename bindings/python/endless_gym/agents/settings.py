@@ -52,7 +52,7 @@ class Environment:
     observation: Literal["rgb", "features"] = "rgb"
     """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
     num_envs: int = 32
-    """number of environments in all groups together; the number of workers in the paper"""
+    """number of environments, in all groups and at all ranks of a data-parallel run; the number of workers in the paper"""
     groups: int = 2
     """groups of environments; one group is stepped while the agent computes the actions of another"""
     engine: Literal["thread", "process"] = "thread"
@@ -189,6 +189,8 @@ class Settings:
     """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
     threads: int = 0
     """CPU threads of PyTorch; 0 for PyTorch's default"""
+    bind_cores: bool = False
+    """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
     compile: bool = False
     """compile the network with `torch.compile`; the first updates then take minutes longer"""
     bf16: bool = False

@@ -1,8 +1,9 @@
-"""`endless-train`: train an agent.
+"""`endless-train`: train an agent, in one process or, started by `torchrun`, in several.
 
 ```console
 endless-train --env Endless-MortarMayhem-v0 --agent gru
 endless-train --env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --agent trxl --preset quick
+torchrun --nproc-per-node=4 -m endless_gym.agents.train -- --env MortarMayhem-v0    # see `endless_gym.agents.ranks`
 ```
 """
 
@@ -27,8 +28,9 @@ from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.learnt import learnt
-from endless_gym.agents.logs import Episodes, Logger
+from endless_gym.agents.logs import Episodes, Logger, SilentLogger
 from endless_gym.agents.ppo import learn, make_optimizer
+from endless_gym.agents.ranks import Ranks
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings, to_dict
 from endless_gym.episodes import EpisodeOptions
@@ -41,6 +43,9 @@ def train(
 ) -> Path:
     """Train an agent: a new run, or from the last checkpoint of a run.
 
+    Each of the processes that `torchrun` starts calls it with the same settings. A run that `torchrun` starts again goes on from
+    its last checkpoint.
+
     Args:
         settings: Settings of the run.
         watch: Called after each update with its number and the means of the last 100 episodes; the run stops if it returns true.
@@ -51,45 +56,57 @@ def train(
         The folder of the run, with `settings.json`, `progress.jsonl`, the TensorBoard files and `checkpoints`.
 
     Raises:
+        RankLost: Another process of the run has ended.
         ValueError: The settings are invalid, or do not fit the run to resume.
         FileExistsError: The folder already contains a run.
         FileNotFoundError: There is no run to resume.
         EngineLost: The engine process failed, and was not replaced; see `Settings.on_engine_failure`.
     """
-    settings, resumed = settings.validated(), None
-    if settings.resume:
-        run = Path(settings.resume)
-        resumed = command.load_checkpoint(run, "cpu").state
-        check_resumable(settings, checkpoint.read_settings(run))
-        settings = dataclasses.replace(settings, resume="", run=str(run))
-    else:
-        run = Path(
-            settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-        )
-        if (run / checkpoint.SETTINGS).exists():
-            raise FileExistsError(
-                f"{run} already contains a run; continue it with --resume {run}, or choose another folder"
-            )
-        run.mkdir(parents=True, exist_ok=True)
-
-    device = choose_device(settings.device)
+    settings, ranks = settings.validated(), Ranks()
+    ranks.check(settings.environment.num_envs, settings.environment.groups)
+    device = choose_device(settings.device, ranks)
+    if settings.bind_cores:
+        ranks.bind()
     if settings.threads:
         torch.set_num_threads(settings.threads)
     if device.type == "cuda":
+        torch.cuda.set_device(device)
         torch.set_float32_matmul_precision("high")  # TF32
+    with ranks.connected():
+        return train_rank(settings, ranks, device, watch, episode_options)
+
+
+def train_rank(
+    settings: Settings,
+    ranks: Ranks,
+    device: torch.device,
+    watch: Callable[[int, dict[str, float]], bool] | None,
+    episode_options: EpisodeOptions | None,
+) -> Path:
+    """The part of `train` that the processes of a run do together."""
+    resumed: dict[str, Any] | None = None
+    folder, has_begun = (
+        (settings.resume, True) if settings.resume else ranks.of_first(lambda: make_folder(settings, ranks))
+    )
+    run = Path(folder)
+    if has_begun:
+        resumed = command.load_checkpoint(run, "cpu").state
+        check_resumable(settings, checkpoint.read_settings(run))
+        settings = dataclasses.replace(settings, resume="", run=str(run))
+
     torch.manual_seed(settings.seed)
     generators = {
         "actions": torch.Generator(device).manual_seed(settings.seed),
         "minibatches": torch.Generator().manual_seed(settings.seed),
     }
 
-    ppo, started, stop = settings.ppo, time.monotonic(), Interrupt()
-    with Environments(settings, episode_options) as environments, stop:
+    ppo, started, stop = settings.ppo, time.monotonic(), Interrupt(ranks)
+    with Environments(settings, episode_options, ranks) as environments, stop:
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()
         optimizer = make_optimizer(agent, ppo.learning_rate)
-        collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"])
+        collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)
         episodes, update, steps = Episodes(), 0, 0
         if resumed is not None:
             update, steps = resumed["update"], resumed["steps"]
@@ -98,9 +115,17 @@ def train(
             for name, generator in generators.items():
                 restore_generator(generator, resumed["generators"][name], settings.seed + update)
             episodes.add(resumed["episodes"])
-            collector.load_state_dict(resumed["player"])
+            players = resumed["player"].get("ranks", [resumed["player"]])
+            if len(players) == ranks.size:
+                collector.load_state_dict(players[ranks.rank])
+            else:
+                collector.start_episodes([player["environments"] for player in players])
+        ranks.copy_from_first(agent.state_dict().values())
 
         def save() -> None:
+            players = ranks.gathered(collector.state_dict())
+            if players is None:
+                return
             state: dict[str, Any] = {
                 "settings": to_dict(settings),
                 "update": update,
@@ -108,32 +133,35 @@ def train(
                 "model": agent.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "generators": {name: generator.get_state() for name, generator in generators.items()},
-                "player": collector.state_dict(),
+                "player": players[0] if ranks.size == 1 else {"ranks": players},
                 "episodes": list(episodes.recent),
             }
             checkpoint.save(run, state, settings.keep_checkpoints)
 
-        logger = Logger(run, settings, update)
+        logger = Logger(run, settings, update) if ranks.is_first else SilentLogger()
         # Written only after everything above has succeeded; the changed settings of a resumed run are its settings from now on.
-        (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
+        if ranks.is_first:
+            (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
         if resumed is None:
             save()
+        where = f"{device}" if ranks.size == 1 else f"{ranks.size} ranks"
         logger.print(
-            f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {device}, in {run}; Ctrl-C stops the run"
+            f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {where}, in {run}; Ctrl-C stops the run"
         )
 
         success: str | None = None
-        clock = Clock()
-        while update < ppo.updates and not stop.requested:
+        clock, stops = Clock(), False
+        while update < ppo.updates and not stops:
             start = time.perf_counter()
             environments.mark(logger.print)
             segment, ended = collector.collect(clock)
             with clock.measure("learning"):
                 states = [memory.state for memory in collector.memories]
-                learning = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"])
-            new_steps = environments.groups * environments.per_group * ppo.steps
+                learning = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"], ranks)
+            new_steps = settings.environment.num_envs * ppo.steps
             update, steps = update + 1, steps + new_steps
-            episodes.add(ended)
+            for infos in ranks.everywhere(ended):
+                episodes.add(infos)
             means = episodes.means()
             rate = new_steps / (time.perf_counter() - start)
             logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | learning, clock.take())
@@ -151,50 +179,86 @@ def train(
                 stop.requested = True
             if watch is not None and watch(update, means):
                 stop.requested = True
-            if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stop.requested:
+            # All ranks stop after the same update.
+            stops = any(ranks.everywhere(stop.requested))
+            if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stops:
                 save()
         if success is not None:
             logger.print(f"the task is learnt: {success}; train longer with --no-stop-when-learnt")
         logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
         logger.close()
-        if environments.failure is not None:
+        failures = [failure for failure in ranks.everywhere(environments.failure) if failure is not None]
+        if failures:
             raise EngineLost(
-                f"{environments.failure}; the checkpoint is of update {update}; continue with: endless-train --resume {run}"
+                f"{failures[0]}; the checkpoint is of update {update}; continue with: endless-train --resume {run}"
             )
     return run
+
+
+def make_folder(settings: Settings, ranks: Ranks) -> tuple[str, bool]:
+    """Make the folder of a new run.
+
+    Returns:
+        The folder, and whether it contains a checkpoint of this run, from before `torchrun` started it again.
+
+    Raises:
+        FileExistsError: The folder contains another run.
+        ValueError: The run was started again, and its folder has no fixed name.
+    """
+    if ranks.restarts and not settings.run:
+        raise ValueError("a run that torchrun starts again needs --run, to find its checkpoint; got no folder")
+    run = Path(settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    has_begun = bool(ranks.restarts) and (run / checkpoint.FOLDER / checkpoint.LAST).exists()
+    if (run / checkpoint.SETTINGS).exists() and not ranks.restarts:
+        raise FileExistsError(
+            f"{run} already contains a run; continue it with --resume {run}, or choose another folder"
+        )
+    run.mkdir(parents=True, exist_ok=True)
+    return str(run), has_begun
 
 
 class Interrupt:
     """Context manager that turns the first SIGINT into a request to stop; the second one raises `KeyboardInterrupt`.
 
+    For a rank of several, SIGTERM is such a request, too. `torchrun` passes signals on that the terminal has already sent, so
+    that signals within two seconds count as one.
+
     Attributes:
         requested: Whether the run should stop after the current update.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ranks: Ranks) -> None:
         """Make the handler; it is installed on entry."""
         self.requested = False
-        self._before: Any = None
+        self._ranks = ranks
+        self._before: dict[int, Any] = {}
+        self._first = 0.0
 
     def __enter__(self) -> Interrupt:
         try:
-            self._before = signal.signal(signal.SIGINT, self._on_signal)
+            for number in (signal.SIGINT, signal.SIGTERM) if self._ranks.size > 1 else (signal.SIGINT,):
+                self._before[number] = signal.signal(number, self._on_signal)
         except ValueError:  # Only the main thread can install handlers, and only it is interrupted.
-            self._before = None
+            pass
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            # `torchrun` ends all ranks by SIGTERM when one has ended: this one closes its environments first.
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGTERM else handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         del number, frame
-        if self.requested:
+        if self._first:
+            if self._ranks.size > 1 and time.monotonic() < self._first + 2.0:
+                return
             raise KeyboardInterrupt
-        self.requested = True
-        print(
-            "\nstopping after this update, with a checkpoint; press Ctrl-C again to stop immediately", file=sys.stderr
-        )
+        self.requested, self._first = True, time.monotonic()
+        if self._ranks.is_first:
+            print(
+                "\nstopping after this update, with a checkpoint; press Ctrl-C again to stop immediately",
+                file=sys.stderr,
+            )
 
 
 def check_resumable(settings: Settings, before: Settings) -> None:
@@ -240,19 +304,25 @@ def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int
         generator.manual_seed(seed)
 
 
-def choose_device(name: str) -> torch.device:
+def choose_device(name: str, ranks: Ranks | None = None) -> torch.device:
     """The device with the name `cpu`, `cuda` or `cuda:INDEX`, or for `auto` CUDA if available, else the CPU.
+
+    Each of several ranks on a machine has a GPU of its own.
 
     Raises:
         ValueError: The name is invalid, or the device is not available.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
         raise ValueError(f"--device must be auto, cpu, cuda or cuda:INDEX, got `{name}`") from None
     if device.type == "cuda":
+        if ranks is not None and ranks.local_size > 1:
+            if device.index is not None:
+                raise ValueError(f"--device must be auto, cpu or cuda with several ranks on a machine, got `{name}`")
+            device = torch.device("cuda", ranks.local_rank)
         if not torch.cuda.is_available():
             raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; use cpu or auto")
         if (device.index or 0) >= torch.cuda.device_count():

@@ -29,7 +29,7 @@ from torch.nn import functional
 
 from endless_gym.agents.acting import Affine, linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
-from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, balanced_split
+from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, balanced_split, is_own
 from endless_gym.agents.settings import Transformer
 from endless_gym.agents.transformer_cache import Projection, RingCache, ring_ages
 
@@ -406,9 +406,15 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         state.fill += 1
 
     def minibatches(
-        self, states: Sequence[TransformerState], reset_mask: Tensor, num_minibatches: int, generator: torch.Generator
+        self,
+        states: Sequence[TransformerState],
+        reset_mask: Tensor,
+        num_minibatches: int,
+        generator: torch.Generator,
+        own: range | None = None,
     ) -> Sequence[TransformerMinibatch]:
         steps, envs = reset_mask.shape
+        own = range(envs) if own is None else own
         length = min(self.settings.sequence_length, steps)
         longest = torch.stack([state.position[:, self.past :].max() for state in states]).max()
         past = max(1, min(self.past, int(longest)))
@@ -419,12 +425,18 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         position = torch.cat([state.position[:, skipped:].unfold(1, span, length) for state in states])
         distance = torch.arange(past, span, device=self.device).unsqueeze(1) - torch.arange(span, device=self.device)
         outside = (distance < 1) | (distance > self.past)
-        per_group = envs // len(states)
+        per_group = len(own) // len(states)
 
         def minibatch(chosen: Tensor) -> TransformerMinibatch:
             chosen = chosen.sort().values
-            env, sequence = chosen // sequences, chosen % sequences
-            time = (sequence * length).unsqueeze(1) + torch.arange(length)
+
+            def indices(env: Tensor, sequence: Tensor, envs: int) -> Tensor:
+                time = (sequence * length).unsqueeze(1) + torch.arange(length)
+                return (time * envs + env.unsqueeze(1)).flatten().to(self.device)
+
+            everywhere = indices(chosen // sequences, chosen % sequences, envs)
+            chosen = chosen[is_own(chosen // sequences, own)]
+            env, sequence = chosen // sequences - own.start, chosen % sequences
             counts = torch.bincount(env // per_group, minlength=len(states)).tolist()
             env_, sequence_ = env.to(self.device), sequence.to(self.device)
             tokens = [
@@ -435,7 +447,8 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             queries = positions[:, past:].unsqueeze(-1)
             bias = torch.zeros(len(chosen), length, span, device=self.device)
             return TransformerMinibatch(
-                indices=(time * envs + env.unsqueeze(1)).flatten().to(self.device),
+                indices=indices(env, sequence, len(own)),
+                everywhere=everywhere,
                 tokens=torch.cat(tokens, dim=1).transpose(2, 3),
                 position=positions,
                 bias=bias.masked_fill_(outside | (distance > queries), MASKED).unsqueeze(1),
