@@ -70,7 +70,7 @@ impl Session {
         let parser = self.screen.lock().unwrap();
         let pixel = |place: u16| {
             let cell = parser.screen().cell(place / 84 / 2, place % 84).unwrap();
-            match if place / 84 % 2 == 0 { cell.fgcolor() } else { cell.bgcolor() } {
+            match if (place / 84).is_multiple_of(2) { cell.fgcolor() } else { cell.bgcolor() } {
                 vt100::Color::Rgb(r, g, b) => [r, g, b],
                 other => panic!("pixel {place} is {other:?}"),
             }
