@@ -158,9 +158,10 @@ def mlp_probe(x: Tensor, y: Tensor, seed: int = 0, steps: int = 1000) -> nn.Modu
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = nn.Sequential(nn.Linear(x.shape[1], 64), nn.ReLU(), nn.Linear(64, y.shape[1]))
-    network[2].weight.data.zero_()
-    network[2].bias.data = y.mean(0)
+        hidden, output = nn.Linear(x.shape[1], 64), nn.Linear(64, y.shape[1])
+    network = nn.Sequential(hidden, nn.ReLU(), output)
+    output.weight.data.zero_()
+    output.bias.data = y.mean(0)
     optimizer = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=0.1)
     for _ in range(steps):
         chosen = torch.randint(len(x), (256,), generator=generator)

@@ -19,6 +19,8 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
 T = TypeVar("T")
 
@@ -73,9 +75,9 @@ class Ranks:
             return
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
         with self._watched("could not be reached"):
-            store, rank, size = next(distributed.rendezvous("env://", timeout=TIMEOUT))
+            store, rank, size = next(rendezvous("env://", timeout=TIMEOUT))
             # The store may be that of the run before a restart, with the addresses of processes that have ended.
-            store = distributed.PrefixStore(f"restart-{self.restarts}", store)
+            store = PrefixStore(f"restart-{self.restarts}", store)
             distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
         with self._watched("has ended or does not answer"):
             yield

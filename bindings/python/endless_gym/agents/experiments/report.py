@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from endless_gym.agents import metrics, results
-from endless_gym.agents.curves import FAMILIES, Curve, aggregate, evaluated, published
+from endless_gym.agents.curves import FAMILIES, Curve, Family, aggregate, evaluated, published
 from endless_gym.agents.experiments import planning
 from endless_gym.agents.experiments.definitions import Run
 from endless_gym.agents.experiments.planning import Job
@@ -126,8 +126,9 @@ def _curves(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
         if curves[0].steps[-1] < 0.1 * max((one.steps[-1] for one in published(env, labels)), default=0):
             # Beside the published curves these would be a dot.
             figures.append(draw(f"{name}-ours", axis, curves, "std", folder))
-    family = jobs[0].experiment.aggregate if jobs else ""
-    if family == "finite" or family == "endless":
+    aggregated = jobs[0].experiment.aggregate if jobs else ""
+    families: tuple[Family, ...] = ("finite", "endless")
+    for family in (family for family in families if family == aggregated):
         labels = list(dict.fromkeys(run.published for run in jobs[0].experiment.runs))
         paper = [curve for env in FAMILIES[family] for curve in published(env, labels)]
         own_curves = [curve for _, curves, _ in panels.values() for curve in curves]
