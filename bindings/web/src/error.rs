@@ -5,6 +5,8 @@ use endless_gym_core::pool::{ExpertsError, PoolError};
 use endless_gym_core::trace::TraceError;
 use thiserror::Error;
 
+use crate::agent::AgentFileError;
+
 /// A request that cannot be carried out.
 #[derive(Debug, Error)]
 pub enum WebError {
@@ -26,6 +28,26 @@ pub enum WebError {
     /// The expert has not seen the episode's observations.
     #[error("the expert must play an episode from its first step, since it remembers what it has seen")]
     LateExpert,
+    /// The agent has not seen the episode's observations.
+    #[error("the agent must play an episode from its first step, since it remembers what it has seen")]
+    LateAgent,
+    /// No agent of that environment was loaded.
+    #[error("no agent of {id} is loaded; load its file first")]
+    NoAgent {
+        /// The environment of the episode.
+        id: &'static str,
+    },
+    /// The agent was trained in another environment, or with other observations or actions.
+    #[error("the agent was trained in {trained} and cannot play {played}")]
+    OtherAgent {
+        /// The environment of the agent.
+        trained: String,
+        /// The environment of the episode.
+        played: &'static str,
+    },
+    /// The file is no agent.
+    #[error(transparent)]
+    AgentFile(#[from] AgentFileError),
     /// The episode is not a trace's.
     #[error("the episode is not a recorded one; it has no actions to replay")]
     NoScript,

@@ -1,5 +1,7 @@
 //! One environment that a person, its expert or a trace plays, with a recording.
 
+use std::rc::Rc;
+
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
 use endless_gym_core::envs::{self, Expert};
@@ -7,6 +9,8 @@ use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOption
 use endless_gym_core::trace::{Recorder, Trace};
 use serde_json::{Map, Value as Json, json};
 
+use crate::agent::{Agent, Memory};
+use crate::clues::Clues;
 use crate::error::WebError;
 use crate::pixels::{RGBA_BYTES, put_observation, put_view};
 
@@ -14,6 +18,7 @@ use crate::pixels::{RGBA_BYTES, put_observation, put_view};
 pub enum Player {
     Person(Vec<i32>),
     Expert,
+    Agent(Rc<Agent>),
     Trace,
 }
 
@@ -26,6 +31,9 @@ pub struct Game {
     expert: Box<dyn Expert>,
     /// The expert has seen every observation of the episode so far.
     expert_is_in: bool,
+    /// What the agent remembers, if it has played the episode from its start.
+    agent_memory: Option<Memory>,
+    clues: Clues,
     action: Vec<i32>,
     /// The trace that is replayed, and the number of the episode.
     script: Option<(Trace, usize)>,
@@ -60,6 +68,8 @@ impl Game {
         let mut game = Game {
             expert: envs::expert(pool.spec()),
             expert_is_in: true,
+            agent_memory: None,
+            clues: Clues::new(pool.spec()),
             action: vec![0; pool.spec().action_space.branches().len()],
             recorder: Recorder::new(id, &options),
             pool,
@@ -84,8 +94,10 @@ impl Game {
         self.recorder.reset(seed, &self.pool, &self.blocks);
         self.expert.reset();
         self.expert_is_in = true;
+        self.agent_memory = None;
+        self.clues.reset();
         self.action.fill(0);
-        self.draw()
+        self.observe()
     }
 
     fn batch(&self) -> Batch<'_> {
@@ -96,11 +108,13 @@ impl Game {
     pub fn step(&mut self, player: Player) -> Result<(), WebError> {
         match player {
             Player::Person(action) => {
-                self.expert_is_in = false;
+                (self.expert_is_in, self.agent_memory) = (false, None);
                 self.action = action;
             }
+            Player::Agent(agent) => self.ask(&agent)?,
             Player::Expert if !self.expert_is_in => return Err(WebError::LateExpert),
             Player::Expert => {
+                self.agent_memory = None;
                 let batch = Batch::new(self.pool.layout(), &self.blocks);
                 self.expert.act(batch.features(), batch.vector_observation(), &mut self.action);
             }
@@ -116,12 +130,38 @@ impl Game {
                         return self.reset(seed);
                     }
                 }
-                self.expert_is_in = false;
+                (self.expert_is_in, self.agent_memory) = (false, None);
             }
         }
         self.pool.step(&self.action, &mut self.blocks)?;
         self.recorder.step(&self.action, &self.pool, &self.blocks);
+        self.observe()
+    }
+
+    /// Has the agent choose the action.
+    fn ask(&mut self, agent: &Agent) -> Result<(), WebError> {
+        let spec = self.pool.spec();
+        if !agent.fits(spec) {
+            return Err(WebError::OtherAgent { trained: agent.env().to_owned(), played: spec.id });
+        }
+        if self.length() == 0 && self.agent_memory.is_none() {
+            self.agent_memory = Some(agent.memory(self.seed.unwrap_or(0)));
+        }
+        let memory = self.agent_memory.as_mut().ok_or(WebError::LateAgent)?;
+        self.expert_is_in = false;
+        agent.act(Batch::new(self.pool.layout(), &self.blocks).features(), memory, &mut self.action);
+        Ok(())
+    }
+
+    /// Takes in what the last reset or step has changed.
+    fn observe(&mut self) -> Result<(), WebError> {
+        self.clues.observe(Batch::new(self.pool.layout(), &self.blocks).features());
         self.draw()
+    }
+
+    /// The environment.
+    pub fn id(&self) -> &'static str {
+        self.pool.spec().id
     }
 
     /// Steps of the episode.
@@ -179,6 +219,7 @@ impl Game {
             "done": done,
             "info": done.then_some(info),
             "progress": self.pool.progress(0)?,
+            "clues": self.clues.shown(),
             "action": self.action,
             "vector": batch.vector_observation(),
             "recording": recording,

@@ -1,9 +1,11 @@
-//! The core for the page: one game that a person, an expert or a trace plays, and a wall of many environments.
+//! The core for the page: one game that a person, an expert, a trained agent or a trace plays, and a wall of many environments.
 //!
 //! The interface to JavaScript is a few functions that pass numbers. [`input`] makes room for a request, JSON or the bytes of a
 //! trace; [`call`] and [`open`] answer in [`output`], with JSON, an error's text or bytes. Pictures are read from the memory, RGBA,
 //! \[row\]\[column\]. No function takes a pointer, so nothing here is unsafe, and the page needs no generated code.
 
+mod agent;
+mod clues;
 mod error;
 mod game;
 mod group;
@@ -12,7 +14,10 @@ mod request;
 mod wall;
 
 use std::cell::RefCell;
+use std::collections::HashMap;
+use std::rc::Rc;
 
+use agent::Agent;
 use game::Game;
 use request::Request;
 use wall::Wall;
@@ -30,6 +35,8 @@ enum Kind {
 struct App {
     game: Option<Game>,
     wall: Option<Wall>,
+    /// The loaded agents by the id of their environment.
+    agents: HashMap<String, Rc<Agent>>,
 }
 
 thread_local! {
@@ -58,6 +65,12 @@ pub extern "C" fn call() -> u32 {
 #[unsafe(no_mangle)]
 pub extern "C" fn open() -> u32 {
     reply(request::open)
+}
+
+/// Reads the agent in the input, the file that `endless_gym.agents.export` writes. Returns as [`call`] does.
+#[unsafe(no_mangle)]
+pub extern "C" fn load_agent() -> u32 {
+    reply(request::load_agent)
 }
 
 /// The answer to the last call, or after a trap what the engine said.

@@ -1,5 +1,7 @@
 //! The page's requests, and their answers.
 
+use std::rc::Rc;
+
 use endless_gym_core::envs::{self, EnvSpec};
 use endless_gym_core::pool::{OptionMap, PoolConfig, ResetOptions};
 use endless_gym_core::trace::{Trace, replay};
@@ -7,6 +9,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
 
 use crate::App;
+use crate::agent::Agent;
 use crate::error::WebError;
 use crate::game::{Game, Player};
 use crate::group::Group;
@@ -32,11 +35,12 @@ pub enum Request {
         options: Options,
         seed: String,
     },
-    /// Plays a step with the action of a person, of the expert or of the trace.
+    /// Plays a step with the action of a person, of the expert, of the loaded agent or of the trace.
     Step {
         action: Vec<i32>,
     },
     StepOfExpert,
+    StepOfAgent,
     StepOfTrace,
     /// The recording of the game, as bytes.
     Save,
@@ -65,6 +69,10 @@ pub enum Reply {
 impl Request {
     pub fn carry_out(self, app: &mut App) -> Result<Reply, WebError> {
         let player = match self {
+            Request::StepOfAgent => {
+                let id = app.game.as_ref().ok_or(WebError::NoGame)?.id();
+                Player::Agent(Rc::clone(app.agents.get(id).ok_or(WebError::NoAgent { id })?))
+            }
             Request::Specs => return Ok(Reply::Json(envs::specs().map(spec).collect())),
             Request::Check { id, options } => {
                 let options = ResetOptions::Shared(parse(&options));
@@ -106,6 +114,14 @@ pub fn open(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
         "first": outcome.first.map(|first| first.to_string()),
         "state": state,
     })))
+}
+
+/// Reads the file of an agent, which then plays the episodes of its environment.
+pub fn load_agent(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
+    let agent = Rc::new(Agent::read(file)?);
+    let description = agent.description();
+    app.agents.insert(agent.env().to_owned(), agent);
+    Ok(Reply::Json(description))
 }
 
 pub fn step_wall(app: &mut App, count: u32) -> Result<Reply, WebError> {

@@ -39,7 +39,12 @@ class App {
   follow() {
     const link = readLink(location.hash);
     if (link.wall !== undefined) return this.showWall(link);
-    this.start({ id: link.id ?? FIRST, options: link.options, seed: link.seed ?? randomSeed() });
+    const episode = { id: link.id ?? FIRST, options: link.options, seed: link.seed ?? randomSeed() };
+    this.start(episode);
+    if (!$("message").hidden) return;
+    if (link.by === "agent") this.play.playAgent(episode);
+    else if (link.by === "expert") this.play.toggleExpert();
+    else if (link.by) say(`by must be agent or expert, got \`${link.by}\``);
   }
 
   /** Starts an episode, or says why not. */
@@ -94,7 +99,8 @@ class App {
     document.title = `${state.id} – Endless Gym`;
     this.form.show(this.play.spec, state.options);
     if (Object.keys(state.options).length > 0) $("parameters").open = true;
-    this.#address(episodeLink({ ...state, seed: state.seed ?? "0" }));
+    const by = ["agent", "expert"].find((player) => player === this.play.player);
+    this.#address(episodeLink({ ...state, seed: state.seed ?? "0", by }));
   }
 
   #address(hash) {
@@ -205,6 +211,8 @@ try {
   // For tests, and for the curious.
   globalThis.endless = app;
   app.follow();
+  // For measurements: milliseconds from the navigation to the frame after the first picture.
+  requestAnimationFrame((now) => (app.firstFrame = now));
 } catch (error) {
   report(error);
 }

@@ -33,6 +33,12 @@ export class Engine {
     return this.#reply(() => this.#wasm.open());
   }
 
+  /** Reads an agent's file. Returns what it says about the agent, which then plays the environment that it was trained in. */
+  loadAgent(bytes) {
+    this.#put(bytes);
+    return this.#reply(() => this.#wasm.load_agent());
+  }
+
   /** Steps every environment of the wall. */
   stepWall(count) {
     return this.#reply(() => this.#wasm.step_wall(count));

@@ -1,4 +1,4 @@
-// The address: environment, reset parameters and seed, or a wall.
+// The address: environment, seed, who plays and reset parameters, or a wall.
 
 /** What an address asks for. */
 export function readLink(hash) {
@@ -12,12 +12,13 @@ export function readLink(hash) {
   if (wall !== null) return { wall, count: take("count"), by: take("by") };
   const id = take("env");
   const seed = take("seed");
-  return { id, seed, options: Object.fromEntries(fields) };
+  const by = take("by");
+  return { id, seed, by, options: Object.fromEntries(fields) };
 }
 
-/** The address of an episode. */
-export function episodeLink({ id, seed, options }) {
-  return "#" + new URLSearchParams({ env: id, seed, ...options });
+/** The address of an episode; `by` is who plays it, if not a person. */
+export function episodeLink({ id, seed, options, by }) {
+  return "#" + new URLSearchParams({ env: id, seed, ...(by ? { by } : {}), ...options });
 }
 
 /** The address of a wall. */

@@ -1,9 +1,12 @@
 // The episode on the screen: who plays it, at which pace, and what is shown of it.
 
+import { Agents } from "./agents.js";
+import { flash } from "./flash.js";
 import { Directions, isTyping } from "./keys.js";
+import { showMemory } from "./memory.js";
 import { Pace } from "./pace.js";
 import { enable, tone } from "./sound.js";
-import { actionFor, commandsOf, directionsOf, steering, TASKS } from "./tasks.js";
+import { actionFor, commandsOf, directionsOf, outcomeOf, steering, TASKS } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -14,6 +17,11 @@ const PADS = {
 };
 
 const DIRECTION_SIGNS = { left: "←", right: "→", up: "↑", down: "↓" };
+
+const STEP_REQUESTS = { expert: "step_of_expert", agent: "step_of_agent", trace: "step_of_trace" };
+
+/** Milliseconds from the end of an agent's episode to its next one. */
+const BREAK = 2500;
 
 // A phone has no keys.
 const TOUCH = matchMedia("(pointer: coarse)").matches;
@@ -29,6 +37,7 @@ export class Play {
     this.report = report;
     this.state = null;
     this.player = "person";
+    this.agents = new Agents(engine);
     this.directions = new Directions(() => this.#takeOver());
     this.directions.attach($("pad"));
     this.pace = new Pace(25, (count) => this.#steps(count));
@@ -45,7 +54,31 @@ export class Play {
     const state = this.engine.request({ start: { id, options, seed } });
     this.player = player;
     this.#begin(state);
-    if (player === "expert") this.play();
+    if (player === "expert" || player === "agent") this.play();
+  }
+
+  /** Loads the agent of an environment and lets it play, with the reset parameters of its training where none are given. */
+  async playAgent({ id, options, seed }) {
+    const before = this.state;
+    try {
+      await this.agents.load(id);
+    } catch (error) {
+      return this.report(error);
+    }
+    // Meanwhile a person may have started another episode.
+    if (this.state !== before) return;
+    this.#attempt(() => this.start({ id, options: { ...this.agents.options(id), ...options }, seed }, "agent"));
+  }
+
+  /** Lets the trained agent play, or ends that. */
+  toggleAgent() {
+    if (!this.state || !this.agents.has(this.state.id)) return;
+    if (this.player === "agent") {
+      this.player = "person";
+      this.changed(this.state);
+      return this.stop();
+    }
+    this.playAgent({ ...this.state, seed: this.state.seed ?? "0" });
   }
 
   /** Opens a trace's file. */
@@ -65,6 +98,7 @@ export class Play {
   }
 
   stop() {
+    clearTimeout(this.following);
     this.pace.stop();
     this.#show();
   }
@@ -80,7 +114,7 @@ export class Play {
   otherSeed(by) {
     if (!this.state) return;
     const seed = BigInt.asUintN(64, BigInt(this.state.seed ?? 0) + BigInt(by)).toString();
-    this.#attempt(() => this.start({ ...this.state, seed }, this.player === "expert" ? "expert" : "person"));
+    this.#attempt(() => this.start({ ...this.state, seed }, this.player === "trace" ? "person" : this.player));
   }
 
   /** Lets the expert play, which remembers an episode from its start, or ends that. */
@@ -88,6 +122,7 @@ export class Play {
     if (!this.state) return;
     if (this.player === "expert") {
       this.player = "person";
+      this.changed(this.state);
       return this.stop();
     }
     // A recording may start without a seed.
@@ -98,7 +133,7 @@ export class Play {
   oneStep() {
     if (!this.state || this.#over()) return;
     this.pace.stop();
-    this.#steps(1);
+    this.#steps(1, true);
   }
 
   /** The recording as the file of a trace, and its name. */
@@ -113,6 +148,7 @@ export class Play {
 
   #begin(state) {
     const other = this.state?.id !== state.id;
+    clearTimeout(this.following);
     this.pace.stop();
     this.state = state;
     this.directions.clear();
@@ -139,24 +175,37 @@ export class Play {
 
   #takeOver() {
     if (!this.active || !this.state || this.state.done) return;
-    if (this.player !== "person") this.player = "person";
+    if (this.player !== "person") {
+      this.player = "person";
+      this.changed(this.state);
+    }
     this.play();
   }
 
-  #steps(count) {
+  #steps(count, single = false) {
     this.#attempt(() => {
       for (let step = 0; step < count && !this.#over(); step += 1) {
-        if (this.player === "expert") this.state = this.engine.request("step_of_expert");
-        else if (this.player === "trace") this.state = this.engine.request("step_of_trace");
-        else {
-          const action = actionFor(this.spec, this.directions.take());
-          this.state = this.engine.request({ step: { action } });
-        }
+        const by = STEP_REQUESTS[this.player];
+        this.state = this.engine.request(by ?? { step: { action: actionFor(this.spec, this.directions.take()) } });
         this.#sound();
+        this.#flash();
+        if (this.player === "agent" && this.state.done) this.agents.count(this.state, outcomeOf(this.state) === "success");
       }
     });
-    if (this.#over()) this.pace.stop();
+    if (this.#over()) {
+      this.pace.stop();
+      // An agent that was started plays one episode after the other.
+      if (this.player === "agent" && this.state.done && !single) this.following = setTimeout(() => this.otherSeed(1), BREAK);
+    }
     this.#show();
+  }
+
+  #flash() {
+    if (!$("flash").checked) return;
+    const { done, reward } = this.state;
+    const outcome = outcomeOf(this.state);
+    const kind = done ? (outcome === "success" ? "success" : "failure") : reward > 0 ? "reward" : reward < 0 ? "damage" : null;
+    if (kind) flash($("observation").closest(".screen"), kind);
   }
 
   #sound() {
@@ -189,16 +238,30 @@ export class Play {
     $("pause").textContent = running ? "Pause" : state.length === 0 ? "Start" : "Continue";
     $("pause").disabled = $("step").disabled = this.#over();
     $("expert").setAttribute("aria-pressed", String(this.player === "expert"));
+    this.#agent();
     $("status").textContent = this.#said(spec, state);
     const overlay = this.#overlay();
     $("overlay").hidden = overlay === "";
     $("overlay").textContent = overlay;
   }
 
+  #agent() {
+    const { player, state } = this;
+    const reason = this.agents.reason(state.id);
+    // A disabled button would not be reached by the keyboard, and its reason not be read.
+    $("agent").setAttribute("aria-pressed", String(player === "agent"));
+    $("agent").setAttribute("aria-disabled", String(reason !== ""));
+    $("agent").title = reason;
+    $("agent-reason").textContent = reason;
+    $("memory").hidden = player !== "agent";
+    if (player === "agent") showMemory(state, this.agents);
+  }
+
   #said(spec, state) {
     const signs = directionsOf(spec, state.action).map((direction) => DIRECTION_SIGNS[direction]).join(" ") || "nothing";
     const action = state.length > 0 ? `last action ${signs}` : "no step yet";
     if (this.player === "expert") return `The expert plays; ${action}. A direction key takes over.`;
+    if (this.player === "agent") return `The agent plays; ${action}. A direction key takes over.`;
     if (this.player === "trace") {
       const { episode, episodes, steps } = state.recording;
       return `Recording, episode ${episode + 1} of ${episodes}, step ${state.length} of ${steps}; ${action}. A direction key takes over.`;
@@ -209,7 +272,7 @@ export class Play {
   #overlay() {
     const { state } = this;
     if (this.#over() && state.done) {
-      const success = state.info?.success === 1 && state.return > 0 ? "Done" : "Episode over";
+      const success = { success: "Done", failure: "Failed", end: "Episode over" }[outcomeOf(state)];
       return `${success}: return ${round(state.return)} in ${state.length} steps. ${AGAIN}`;
     }
     if (this.#over()) return "The recording ends here.";
@@ -264,6 +327,7 @@ export class Play {
     $("restart").addEventListener("click", () => this.restart());
     $("next").addEventListener("click", () => this.otherSeed(1));
     $("expert").addEventListener("click", () => this.toggleExpert());
+    $("agent").addEventListener("click", () => this.toggleAgent());
     $("pace").addEventListener("input", () => this.setPace(Number($("pace").value)));
     $("original-pace").addEventListener("click", () => this.spec && this.#originalPace());
     $("sound").addEventListener("change", () => $("sound").checked && enable());
@@ -275,6 +339,7 @@ export class Play {
       KeyN: () => this.oneStep(),
       KeyR: () => this.restart(),
       KeyE: () => this.toggleExpert(),
+      KeyG: () => this.toggleAgent(),
       Enter: () => this.otherSeed(1),
       PageDown: () => this.otherSeed(1),
       PageUp: () => this.otherSeed(-1),

@@ -59,6 +59,20 @@ export function directionsOf(spec, action) {
 const COMMANDS = ["stay", "right", "left", "up", "down", "right down", "right up", "left down", "left up"];
 const ARROWS = { stay: "⊗", right: "→", left: "←", up: "↑", down: "↓", "right down": "↘", "right up": "↗", "left down": "↙", "left up": "↖" };
 
+/** The sign of a command. */
+export function arrowOf(command) {
+  return ARROWS[command];
+}
+
+/** How an episode has ended: `success`, `failure`, `end` where none is defined, or null before its end. */
+export function outcomeOf(state) {
+  if (!state.done) return null;
+  if (!("success" in (state.info ?? {}))) return "end";
+  // The original counts a failed last command as a success; the progress does not.
+  const complete = !state.id.startsWith("MortarMayhem") || state.progress.every(({ value, of }) => value >= of);
+  return state.info.success === 1 && complete ? "success" : "failure";
+}
+
 /** The commands of a vector observation, as arrows and as words. */
 export function commandsOf(vector) {
   const commands = [];

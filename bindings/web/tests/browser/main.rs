@@ -1,5 +1,6 @@
 //! The page in a real browser. `cargo xtask stage web` builds the page and runs these tests.
 
+mod agents;
 mod chromium;
 mod server;
 
@@ -393,6 +394,8 @@ fn measure_by_eye() {
         ("middle-dark", (1024, 768), false, "dark", "env=MortarMayhemB-v0&seed=3"),
         ("narrow-light", (390, 844), true, "light", "env=Endless-MysteryPath-v0&seed=3"),
         ("narrow-dark", (390, 844), true, "dark", "env=MortarMayhem-Grid-v0&seed=3"),
+        ("agent-light", (1440, 900), false, "light", "env=MortarMayhem-Grid-v0&seed=200004&by=agent"),
+        ("agent-narrow", (390, 844), true, "dark", "env=MortarMayhem-Grid-v0&seed=200004&by=agent"),
         ("wall-dark", (1440, 900), false, "dark", "wall=all&count=100&by=expert"),
         ("wall-narrow", (390, 844), true, "light", "wall=all&count=100&by=random"),
     ] {

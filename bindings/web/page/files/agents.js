@@ -1,0 +1,65 @@
+// The trained agents, and how they do on the page.
+
+/** The file of each environment's agent; docs/train/agents.md says how it is made. */
+const FILES = { "MortarMayhem-Grid-v0": "MortarMayhem-Grid-v0.agent.bin" };
+
+export class Agents {
+  #loaded = new Map();
+  #counts = new Map();
+
+  constructor(engine) {
+    this.engine = engine;
+  }
+
+  has(id) {
+    return id in FILES;
+  }
+
+  /** Why there is no agent to play, or an empty text. */
+  reason(id) {
+    return this.has(id) ? "" : `No agent was trained in ${id}; there is one for ${Object.keys(FILES).join(", ")}.`;
+  }
+
+  /** What the file says about an agent that was loaded. */
+  description(id) {
+    return this.#loaded.get(id);
+  }
+
+  /** Loads an agent, once. Throws if its file cannot be loaded or read. */
+  async load(id) {
+    if (!this.has(id)) throw new Error(this.reason(id));
+    if (this.#loaded.has(id)) return this.#loaded.get(id);
+    const url = new URL(FILES[id], import.meta.url);
+    const response = await fetch(url);
+    if (!response.ok) throw new Error(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
+    this.#loaded.set(id, this.engine.loadAgent(new Uint8Array(await response.arrayBuffer())));
+    return this.#loaded.get(id);
+  }
+
+  /** The reset parameters that an agent was trained with, as the form has them. */
+  options(id) {
+    return Object.fromEntries(Object.entries(this.description(id).options).map(([name, value]) => [name, JSON.stringify(value)]));
+  }
+
+  /** Counts an episode that the agent has ended; those of the same environment and reset parameters together. */
+  count({ id, options }, succeeded) {
+    const count = this.counted({ id, options });
+    this.#counts.set(key(id, options), { episodes: count.episodes + 1, successes: count.successes + Number(succeeded) });
+  }
+
+  counted({ id, options }) {
+    return this.#counts.get(key(id, options)) ?? { episodes: 0, successes: 0 };
+  }
+
+  /** One sentence on the training. */
+  trained(id) {
+    const { steps, evaluation } = this.description(id);
+    const share = ({ options, success }) =>
+      `${Math.round(100 * success)} %` + Object.entries(options).map(([name, value]) => ` with ${name.replace("_", " ")} ${value}`).join("");
+    return `A GRU, trained for ${(steps / 1e6).toFixed(1)} million steps; it succeeds in ${evaluation.map(share).join(", ")}.`;
+  }
+}
+
+function key(id, options) {
+  return JSON.stringify([id, Object.entries(options).sort()]);
+}

@@ -1,0 +1,34 @@
+// What a player that remembers should know at this step, and how often it succeeds.
+
+import { arrowOf, outcomeOf } from "./tasks.js";
+
+const $ = (id) => document.getElementById(id);
+
+/** Shows the commands that an episode has shown, those that are done, and the next one. */
+export function showMemory(state, agents) {
+  const { clues } = state;
+  const done = state.progress.find(({ name }) => name === "commands")?.value ?? 0;
+  const outcome = outcomeOf(state);
+  const kind = (place) => {
+    if (place < done) return "done";
+    if (place > done || outcome === "success") return "later";
+    return outcome === "failure" ? "failed" : "next";
+  };
+  const list = $("clues");
+  list.replaceChildren(...clues.map((command, place) => {
+    const item = document.createElement("li");
+    item.className = kind(place);
+    const said = { done: "✓", failed: "✕ failed", next: "next", later: "" }[item.className];
+    item.append(
+      Object.assign(document.createElement("b"), { textContent: arrowOf(command), ariaHidden: "true" }),
+      ` ${command} `,
+      Object.assign(document.createElement("span"), { textContent: said }),
+    );
+    return item;
+  }));
+  $("no-clues").hidden = clues.length > 0;
+  const { episodes, successes } = agents.counted(state);
+  const count = episodes === 0 ? "No episode has ended yet." : `Successes: ${successes} of ${episodes}.`;
+  $("successes").textContent = count;
+  $("trained").textContent = agents.trained(state.id);
+}

@@ -1,0 +1,209 @@
+//! Trained agents on the page, and the flash.
+
+use endless_gym_core::envs::specs;
+use serde_json::{Value as Json, json};
+
+use crate::chromium::Chromium;
+use crate::server::PageServer;
+use crate::{STATE, start, visit};
+
+const ID: &str = "MortarMayhem-Grid-v0";
+
+fn text(browser: &mut Chromium, id: &str) -> String {
+    browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
+}
+
+fn clues(browser: &mut Chromium) -> Vec<String> {
+    let items = browser.value("[...document.querySelectorAll('#clues li')].map((item) => item.className)");
+    items.as_array().unwrap().iter().map(|kind| kind.as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn an_agent_plays_from_memory() {
+    let (server, mut browser) = (PageServer::start(), start("agents"));
+    visit(&mut browser, &server, &format!("env={ID}&seed=200000"));
+    assert_eq!(browser.value("document.getElementById('memory').hidden"), true);
+    browser.press("KeyG");
+    browser.wait("endless.play.player === 'agent'");
+    browser.value("endless.play.stop()");
+    // It starts with the reset parameters of its training, and the address says so.
+    assert_eq!(browser.value(STATE)["options"], json!({"command_count": "[1,2,3]"}));
+    assert_eq!(
+        browser.value("Object.fromEntries(new URLSearchParams(location.hash.slice(1)))"),
+        json!({"env": ID, "seed": "200000", "by": "agent", "command_count": "[1,2,3]"})
+    );
+    assert!(text(&mut browser, "trained").contains("% with command count 1"), "{}", text(&mut browser, "trained"));
+    // Episode after episode: each shows its commands, and the count says how it ended.
+    let mut successes = 0;
+    for episode in 0..5 {
+        browser.value("while (!endless.play.state.done) endless.play.oneStep()");
+        let state = browser.value(STATE);
+        let (of, done) =
+            (state["progress"][0]["of"].as_u64().unwrap(), state["progress"][0]["value"].as_u64().unwrap());
+        assert_eq!(state["clues"].as_array().unwrap().len() as u64, of, "every command was shown");
+        let kinds = clues(&mut browser);
+        assert_eq!(kinds.iter().filter(|kind| *kind == "done").count() as u64, done);
+        assert_eq!(kinds.iter().any(|kind| kind == "failed"), done < of);
+        successes += u64::from(done == of);
+        let expected = if done == of { "Done" } else { "Failed" };
+        assert!(text(&mut browser, "overlay").starts_with(expected), "{}", text(&mut browser, "overlay"));
+        let count = format!("Successes: {successes} of {}.", episode + 1);
+        assert_eq!(text(&mut browser, "successes"), count);
+        browser.press("PageDown");
+        browser.value("endless.play.stop()");
+        assert_eq!(browser.value("endless.play.player"), "agent");
+    }
+    // One command is remembered nearly always.
+    visit(&mut browser, &server, &format!("env={ID}&seed=200000&by=agent&command_count=%5B1%5D"));
+    browser.wait("endless.play.player === 'agent'");
+    let played = "for (let episode = 0; episode < 20; episode += 1) { endless.play.stop(); \
+                  while (!endless.play.state.done) endless.play.oneStep(); endless.play.otherSeed(1) } endless.play.stop()";
+    browser.value(played);
+    let counted = browser.value("endless.play.agents.counted(endless.play.state)");
+    assert_eq!(counted["episodes"], 20);
+    assert!(counted["successes"].as_u64() >= Some(17), "{counted}");
+    // The same seed, the same episode.
+    let play = "while (!endless.play.state.done) endless.play.oneStep()";
+    let outcome = |browser: &mut Chromium| {
+        browser.value("endless.play.restart(); endless.play.stop()");
+        browser.value(play);
+        let state = browser.value(STATE);
+        (state["return"].clone(), state["length"].clone())
+    };
+    assert_eq!(outcome(&mut browser), outcome(&mut browser));
+    // When it was started it goes on by itself.
+    let seed = browser.value(STATE)["seed"].clone();
+    browser.value("endless.play.setPace(10000); endless.play.restart()");
+    browser.wait(&format!("{STATE}.seed !== '{}'", seed.as_str().unwrap()));
+    browser.value("endless.play.stop()");
+    // A person takes over, and the agent cannot continue what it has not seen.
+    browser.value("endless.play.setPace(25); endless.play.restart()");
+    browser.press("ArrowUp");
+    browser.wait("endless.play.player === 'person'");
+    browser.wait(&format!("{STATE}.length > 0"));
+    browser.value("endless.play.stop()");
+    assert_eq!(browser.value("location.hash.includes('by=')"), false);
+    let late = browser
+        .value("(() => { try { endless.engine.request('step_of_agent') } catch (error) { return error.message } })()");
+    if browser.value(STATE)["done"] == false {
+        assert!(late.as_str().unwrap().starts_with("the agent must play an episode from its first step"), "{late}");
+    }
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn agents_are_there_for_some_environments() {
+    let (server, mut browser) = (PageServer::start(), start("no-agents"));
+    for spec in specs() {
+        visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
+        let disabled = browser.value("document.getElementById('agent').ariaDisabled");
+        assert_eq!(disabled, (spec.id != ID).to_string(), "{}", spec.id);
+        let reason = text(&mut browser, "agent-reason");
+        assert_eq!(reason.is_empty(), spec.id == ID, "{reason}");
+        if spec.id != ID {
+            assert!(
+                reason.starts_with(&format!("No agent was trained in {}; there is one for {ID}", spec.id)),
+                "{reason}"
+            );
+            browser.value("document.getElementById('agent').click()");
+            assert_eq!(browser.value("endless.play.player"), "person");
+        }
+    }
+    // Links say who plays, and keep the reset parameters that they name.
+    visit(&mut browser, &server, &format!("env={ID}&seed=5&by=agent&command_count=%5B2%5D"));
+    browser.wait("endless.play.player === 'agent'");
+    assert_eq!(browser.value(STATE)["options"], json!({"command_count": "[2]"}));
+    visit(&mut browser, &server, "env=MysteryPath-v0&seed=5&by=expert");
+    browser.wait("endless.play.player === 'expert'");
+    for (link, message) in [
+        ("env=MysteryPath-v0&seed=5&by=agent", "No agent was trained in MysteryPath-v0"),
+        ("env=MysteryPath-v0&seed=5&by=magic", "by must be agent or expert, got `magic`"),
+    ] {
+        visit(&mut browser, &server, link);
+        browser.wait("!document.getElementById('message').hidden");
+        assert!(text(&mut browser, "message").starts_with(message), "{}", text(&mut browser, "message"));
+    }
+    assert_eq!(browser.complaints, Vec::<String>::new());
+    // A file that is broken or missing is said so, and a person still plays.
+    let failing = "globalThis.fetch = async () => new Response(new Uint8Array([80, 75]), { status: STATUS })";
+    for (status, message) in [("200", "the file must be an exported agent"), ("404", "cannot be loaded: 404")] {
+        visit(&mut browser, &server, &format!("env={ID}&seed=1"));
+        browser.value(&format!("{}; 0", failing.replace("STATUS", status)));
+        browser.press("KeyG");
+        browser.wait("!document.getElementById('message').hidden");
+        assert!(text(&mut browser, "message").contains(message), "{}", text(&mut browser, "message"));
+        assert_eq!(browser.value("endless.play.player"), "person");
+    }
+}
+
+#[test]
+#[ignore = "needs the built page and Chromium"]
+fn a_flash_says_what_happens_by_more_than_colour() {
+    let (server, mut browser) = (PageServer::start(), start("flash"));
+    visit(&mut browser, &server, &format!("env={ID}&seed=200000"));
+    // What each flash shows, in order.
+    browser.value(
+        "globalThis.flashes = []; const screen = document.querySelector('.agent .screen'); new MutationObserver(() => { \
+         if (screen.dataset.flash) flashes.push([screen.dataset.flash, screen.querySelector('.sign').textContent, \
+         getComputedStyle(screen.querySelector('.sign')).animationName]) }).observe(screen, { attributes: true }); 0",
+    );
+    let play = "(async () => { endless.play.start({ ID_AND_OPTIONS, seed: 'SEED' }, 'PLAYER'); endless.play.stop(); \
+                while (!endless.play.state.done) { endless.play.oneStep(); await new Promise((done) => setTimeout(done)) } \
+                return endless.play.state.return })()";
+    let play = |browser: &mut Chromium, what: &str, seed: u32, player: &str| {
+        let given = play.replace("ID_AND_OPTIONS", what).replace("SEED", &seed.to_string()).replace("PLAYER", player);
+        browser.value("flashes.length = 0; 0");
+        browser.value(&given);
+        browser.value("flashes")
+    };
+    let mortar = format!("id: '{ID}', options: {{ command_count: '[2]' }}");
+    assert_eq!(play(&mut browser, &mortar, 1, "expert"), json!([]), "off by default");
+    browser.value("document.getElementById('flash').click()");
+    assert_eq!(
+        play(&mut browser, &mortar, 1, "expert"),
+        json!([["reward", "+", "flash"], ["success", "✓", "flash"]]),
+        "one command, then the last one"
+    );
+    assert_eq!(play(&mut browser, &mortar, 1, "person"), json!([["failure", "✕", "flash"]]));
+    let spotlights = "id: 'SearingSpotlights-v0', options: { reward_inside_spotlight: '-0.1', max_steps: '60' }";
+    let found = (0..8).map(|seed| play(&mut browser, spotlights, seed, "person")).find(|found| found[0][0] == "damage");
+    assert_eq!(found.expect("a spotlight finds the agent")[0], json!(["damage", "−", "flash"]));
+    // It goes away.
+    browser.wait("!document.querySelector('[data-flash]')");
+    // Nothing moves where no motion is wanted, and the sign is still there.
+    let reduced = json!({"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]});
+    browser.call("Emulation.setEmulatedMedia", &reduced);
+    let found: Json = play(&mut browser, &mortar, 1, "expert");
+    assert_eq!(found, json!([["reward", "+", "none"], ["success", "✓", "none"]]));
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+/// Not a test: `cargo test --package endless-gym-web --test browser -- --ignored --nocapture measure_start`.
+#[test]
+#[ignore = "a measurement"]
+fn measure_start_and_frame_rate() {
+    let (server, mut browser) = (PageServer::start(), start("start"));
+    let mut times = Vec::new();
+    for _ in 0..5 {
+        visit(&mut browser, &server, &format!("env={ID}&seed=1"));
+        // The first frame of the environment is on the screen two frames after it is drawn.
+        times.push(browser.value("endless.firstFrame").as_f64().unwrap());
+    }
+    times.sort_by(f64::total_cmp);
+    println!(
+        "navigation to first frame: {:.0} ms (median of 5), {:.0} (best), {:.0} (worst)",
+        times[2], times[0], times[4]
+    );
+    for pace in [25, 10_000] {
+        visit(&mut browser, &server, "wall=all&count=100&by=expert");
+        browser.value(&format!("endless.wall.pace.stepsPerSecond = {pace}; 0"));
+        let frames = browser.value(
+            "new Promise((done) => { let frames = 0; const start = performance.now(); const next = (now) => { frames += 1; \
+             if (now - start >= 5000) done(frames / (now - start) * 1000); else requestAnimationFrame(next) }; \
+             requestAnimationFrame(next) })",
+        );
+        println!("wall of 100 environments at {pace} steps a second: {:.1} frames a second", frames.as_f64().unwrap());
+    }
+}
