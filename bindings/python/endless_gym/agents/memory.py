@@ -220,8 +220,10 @@ class NoMemory(Memory[NoState, None, Minibatch]):
         own = range(envs) if own is None else own
         minibatches = []
         for everywhere in torch.randperm(reset_mask.numel(), generator=generator).chunk(num_minibatches):
-            here = everywhere[is_own(everywhere % envs, own)]
-            indices = here // envs * len(own) + here % envs - own.start
+            indices = everywhere
+            if len(own) < envs:
+                here = everywhere[is_own(everywhere % envs, own)]
+                indices = here // envs * len(own) + here % envs - own.start
             minibatches.append(Minibatch(indices.to(self.device), everywhere.to(self.device)))
         return minibatches
 

@@ -137,7 +137,8 @@ def learn(
             optimizer.zero_grad(set_to_none=True)
             parts: dict[str, Tensor] = {}
             if len(minibatch.indices):
-                reference = advantages[minibatch.everywhere]
+                is_minibatch = settings.advantage_normalisation == "minibatch"
+                reference = advantages[minibatch.everywhere] if is_minibatch else None
                 loss, parts = minibatch_loss(
                     agent, flat, minibatch, own_advantages, returns, settings, entropy_coefficient, reference
                 )
@@ -147,8 +148,8 @@ def learn(
             norm = nn.utils.clip_grad_norm_(agent.parameters(), settings.max_gradient_norm)
             optimizer.step()
             for name, part in parts.items():
-                sums[name] += part * share
-            sums["gradient_norm"] += norm / ranks.size
+                sums[name].add_(part, alpha=share)
+            sums["gradient_norm"].add_(norm, alpha=1.0 / ranks.size)
             count += 1
     ranks.add(sums[name] for name in sorted(sums))
     metrics |= {name: total / count for name, total in sums.items()}

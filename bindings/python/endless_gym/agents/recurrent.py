@@ -161,17 +161,20 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         lengths = torch.cat([start[1:], torch.tensor([envs * steps])]) - start
         minibatches = []
         for chosen in balanced_split(lengths.tolist(), num_minibatches, generator):
-            everywhere = packed(time[chosen], env[chosen], lengths[chosen], envs)[0]
-            chosen = chosen[is_own(env[chosen], own)]
+            everywhere = None
+            if len(own) < envs:
+                everywhere, _ = packed(time[chosen], env[chosen], lengths[chosen], envs)
+                everywhere, chosen = everywhere.to(self.device), chosen[is_own(env[chosen], own)]
             chosen = chosen[lengths[chosen].argsort(descending=True, stable=True)]
-            n, t = env[chosen] - own.start, time[chosen]
-            indices, batch_sizes = packed(t, n, lengths[chosen], len(own))
+            e, t, sizes = env[chosen], time[chosen], lengths[chosen]
+            n = e - own.start if own.start else e
+            indices, batch_sizes = packed(t, n, sizes, len(own))
+            indices = indices.to(self.device)
             hidden = stored[(t // length).to(stored.device), :, :, n.to(stored.device)]
-            starts_episode = reset_mask[t, env[chosen]].to(stored.device)[:, None]
+            starts_episode = reset_mask[t, e].to(stored.device)[:, None]
             hidden = hidden.permute(1, 2, 0, 3).masked_fill(starts_episode, 0.0).contiguous()
-            minibatches.append(
-                RecurrentMinibatch(indices.to(self.device), everywhere.to(self.device), batch_sizes, hidden)
-            )
+            everywhere = indices if everywhere is None else everywhere
+            minibatches.append(RecurrentMinibatch(indices, everywhere, batch_sizes, hidden))
         return minibatches
 
     def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:

@@ -434,9 +434,12 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
                 time = (sequence * length).unsqueeze(1) + torch.arange(length)
                 return (time * envs + env.unsqueeze(1)).flatten().to(self.device)
 
-            everywhere = indices(chosen // sequences, chosen % sequences, envs)
-            chosen = chosen[is_own(chosen // sequences, own)]
-            env, sequence = chosen // sequences - own.start, chosen % sequences
+            everywhere = None
+            if len(own) < envs:
+                everywhere = indices(chosen // sequences, chosen % sequences, envs)
+                chosen = chosen[is_own(chosen // sequences, own)] - own.start * sequences
+            env, sequence = chosen // sequences, chosen % sequences
+            steps_here = indices(env, sequence, len(own))
             counts = torch.bincount(env // per_group, minlength=len(states)).tolist()
             env_, sequence_ = env.to(self.device), sequence.to(self.device)
             tokens = [
@@ -447,8 +450,8 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             queries = positions[:, past:].unsqueeze(-1)
             bias = torch.zeros(len(chosen), length, span, device=self.device)
             return TransformerMinibatch(
-                indices=indices(env, sequence, len(own)),
-                everywhere=everywhere,
+                indices=steps_here,
+                everywhere=steps_here if everywhere is None else everywhere,
                 tokens=torch.cat(tokens, dim=1).transpose(2, 3),
                 position=positions,
                 bias=bias.masked_fill_(outside | (distance > queries), MASKED).unsqueeze(1),
