@@ -29,7 +29,7 @@ pub struct Args {
     #[command(flatten)]
     page: PageArgs,
     #[command(flatten)]
-    terminal: terminal::play::Args,
+    terminal: terminal::play::TerminalArgs,
 }
 
 /// Runs `endless play`.

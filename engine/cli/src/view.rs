@@ -26,7 +26,7 @@ pub struct Args {
     #[command(flatten)]
     page: PageArgs,
     #[command(flatten)]
-    terminal: terminal::view::Args,
+    terminal: terminal::view::TerminalArgs,
     /// Stop when standard input closes or gives a byte: for a server that is a child process. With the id of the parent process,
     /// also stop when that process ends.
     #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]

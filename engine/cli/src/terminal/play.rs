@@ -29,7 +29,7 @@ const LINES: u16 = 4;
 
 /// Arguments of `endless play` for the terminal.
 #[derive(clap::Args)]
-pub struct Args {
+pub struct TerminalArgs {
     /// Play in the terminal, which must show 24-bit colours, at best with 84 columns and 46 lines.
     #[arg(long)]
     pub terminal: bool,
@@ -53,7 +53,7 @@ struct Player {
 }
 
 /// Plays until a key or a signal ends it.
-pub fn run(id: &str, options: OptionMap, seed: u64, args: &Args) -> Result<(), Failure> {
+pub fn run(id: &str, options: OptionMap, seed: u64, args: &TerminalArgs) -> Result<(), Failure> {
     let fps = args.fps.unwrap_or(envs::spec(id)?.render_fps);
     let hold = args.hold.unwrap_or(if fps > SLOW_FPS { HOLD } else { 0.0 });
     let hold =

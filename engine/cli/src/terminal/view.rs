@@ -38,7 +38,7 @@ const LINES: u16 = 3;
 
 /// Arguments of `endless view` for the terminal.
 #[derive(clap::Args)]
-pub struct Args {
+pub struct TerminalArgs {
     /// Show the environments in the terminal, which must show 24-bit colours.
     #[arg(long)]
     pub terminal: bool,
@@ -115,7 +115,7 @@ impl Grid {
 }
 
 /// Shows an engine until a key or a signal ends it.
-pub fn run(service: &str, args: &Args) -> Result<(), Failure> {
+pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     check()?;
     let timeout = seconds("--timeout", args.timeout)?;
     let stop = stop::on_signal()?;
