@@ -12,7 +12,7 @@ fn the_page_opens_at_an_episode() {
     let room = Room::new("play");
     let arguments = ["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]"];
     if !endless_gym_page::is_built() {
-        // `cargo xtask test` builds the program before the page.
+        // Only release builds have it; `cargo xtask packages` tests them.
         let output = room.run(&arguments);
         assert!(!output.status.success());
         assert!(text(&output.stderr).contains("run `cargo xtask web`"), "{}", text(&output.stderr));

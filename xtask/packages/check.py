@@ -2,7 +2,9 @@
 
 import importlib.metadata
 import platform
+import subprocess
 import sys
+import urllib.request
 
 import endless_gym
 import gymnasium
@@ -43,4 +45,13 @@ with endless_gym.serve(ENV, num_envs=4) as served:
     served_rewards, served_frames = play(served)
 if rewards != served_rewards or not np.array_equal(frames, served_frames) or frames.std() == 0:
     sys.exit("an engine process and this process must give the same frames and rewards")
+if sys.argv[2] == "page":
+    with subprocess.Popen([f"{sys.prefix}/bin/endless", "play", ENV], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        address = server.stdout.readline().split()[-1].partition("#")[0]
+        with urllib.request.urlopen(f"{address}engine.wasm") as answer:
+            is_page = answer.read(4) == b"\0asm"
+        server.terminate()
+    if not is_page or server.returncode:
+        sys.exit(f"`endless play` must serve the page and end with status 0, got {server.returncode}")
 print(f"CPython {platform.python_version()}: endless-gym {version}, {STEPS} steps in process and served")

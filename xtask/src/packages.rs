@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 use crate::python::run;
 use crate::requirements::Requirement;
 use crate::venv::{target, workspace};
+use crate::wasm::Toolchain;
 use crate::{dist, interpreters};
 
 /// The smallest agent, for ten updates.
@@ -52,6 +53,7 @@ impl Environment {
     fn check(&self) -> Result<(), String> {
         let mut check = self.program("python");
         check.arg(workspace().join("xtask/packages/check.py")).arg(env!("CARGO_PKG_VERSION"));
+        check.arg(if Toolchain::find().is_some() { "page" } else { "no page" });
         run("import, step and serve", &mut check)?;
         run("endless list", self.program("endless").arg("list").stdout(Stdio::null()))
     }

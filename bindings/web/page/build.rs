@@ -1,4 +1,5 @@
-//! Lists the files for `include_bytes!`: those of the built page, or the sources where it has not been built.
+//! Lists the files for `include_bytes!`: in a release build those of the built page, otherwise or where it has not been built the
+//! sources. So tests do not depend on what was built before.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -6,9 +7,10 @@ use std::{env, fs, io};
 
 fn main() -> io::Result<()> {
     let package = PathBuf::from(variable("CARGO_MANIFEST_DIR")?);
-    let built = package.join("built");
-    println!("cargo::rerun-if-changed=.");
-    let folder = if built.join("engine.wasm").exists() { built } else { package.join("files") };
+    let (built, files) = (package.join("built"), package.join("files"));
+    let is_release = variable("PROFILE")? == "release";
+    println!("cargo::rerun-if-changed={}", if is_release { "." } else { "files" });
+    let folder = if is_release && built.join("engine.wasm").exists() { built } else { files };
     let mut paths: Vec<PathBuf> = fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>()?;
     paths.sort();
     let mut list = String::from("&[\n");

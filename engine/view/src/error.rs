@@ -13,7 +13,7 @@ pub enum ViewError {
     },
     /// The page on which the environments are played is not part of this program.
     #[error(
-        "this program was built without the page that plays the environments: run `cargo xtask web`, then build it again"
+        "this program was built without the page that plays the environments: run `cargo xtask web`, then build with --release"
     )]
     PageNotBuilt,
     /// The server cannot run.

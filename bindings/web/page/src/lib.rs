@@ -1,7 +1,7 @@
 //! The files of the page on which the environments are played in a browser, for a program that serves them.
 //!
-//! `cargo xtask web` builds the page into this package's folder `built`, with the engine as WebAssembly. A build of this crate before
-//! that contains the sources of the page alone, which others share: style, icon, modules.
+//! `cargo xtask web` builds the page into this package's folder `built`, with the engine as WebAssembly. Release builds of this crate
+//! after that contain it. Others contain the sources of the page alone, which other pages share: style, icon, modules.
 
 /// Names and contents of the files.
 pub const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
