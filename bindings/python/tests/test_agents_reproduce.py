@@ -294,13 +294,13 @@ def test_stopped_run_equals_an_uninterrupted_one(how: str, tmp_path: Path) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_smallest_version_of_an_experiment(name: str, tmp_path: Path) -> None:
-    """One run of each environment with one update, through evaluation and report."""
+    """One run with one update, through evaluation and report."""
     file = tmp_path / f"{name}.json"
     experiment = definitions.load(name)
     folder = Path(definitions.__file__).parent
     given = json.loads((folder / f"{name}.json").read_text())
     last = {run["env"]: run for run in given["runs"]}
-    given["runs"] = list(last.values())[-2:]
+    given["runs"] = list(last.values())[-1:]
     for run in given["runs"]:
         # Compilation takes minutes, and is tested with the agents.
         run.get("flags", {}).pop("compile", None)
