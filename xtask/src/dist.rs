@@ -1,16 +1,14 @@
 //! What a release consists of, made into `target/dist`: the source distribution and the wheel of the Python package, and the crates.
 
-use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::interpreters;
 use crate::python::run;
 use crate::requirements::Requirement;
 use crate::venv::{Install, target, venv, workspace};
 use crate::wasm::Toolchain;
-use crate::web;
+use crate::{interpreters, paths, web};
 
 const TOOLS: [&str; 5] = ["auditwheel==6.8.2", "maturin==1.16.0", "uv==0.13.9", "wheel==0.48.0", "ziglang==0.17.1"];
 
@@ -92,7 +90,7 @@ fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
     let mut maturin = maturin(tools, "build")?;
     maturin.current_dir(source).args(["--locked", "--zig", "--compatibility", PLATFORM]);
     maturin.arg("--target-dir").arg(target()?).arg("--out").arg(&built);
-    maturin.env("CARGO_ENCODED_RUSTFLAGS", remap(source)?);
+    maturin.env("CARGO_ENCODED_RUSTFLAGS", paths::remap(source)?);
     run(&format!("maturin build, {PLATFORM}"), &mut maturin)?;
 
     // The bill of materials names the folders of the local crates. `wheel pack` writes the new checksums.
@@ -121,7 +119,7 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
             return Err(format!("the wheel must contain {licence}"));
         }
     }
-    let local: Vec<String> = [workspace().to_path_buf(), target()?, cargo_home()?, sysroot()?]
+    let local: Vec<String> = [workspace().to_path_buf(), target()?, paths::cargo_home()?, paths::sysroot()?]
         .iter()
         .map(|path| path.display().to_string())
         .collect();
@@ -183,7 +181,7 @@ fn crates(folder: &Path) -> Result<(), String> {
 /// Removes what earlier runs unpacked and built of these crates. Cargo packages a workspace by way of a temporary registry in the
 /// target directory, and what comes from a registry never changes for it as long as the version is the same.
 fn remove_earlier(build: &Path) -> Result<(), String> {
-    let sources = cargo_home()?.join("registry/src");
+    let sources = paths::cargo_home()?.join("registry/src");
     // The folders of other registries begin with their host.
     let registries = entries(&sources)?.into_iter().filter(|(name, _)| name.starts_with('-'));
     let mut parents: Vec<PathBuf> = registries.map(|(_, path)| path).collect();
@@ -241,35 +239,6 @@ fn check_files(name: &str, package: &Path) -> Result<(), String> {
         Some(stray) => Err(format!("the package of {name} contains {stray}; list what it needs in `include`")),
         None => Ok(()),
     }
-}
-
-/// Compiler flags that replace the folders of this machine in panic messages.
-fn remap(source: &Path) -> Result<OsString, String> {
-    let registry = cargo_home()?.join("registry/src");
-    let (target, sysroot) = (target()?, sysroot()?);
-    let mut flags = OsString::new();
-    // Of several that match, the compiler applies the last.
-    for (from, to) in [(&*target, "target"), (source, "endless-gym"), (&registry, "registry"), (&sysroot, "rust")] {
-        if !flags.is_empty() {
-            flags.push("\x1f");
-        }
-        flags.push("--remap-path-prefix=");
-        flags.push(from);
-        flags.push(format!("={to}"));
-    }
-    Ok(flags)
-}
-
-fn cargo_home() -> Result<PathBuf, String> {
-    let home = std::env::var_os("CARGO_HOME").map(PathBuf::from);
-    home.or_else(|| Some(std::env::home_dir()?.join(".cargo"))).ok_or_else(|| "CARGO_HOME must be set".to_owned())
-}
-
-fn sysroot() -> Result<PathBuf, String> {
-    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
-    let output = Command::new(rustc).args(["--print", "sysroot"]).output();
-    let output = output.map_err(|error| format!("rustc cannot be run: {error}"))?;
-    Ok(PathBuf::from(String::from_utf8_lossy(&output.stdout).trim()))
 }
 
 fn cargo() -> Command {

@@ -11,6 +11,7 @@ mod interpreters;
 mod modules;
 mod original;
 mod packages;
+mod paths;
 mod pictures;
 mod python;
 mod requirements;
