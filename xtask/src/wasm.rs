@@ -5,8 +5,8 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::cargo;
-use crate::venv::{execute, target};
+use crate::venv::{execute, target, workspace};
+use crate::{cargo, paths};
 
 const TARGET: &str = "wasm32-unknown-unknown";
 
@@ -37,10 +37,11 @@ impl Toolchain {
     pub fn build(&self) -> Result<Command, String> {
         let mut command = cargo::command();
         command.args(["build", "--locked", "--target", TARGET]);
-        // A browser downloads the result: without names and lines.
+        // A browser downloads the result, and programs contain it: without names, lines and folders of this machine.
+        command.env("CARGO_ENCODED_RUSTFLAGS", paths::remap(workspace())?);
         command.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
         let Toolchain::Debian(folder) = self else { return Ok(command) };
-        let paths = |variable: &str, first: &[&str]| -> Result<OsString, String> {
+        let joined = |variable: &str, first: &[&str]| -> Result<OsString, String> {
             let before = std::env::var_os(variable).unwrap_or_default();
             let first = first.iter().map(|path| folder.join(path));
             let all = first.chain(std::env::split_paths(&before).filter(|path| !path.as_os_str().is_empty()));
@@ -50,8 +51,8 @@ impl Toolchain {
         // A folder of its own, so that the two compilers do not invalidate each other's builds.
         command.args(["-Zbuild-std=std,panic_abort", "--target-dir"]).arg(target()?.join("wasm"));
         command.env("RUSTC", folder.join("bin/rustc")).env("RUSTC_BOOTSTRAP", "1");
-        command.env("PATH", paths("PATH", &["bin", "lib/llvm/bin"])?);
-        command.env("LD_LIBRARY_PATH", paths("LD_LIBRARY_PATH", &[&libraries, "lib/llvm/lib"])?);
+        command.env("PATH", joined("PATH", &["bin", "lib/llvm/bin"])?);
+        command.env("LD_LIBRARY_PATH", joined("LD_LIBRARY_PATH", &[&libraries, "lib/llvm/lib"])?);
         Ok(command)
     }
 

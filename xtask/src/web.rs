@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
+use crate::cargo;
 use crate::venv::{execute, target, workspace};
 use crate::wasm::Toolchain;
-use crate::{cargo, paths};
 
 /// Bytes of all files, each compressed: what a browser downloads at most.
 const LIMIT: usize = 1_000_000;
@@ -31,10 +31,7 @@ pub fn folder() -> Result<PathBuf, String> {
 pub fn build() -> Result<(), String> {
     println!("==> page");
     let toolchain = Toolchain::find().ok_or_else(Toolchain::missing)?;
-    // Programs contain the page.
-    let mut build = toolchain.build()?;
-    build.env("CARGO_ENCODED_RUSTFLAGS", paths::remap(workspace())?);
-    execute(build.args(["--release", "--package", "endless-gym-web"]))?;
+    execute(toolchain.build()?.args(["--release", "--package", "endless-gym-web"]))?;
     let mut files = vec![("engine.wasm".to_owned(), read(&toolchain.output()?.join("release/endless_gym_web.wasm"))?)];
     let page = workspace().join("bindings/web/page/files");
     let entries = fs::read_dir(&page).map_err(|error| describe(&page, &error))?;
