@@ -10,7 +10,7 @@ use crate::venv::{Install, target, venv, workspace};
 use crate::wasm::Toolchain;
 use crate::{interpreters, paths, web};
 
-const TOOLS: [&str; 5] = ["auditwheel==6.8.2", "maturin==1.16.0", "uv==0.13.9", "wheel==0.48.0", "ziglang==0.17.1"];
+const TOOLS: [&str; 4] = ["auditwheel==6.8.2", "maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"];
 
 /// The oldest C library that the wheel supports. Zig links against any version of it, whatever the machine has.
 const PLATFORM: &str = "manylinux_2_17";
@@ -51,7 +51,7 @@ pub fn folder() -> Result<PathBuf, String> {
     Ok(target()?.join("dist"))
 }
 
-/// The virtual environment with maturin, zig, uv and the tools that inspect wheels.
+/// The virtual environment with maturin, zig and the tools that inspect wheels.
 pub fn tools() -> Result<PathBuf, String> {
     let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
     venv("packaging", &base, &[Install::of(&TOOLS)])
@@ -160,6 +160,8 @@ fn crates(folder: &Path) -> Result<(), String> {
     remove_earlier(&build)?;
     let mut cargo = cargo();
     cargo.args(["package", "--locked", "--allow-dirty", "--target-dir"]).arg(&build);
+    // The profiles of the workspace do not apply.
+    cargo.env("CARGO_PROFILE_DEV_DEBUG", "false");
     for name in CRATES {
         cargo.args(["--package", name]);
     }
@@ -174,6 +176,7 @@ fn crates(folder: &Path) -> Result<(), String> {
     // The tests of the core read recorded cases, which its package must contain.
     let manifest = build.join(format!("package/endless-gym-core-{}/Cargo.toml", env!("CARGO_PKG_VERSION")));
     let mut check = self::cargo();
+    check.env("CARGO_PROFILE_DEV_DEBUG", "false");
     check.args(["check", "--quiet", "--tests", "--manifest-path"]).arg(manifest);
     run("cargo check --tests, packaged core", check.arg("--target-dir").arg(&build))
 }

@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 
 use crate::python::run;
 use crate::requirements::Requirement;
-use crate::venv::{target, workspace};
+use crate::venv::{target, uv, uv_pip_install, workspace};
 use crate::wasm::Toolchain;
 use crate::{dist, interpreters};
 
@@ -15,30 +15,23 @@ const TRAIN: &[&str] = &[
     "--environment.num-envs 8 --ppo.steps 16 --ppo.updates 10 --ppo.epochs 1 --threads 1 --run run",
 ];
 
-/// A virtual environment of uv, which links files from one cache. Environments with PyTorch share its gigabytes.
+/// A virtual environment without anything that the package does not ask for.
 struct Environment {
-    uv: PathBuf,
     folder: PathBuf,
 }
 
 impl Environment {
-    fn create(tools: &Path, python: &Path, name: &str) -> Result<Self, String> {
-        let environment = Environment { uv: tools.join("bin/uv"), folder: target()?.join("packages").join(name) };
+    fn create(python: &Path, name: &str) -> Result<Self, String> {
+        let environment = Environment { folder: target()?.join("packages").join(name) };
         let arguments = ["venv", "--quiet", "--clear", "--no-project", "--python"];
-        run("uv venv", environment.uv(&arguments)?.arg(python).arg(&environment.folder))?;
+        run("uv venv", uv()?.args(arguments).arg(python).arg(&environment.folder))?;
         Ok(environment)
-    }
-
-    fn uv(&self, arguments: &[&str]) -> Result<Command, String> {
-        let mut command = Command::new(&self.uv);
-        command.args(arguments).env("UV_CACHE_DIR", target()?.join("uv-cache")).env("UV_NO_CONFIG", "1");
-        Ok(command)
     }
 
     /// `uv pip install` into the environment, with the versions that this was tested with.
     fn install(&self, arguments: &[&str]) -> Result<Command, String> {
-        let mut command = self.uv(&["pip", "install", "--quiet", "--python"])?;
-        command.arg(self.folder.join("bin/python")).args(arguments);
+        let mut command = uv_pip_install(&self.folder)?;
+        command.args(arguments);
         command.arg("--constraint").arg(workspace().join("xtask/packages/constraints.txt"));
         Ok(command)
     }
@@ -63,7 +56,6 @@ impl Environment {
 /// Tests the wheel on each CPython, and the source distribution on the oldest.
 pub fn test() -> Result<(), String> {
     dist::build()?;
-    let tools = dist::tools()?;
     let wheel = dist::only_file(&dist::folder()?, ".whl")?.display().to_string();
     let pythons = interpreters::all();
     let oldest = pythons.first().ok_or_else(|| Requirement::Python.missing())?;
@@ -73,13 +65,13 @@ pub fn test() -> Result<(), String> {
             continue;
         };
         println!("==> CPython 3.{minor}, {}", python.path.display());
-        let environment = Environment::create(&tools, &python.path, &format!("3.{minor}"))?;
+        let environment = Environment::create(&python.path, &format!("3.{minor}"))?;
         run("install the wheel", &mut environment.install(&[&wheel])?)?;
         environment.check(Toolchain::find().is_some())?;
         train(&environment, &wheel)?;
     }
     println!("==> CPython 3.{}, from source", oldest.minor);
-    source(&tools, &oldest.path)
+    source(&oldest.path)
 }
 
 /// Trains the smallest agent where PyTorch has a wheel for this CPython, and otherwise says that it was not trained.
@@ -102,9 +94,9 @@ fn train(environment: &Environment, wheel: &str) -> Result<(), String> {
 }
 
 /// Installs the source distribution. It is built with the profile of the tests, for which the dependencies have been compiled.
-fn source(tools: &Path, python: &Path) -> Result<(), String> {
+fn source(python: &Path) -> Result<(), String> {
     let archive = dist::only_file(&dist::folder()?, ".tar.gz")?.display().to_string();
-    let environment = Environment::create(tools, python, "source")?;
+    let environment = Environment::create(python, "source")?;
     let mut install = environment.install(&["--reinstall-package", "endless-gym", &archive])?;
     install.env("CARGO_TARGET_DIR", target()?).env("MATURIN_PEP517_ARGS", "--profile dev");
     run("install the source distribution", &mut install)?;

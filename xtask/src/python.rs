@@ -5,7 +5,7 @@ use std::process::Command;
 use std::time::Instant;
 
 use crate::requirements::Requirement;
-use crate::venv::{Install, execute, folder, target, venv, venv_above, workspace};
+use crate::venv::{Install, execute, folder, target, uv_pip_install, venv, venv_above, workspace};
 use crate::{interpreters, original};
 
 const NAME: &str = "python";
@@ -22,10 +22,7 @@ pub fn environment() -> Result<PathBuf, String> {
 pub fn libraries() -> Result<PathBuf, String> {
     environment()?;
     let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    let mut install = Install::of_file("requirements-libraries.txt")?;
-    // PufferLib asks for another Gymnasium; it is not used here.
-    install.arguments.push("--no-warn-conflicts".to_owned());
-    venv_above(NAME, LIBRARIES, &base, &[install])
+    venv_above(NAME, LIBRARIES, &base, &[Install::of_file("requirements-libraries.txt")?])
 }
 
 /// Checks the format of the Python files and lints them.
@@ -90,8 +87,7 @@ pub fn install(profile: &str) -> Result<(), String> {
     maturin.arg("--manifest-path").arg(package().join("Cargo.toml")).arg("--out").arg(&wheels);
     execute(&mut maturin)?;
     let wheel = only_file(&wheels)?;
-    let install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--force-reinstall", "--no-deps"];
-    execute(Command::new(folder.join("bin/python")).args(install).arg(wheel))
+    execute(uv_pip_install(&folder)?.args(["--reinstall", "--no-deps"]).arg(wheel))
 }
 
 fn only_file(folder: &Path) -> Result<PathBuf, String> {

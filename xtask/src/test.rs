@@ -27,7 +27,7 @@ pub fn run(selection: Selection, all: bool) -> Result<(), String> {
     }
     let lacks = |stage: &Stage| stage.requirements().into_iter().find(|requirement| missing.contains_key(requirement));
     let (not_run, to_run): (Vec<_>, Vec<_>) = selected.into_iter().partition(|stage| lacks(stage).is_some());
-    let outcomes = runner::run(&to_run)?;
+    let outcomes = runner::run(&to_run, selection == Selection::Quick)?;
 
     println!("\n{:34} {:>9}", "stage", "seconds");
     for Outcome { stage, duration, output, result, .. } in &outcomes {

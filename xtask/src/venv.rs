@@ -1,9 +1,12 @@
-//! Virtual environments under the target directory.
+//! Virtual environments under the target directory. uv installs their packages, from one cache by hard links: gigabytes of PyTorch
+//! take their space once.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::interpreters::Interpreter;
+use crate::interpreters::{self, Interpreter};
+use crate::requirements::Requirement;
 
 /// The root of the workspace.
 pub fn workspace() -> &'static Path {
@@ -16,10 +19,12 @@ pub fn target() -> Result<PathBuf, String> {
     std::path::absolute(target).map_err(|error| error.to_string())
 }
 
-/// One call of `pip install`.
+const UV: &str = "uv==0.13.9";
+
+/// One call of `uv pip install`.
 #[derive(Clone, Debug, Default)]
 pub struct Install {
-    /// Packages with their versions, and options of pip.
+    /// Packages with their versions, and options of uv.
     pub arguments: Vec<String>,
     pub environment: Vec<(&'static str, String)>,
 }
@@ -49,8 +54,7 @@ pub fn venv(name: &str, base: &Interpreter, installs: &[Install]) -> Result<Path
     create(name, base, installs, None)
 }
 
-/// As [`venv`], with the packages of the environment `below`, made from the same Python, where it has none of its own. They take no
-/// space a second time.
+/// As [`venv`], with the packages of the environment `below`, made from the same Python, where it has none of its own.
 pub fn venv_above(below: &str, name: &str, base: &Interpreter, installs: &[Install]) -> Result<PathBuf, String> {
     create(name, base, installs, Some(below))
 }
@@ -69,20 +73,50 @@ fn create(name: &str, base: &Interpreter, installs: &[Install], below: Option<&s
         return Ok(folder);
     }
     eprintln!("==> virtual environment {}", folder.display());
-    execute(Command::new(&base.path).args(["-m", "venv", "--clear"]).arg(&folder))?;
+    execute(Command::new(&base.path).args(["-m", "venv", "--without-pip", "--clear"]).arg(&folder))?;
     if let Some(below) = below {
         let packages = format!("lib/python3.{}/site-packages", base.minor);
         let path = folder.join(&packages).join("below.pth");
         std::fs::write(path, format!("../../../../{below}/{packages}\n")).map_err(|error| error.to_string())?;
     }
     for install in installs {
-        let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
-        let mut command = Command::new(folder.join("bin/python"));
-        command.args(pip).args(&install.arguments);
+        let mut command = uv_pip_install(&folder)?;
+        command.args(&install.arguments);
         execute(command.envs(install.environment.iter().map(|(name, value)| (name, value))))?;
     }
     std::fs::write(stamp, wanted).map_err(|error| error.to_string())?;
     Ok(folder)
+}
+
+/// `uv pip install` into a virtual environment.
+pub fn uv_pip_install(environment: &Path) -> Result<Command, String> {
+    let mut command = uv()?;
+    command.args(["pip", "install", "--quiet", "--python"]).arg(environment.join("bin/python"));
+    Ok(command)
+}
+
+/// uv with its cache in the target directory, without the settings of the user. Installs it if necessary.
+pub fn uv() -> Result<Command, String> {
+    let folder = folder("uv")?;
+    let program = folder.join("bin/uv");
+    let stamp = folder.join("packages");
+    let installed = || std::fs::read_to_string(&stamp).is_ok_and(|made| made == UV);
+    // Stages that run side by side may need it at the same time.
+    let lock = target()?.join("venvs/uv.lock");
+    let describe = |error: std::io::Error| format!("{}: {error}", lock.display());
+    std::fs::create_dir_all(target()?.join("venvs")).map_err(describe)?;
+    let file = File::create(&lock).map_err(describe)?;
+    file.lock().map_err(describe)?;
+    if !installed() {
+        let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
+        execute(Command::new(&base.path).args(["-m", "venv", "--clear"]).arg(&folder))?;
+        let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", UV];
+        execute(Command::new(folder.join("bin/python")).args(pip))?;
+        std::fs::write(&stamp, UV).map_err(|error| error.to_string())?;
+    }
+    let mut command = Command::new(program);
+    command.env("UV_CACHE_DIR", target()?.join("uv-cache")).env("UV_NO_CONFIG", "1");
+    Ok(command)
 }
 
 /// Runs a command and waits for it.
