@@ -46,7 +46,7 @@ struct Player {
 
 impl Player {
     fn new(spec: &EnvSpec, frames: Frames) -> Self {
-        // Short episodes, where they can be had.
+        // Short episodes, where a reset parameter makes them so.
         let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
         let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
         let config = PoolConfig {

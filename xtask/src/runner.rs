@@ -113,7 +113,7 @@ fn start(
 ) -> Result<Running, String> {
     let output = File::create(&log).and_then(|file| Ok((file.try_clone()?, file)));
     let (output, errors) = output.map_err(|error| format!("{}: {error}", log.display()))?;
-    // A stage may build this program anew: then its path names another file or, for a moment, none.
+    // A stage may rebuild this program: then its path names another file or, for a moment, none.
     let mut command = Command::new("/proc/self/exe");
     command.args(["stage", stage.name]).process_group(0).stdin(Stdio::null()).stdout(output).stderr(errors);
     if !incremental {

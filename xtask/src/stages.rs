@@ -18,7 +18,7 @@ pub struct Stage {
     pub quick: bool,
 }
 
-/// All tests of the workspace, by one command line up to here: another selection of targets would compile dependencies anew.
+/// All tests of the workspace, by one command line up to here: another selection of targets would compile dependencies again.
 const RUST_TESTS: &[&str] = &["test", "--workspace", "--locked", "--no-fail-fast", "--"];
 
 /// The tests that take more than some seconds.

@@ -110,7 +110,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._copy = copy
         self._options = NextOptions(backend, num_envs, options, knows_options)
         self._chooses = checked_choice(episode_options) is not None
-        # By group; none if nobody wants to follow the episodes.
+        # By group; none unless episodes are followed.
         self._trackers = [
             EpisodeTracker(group, num_envs, backend, self._options, autoreset, episode_options, episode_info, copy)
             for group in range(backend.groups if self._chooses or episode_info else 0)

@@ -45,7 +45,7 @@ impl Observer {
     fn next<'py>(&mut self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Watched<'py>> {
         if self.process != std::process::id() {
             return Err(PyRuntimeError::new_err(
-                "this observer belongs to the process that this process was forked from; watch the engine anew in the child",
+                "this observer belongs to the process that this process was forked from; create a new observer in the child",
             ));
         }
         let timeout = timeout.map_or(Ok(Duration::MAX), arguments::timeout)?;

@@ -24,7 +24,7 @@ def played(envs: Envs, group: int = 0) -> list[dict[str, Any]]:
 
 
 def stay(envs: Envs, group: int = 0) -> tuple[Any, ...]:
-    """One step in which nobody moves."""
+    """One step in which no agent moves."""
     envs.send(np.zeros(envs.action_space.shape, np.int64), group)
     return envs.recv(group)
 

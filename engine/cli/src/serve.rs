@@ -104,7 +104,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             let steps: Vec<_> = engine.steps().iter().map(u64::to_string).collect();
             let steps = steps.join(", ");
             print(match steps.chars().all(|c| "0, ".contains(c)) {
-                true => format!("{} does not exist yet: the environments start anew", path.display()),
+                true => format!("{} does not exist yet: the environments start with new episodes", path.display()),
                 false => format!("resumed from {} after {steps} batches", path.display()),
             })?;
         }

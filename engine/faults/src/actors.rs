@@ -127,7 +127,7 @@ impl Drop for Actor {
     }
 }
 
-/// Whether a process crashed: it was ended by a signal that nobody sent, or by a panic.
+/// Whether a process crashed: it was ended by a signal that no process of the run sent, or by a panic.
 pub fn is_crash(status: ExitStatus) -> bool {
     status.signal().is_some() || status.code() == Some(101)
 }

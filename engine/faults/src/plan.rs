@@ -32,7 +32,7 @@ pub enum Fault {
     Restart { down: u64 },
     /// A trainer with a forked child is killed or ends; the child lives on.
     Fork { is_killed: bool },
-    /// A process is started anew with a limit of its descriptors.
+    /// A process is restarted with a limit of its descriptors.
     Descriptors { role: Role, limit: u64 },
     /// Modification times of all files move, as seen after a jump of the clock; then the trainer is replaced.
     ClockJump { seconds: i64 },

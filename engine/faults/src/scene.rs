@@ -281,7 +281,7 @@ impl<'a> Scene<'a> {
             Event::Error { during, kind, text, engine } => {
                 *self.outcome.errors.entry(kind.clone()).or_default() += 1;
                 let is_lost = matches!(kind.as_str(), "EngineLost" | "EngineRestarted");
-                // An engine without its directory starts anew in the same process.
+                // An engine without its directory starts again in the same process.
                 let is_removed = self.began_before(process, self.removed);
                 let has_crashed = self.engine.as_mut().is_some_and(|engine| engine.ended().is_some());
                 let is_running = engine.is_some_and(|engine| !self.ended_engines.contains(&engine)) && !has_crashed;

@@ -60,7 +60,7 @@ pub(crate) fn foreign_segment(config: &Config) -> Option<(PathBuf, u32)> {
     })
 }
 
-/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and creates it anew: a node's id also
+/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and creates a new one each time: a node's id also
 /// contains its process id and its start time. All users may write to the counter, and one that a process left which died in
 /// between is unusable, so it exists only while a node is created.
 pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(), ServiceError> {

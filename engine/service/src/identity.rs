@@ -4,8 +4,8 @@
 //! that share `/dev/shm` and not `/tmp`), and so that another user cannot create a segment before we do. The first process that
 //! joins writes the file and the last one that leaves removes it, both under the namespace's lock.
 //!
-//! The file also carries the **creation lock**: a process holds it shared while it creates services and ports. Whoever holds it
-//! exclusively together with the namespace's lock knows that every incomplete resource belongs to a dead process, however long a
+//! The file also carries the **creation lock**: a process holds it shared while it creates services and ports. The process that holds
+//! it exclusively together with the namespace's lock knows that every incomplete resource belongs to a dead process, however long a
 //! living one is stopped.
 
 use std::fs::{self, File};

@@ -42,7 +42,7 @@
 //! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
 //! | an observer holds batches | it has reserved their memory in the engine's segment when it connected, or was refused; engine and trainer have reserved theirs when the engine started |
 //! | a request names another incarnation | the engine ignores it |
-//! | any process wants to know what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects nobody |
+//! | any process wants to know what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects no other process |
 //! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |
 //!
 //! # Faults of the surroundings
@@ -55,7 +55,7 @@
 //! | dead processes fill `/dev/shm`, or their directory was removed | the next process that joins a namespace of the same path removes what no process uses, by the locks of the prefixes |
 //! | a process is stopped while it holds the namespace's lock | the others wait: an engine 30 s to start, a trainer or observer as long as its timeout and at least 5 s, and up to six times that while one process takes it after another; after a second they log who holds it, and [`ServiceError::NamespaceLocked`] names it |
 //! | two directories have the same path (containers that share `/dev/shm` and not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
-//! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts anew in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
+//! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts again in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
 //! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix, otherwise [`ServiceError::ForeignSegment`]; no segment that stays is accessible to other users |
 //! | a process forks | liveness is that of the process that connected; a child that it forked neither keeps it alive nor releases what it holds |
 //! | an engine's files are removed while it starts | it checks after publishing that it can be found, starts again up to twice, and then ends with [`ServiceError::EngineUnreachable`] |

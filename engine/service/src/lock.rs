@@ -40,7 +40,7 @@ const HOLDER_INTERVAL: Duration = Duration::from_millis(250);
 /// How many times its timeout a process waits in all while one holder follows another.
 const LONGEST_WAIT: u32 = 6;
 
-/// The lock while it is held. Every acquisition opens the directory anew, so that threads of one process exclude each other too.
+/// The lock while it is held. Every acquisition opens the directory again, so that threads of one process exclude each other too.
 /// A thread must not acquire it twice.
 pub(crate) struct NamespaceLock(File);
 

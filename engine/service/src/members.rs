@@ -1,6 +1,6 @@
 //! The processes that use a prefix of segments: each holds a shared lock on a file of that prefix in `/dev/shm`.
 //!
-//! The namespace's directory says which processes use it, but it may have been removed, or be in another container. Whoever gets
+//! The namespace's directory says which processes use it, but it may have been removed, or be in another container. A process that gets
 //! the lock of a prefix exclusively knows that no process uses it any more, and may remove its segments.
 
 use std::fs::{self, File};

@@ -249,7 +249,7 @@ impl Drop for NamespaceNode {
         {
             self.identity.remove(lock, &all);
         }
-        // Nobody will join under this prefix again.
+        // No process will join under this prefix again.
         if let Err(ServiceError::RootRemoved { .. }) = lock {
             drop(self.membership.take());
             members::remove_if_unused(self.identity.prefix());

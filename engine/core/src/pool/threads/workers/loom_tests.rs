@@ -27,7 +27,7 @@ impl Pieces {
         Pieces { left: Mutex::new((0..count).collect()), done: (0..count).map(|_| UnsafeCell::new(0)).collect() }
     }
 
-    /// Does the pieces that nobody else has taken.
+    /// Does the pieces that no other thread has taken.
     fn work(&self) {
         while let Some(piece) = { lock(&self.left).pop() } {
             // SAFETY: loom checks that no other access is possible at the same time.
