@@ -81,7 +81,8 @@ fn create(name: &str, base: &Interpreter, installs: &[Install], below: Option<&s
     }
     for install in installs {
         let mut command = uv_pip_install(&folder)?;
-        command.args(&install.arguments);
+        // As pip does: the first import of PyTorch takes long otherwise, and tests have time limits.
+        command.arg("--compile-bytecode").args(&install.arguments);
         execute(command.envs(install.environment.iter().map(|(name, value)| (name, value))))?;
     }
     std::fs::write(stamp, wanted).map_err(|error| error.to_string())?;
