@@ -3,7 +3,6 @@
 Trial 0 kills its process after update 3, once. Trial 1 has the lowest reward, and waits until trial 0 is complete.
 """
 
-import json
 import os
 import shutil
 import signal

@@ -103,6 +103,15 @@ def test_torchrl_rollout(tmp_path, env_id):
         assert summary[3] != "none yet"
 
 
+def test_torchrl_rollout_with_workers(tmp_path, segments):
+    sizes = ("--num-envs", "8", "--num-workers", "2", "--num-steps", "32", "--total-timesteps", "512")
+    output, summary = run("torchrl_rollout.py", tmp_path, *sizes)
+    assert summary[1] == "512"
+    assert output.count("batch=(8, 32) observation=(8, 32, 84, 84, 3)") == 2
+    assert summary[3] != "none yet"
+    assert not segments()
+
+
 @pytest.mark.parametrize(
     ("env_id", "backend"),
     [
