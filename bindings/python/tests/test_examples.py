@@ -146,10 +146,14 @@ def test_cleanrl_ppo(tmp_path, env_id):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "observation", "runners", "lstm"),
-    [("Endless-MortarMayhem-v0", "rgb", 0, "--lstm"), ("MysteryPath-Grid-v0", "features", 1, "--no-lstm")],
+    ("env_id", "observation", "runners", "memory"),
+    [
+        ("Endless-MortarMayhem-v0", "rgb", 0, "lstm"),
+        ("MysteryPath-Grid-v0", "features", 1, "none"),
+        ("Endless-MortarMayhem-v0", "rgb", 1, "gru"),
+    ],
 )
-def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, runners, lstm):
+def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, runners, memory):
     arguments = {
         "--env-id": env_id,
         "--options": "{}",
@@ -158,9 +162,10 @@ def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, 
         "--num-envs": 8,
         "--num-steps": 16,
         "--total-timesteps": 256,
+        "--memory": memory,
     }
     flat = (str(part) for pair in arguments.items() for part in pair)
-    output, summary = run("rllib_ppo.py", tmp_path, *flat, lstm, python=libraries_python)
+    output, summary = run("rllib_ppo.py", tmp_path, *flat, python=libraries_python)
     assert summary[1] == "256"
     assert output.count("steps=") >= 2
     if env_id.startswith("Endless"):
