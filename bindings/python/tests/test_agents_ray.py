@@ -1,5 +1,6 @@
 """The hyperparameter search on Ray Tune."""
 
+import contextlib
 import json
 import os
 import subprocess
@@ -26,15 +27,22 @@ def test_search_on_ray(
     pruning = ["--period", "1", "--warm-up", "4", "--startup-trials", "1"]
     command = ["--preset", "quick", "--folder", "search", *environments, *sizes, *searched, *pruning]
     shared_memory = {name for name in os.listdir("/dev/shm") if "plasma" in name or "ray" in name}
-    ran = subprocess.run(
+    # Ray's processes are in the session of the search, which can be ended as a whole.
+    with subprocess.Popen(
         [libraries_python, SCRIPT, *command, "--ray", "--workers", "2"],
         cwd=tmp_path,
         env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
-        timeout=280,
-    )
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+        start_new_session=True,
+    ) as ran:
+        try:
+            output, _ = ran.communicate(timeout=280)
+        except subprocess.TimeoutExpired:
+            _kill_session(ran.pid)
+            raise
+    assert ran.returncode == 0, output
     folder = tmp_path / "search"
     study = optuna.load_study(study_name="search", storage=f"sqlite:///{folder / 'study.db'}")
     ended = [(trial.params["ppo.epochs"], trial.state.name, trial.value) for trial in study.trials]
@@ -56,6 +64,13 @@ def test_search_on_ray(
     assert not segments()
     assert {name for name in os.listdir("/dev/shm") if "plasma" in name or "ray" in name} == shared_memory
     assert not [process for process in psutil.process_iter() if ray_folder in " ".join(_command_line(process))]
+
+
+def _kill_session(session: int) -> None:
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error, ProcessLookupError):
+            if os.getsid(process.pid) == session:
+                process.kill()
 
 
 def _command_line(process: psutil.Process) -> list[str]:

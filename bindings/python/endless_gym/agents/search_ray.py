@@ -70,9 +70,10 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
     try:
         _tune(study, trainer, _gpus(trials))
     finally:
-        study.interrupt()
         if not is_running:
             ray.shutdown()
+        # Only now, since another process may begin the trials from here on.
+        study.interrupt()
     if study.failed:
         numbers = ", ".join(map(str, study.failed))
         raise ValueError(

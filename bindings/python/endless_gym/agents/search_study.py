@@ -248,11 +248,6 @@ class Trials:
             states = [trial.state.name for trial in self.study.trials]
             return states.count("COMPLETE") + states.count("PRUNED"), self._left()
 
-    def left_behind(self) -> bool:
-        """Whether a trial is running whose process has ended."""
-        with self._locked():
-            return any(self._is_left_behind(trial.number) for trial in self._in_states("RUNNING"))
-
     def begin(self) -> Trial | None:
         """Begin the next trial: one that was interrupted, a single change, or a combination.
 
