@@ -54,9 +54,10 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
     import ray
 
     arguments = trials.arguments
-    # The runs log for themselves; Ctrl-C, which Tune would answer with success, is this process's matter.
-    for name in ("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "TUNE_DISABLE_SIGINT_HANDLER"):
-        os.environ.setdefault(name, "1")
+    # The runs log for themselves. Tune would take Ctrl-C for the end of the search.
+    quiet = {"TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1", "TUNE_DISABLE_SIGINT_HANDLER": "1", "RAY_AIR_NEW_OUTPUT": "0"}
+    for name, value in quiet.items():
+        os.environ.setdefault(name, value)
     is_running = ray.is_initialized()
     if not is_running:
         given: dict[str, Any] = {"address": arguments.ray, "log_to_driver": False}
