@@ -31,12 +31,11 @@ def test_workers_play_the_episodes_of_one_process(segments: Callable[[], set[str
     )
     try:
         batches = [batch.clone() for batch in collector]
-        engines = {name for name in segments()}
+        assert segments(), "the frames come from engines"
     finally:
         collector.shutdown()
     data = torch.cat(batches, 1)
     assert tuple(data.batch_size) == (ENVS, 2 * STEPS)
-    assert not engines, "the engines end with the last batch"
 
     with endless_gym.make_vec(ID, num_envs=ENVS, autoreset="disabled", seed=40, options={"max_steps": 5}) as envs:
         observation, _ = envs.reset()
