@@ -49,13 +49,15 @@ def test_search_on_ray(
     # Also the trial whose process was killed is one trial: Tune resumed it.
     assert ended == [(3, "COMPLETE", 1.0), (2, "PRUNED", 0.5), (4, "COMPLETE", 2.0)]
     reported = [list(trial.intermediate_values) for trial in study.trials]
-    assert reported == [[1, 2, 3, 4, 5], [1, 2, 3, 4], [1, 2, 3, 4, 5]]
+    assert reported == [[1, 2, 3, 4, 5]] * 3
+    # Nothing is reported at the last update; the pruned trial has not reached it.
+    assert len(_rows(folder / "trial-0001")) == 5
     assert json.loads((folder / "best.json").read_text())["settings"]["ppo"]["epochs"] == 4
     assert (folder / "threads").read_text() == "1 1"
 
     # The rows up to the checkpoint are those of the killed process, with its times.
     before = (folder / "killed").read_text().splitlines()
-    rows = (folder / "trial-0000/progress.jsonl").read_text().splitlines()
+    rows = _rows(folder / "trial-0000")
     assert [json.loads(row)["update"] for row in rows] == [1, 2, 3, 4, 5, 6]
     assert len(before) == 3
     assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
@@ -64,6 +66,10 @@ def test_search_on_ray(
     assert not segments()
     assert {name for name in os.listdir("/dev/shm") if "plasma" in name or "ray" in name} == shared_memory
     assert not [process for process in psutil.process_iter() if ray_folder in " ".join(_command_line(process))]
+
+
+def _rows(run: Path) -> list[str]:
+    return (run / "progress.jsonl").read_text().splitlines()
 
 
 def _kill_session(session: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -170,6 +171,20 @@ def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, 
     assert output.count("steps=") >= 2
     if env_id.startswith("Endless"):
         assert summary[3] != "none yet"
+
+
+def test_rllib_ppo_remembers_a_command(tmp_path, ray_folder, libraries_python):
+    """In episodes that are as short as the task permits, with the module's GRU and without a memory."""
+    options = {"command_count": [1], "command_show_duration": [1], "command_show_delay": [0]}
+    options |= {"explosion_delay": [5], "explosion_duration": [1]}
+    sizes = ("--num-envs", "32", "--num-steps", "32", "--total-timesteps", "24000", "--learning-rate", "0.003")
+    returns = {}
+    for memory in ("gru", "none"):
+        given = ("--options", json.dumps(options), *sizes, "--memory", memory)
+        _, summary = run("rllib_ppo.py", tmp_path, *given, python=libraries_python)
+        returns[memory] = float(summary[3])
+    # The reward of the one command is 0.1.
+    assert returns["gru"] > returns["none"] + 0.02
 
 
 @pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
