@@ -10,6 +10,8 @@ data = env.rollout(128, break_when_any_done=False)    # batch size [64, 128]
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -25,6 +27,7 @@ except ImportError as error:
 
 from endless_gym import torch_view
 from endless_gym.adapters import check_adaptable
+from endless_gym.engine import serve
 from endless_gym.vector import EndlessVectorEnv, make_vec
 
 __all__ = ["EndlessEnv"]
@@ -86,6 +89,40 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
     def make(cls, env_id: str, num_envs: int, device: torch.device | str = "cpu", **kwargs: Any) -> EndlessEnv:
         """Make `num_envs` environments; `kwargs` are those of `make_vec`."""
         return cls(make_vec(env_id, num_envs=num_envs, autoreset="disabled", **kwargs), device=device)
+
+    @classmethod
+    def serve(cls, env_id: str, num_envs: int, device: torch.device | str = "cpu", **kwargs: Any) -> EndlessEnv:
+        """Start an engine process with `num_envs` environments; `kwargs` are those of `endless_gym.serve`."""
+        return cls(serve(env_id, num_envs=num_envs, autoreset="disabled", **kwargs), device=device)
+
+    @classmethod
+    def workers(
+        cls, env_id: str, num_envs: int, num_workers: int, device: torch.device | str = "cpu", **kwargs: Any
+    ) -> list[Callable[[], EndlessEnv]]:
+        """Functions for the processes of a `MultiCollector`, each of which starts an engine with its share of the environments.
+
+        The environments are numbered over all workers: with `seed`, they play the episodes that they play in one process. Do not
+        call the collector's `set_seed`, which seeds each worker by itself.
+
+        Args:
+            env_id: The environment id.
+            num_envs: Number of environments of all workers.
+            num_workers: Number of workers.
+            device: Device of the tensors.
+            **kwargs: Those of `endless_gym.serve`.
+
+        Raises:
+            ValueError: `num_envs` is not a multiple of `num_workers`.
+        """
+        if num_workers < 1 or num_envs < 1 or num_envs % num_workers:
+            raise ValueError(
+                f"num_envs must be a positive multiple of num_workers, got {num_envs} environments and {num_workers} workers"
+            )
+        share = num_envs // num_workers
+        return [
+            functools.partial(cls.serve, env_id, share, device, first_env=first, total_envs=num_envs, **kwargs)
+            for first in range(0, num_envs, share)
+        ]
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)

@@ -1,8 +1,9 @@
-"""Train RLlib's PPO with an LSTM, on RLlib's new API stack, to remember one command of Mortar Mayhem.
+"""Train RLlib's PPO with a memory, on RLlib's new API stack, to remember one command of Mortar Mayhem.
 
-pip install ./bindings/python 'ray[rllib]' torch
+pip install './bindings/python[agents]' 'ray[rllib]'
 python rllib_ppo.py                   # feature observations: learns the command in a few minutes on one core
-python rllib_ppo.py --no-lstm         # the baseline without memory, which cannot
+python rllib_ppo.py --memory gru      # a module of its own, with the GRU of endless_gym.agents, in place of RLlib's LSTM
+python rllib_ppo.py --memory none     # the baseline without memory, which cannot
 python rllib_ppo.py --env-id Endless-MortarMayhem-v0 --options '{}' --observation rgb --total-timesteps 10000000
 
 All environments of an env runner are one vector environment, stepped by one call. RLlib's own loop over their episodes, in
@@ -17,17 +18,71 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import ray
+import torch
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.common.add_observations_from_episodes_to_batch import AddObservationsFromEpisodesToBatch
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch import TorchRLModule
+
+from endless_gym.agents.encoders import FRAME, Encoder
+from endless_gym.agents.heads import PolicyHead, ValueHead
+from endless_gym.agents.recurrence import packed_layers
+from endless_gym.agents.recurrent import RecurrentMemory
+from endless_gym.agents.settings import Recurrence
+
+
+class GRUModule(TorchRLModule, ValueFunctionAPI):
+    """The paper's GRU agent as an RLModule: encoder, fully connected layer, GRU, policy and value.
+
+    RLlib cuts the episodes into sequences of `max_seq_len` steps, which start from the states that were stored while acting, and
+    pads them with zeros.
+    """
+
+    def setup(self) -> None:
+        hidden, shape = self.model_config["hidden_size"], self.observation_space.shape
+        actions = self.action_space
+        branches = actions.nvec.tolist() if isinstance(actions, gym.spaces.MultiDiscrete) else [int(actions.n)]
+        self.key = FRAME if len(shape) == 3 else "features"
+        self.encoder = Encoder({self.key: shape}, 64)
+        recurrence = Recurrence(hidden_size=hidden)
+        self.memory = RecurrentMemory("gru", self.encoder.width, recurrence, torch.device("cpu"))
+        self.policy = PolicyHead(hidden, 64, branches)
+        self.value = ValueHead(hidden, 64, gain=0.05)
+
+    def get_initial_state(self) -> dict[str, np.ndarray]:
+        return {"hidden": np.zeros(self.memory.width, np.float32)}
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        remembered = self._remember(batch)  # (B, T, hidden size)
+        logits = torch.cat(self.policy(remembered), -1)
+        return {
+            Columns.ACTION_DIST_INPUTS: logits,
+            Columns.STATE_OUT: {"hidden": remembered[:, -1]},
+            Columns.EMBEDDINGS: remembered,
+        }
+
+    def compute_values(self, batch: dict[str, Any], embeddings: torch.Tensor | None = None) -> torch.Tensor:
+        return self.value(self._remember(batch) if embeddings is None else embeddings)
+
+    def _remember(self, batch: dict[str, Any]) -> torch.Tensor:
+        """The outputs of the GRU, float32 (B, T, hidden size), for observations (B, T, ...)."""
+        observed, hidden = batch[Columns.OBS], batch[Columns.STATE_IN]["hidden"]
+        sequences, steps = observed.shape[:2]
+        # In the order of packed sequences: first step 0 of all, then step 1, ...
+        flat = observed.transpose(0, 1).flatten(0, 1)
+        encoded = self.memory.embedding(self.encoder({self.key: flat}))
+        outputs = packed_layers(encoded, self.memory.recurrent.all_weights, hidden[None, None], [sequences] * steps)
+        return outputs.unflatten(0, (steps, sequences)).transpose(0, 1)
 
 
 class ScaleFrames(ConnectorV2):
     """Convert frames uint8 (84, 84, 3) in a batch to float32 in [0, 1]. The episodes keep them as uint8, a quarter of the memory.
 
-    RLlib's convolutions take no uint8. Feature observations, which are float32, are left as they are.
+    RLlib's convolutions take no uint8; those of `GRUModule` do. Feature observations, which are float32, are left as they are.
     """
 
     def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> gym.Space:
@@ -44,15 +99,21 @@ class ScaleFrames(ConnectorV2):
 
 
 def make_config(args: argparse.Namespace) -> PPOConfig:
-    model = DefaultModelConfig(
-        fcnet_hiddens=[64],
-        fcnet_activation="relu",
-        conv_filters=[[32, 8, 4], [64, 4, 2], [64, 3, 1]] if args.observation == "rgb" else None,
-        head_fcnet_hiddens=[64],
-        use_lstm=args.lstm,
-        lstm_cell_size=128,
-        max_seq_len=args.max_seq_len,
-    )
+    if args.memory == "gru":
+        sizes = {"hidden_size": 128, "max_seq_len": args.max_seq_len}
+        model = {"rl_module_spec": RLModuleSpec(module_class=GRUModule, model_config=sizes)}
+    else:
+        config = DefaultModelConfig(
+            fcnet_hiddens=[64],
+            fcnet_activation="relu",
+            conv_filters=[[32, 8, 4], [64, 4, 2], [64, 3, 1]] if args.observation == "rgb" else None,
+            head_fcnet_hiddens=[64],
+            use_lstm=args.memory == "lstm",
+            lstm_cell_size=128,
+            max_seq_len=args.max_seq_len,
+        )
+        model = {"model_config": config}
+    scale = [] if args.memory == "gru" else [ScaleFrames()]
     return (
         PPOConfig()
         .environment(
@@ -66,15 +127,15 @@ def make_config(args: argparse.Namespace) -> PPOConfig:
             gym_env_vectorize_mode="vector_entry_point",
             rollout_fragment_length=args.num_steps,
             # RLlib adds its own pieces after these, except the observations, which are in the batch already.
-            env_to_module_connector=lambda env, spaces, device: [AddObservationsFromEpisodesToBatch(), ScaleFrames()],
+            env_to_module_connector=lambda env, spaces, device: [AddObservationsFromEpisodesToBatch(), *scale],
         )
         .learners(
             learner_connector=lambda observation_space, action_space: [
                 AddObservationsFromEpisodesToBatch(as_learner_connector=True),
-                ScaleFrames(),
+                *scale,
             ]
         )
-        .rl_module(model_config=model)
+        .rl_module(**model)
         .training(
             train_batch_size_per_learner=args.num_steps * args.num_envs * max(1, args.num_env_runners),
             minibatch_size=args.num_steps * args.num_envs * max(1, args.num_env_runners) // 4,
@@ -97,7 +158,8 @@ def main() -> None:
     parser.add_argument("--env-id", default="MortarMayhem-Grid-v0", help="environment id")
     parser.add_argument("--options", default='{"command_count": [1]}', help="reset parameters as JSON")
     parser.add_argument("--observation", choices=["features", "rgb"], default="features", help="what the agent sees")
-    parser.add_argument("--lstm", action=argparse.BooleanOptionalAction, default=True, help="memory of the agent")
+    memories = "lstm: RLlib's; gru: a module with the GRU of endless_gym.agents; none: the baseline"
+    parser.add_argument("--memory", choices=["lstm", "gru", "none"], default="lstm", help=memories)
     parser.add_argument("--max-seq-len", type=int, default=16, help="steps of truncated backpropagation through time")
     parser.add_argument("--num-env-runners", type=int, default=0, help="worker processes; 0 samples in this process")
     parser.add_argument("--num-envs", type=int, default=64, help="number of environments of each env runner")

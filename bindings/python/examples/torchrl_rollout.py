@@ -2,17 +2,20 @@
 
 pip install ./bindings/python torchrl tensordict
 python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 64 --total-timesteps 100000
+python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-workers 2    # two processes, each with an engine of its own
 """
 
 import argparse
+import functools
 import math
 import time
+from collections.abc import Callable
 
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from torch import nn
 from torch.distributions import Categorical
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector, MultiCollector
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.modules import ProbabilisticActor
 
@@ -26,7 +29,11 @@ class Pixels(nn.Module):
         return frames.movedim(-1, -3) / 255.0
 
 
-def make_policy(env: TransformedEnv) -> ProbabilisticActor:
+def transformed(make: Callable[[], EndlessEnv]) -> TransformedEnv:
+    return TransformedEnv(make(), Compose(StepCounter(), RewardSum()))
+
+
+def make_policy(env: EndlessEnv) -> ProbabilisticActor:
     """A convolutional network that computes logits, (num_envs, 4) or (num_envs, 2, 3), and samples an action from them."""
     shape = (*env.action_spec.shape[1:], env.action_spec.space.n)
     network = nn.Sequential(
@@ -49,10 +56,27 @@ def make_policy(env: TransformedEnv) -> ProbabilisticActor:
     )
 
 
+def make_collector(args: argparse.Namespace) -> BaseCollector:
+    """A collector in this process, or in several that each collect the frames of their share of the environments."""
+    sizes = {"frames_per_batch": args.num_envs * args.num_steps, "total_frames": args.total_timesteps}
+    sizes["auto_register_policy_transforms"] = False  # the policy has no recurrent state to reset
+    if not args.num_workers:
+        env = EndlessEnv.make(args.env_id, args.num_envs, device=args.device, seed=args.seed)
+        return Collector(transformed(lambda: env), make_policy(env), **sizes)
+    makers = EndlessEnv.workers(args.env_id, args.num_envs, args.num_workers, args.device, seed=args.seed)
+    with EndlessEnv.make(args.env_id, args.num_envs // args.num_workers, device=args.device) as one:
+        policy = make_policy(one)
+    makers = [functools.partial(transformed, make) for make in makers]
+    return MultiCollector(makers, policy, sync=True, cat_results=0, **sizes)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env-id", default="Endless-MortarMayhem-v0", help="environment id")
-    parser.add_argument("--num-envs", type=int, default=64, help="number of environments")
+    parser.add_argument("--num-envs", type=int, default=64, help="number of environments of all workers")
+    parser.add_argument(
+        "--num-workers", type=int, default=0, help="processes, each with an engine; 0 for this one, without"
+    )
     parser.add_argument("--num-steps", type=int, default=32, help="rollout length: steps per environment and batch")
     parser.add_argument("--total-timesteps", type=int, default=100_000, help="environment steps in total")
     parser.add_argument("--seed", type=int, default=1, help="seed of the environments and the network")
@@ -63,16 +87,7 @@ def main() -> None:
         parser.error(f"{args.env_id} has dict observations, which the policy here does not support; choose another id")
 
     torch.manual_seed(args.seed)
-    env = EndlessEnv.make(args.env_id, args.num_envs, device=args.device)
-    env = TransformedEnv(env, Compose(StepCounter(), RewardSum()))
-    env.set_seed(args.seed)
-    collector = Collector(
-        env,
-        make_policy(env),
-        frames_per_batch=args.num_envs * args.num_steps,
-        total_frames=args.total_timesteps,
-        auto_register_policy_transforms=False,  # the policy has no recurrent state to reset
-    )
+    collector = make_collector(args)
     steps, returns = 0, []
     start = time.perf_counter()
     for data in collector:

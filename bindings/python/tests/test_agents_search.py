@@ -1,20 +1,29 @@
 """The hyperparameter search: search space, order of the trials, pruning, and resumption."""
 
 import json
+import os
 import re
+import shutil
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import psutil
 import pytest
 from agents_helpers import settings
 from rich.console import Console
 
-from endless_gym.agents import search
-from endless_gym.agents.search import SearchArguments, Trials, parse
+from endless_gym.agents import search, search_workers
+from endless_gym.agents.command import load_checkpoint
+from endless_gym.agents.logs import read_progress
+from endless_gym.agents.search import parse
 from endless_gym.agents.search_space import single_changes, space, value, with_choices
+from endless_gym.agents.search_study import SearchArguments, Trials
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import train
 
@@ -70,13 +79,13 @@ def test_single_changes_differ_in_one_parameter() -> None:
 def test_search_from_start_to_end(tmp_path: Path) -> None:
     """Single changes, then a combination; restarting a complete search runs no trial."""
     first = Trials(small(tmp_path, stage="single"), QUIET)
-    first.run()
+    search.run_trials(first)
     assert [trial.params["ppo.epochs"] for trial in first.study.trials] == [3, 2, 4]
     second = Trials(small(tmp_path), QUIET)
-    second.run()
+    search.run_trials(second)
     assert states(second) == ["COMPLETE"] * 4
     third = Trials(small(tmp_path), QUIET)
-    third.run()
+    search.run_trials(third)
     assert len(third.study.trials) == 4
     third.report()
     best = json.loads((tmp_path / "best.json").read_text())
@@ -95,7 +104,7 @@ def test_search_from_start_to_end(tmp_path: Path) -> None:
 def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that is interrupted after the first update has the results of an uninterrupted search."""
     through = Trials(small(tmp_path / "through", stage="single"), QUIET)
-    through.run()
+    search.run_trials(through)
 
     def stopped(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
         return train(given, lambda update, means: watch(update, means) or update == 1)
@@ -103,13 +112,13 @@ def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkey
     monkeypatch.setattr(search, "train", stopped)
     broken = Trials(small(tmp_path / "broken", stage="single"), QUIET)
     with pytest.raises(KeyboardInterrupt):
-        broken.run()
+        search.run_trials(broken)
     assert states(broken) == ["FAIL", "WAITING", "WAITING"]
     if not with_checkpoint:
         (tmp_path / "broken" / "trial-0000" / "checkpoints" / "last.pt").unlink()
     monkeypatch.setattr(search, "train", train)
     resumed = Trials(small(tmp_path / "broken", stage="single"), QUIET)
-    resumed.run()
+    search.run_trials(resumed)
     assert states(resumed) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
 
     def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
@@ -134,10 +143,105 @@ def test_trials_are_pruned_after_the_warm_up(tmp_path: Path, monkeypatch: pytest
     given = small(tmp_path, stage="single", warm_up=6, startup_trials=1, period=2)
     given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
     trials = Trials(given, QUIET)
-    trials.run()
+    search.run_trials(trials)
     assert watched == {3: 10, 2: 6, 4: 10}
     assert states(trials) == ["COMPLETE", "PRUNED", "COMPLETE"]
     assert trials.study.best_params == {"ppo.epochs": 4}
+
+
+@pytest.mark.parametrize(("pruner", "updates"), [("asha", {3: 10, 2: 2, 4: 10}), ("none", {3: 10, 2: 10, 4: 10})])
+def test_other_pruners(
+    pruner: Literal["asha", "none"], updates: dict[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ASHA keeps the best of the trials that have reached an update, from the first trial on."""
+    rewards, watched = {3: 1.0, 2: 0.5, 4: 2.0}, {}
+
+    def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
+        for update in range(1, given.ppo.updates + 1):
+            watched[given.ppo.epochs] = update
+            if watch(update, {"episode/reward": rewards[given.ppo.epochs]}):
+                break
+
+    monkeypatch.setattr(search, "train", played)
+    given = small(tmp_path, stage="single", warm_up=2, period=2, pruner=pruner)
+    given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
+    search.run_trials(Trials(given, QUIET))
+    assert watched == updates
+
+
+def killed_once(trials: Trials, share: search_workers.Share | None) -> None:
+    """The work of a worker whose first two trials wait for each other; the process of the first trial is then killed, once."""
+    folder = trials.folder
+
+    def trained(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
+        def watched(update: int, means: dict[str, float]) -> bool:
+            stops = watch(update, means)
+            if update == 3:
+                (folder / f"met-{Path(given.run).name}").touch()
+                while len(list(folder.glob("met-*"))) < 2:
+                    time.sleep(0.01)
+                if given.run.endswith("trial-0000") and not (folder / "killed").exists():
+                    shutil.copy(Path(given.run) / "progress.jsonl", folder / "killed")
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return stops
+
+        return train(given, watched)
+
+    search.train = trained
+    search.run_trials(trials, share)
+
+
+def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -> None:
+    def given(name: str) -> SearchArguments:
+        given = small(tmp_path / name, stage="single", workers=2)
+        ppo = replace(given.settings.ppo, updates=4)
+        return replace(given, settings=replace(given.settings, ppo=ppo, checkpoint_interval=1))
+
+    through = Trials(given("through"), QUIET)
+    search.run_trials(through)
+    shared = Trials(given("shared"), QUIET)
+    search_workers.run_workers(shared, killed_once)
+    assert states(shared) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
+    assert [file.name for file in (tmp_path / "shared/locks").iterdir()] == ["study"]
+
+    def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
+        done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
+        return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
+
+    assert values(shared) == values(through)
+    # The rows up to the checkpoint are those of the killed process, with its times.
+    before = (tmp_path / "shared/killed").read_text().splitlines()
+    rows = (tmp_path / "shared/trial-0000/progress.jsonl").read_text().splitlines()
+    assert [json.loads(row)["update"] for row in rows] == [1, 2, 3, 4]
+    assert len(before) == 3
+    assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
+    assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) -> None:
+    """Also if it is killed: they stop after their update, with checkpoints, as if they had been interrupted."""
+    command = [sys.executable, "-m", "endless_gym.agents.search", "--preset", "quick", "--folder", str(tmp_path)]
+    sizes = ["--environment.num-envs", "4", "--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "100000"]
+    choice = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single", "--workers", "2"]
+    with subprocess.Popen([*command, *sizes, *choice], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as started:
+        runs = [tmp_path / f"trial-000{number}" for number in (0, 1)]
+        while not all((run / "progress.jsonl").exists() and read_progress(run) for run in runs):
+            assert started.poll() is None, started.communicate()[0]
+            time.sleep(0.05)
+        workers = [
+            child for child in psutil.Process(started.pid).children() if "spawn_main" in " ".join(child.cmdline())
+        ]
+        assert len(workers) == 2
+        started.send_signal(number)
+        assert started.wait(60) == (130 if number == signal.SIGINT else -number)
+        assert not psutil.wait_procs(workers, timeout=60)[1]
+    for run in runs:
+        assert load_checkpoint(run, "cpu").update == read_progress(run)[-1]["update"]
+    given = parse([*command[3:], *sizes, *choice])
+    left = Trials(given, QUIET)
+    assert states(left) == ["FAIL", "FAIL", "WAITING"]
+    assert left.remaining() == (0, 3)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +255,9 @@ def test_trials_are_pruned_after_the_warm_up(tmp_path: Path, monkeypatch: pytest
         ("--ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
         ("--trials -1", "--trials must be 0 or more, got -1"),
         ("--period 0", "--period must be 1 or more, got 0"),
+        ("--workers -1", "--workers must be 0 or more, got -1"),
+        ("--trial-cpus 0", "--trial-cpus must be 1 or more, got 0"),
+        ("--ray", "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"),
     ],
 )
 def test_errors_are_one_line(
@@ -168,5 +275,11 @@ def test_errors_are_one_line(
 def test_command_line_includes_the_training_flags() -> None:
     given = parse(["--preset", "quick", "--agent", "trxl", "--ppo.updates", "7", "--trials", "3"])
     assert (given.trials, given.warm_up, given.percentile) == (3, 2000, 25.0)
+    assert [parse(line.split()).ray for line in ("", "--ray", "--ray --trials 3", "--ray auto")] == [
+        "",
+        "local",
+        "local",
+        "auto",
+    ]
     expected = PRESETS["quick"]
     assert given.settings == replace(expected, agent="trxl", ppo=replace(expected.ppo, updates=7))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -103,6 +104,15 @@ def test_torchrl_rollout(tmp_path, env_id):
         assert summary[3] != "none yet"
 
 
+def test_torchrl_rollout_with_workers(tmp_path, segments):
+    sizes = ("--num-envs", "8", "--num-workers", "2", "--num-steps", "32", "--total-timesteps", "512")
+    output, summary = run("torchrl_rollout.py", tmp_path, *sizes)
+    assert summary[1] == "512"
+    assert output.count("batch=(8, 32) observation=(8, 32, 84, 84, 3)") == 2
+    assert summary[3] != "none yet"
+    assert not segments()
+
+
 @pytest.mark.parametrize(
     ("env_id", "backend"),
     [
@@ -137,10 +147,14 @@ def test_cleanrl_ppo(tmp_path, env_id):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "observation", "runners", "lstm"),
-    [("Endless-MortarMayhem-v0", "rgb", 0, "--lstm"), ("MysteryPath-Grid-v0", "features", 1, "--no-lstm")],
+    ("env_id", "observation", "runners", "memory"),
+    [
+        ("Endless-MortarMayhem-v0", "rgb", 0, "lstm"),
+        ("MysteryPath-Grid-v0", "features", 1, "none"),
+        ("Endless-MortarMayhem-v0", "rgb", 1, "gru"),
+    ],
 )
-def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, runners, lstm):
+def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, runners, memory):
     arguments = {
         "--env-id": env_id,
         "--options": "{}",
@@ -149,13 +163,28 @@ def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, 
         "--num-envs": 8,
         "--num-steps": 16,
         "--total-timesteps": 256,
+        "--memory": memory,
     }
     flat = (str(part) for pair in arguments.items() for part in pair)
-    output, summary = run("rllib_ppo.py", tmp_path, *flat, lstm, python=libraries_python)
+    output, summary = run("rllib_ppo.py", tmp_path, *flat, python=libraries_python)
     assert summary[1] == "256"
     assert output.count("steps=") >= 2
     if env_id.startswith("Endless"):
         assert summary[3] != "none yet"
+
+
+def test_rllib_ppo_remembers_a_command(tmp_path, ray_folder, libraries_python):
+    """In episodes that are as short as the task permits, with the module's GRU and without a memory."""
+    options = {"command_count": [1], "command_show_duration": [1], "command_show_delay": [0]}
+    options |= {"explosion_delay": [5], "explosion_duration": [1]}
+    sizes = ("--num-envs", "32", "--num-steps", "32", "--total-timesteps", "24000", "--learning-rate", "0.003")
+    returns = {}
+    for memory in ("gru", "none"):
+        given = ("--options", json.dumps(options), *sizes, "--memory", memory)
+        _, summary = run("rllib_ppo.py", tmp_path, *given, python=libraries_python)
+        returns[memory] = float(summary[3])
+    # The reward of the one command is 0.1.
+    assert returns["gru"] > returns["none"] + 0.02
 
 
 @pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])

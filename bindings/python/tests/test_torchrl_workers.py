@@ -1,0 +1,56 @@
+"""TorchRL's collector in several processes, each with an engine of its own."""
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torchrl.collectors import MultiCollector
+
+import endless_gym
+from endless_gym.torchrl import EndlessEnv
+
+ID, ENVS, WORKERS, STEPS = "MysteryPath-Grid-v0", 6, 2, 12
+
+
+def test_environments_must_be_divisible_among_the_workers() -> None:
+    with pytest.raises(ValueError, match="multiple of num_workers, got 6 environments and 4 workers"):
+        EndlessEnv.workers(ID, 6, 4)
+    with pytest.raises(ValueError, match="multiple of num_workers, got 6 environments and 0 workers"):
+        EndlessEnv.workers(ID, 6, 0)
+
+
+@pytest.mark.slow
+def test_workers_play_the_episodes_of_one_process(segments: Callable[[], set[str]]) -> None:
+    """Each plays its share of what one process plays with the same actions: no seed is used twice, and none is left out."""
+    before = set(os.listdir("/dev/shm"))
+    makers = EndlessEnv.workers(ID, ENVS, WORKERS, seed=40, options={"max_steps": 5})
+    collector = MultiCollector(
+        makers, None, sync=True, cat_results=0, frames_per_batch=ENVS * STEPS, total_frames=2 * ENVS * STEPS
+    )
+    try:
+        batches = [batch.clone() for batch in collector]
+        assert segments(), "the frames come from engines"
+    finally:
+        collector.shutdown()
+    data = torch.cat(batches, 1)
+    assert tuple(data.batch_size) == (ENVS, 2 * STEPS)
+
+    with endless_gym.make_vec(ID, num_envs=ENVS, autoreset="disabled", seed=40, options={"max_steps": 5}) as envs:
+        observation, _ = envs.reset()
+        assert len({frame.tobytes() for frame in observation}) > 1, "different seeds look different"
+        ended = 0
+        for step in range(2 * STEPS):
+            np.testing.assert_array_equal(data["observation"][:, step], observation)
+            observation, reward, terminated, truncated, _ = envs.step(data["action"][:, step].numpy())
+            np.testing.assert_array_equal(data["next", "observation"][:, step], observation)
+            np.testing.assert_allclose(data["next", "reward"][:, step, 0], reward)
+            over = terminated | truncated
+            np.testing.assert_array_equal(data["next", "done"][:, step, 0], over)
+            ended += int(over.sum())
+            if over.any():
+                observation, _ = envs.reset(options={"reset_mask": over})
+        assert ended >= ENVS, "later episodes were compared, too"
+    assert not segments()
+    assert not {name for name in set(os.listdir("/dev/shm")) - before if name.startswith("torch_")}
