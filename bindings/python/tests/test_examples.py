@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -227,3 +230,75 @@ def test_curriculum(tmp_path):
         "curriculum=True",
         "curriculum=False",
     ]
+
+
+ACTORS = ("--num-envs", "8", "--num-steps", "16", "--hidden-size", "16")
+
+
+@pytest.mark.parametrize("service", [(), ("--service",)])
+@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0"])
+def test_asynchronous_actors(tmp_path, segments, env_id, service):
+    sizes = ("--total-timesteps", "2048", "--batch-trajectories", "2")
+    output, summary = run(
+        "asynchronous_actors.py", tmp_path, "--env-id", env_id, "--options", "{}", *ACTORS, *sizes, *service
+    )
+    assert summary[1] == "2048"
+    assert output.count("steps=") >= 2
+    if env_id.startswith("Endless"):
+        assert summary[3] != "none yet"
+    assert not segments()
+
+
+def test_asynchronous_actors_limit_the_policy_lag(tmp_path):
+    sizes = ("--total-timesteps", "2048", "--batch-trajectories", "1", "--max-policy-lag", "0")
+    output, summary = run("asynchronous_actors.py", tmp_path, *ACTORS, *sizes)
+    assert summary[1] == "2048"
+    assert set(re.findall(r"largest_lag=(\d+)", output)) == {"0"}
+    # While the learner learns, every actor completes or begins a trajectory of the policy before.
+    assert int(re.findall(r"dropped=(\d+)", output)[-1]) > 0
+
+
+def test_asynchronous_actors_learn_one_command(tmp_path):
+    _, summary = run("asynchronous_actors.py", tmp_path, "--total-timesteps", "250000")
+    # By chance, and without memory, 0.025 of 0.1.
+    assert float(summary[3]) > 0.04
+
+
+@pytest.mark.parametrize("ended", ["actor", "learner", "ctrl-c"])
+def test_asynchronous_actors_end_together(tmp_path, segments, ended):
+    """Within seconds, with a message, and nothing is left in /dev/shm."""
+    before = set(os.listdir("/dev/shm"))
+    process = subprocess.Popen(
+        [sys.executable, EXAMPLES / "asynchronous_actors.py", *ACTORS, "--total-timesteps", "100000000", "--service"],
+        cwd=tmp_path,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        pids = re.fullmatch(r"learner=(\d+) actors=(\d+),(\d+)\n", process.stdout.readline())
+        learner, *actors = (int(pid) for pid in pids.groups())
+        assert process.stdout.readline().startswith("steps=")
+        if ended == "actor":
+            os.kill(actors[1], signal.SIGKILL)
+        elif ended == "learner":
+            os.kill(learner, signal.SIGKILL)
+        else:
+            os.killpg(process.pid, signal.SIGINT)
+        _, message = process.communicate(timeout=60)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    if ended != "learner":
+        assert process.returncode == 1
+        assert "Traceback" not in message
+        cause = rf"by Ctrl-C after \d+ steps|after \d+ steps: actor 1 \(process {actors[1]}\) has ended.*"
+        assert re.fullmatch(rf"stopped ({cause})", message.strip().splitlines()[-1]), message
+    deadline = time.monotonic() + 60
+    while (left := segments() | set(os.listdir("/dev/shm")) - before) or any(
+        Path(f"/proc/{pid}").exists() for pid in actors
+    ):
+        assert time.monotonic() < deadline, left
+        time.sleep(0.05)
