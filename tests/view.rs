@@ -429,7 +429,7 @@ fn measure_the_cost_of_a_page() {
             alone.push(steps_per_second(&mut trainer, num_envs));
         }
         println!("{num_envs:5} environments: {:.0} steps/s alone", median(alone.iter().copied()));
-        for (which, (page, rates)) in pages.iter().zip(&shown).enumerate() {
+        for (which, ((page, _), rates)) in pages.iter().zip(&shown).enumerate() {
             let ratios = rates.iter().enumerate().map(|(round, rate)| {
                 let place = 2 * round + which;
                 2.0 * rate / (alone[place] + alone[place + 1])

@@ -1,5 +1,7 @@
 //! A headless Chromium, driven over pipes by the DevTools protocol.
 
+#![allow(dead_code)] // Each test program uses its own part.
+
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};

@@ -41,6 +41,7 @@ class View {
     $("large").hidden = true;
     this.socket?.close();
     this.curves.clear();
+    this.#numbers({});
     $("live").hidden = service === "";
     $("list").hidden = service !== "";
     $("grid").replaceChildren();
@@ -119,13 +120,13 @@ class View {
 
   #numbers(status) {
     const values = [
-      ["Environment", status.id],
-      ["Environments", `${status.groups} × ${status.num_envs}`],
+      ["Environment", status.id ?? "–"],
+      ["Environments", status.groups === undefined ? "–" : `${status.groups} × ${status.num_envs}`],
       ["Steps", grouped(status.env_steps)],
       ["Shared memory", megabytes(status.shared_memory_bytes)],
-      ["Held batches", `${status.held} + ${status.held_by_observers} observed`],
+      ["Held batches", `${grouped(status.held)} + ${grouped(status.held_by_observers)} observed`],
       ["Trainer", processes(status.trainers)],
-      ["Last request", status.seconds_since_request === null ? "none" : `${duration(status.seconds_since_request)} ago`],
+      ["Last request", (status.seconds_since_request ?? null) === null ? "none" : `${duration(status.seconds_since_request)} ago`],
       ["Up", duration(status.uptime_seconds)],
     ];
     const rows = values.map(([term, value]) => {
