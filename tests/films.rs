@@ -118,6 +118,49 @@ fn png_films_have_every_pixel_of_every_episode() {
     assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "only the film is left");
 }
 
+/// Pictures and delays in seconds of an animated WebP.
+fn decode_webp(file: &Path) -> Vec<(Picture, f64)> {
+    let mut decoder = image_webp::WebPDecoder::new(BufReader::new(File::open(file).unwrap())).unwrap();
+    assert!(decoder.is_animated() && !decoder.has_alpha() && !decoder.is_lossy());
+    assert_eq!(decoder.loop_count(), image_webp::LoopCount::Forever);
+    let mut buffer = vec![0; decoder.output_buffer_size().unwrap()];
+    let pictures = (0..decoder.num_frames()).map(|_| {
+        let delay = f64::from(decoder.read_frame(&mut buffer).unwrap()) / 1000.0;
+        (buffer.as_chunks::<3>().0.to_vec(), delay)
+    });
+    pictures.collect()
+}
+
+#[test]
+fn webp_films_have_every_pixel_of_every_episode() {
+    let room = Room::new("film-webp");
+    let file = room.root.join("film.webp");
+    for (id, scale, steps, options) in [
+        ("MysteryPath-Grid-v0", 2, 1000, &[][..]),
+        ("SearingSpotlights-v0", 1, 20, &[][..]),
+        ("MortarMayhem-v0", 3, 15, &["--fps", "7"]),
+    ] {
+        let (scale_text, steps_text) = (scale.to_string(), steps.to_string());
+        let arguments = [id, "--seed", "3", "--episodes", "2", "--scale", &scale_text, "--max-steps", &steps_text];
+        record(&room, &[&arguments, options].concat(), &file);
+        let episodes = [frames(id, 3, steps), frames(id, 4, steps)];
+        let decoded = decode_webp(&file);
+        assert_eq!(decoded.len(), episodes[0].len() + episodes[1].len(), "{id}");
+        for (number, ((picture, _), frame)) in decoded.iter().zip(episodes.iter().flatten()).enumerate() {
+            assert!(*picture == both(frame, scale), "{id}, picture {number}");
+        }
+        // Milliseconds, but the film as a whole is as long as it has to be.
+        let fps = options.get(1).map_or(f64::from(envs::spec(id).unwrap().render_fps), |fps| fps.parse().unwrap());
+        let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
+        let expected = decoded.len() as f64 / fps + 2.0;
+        assert!((duration - expected).abs() < 0.0006, "{id}: {duration} s, expected {expected} s");
+        // Length and padding, as decoders that read chunk by chunk need them.
+        let bytes = std::fs::read(&file).unwrap();
+        assert_eq!(u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize + 8, bytes.len());
+    }
+    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "only the film is left");
+}
+
 #[test]
 fn films_show_one_view_or_both() {
     let room = Room::new("film-view");
@@ -232,7 +275,7 @@ fn what_cannot_be_recorded_is_an_error_and_leaves_no_file() {
         (output.status.code(), text(&output.stderr).to_owned())
     };
     for (arguments, status, message) in [
-        (&["MysteryPath-v0", "--film", "a.webp"][..], 1, "--film must end in .gif, .png or .mp4, got `a.webp`"),
+        (&["MysteryPath-v0", "--film", "a.apng"][..], 1, "--film must end in .gif, .webp, .png or .mp4, got `a.apng`"),
         (&["MysteryPath-v1", "--film", "a.gif"], 1, "no environment `MysteryPath-v1`; there are"),
         (&["MysteryPath-v0", "--film", "no/a.gif"], 1, "cannot write no/a.gif: "),
         (&["MysteryPath-v0", "--film", "a.gif", "--option", "x"], 1, "--option x: expected NAME=VALUE"),

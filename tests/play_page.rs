@@ -3,22 +3,26 @@
 mod page_support;
 mod program_support;
 
-use page_support::Server;
+use page_support::{BROWSER, Server, given};
 use program_support::{Room, signal, text, wait};
 use rustix::process::Signal;
 
 #[test]
 fn the_page_opens_at_an_episode() {
     let room = Room::new("play");
-    let arguments = ["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]"];
+    let arguments = ["play", "SearingSpotlights-v0", "--seed", "9", "--option", "num_coins=[3]", "--open"];
+    let browser = room.program("browser", BROWSER);
+    let mut command = room.endless(&arguments);
+    command.env("BROWSER", &browser);
     if !endless_gym_page::is_built() {
         // Only release builds have it; `cargo xtask packages` tests them.
-        let output = room.run(&arguments);
+        let output = command.output().unwrap();
         assert!(!output.status.success());
         assert!(text(&output.stderr).contains("run `cargo xtask web`"), "{}", text(&output.stderr));
         return;
     }
-    let mut server = Server::start(room.endless(&arguments));
+    let mut server = Server::start(command);
+    assert_eq!(given(&browser), server.url);
     let link = "/#env=SearingSpotlights-v0&seed=9&num_coins=%5B3%5D";
     assert_eq!(server.url, format!("http://{}{link}", server.address()));
     for (path, kind) in [

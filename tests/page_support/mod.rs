@@ -3,6 +3,7 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -12,6 +13,21 @@ use tungstenite::{Message, WebSocket};
 
 /// How long anything may take; the machine may be busy with other tests.
 const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A script in place of a browser: it writes down its arguments, in a file that is complete when it has its name.
+pub const BROWSER: &str = "echo \"$@\" > \"$0.part\"; mv \"$0.part\" \"$0.given\"";
+
+/// What such a browser was given, once it was started; it may be started again.
+pub fn given(browser: &Path) -> String {
+    let (file, start) = (PathBuf::from(format!("{}.given", browser.display())), Instant::now());
+    while !file.exists() {
+        assert!(start.elapsed() < PATIENCE, "{} was not started", browser.display());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::remove_file(&file).unwrap();
+    text.trim().to_owned()
+}
 
 /// A server process. It is killed when this is dropped.
 pub struct Server {

@@ -3,7 +3,7 @@
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
-use std::process::{Child, Command, Output};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use endless_gym::service::{ConnectConfig, Namespace, Trainer};
@@ -32,6 +32,15 @@ impl Room {
 
     pub fn run(&self, arguments: &[&str]) -> Output {
         self.endless(arguments).output().unwrap()
+    }
+
+    /// A program that is a script.
+    pub fn program(&self, name: &str, script: &str) -> PathBuf {
+        let path = self.root.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, format!("#!/bin/sh\n{script}\n")).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o700)).unwrap();
+        path
     }
 
     pub fn segments(&self) -> Vec<String> {
@@ -107,5 +116,30 @@ pub fn wait(child: &mut Child) -> std::process::ExitStatus {
         }
         assert!(start.elapsed() < Duration::from_secs(20), "the program does not end");
         std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// An engine process, `endless serve`. It is killed when this is dropped.
+pub struct Engine(pub Child);
+
+impl Engine {
+    pub fn start(room: &Room, arguments: &[&str]) -> Self {
+        let mut command = room.endless(&[&["serve", "--threads", "1"], arguments].concat());
+        let engine = Engine(command.stdout(Stdio::null()).spawn().unwrap());
+        room.wait_for_engine();
+        engine
+    }
+
+    /// Ends it as Ctrl-C does.
+    pub fn end(&mut self) {
+        signal(&self.0, Signal::INT);
+        wait(&mut self.0);
+    }
+}
+
+impl Drop for Engine {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }

@@ -134,7 +134,14 @@ pub const STAGES: &[Stage] = &[
     },
     Stage { name: "loom", run: cargo::loom, needs: &[Linker, Disk], compiles: true, ..STAGE },
     Stage { name: "wasm", run: wasm::build, needs: &[Linker, Wasm], compiles: true, ..STAGE },
-    Stage { name: "web", run: web::test, needs: &[Browser], after: &["rust build", "wasm"], compiles: true, ..STAGE },
+    Stage {
+        name: "web",
+        run: web::test,
+        needs: &[Browser, SharedMemory],
+        after: &["rust build", "wasm"],
+        compiles: true,
+        ..STAGE
+    },
     Stage {
         name: "shared memory of other sizes",
         run: || {

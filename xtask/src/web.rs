@@ -55,7 +55,7 @@ pub fn build() -> Result<(), String> {
     Ok(())
 }
 
-/// Builds the page and tests it in a browser.
+/// Builds the page that plays, and tests it and the page of a running engine in a browser.
 pub fn test() -> Result<(), String> {
     build()?;
     // Not what only measures or makes pictures.

@@ -68,6 +68,25 @@ def test_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.Captur
     assert [file.name for file in tmp_path.iterdir()] == ["video.gif"]
 
 
+def test_webp_shows_every_pixel(tmp_path: Path) -> None:
+    agent = make_agent(settings("none", env=GRID), spec(GRID))
+    frames = list(enjoy.EpisodeRecorder(agent, 0, max_steps=12).frames((5,)))
+    # Noise, too: every colour, and no two pixels alike.
+    frames.append(np.random.default_rng(0).integers(256, size=frames[0].shape, dtype=np.uint8))
+    distinct = [frame for at, frame in enumerate(frames) if at == 0 or not np.array_equal(frame, frames[at - 1])]
+    video.write(tmp_path / "video.webp", frames, 25)
+    with Image.open(tmp_path / "video.webp") as image:
+        # A repeated frame is merged with the one before.
+        assert image.n_frames in (len(distinct), len(frames))
+        expected = distinct if image.n_frames == len(distinct) else frames
+        duration = 0
+        for place, frame in enumerate(expected):
+            image.seek(place)
+            assert np.array_equal(rgb(image), frame), place
+            duration += image.info["duration"]
+    assert duration == 40 * len(frames)
+
+
 def test_video_is_reproducible() -> None:
     agent = make_agent(settings("none", env=GRID), spec(GRID))
     one, two, other = (
@@ -110,7 +129,7 @@ def test_interrupted_video_leaves_no_file(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ("nowhere", "no checkpoint nowhere"),
-        ("nowhere --out video.avi", "--out must end in .gif or .mp4, got `video.avi`"),
+        ("nowhere --out video.avi", "--out must end in .gif, .webp or .mp4, got `video.avi`"),
         ("nowhere --out none/video.gif", "cannot write none/video.gif: no folder none"),
         ("nowhere --out video.mp4", "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg"),
         ("nowhere --seeds", "--seeds must contain at least one seed, got none"),

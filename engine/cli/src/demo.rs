@@ -40,7 +40,7 @@ pub struct Args {
     /// Show the environments in a browser, as `endless view` does: print the address [default: no page].
     #[arg(long, conflicts_with = "json")]
     view: bool,
-    /// Open that page in a browser, with `xdg-open` [default: print the address].
+    /// Open that page in the browser that the variable BROWSER names, or the desktop [default: print the address].
     #[arg(long, requires = "view")]
     open: bool,
     #[command(flatten)]

@@ -1,4 +1,4 @@
-//! The files of films: GIF, animated PNG, and MP4 by ffmpeg.
+//! The files of films: GIF, animated WebP, animated PNG, and MP4 by ffmpeg.
 
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Read, Write};
@@ -7,6 +7,7 @@ use std::process::{Child, Command, Stdio};
 
 use super::failure::Failure;
 use super::film_picture::{Picture, magnified};
+use super::film_webp::WebpFilm;
 
 /// The variable that names the program ffmpeg; that of the Python package imageio-ffmpeg.
 const FFMPEG: &str = "IMAGEIO_FFMPEG_EXE";
@@ -16,6 +17,8 @@ const FFMPEG: &str = "IMAGEIO_FFMPEG_EXE";
 pub enum Format {
     /// With a palette of 256 colours for each picture.
     Gif,
+    /// Animated WebP, without loss.
+    Webp,
     /// Animated PNG, without loss.
     Png,
     /// H.264 or what else ffmpeg chooses, with loss.
@@ -28,9 +31,10 @@ impl Format {
         let suffix = file.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match suffix.as_str() {
             "gif" => Ok(Format::Gif),
+            "webp" => Ok(Format::Webp),
             "png" => Ok(Format::Png),
             "mp4" => Ok(Format::Mp4),
-            _ => Err(format!("--film must end in .gif, .png or .mp4, got `{}`", file.display()).into()),
+            _ => Err(format!("--film must end in .gif, .webp, .png or .mp4, got `{}`", file.display()).into()),
         }
     }
 }
@@ -50,6 +54,7 @@ pub struct Shape {
 
 enum Encoder {
     Gif(gif::Encoder<BufWriter<File>>),
+    Webp(WebpFilm<BufWriter<File>>),
     Png(png::Writer<BufWriter<File>>),
     Mp4(Child),
 }
@@ -87,6 +92,7 @@ impl FilmFile {
                 encoder.set_repeat(gif::Repeat::Infinite)?;
                 Encoder::Gif(encoder)
             }
+            Format::Webp => Encoder::Webp(WebpFilm::new(file, (u32::try_from(width)?, u32::try_from(height)?))?),
             Format::Png => {
                 let mut encoder = png::Encoder::new(file, u32::try_from(width)?, u32::try_from(height)?);
                 encoder.set_color(png::ColorType::Rgb);
@@ -106,7 +112,7 @@ impl FilmFile {
         let child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
         child.map_err(|error| match error.kind() {
             ErrorKind::NotFound => format!(
-                "an .mp4 needs ffmpeg, and there is no program `{}`: install it, or let {FFMPEG} name it, or use .gif or .png",
+                "an .mp4 needs ffmpeg, and there is no program `{}`: install it, or let {FFMPEG} name it, or use .gif, .webp or .png",
                 program.display()
             )
             .into(),
@@ -119,6 +125,9 @@ impl FilmFile {
         let Shape { scale, fps, .. } = self.shape;
         let (start, end) = (self.duration, self.duration + u64::from(count));
         self.duration = end;
+        // Rounded so that the film as a whole has the right duration.
+        let time = |pictures: u64, unit: u64| (pictures * unit + u64::from(fps) / 2) / u64::from(fps);
+        let duration = |unit: u64| time(end, unit) - time(start, unit);
         let pixels = || magnified(&picture.pixels, picture.width, scale).into_flattened();
         match self.encoder.as_mut() {
             Some(Encoder::Gif(encoder)) => {
@@ -127,11 +136,10 @@ impl FilmFile {
                 frame.buffer = magnified(&frame.buffer, picture.width, scale).into();
                 (frame.width, frame.height) =
                     (u16::try_from(picture.width * scale)?, u16::try_from(picture.height * scale)?);
-                // In hundredths of a second, rounded so that the film as a whole has the right duration.
-                let time = |pictures: u64| (pictures * 100 + u64::from(fps) / 2) / u64::from(fps);
-                frame.delay = u16::try_from(time(end) - time(start))?;
+                frame.delay = u16::try_from(duration(100))?;
                 encoder.write_frame(&frame)?;
             }
+            Some(Encoder::Webp(film)) => film.add(&pixels(), u32::try_from(duration(1000))?)?,
             Some(Encoder::Png(writer)) => {
                 writer.set_frame_delay(count, fps)?;
                 writer.write_image_data(&pixels())?;
@@ -155,6 +163,7 @@ impl FilmFile {
     fn end(&mut self) -> Result<(), Failure> {
         match self.encoder.take() {
             Some(Encoder::Gif(encoder)) => encoder.into_inner()?.flush()?,
+            Some(Encoder::Webp(film)) => film.finish()?,
             Some(Encoder::Png(writer)) => writer.finish()?,
             Some(Encoder::Mp4(mut child)) => {
                 drop(child.stdin.take());
@@ -198,12 +207,14 @@ mod tests {
 
     #[test]
     fn suffixes_name_formats() {
-        for (name, format) in [("a.gif", Format::Gif), ("x/b.c.PNG", Format::Png), ("c.Mp4", Format::Mp4)] {
+        for (name, format) in
+            [("a.gif", Format::Gif), ("b.webp", Format::Webp), ("x/b.c.PNG", Format::Png), ("c.Mp4", Format::Mp4)]
+        {
             assert_eq!(Format::of(Path::new(name)).unwrap(), format);
         }
-        for wrong in ["film", ".gif", "film.webp", ""] {
+        for wrong in ["film", ".gif", "film.apng", ""] {
             let error = Format::of(Path::new(wrong)).unwrap_err().to_string();
-            assert_eq!(error, format!("--film must end in .gif, .png or .mp4, got `{wrong}`"));
+            assert_eq!(error, format!("--film must end in .gif, .webp, .png or .mp4, got `{wrong}`"));
         }
     }
 }

@@ -8,6 +8,7 @@ mod failure;
 mod film;
 mod film_file;
 mod film_picture;
+mod film_webp;
 mod frames;
 mod list;
 mod logs;

@@ -65,6 +65,11 @@ pub fn print_error(error: &dyn std::error::Error) {
     let _ = writeln!(io::stderr(), "endless: {error}");
 }
 
+/// Prints a line to standard error about something that does not end the command.
+pub fn print_warning(text: &str) {
+    let _ = writeln!(io::stderr(), "endless: {text}");
+}
+
 /// Turns an error of standard output into a failure. A closed pipe is none: with `endless list | head -1`, the reader closed
 /// the pipe deliberately, and the command ends with the status that it would have had.
 fn check(written: io::Result<()>) -> Result<(), Failure> {

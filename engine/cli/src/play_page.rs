@@ -19,7 +19,7 @@ pub fn run(id: &str, options: OptionMap, seed: Option<u64>, page: &PageArgs) -> 
     let url = server.url(spec.id, &options, seed);
     print(format_args!("play {} at {url}\nstop with Ctrl-C", spec.id))?;
     if page.open {
-        open::in_browser(&url)?;
+        open::in_browser(&url);
     }
     Ok(server.run(stop)?)
 }

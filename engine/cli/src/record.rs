@@ -34,7 +34,7 @@ struct FilmArgs {
     /// Environment id; `endless list` lists them.
     #[arg(value_name = "ID")]
     id: String,
-    /// File of the film: .gif (256 colours for each picture), .png (animated, without loss) or .mp4 (needs ffmpeg).
+    /// File of the film: .gif (256 colours for each picture), .webp or .png (animated, without loss) or .mp4 (needs ffmpeg).
     #[arg(long, value_name = "FILE")]
     film: PathBuf,
     /// Number of episodes, which are shown in order.

@@ -40,7 +40,7 @@ pub struct PageArgs {
     /// Port on 127.0.0.1; 0 takes any that is free.
     #[arg(long, default_value_t = 0, conflicts_with = "terminal")]
     pub port: u16,
-    /// Open the page in a browser, with `xdg-open` [default: print the address].
+    /// Open the page in the browser that the variable BROWSER names, or the desktop [default: print the address].
     #[arg(long, conflicts_with = "terminal")]
     pub open: bool,
 }
@@ -67,7 +67,7 @@ fn announce(service: Option<&str>, port: u16, open: bool) -> Result<ViewServer, 
     let url = server.url();
     print(format_args!("view {} at {url}", service.unwrap_or("the running engines")))?;
     if open {
-        open::in_browser(&url)?;
+        open::in_browser(&url);
     }
     Ok(server)
 }

@@ -165,6 +165,12 @@ impl ResponsePort {
         self.engine
     }
 
+    /// Whether there is a message.
+    pub(crate) fn has_response(&self) -> bool {
+        // As for `receive`, an engine that cannot be reached has sent nothing.
+        self.subscriber.has_samples().unwrap_or(false)
+    }
+
     /// The next message; `None` if there is none.
     pub(crate) fn receive(
         self: &Arc<Self>,

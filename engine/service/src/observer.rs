@@ -108,6 +108,27 @@ impl Observer {
         Ok(batch)
     }
 
+    /// Whether [`newest`](Observer::newest) would return a batch: whether the engine has written one since the last call. Nothing
+    /// is received.
+    pub fn has_newer(&self) -> bool {
+        self.port.has_response()
+    }
+
+    /// Checks that the engine runs.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::EngineLost`] if its process has ended, and [`ServiceError::RootRemoved`] if the namespace's directory was
+    /// removed.
+    pub fn check_alive(&self) -> Result<(), ServiceError> {
+        if self.node.is_alive(self.port.engine()) {
+            return Ok(());
+        }
+        self.node.check_root()?;
+        let (service, pid) = (self.specification.service.clone(), self.specification.engine_pid);
+        Err(ServiceError::EngineLost { service, pid })
+    }
+
     /// The next batch. Waits for it up to `timeout`.
     ///
     /// # Errors
@@ -122,18 +143,15 @@ impl Observer {
             let is_over = start.elapsed() >= timeout;
             let is_due = is_over || last_check.elapsed() >= LIVENESS_INTERVAL;
             // Before the poll, which then also finds the last batch of an engine that has ended.
-            let is_lost = is_due && !self.node.is_alive(self.port.engine());
+            let alive = if is_due { self.check_alive() } else { Ok(()) };
             if let Some(lease) = self.newest()? {
                 return Ok(lease);
             }
-            let service = || self.specification.service.clone();
-            if is_lost {
-                self.node.check_root()?;
-                return Err(ServiceError::EngineLost { service: service(), pid: self.specification.engine_pid });
-            }
+            alive?;
             if is_over {
                 let activity = status::observed_activity(self.engine.as_ref(), self.group);
-                return Err(ServiceError::TimedOut { service: service(), waited: timeout, activity });
+                let service = self.specification.service.clone();
+                return Err(ServiceError::TimedOut { service, waited: timeout, activity });
             }
             if is_due {
                 last_check = Instant::now();

@@ -12,12 +12,15 @@ export function frameBytes(frame) {
   return frame.width * frame.height * frame.channels;
 }
 
+/** The pixels of one frame, used again for the next. */
+let image;
+
 /** Draws the frame that begins at byte `start`. `frame` says how far neighbours are apart. */
 export function paint(canvas, frame, pixels, start) {
   if (canvas.width !== frame.width) canvas.width = frame.width;
   if (canvas.height !== frame.height) canvas.height = frame.height;
   const context = canvas.getContext("2d");
-  const image = context.createImageData(frame.width, frame.height);
+  if (image?.width !== frame.width || image.height !== frame.height) image = context.createImageData(frame.width, frame.height);
   const green = frame.channels === 1 ? 0 : frame.channel;
   const blue = 2 * green;
   let to = 0;

@@ -30,7 +30,8 @@ class View {
   async start() {
     const { service } = await this.#list();
     if (service) this.show(service);
-    setInterval(() => this.#list().catch(() => {}), 2000);
+    // Listing costs more than one engine's status, so it is done only while the list is on the screen.
+    setInterval(() => this.service === "" && !document.hidden && this.#list().catch(() => {}), 2000);
   }
 
   /** Shows an engine; the list for an empty name. */
@@ -40,6 +41,7 @@ class View {
     $("large").hidden = true;
     this.socket?.close();
     this.curves.clear();
+    this.#numbers({});
     $("live").hidden = service === "";
     $("list").hidden = service !== "";
     $("grid").replaceChildren();
@@ -99,7 +101,7 @@ class View {
     this.about = about;
     if (before?.num_envs !== about.num_envs || before?.groups !== about.groups) this.#layout(about);
     if (about.status) this.#numbers(about.status);
-    if (!about.batch || about.batch.group !== this.group) return;
+    if (!about.batch || about.batch.group !== this.group || about.batch.envs.length === 0) return;
     this.frames += 1;
     const { frame, envs } = about.batch;
     $("no-frames").hidden = Boolean(frame);
@@ -118,13 +120,13 @@ class View {
 
   #numbers(status) {
     const values = [
-      ["Environment", status.id],
-      ["Environments", `${status.groups} × ${status.num_envs}`],
+      ["Environment", status.id ?? "–"],
+      ["Environments", status.groups === undefined ? "–" : `${status.groups} × ${status.num_envs}`],
       ["Steps", grouped(status.env_steps)],
       ["Shared memory", megabytes(status.shared_memory_bytes)],
-      ["Held batches", `${status.held} + ${status.held_by_observers} observed`],
+      ["Held batches", `${grouped(status.held)} + ${grouped(status.held_by_observers)} observed`],
       ["Trainer", processes(status.trainers)],
-      ["Last request", status.seconds_since_request === null ? "none" : `${duration(status.seconds_since_request)} ago`],
+      ["Last request", (status.seconds_since_request ?? null) === null ? "none" : `${duration(status.seconds_since_request)} ago`],
       ["Up", duration(status.uptime_seconds)],
     ];
     const rows = values.map(([term, value]) => {
@@ -150,13 +152,15 @@ class View {
   #select() {
     const most = this.about?.num_envs ?? Infinity;
     const count = Number($("count").value);
-    const envs = Array.from({ length: count }, (_, i) => this.first + i).filter((env) => env < most);
+    let envs = Array.from({ length: count }, (_, i) => this.first + i).filter((env) => env < most);
     if (this.about) {
       $("range").textContent = `${grouped(this.first)} to ${grouped(envs.at(-1))} of ${grouped(most)}`;
       $("before").disabled = this.first === 0;
       $("after").disabled = this.first + count >= most;
     }
     if (this.large !== null && !envs.includes(this.large)) envs.push(this.large);
+    // A page in the background needs no frames.
+    if (document.hidden) envs = [];
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ group: this.group, envs }));
   }
 
@@ -217,6 +221,8 @@ class View {
       change(Number($("count").value));
       this.#select();
     };
+    document.addEventListener("visibilitychange", () => this.#select());
+    $("engine").addEventListener("focus", () => this.#list().catch(() => {}));
     $("engine").addEventListener("change", () => this.show($("engine").value));
     $("group").addEventListener("change", () => move(() => (this.group = Number($("group").value))));
     $("count").addEventListener("change", () => move((count) => (this.first -= this.first % count)));

@@ -36,7 +36,7 @@ pub(crate) struct Viewer {
     selection: Mutex<Selection>,
     /// The browser has received the last message. Until then it gets no other, so that a slow one costs no copies.
     is_ready: AtomicBool,
-    /// The selection has changed since the last message.
+    /// There is something that the last message did not have: news, or another selection.
     is_changed: AtomicBool,
 }
 
@@ -57,9 +57,22 @@ impl Viewer {
         self.is_ready.store(true, Ordering::Release);
     }
 
-    /// Whether it waits for a message: one with news, or one of its new selection.
+    /// Whether it has received the last message.
+    pub fn is_ready(&self) -> bool {
+        self.is_ready.load(Ordering::Acquire)
+    }
+
+    /// Whether it shows no environment, as a page in the background.
+    pub fn is_hidden(&self) -> bool {
+        lock(&self.selection).envs.is_empty()
+    }
+
+    /// Whether it waits for a message: one with news, which it may have missed before, or one of its new selection.
     pub fn wants(&self, is_news: bool) -> bool {
-        self.is_ready.load(Ordering::Acquire) && (is_news || self.is_changed.load(Ordering::Acquire))
+        if is_news {
+            self.is_changed.store(true, Ordering::Release);
+        }
+        self.is_ready() && self.is_changed.load(Ordering::Acquire)
     }
 
     /// Gives it the newest message, made of the selection that it has now.

@@ -1,18 +1,30 @@
 //! What the page says about engines, from the status that each publishes.
 
-use endless_gym_service::{EngineStatus, GroupStatus, Namespace};
+use endless_gym_service::{EngineProcesses, EngineStatus, GroupStatus, Namespace};
 use serde_json::{Value as Json, json};
 
 /// The running engines, sorted by name.
 pub(crate) fn list(namespace: &Namespace) -> Vec<Json> {
-    EngineStatus::all(namespace).iter().map(|status| describe(status, namespace)).collect()
+    EngineStatus::all(namespace).iter().map(|status| describe(status, &Details::of(status, namespace))).collect()
+}
+
+/// What is not in the status: finding it opens files of all engines of the namespace, and reads the engine's memory map.
+#[derive(Debug, Default)]
+pub(crate) struct Details {
+    processes: EngineProcesses,
+    shared_memory: Option<u64>,
+}
+
+impl Details {
+    pub fn of(status: &EngineStatus, namespace: &Namespace) -> Self {
+        Details { processes: status.processes(namespace), shared_memory: status.shared_memory(namespace) }
+    }
 }
 
 /// One engine: what it has done, and who uses it.
-pub(crate) fn describe(status: &EngineStatus, namespace: &Namespace) -> Json {
+pub(crate) fn describe(status: &EngineStatus, details: &Details) -> Json {
     // Saturating: the numbers come from another process.
     let sum = |field: fn(&GroupStatus) -> u64| status.groups.iter().map(field).fold(0, u64::saturating_add);
-    let processes = status.processes(namespace);
     let last_request = status.groups.iter().filter_map(|group| group.last_request).min();
     json!({
         "service": status.service,
@@ -27,9 +39,9 @@ pub(crate) fn describe(status: &EngineStatus, namespace: &Namespace) -> Json {
         "episodes": sum(|group| group.episodes),
         "held": sum(|group| u64::from(group.held)),
         "held_by_observers": sum(|group| group.observers.iter().map(|observer| u64::from(observer.held)).sum()),
-        "trainers": processes.trainers,
-        "observers": processes.observers,
-        "shared_memory_bytes": status.shared_memory(namespace),
+        "trainers": details.processes.trainers,
+        "observers": details.processes.observers,
+        "shared_memory_bytes": details.shared_memory,
         "recoveries": status.recoveries,
         "seconds_since_request": last_request.map(|since| since.as_secs_f64()),
     })

@@ -51,7 +51,7 @@ pub(crate) fn encode(
     selection: &Selection,
     lease: Option<&BatchLease>,
 ) -> Vec<u8> {
-    let mut pixels = Vec::new();
+    let mut pixels = Vec::<&[u8]>::new();
     if let (Some(specification), Some(lease)) = (specification, lease) {
         let (batch, envs) = (lease.batch(), selection.existing(specification.num_envs));
         about["batch"] = rows(specification, &batch, &envs);
@@ -63,20 +63,25 @@ pub(crate) fn encode(
         }
     }
     let text = about.to_string();
-    let mut message = Vec::with_capacity(4 + text.len() + pixels.len());
+    let mut message = Vec::with_capacity(4 + text.len() + pixels.iter().map(|frame| frame.len()).sum::<usize>());
     message.extend_from_slice(&u32::try_from(text.len()).unwrap_or_default().to_le_bytes());
     message.extend_from_slice(text.as_bytes());
-    message.extend_from_slice(&pixels);
+    pixels.iter().for_each(|frame| message.extend_from_slice(frame));
     message
 }
 
 /// The newest frame of each environment's observation.
-fn newest_frames(specification: &ServiceSpecification, frames: Frames, batch: &Batch<'_>, envs: &[usize]) -> Vec<u8> {
+fn newest_frames<'a>(
+    specification: &ServiceSpecification,
+    frames: Frames,
+    batch: &Batch<'a>,
+    envs: &[usize],
+) -> Vec<&'a [u8]> {
     let width = specification.batch.section(BatchSection::Observation).map_or(0, Section::width);
     // The stack is the first index, oldest first.
     let length = width / frames.stack.max(1);
     let rows = envs.iter().filter_map(|env| batch.observation().get(env * width..(env + 1) * width));
-    rows.flat_map(|row| &row[width - length..]).copied().collect()
+    rows.map(|row| &row[width - length..]).collect()
 }
 
 /// The numbers of each environment.

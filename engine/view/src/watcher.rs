@@ -8,16 +8,18 @@ use endless_gym_service::{BatchLease, ConnectConfig, EngineStatus, Observer, Ser
 use serde_json::{Value as Json, json};
 
 use crate::channel::{Channel, Viewer};
+use crate::engines::{self, Details};
 use crate::message;
 
-/// Time between two looks for a batch. Episodes that end in between are not part of the means.
-const POLL_INTERVAL: Duration = Duration::from_millis(4);
-
-/// Time between two frames that a browser gets.
+/// Time between two frames that a browser gets, and so between two batches that are taken. Episodes that end in other batches are not
+/// part of the means.
 const FRAME_INTERVAL: Duration = Duration::from_millis(33);
 
 /// Time between two readings of the engine's status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Time between two readings of what costs more than the status: the engine's processes and its memory.
+const DETAILS_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Without a batch for this time, the thread looks whether the engine lives.
 const LIVENESS_INTERVAL: Duration = Duration::from_millis(250);
@@ -41,16 +43,16 @@ pub(crate) fn run(channel: &Channel) {
                 state.failed(&error);
             }
         }
-        let begin = Instant::now();
+        let (begin, mut is_news) = (Instant::now(), true);
         while begin.elapsed() < RETRY_INTERVAL {
             let viewers = channel.viewers();
             if viewers.is_empty() {
                 return;
             }
-            let is_news = begin.elapsed() < POLL_INTERVAL;
             for viewer in viewers.iter().filter(|viewer| viewer.wants(is_news)) {
                 viewer.give(|selection| message::encode(state.about(channel), None, selection, None));
             }
+            is_news = false;
             thread::sleep(FRAME_INTERVAL);
         }
     }
@@ -84,9 +86,10 @@ impl State {
 struct Observation {
     specification: Arc<ServiceSpecification>,
     observers: Vec<Observer>,
-    /// The newest batch of each group.
+    /// The newest batch of each group, if it is held.
     newest: Vec<Option<BatchLease>>,
     status: Json,
+    details: Details,
 }
 
 impl Observation {
@@ -105,74 +108,91 @@ impl Observation {
         }
         channel.history().begin(specification.incarnation);
         let newest = observers.iter().map(|_| None).collect();
-        Ok(Observation { specification, observers, newest, status: Json::Null })
+        Ok(Observation { specification, observers, newest, status: Json::Null, details: Details::default() })
     }
 
     /// Until the last browser has left, or the engine is lost.
     fn observe(&mut self, channel: &Channel) -> Result<(), ServiceError> {
-        // Where one batch may be held, it is released before the next is received, and not received more often than shown.
-        let holds_one = self.specification.batches_held == 1;
-        let interval = if holds_one { FRAME_INTERVAL } else { POLL_INTERVAL };
-        let (mut shown, mut read, mut heard) = (None::<Instant>, None::<Instant>, Instant::now());
-        let mut is_news = true;
+        let (mut read, mut detailed, mut heard) = (None::<Instant>, None::<Instant>, Instant::now());
+        let is_due = |last: Option<Instant>, interval| last.is_none_or(|last| last.elapsed() >= interval);
         loop {
             let viewers = channel.viewers();
             if viewers.is_empty() {
                 return Ok(());
             }
-            for (observer, newest) in self.observers.iter_mut().zip(&mut self.newest) {
-                if holds_one {
-                    *newest = None;
+            let mut is_news = false;
+            if is_due(read, STATUS_INTERVAL) {
+                read = Some(Instant::now());
+                let with_details = is_due(detailed, DETAILS_INTERVAL);
+                if with_details {
+                    detailed = read;
                 }
-                if let Some(lease) = observer.newest()? {
-                    channel.history().add(&lease.batch());
-                    *newest = Some(lease);
-                    (is_news, heard) = (true, Instant::now());
-                }
+                is_news = true;
+                self.read_status(channel, with_details);
+            }
+            // For a page that nobody looks at, the curves go on with one batch per status.
+            let shown = |viewer: &&Arc<Viewer>| is_news || !viewer.is_hidden();
+            let shown: Vec<_> = viewers.iter().filter(shown).collect();
+            // A batch is taken only for a browser that can receive it.
+            if shown.iter().any(|viewer| viewer.is_ready()) && self.take(channel)? {
+                (is_news, heard) = (true, Instant::now());
             }
             if heard.elapsed() >= LIVENESS_INTERVAL {
                 self.check_alive()?;
                 heard = Instant::now();
             }
-            if read.is_none_or(|read| read.elapsed() >= STATUS_INTERVAL) {
-                read = Some(Instant::now());
-                self.read_status(channel);
-                is_news = true;
+            self.show(channel, &shown, is_news);
+            self.release();
+            thread::sleep(FRAME_INTERVAL);
+        }
+    }
+
+    /// Takes the newest batch of each group in place of the one before. Returns whether there was any.
+    fn take(&mut self, channel: &Channel) -> Result<bool, ServiceError> {
+        let mut is_new = false;
+        for (observer, newest) in self.observers.iter_mut().zip(&mut self.newest) {
+            if !observer.has_newer() {
+                continue;
             }
-            if shown.is_none_or(|shown| shown.elapsed() >= FRAME_INTERVAL) {
-                shown = Some(Instant::now());
-                self.show(channel, &viewers, is_news);
-                is_news = false;
+            // First, since the engine may permit only one.
+            *newest = None;
+            *newest = observer.newest()?;
+            if let Some(lease) = newest {
+                channel.history().add(&lease.batch());
+                is_new = true;
             }
-            thread::sleep(interval);
+        }
+        Ok(is_new)
+    }
+
+    /// Releases the batches that others have followed. While the trainer pauses, a browser may still select other environments of the
+    /// newest one.
+    fn release(&mut self) {
+        for (observer, newest) in self.observers.iter().zip(&mut self.newest) {
+            if observer.has_newer() {
+                *newest = None;
+            }
         }
     }
 
     /// An error if the engine has ended.
-    fn check_alive(&mut self) -> Result<(), ServiceError> {
-        let Some(observer) = self.observers.first_mut() else { return Ok(()) };
-        match observer.next(Duration::ZERO) {
-            Err(ServiceError::TimedOut { .. }) => Ok(()),
-            // Nothing is held of a group whose observer has no room.
-            Err(ServiceError::TooManyBatchesHeld { .. }) => Ok(()),
-            Err(error) => Err(error),
-            Ok(lease) => {
-                self.newest[0] = Some(lease);
-                Ok(())
-            }
-        }
+    fn check_alive(&self) -> Result<(), ServiceError> {
+        self.observers.first().map_or(Ok(()), Observer::check_alive)
     }
 
-    fn read_status(&mut self, channel: &Channel) {
+    fn read_status(&mut self, channel: &Channel, with_details: bool) {
         let Some(status) = EngineStatus::of(&channel.namespace, &channel.service) else { return };
         if status.incarnation != self.specification.incarnation {
             return;
         }
         channel.history().point(&status);
-        self.status = crate::engines::describe(&status, &channel.namespace);
+        if with_details {
+            self.details = Details::of(&status, &channel.namespace);
+        }
+        self.status = engines::describe(&status, &self.details);
     }
 
-    fn show(&self, channel: &Channel, viewers: &[Arc<Viewer>], is_news: bool) {
+    fn show(&self, channel: &Channel, viewers: &[&Arc<Viewer>], is_news: bool) {
         for viewer in viewers.iter().filter(|viewer| viewer.wants(is_news)) {
             viewer.give(|selection| {
                 let about = json!({

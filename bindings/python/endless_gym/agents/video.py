@@ -1,4 +1,4 @@
-"""Videos of episodes: GIF with Pillow, MP4 with ffmpeg.
+"""Videos of episodes: GIF and WebP with Pillow, MP4 with ffmpeg.
 
 A frame of a video shows the agent's observation on the left, the ground-truth view on the right, and a line of text below.
 """
@@ -22,7 +22,7 @@ Frame = NDArray[np.uint8]
 SIDE, GAP, TEXT = 336, 8, 24
 WIDTH, HEIGHT = 2 * SIDE + GAP, SIDE + TEXT
 #: Supported file name suffixes.
-SUFFIXES = (".gif", ".mp4")
+SUFFIXES = (".gif", ".webp", ".mp4")
 _BACKGROUND, _TEXT_COLOUR = 24, (230, 230, 230)
 
 
@@ -57,7 +57,7 @@ def check(file: Path) -> None:
         FileNotFoundError: The folder does not exist.
     """
     if file.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"--out must end in {' or '.join(SUFFIXES)}, got `{file.name}`")
+        raise ValueError(f"--out must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}, got `{file.name}`")
     if not file.resolve().parent.is_dir():
         raise FileNotFoundError(f"cannot write {file}: no folder {file.parent}")
     if file.suffix.lower() == ".mp4":
@@ -68,7 +68,7 @@ def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
     """Write a video; if writing is interrupted, no partial file remains.
 
     Args:
-        file: Output file, with the suffix `.gif` or `.mp4`.
+        file: Output file, with the suffix `.gif`, `.webp` (without loss) or `.mp4`.
         frames: At least one frame, uint8 (HEIGHT, WIDTH, 3) each.
         fps: Frames per second.
 
@@ -78,9 +78,10 @@ def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
         OSError: ffmpeg has failed; the message contains its error.
     """
     check(file)
+    writers = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}
     partial = file.with_name(f".{file.name}.partial{file.suffix.lower()}")
     try:
-        (_gif if file.suffix.lower() == ".gif" else _mp4)(partial, iter(frames), fps)
+        writers[file.suffix.lower()](partial, iter(frames), fps)
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
@@ -89,6 +90,11 @@ def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
 def _gif(file: Path, frames: Iterator[Frame], fps: int) -> None:
     images = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames)
     next(images).save(file, save_all=True, append_images=images, duration=round(1000 / fps), loop=0)
+
+
+def _webp(file: Path, frames: Iterator[Frame], fps: int) -> None:
+    images = (Image.fromarray(frame) for frame in frames)
+    next(images).save(file, save_all=True, append_images=images, duration=round(1000 / fps), loop=0, lossless=True)
 
 
 def _mp4(file: Path, frames: Iterator[Frame], fps: int) -> None:
@@ -131,7 +137,7 @@ def _ffmpeg() -> str:
         import imageio_ffmpeg
     except ImportError:
         raise ValueError(
-            "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg, or use .gif"
+            "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg, or use .webp"
         ) from None
     program: str = imageio_ffmpeg.get_ffmpeg_exe()
     return program

@@ -1,5 +1,7 @@
 //! A headless Chromium, driven over pipes by the DevTools protocol.
 
+#![allow(dead_code)] // Each test program uses its own part.
+
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -12,6 +14,9 @@ const PATIENCE: Duration = Duration::from_secs(120);
 
 /// The programs that may be Chromium, beside the one that the environment variable CHROMIUM names. `cargo xtask` looks for the same.
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
+
+/// The name of a site that resolves to this machine, as an attacker's would after a change of its address.
+pub const REBOUND: &str = "rebound.test";
 
 /// A browser with one tab.
 pub struct Chromium {
@@ -37,6 +42,7 @@ impl Chromium {
         // It only loads the page of this test, and not every container permits its sandbox.
         command.args(["--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu", "--no-first-run"]);
         command.args(["--disable-background-networking", "--disable-dev-shm-usage", "--disable-extensions"]);
+        command.arg(format!("--host-resolver-rules=MAP {REBOUND} 127.0.0.1"));
         command.arg(format!("--user-data-dir={}", folder.join("profile").display()));
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null());
         let mut process = command.spawn().expect("Chromium starts");
