@@ -45,6 +45,8 @@ class View {
     $("live").hidden = service === "";
     $("list").hidden = service !== "";
     $("grid").replaceChildren();
+    // Where it is depends on what is shown above it.
+    document.querySelector("footer").hidden = false;
     $("engine").value = service;
     document.title = service === "" ? "Endless Gym: view" : `${service} – Endless Gym`;
     if (service === "") this.#state("list", "engines");
