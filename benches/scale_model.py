@@ -88,8 +88,13 @@ class Cluster:
     cores: int = 0
 
     def link(self, ranks: int) -> Link:
-        """What limits the ring: the slowest link in it."""
-        return self.within if ranks <= self.ranks_per_machine else self.between
+        """What limits the ring: the slowest of its links."""
+        if ranks <= self.ranks_per_machine:
+            return self.within
+        if self.ranks_per_machine == 1:
+            return self.between
+        links = (self.within, self.between)
+        return Link(max(link.latency for link in links), min(link.bandwidth for link in links))
 
     def stretch(self, rank: RankCosts, ranks: int) -> float:
         """How much longer a rank computes because others share its cores."""

@@ -106,6 +106,11 @@ class Agent(nn.Module):
         self.gru = nn.GRU(hidden_size, hidden_size)
         self.actor = nn.Sequential(nn.Linear(hidden_size, 64), nn.ReLU(), nn.Linear(64, sum(action_sizes)))
         self.critic = nn.Sequential(nn.Linear(hidden_size, 64), nn.ReLU(), nn.Linear(64, 1))
+        for name, parameter in self.named_parameters():
+            if "weight" in name:
+                nn.init.orthogonal_(parameter, 1.0 if name.startswith("gru") else 2**0.5)
+            else:
+                nn.init.zeros_(parameter)
         # Rewards are small: large initial values would take updates to forget.
         for head, gain in ((self.actor, 0.01), (self.critic, 0.05)):
             nn.init.orthogonal_(head[-1].weight, gain)
@@ -334,7 +339,7 @@ def main() -> None:
     with endless_gym.make_vec(args.env_id, 1, options=json.loads(args.options), observation="features") as envs:
         features = envs.single_observation_space.shape[0]
     agent = Agent(features, list(spec.branches), args.hidden_size).to(device)
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate)
     # A forked process would share the learner's threads and the ends of all pipes.
     context = mp.get_context("spawn")
     shared = Shared(args, features, len(spec.branches), parameters_to_vector(agent.parameters()))

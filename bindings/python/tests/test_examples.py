@@ -267,7 +267,6 @@ def test_asynchronous_actors_learn_one_command(tmp_path):
 @pytest.mark.parametrize("ended", ["actor", "learner", "ctrl-c"])
 def test_asynchronous_actors_end_together(tmp_path, segments, ended):
     """Within seconds, with a message, and nothing is left in /dev/shm."""
-    before = set(os.listdir("/dev/shm"))
     process = subprocess.Popen(
         [sys.executable, EXAMPLES / "asynchronous_actors.py", *ACTORS, "--total-timesteps", "100000000", "--service"],
         cwd=tmp_path,
@@ -297,7 +296,8 @@ def test_asynchronous_actors_end_together(tmp_path, segments, ended):
         cause = rf"by Ctrl-C after \d+ steps|after \d+ steps: actor 1 \(process {actors[1]}\) has ended.*"
         assert re.fullmatch(rf"stopped ({cause})", message.strip().splitlines()[-1]), message
     deadline = time.monotonic() + 60
-    while (left := segments() | set(os.listdir("/dev/shm")) - before) or any(
+    tensors = tuple(f"torch_{pid}_" for pid in (learner, *actors))
+    while (left := segments() | {name for name in os.listdir("/dev/shm") if name.startswith(tensors)}) or any(
         Path(f"/proc/{pid}").exists() for pid in actors
     ):
         assert time.monotonic() < deadline, left

@@ -96,8 +96,10 @@ def test_a_ring_sends_what_the_formula_says() -> None:
     rank = replace(RANK, steps=1000)
     reduced = predict(rank, Cluster(between=link), 4).seconds["all-reduce"]
     assert math.isclose(reduced, 12 * (6e-3 + 1.5) + EXCHANGES * 3e-3 + 3 * (1e-3 + 9e-3))
-    # A machine's own link counts until its ranks are more than it has.
+    # Between machines only if there are several, and then the slowest link of the ring limits it.
     assert predict(rank, Cluster(between=link, ranks_per_machine=4), 4).seconds["all-reduce"] == 0.0
+    assert Cluster(Link(1e-3, 1e9), Link(1e-4, 1e6), ranks_per_machine=4).link(5) == Link(1e-3, 1e6)
+    assert Cluster(Link(1e-3, 1e5), Link(1e-4, 1e6)).link(5) == Link(1e-4, 1e6)
 
 
 def test_a_link_is_found_from_what_it_costs() -> None:
