@@ -23,6 +23,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.common.add_observations_from_episodes_to_batch import AddObservationsFromEpisodesToBatch
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
+from ray.rllib.core.distribution.torch.torch_distribution import TorchMultiCategorical
 from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
@@ -46,6 +47,8 @@ class GRUModule(TorchRLModule, ValueFunctionAPI):
         hidden, shape = self.model_config["hidden_size"], self.observation_space.shape
         actions = self.action_space
         branches = actions.nvec.tolist() if isinstance(actions, gym.spaces.MultiDiscrete) else [int(actions.n)]
+        if len(branches) > 1:  # RLlib has a default for one branch only
+            self.action_dist_cls = TorchMultiCategorical.get_partial_dist_cls(space=actions, input_lens=branches)
         self.key = FRAME if len(shape) == 3 else "features"
         self.encoder = Encoder({self.key: shape}, 64)
         recurrence = Recurrence(hidden_size=hidden)

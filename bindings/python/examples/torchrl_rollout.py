@@ -2,7 +2,7 @@
 
 pip install ./bindings/python torchrl tensordict
 python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 64 --total-timesteps 100000
-python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-workers 2    # two processes, each with an engine of its own
+python torchrl_rollout.py --env-id MysteryPath-Grid-v0 --num-workers 2
 """
 
 import argparse
@@ -10,6 +10,7 @@ import functools
 import math
 import time
 from collections.abc import Callable
+from contextlib import closing
 
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
@@ -64,8 +65,8 @@ def make_collector(args: argparse.Namespace) -> BaseCollector:
         env = EndlessEnv.make(args.env_id, args.num_envs, device=args.device, seed=args.seed)
         return Collector(transformed(lambda: env), make_policy(env), **sizes)
     makers = EndlessEnv.workers(args.env_id, args.num_envs, args.num_workers, args.device, seed=args.seed)
-    with EndlessEnv.make(args.env_id, args.num_envs // args.num_workers, device=args.device) as one:
-        policy = make_policy(one)
+    with closing(EndlessEnv.make(args.env_id, args.num_envs // args.num_workers, device=args.device)) as env:
+        policy = make_policy(env)
     makers = [functools.partial(transformed, make) for make in makers]
     return MultiCollector(makers, policy, sync=True, cat_results=0, **sizes)
 

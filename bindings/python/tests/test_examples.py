@@ -170,7 +170,8 @@ def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, 
     }
     flat = (str(part) for pair in arguments.items() for part in pair)
     output, summary = run("rllib_ppo.py", tmp_path, *flat, python=libraries_python)
-    assert summary[1] == "256"
+    # A step that resets an environment is not counted, and RLlib samples whole steps of all environments.
+    assert 256 <= int(summary[1]) < 256 + 2 * 8
     assert output.count("steps=") >= 2
     if env_id.startswith("Endless"):
         assert summary[3] != "none yet"
