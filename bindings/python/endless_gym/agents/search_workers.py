@@ -69,6 +69,8 @@ def run_workers(trials: Trials, work: Work) -> None:
         process = context.Process(target=_worker, args=(arguments, machine, slot, work), name=f"endless-search-{slot}")
         process.start()
         alive[slot] = process
+        if stopped:  # while it was being started, so that `stop` did not know it
+            os.kill(alive[slot].pid, signal.SIGINT)
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
@@ -82,7 +84,8 @@ def run_workers(trials: Trials, work: Work) -> None:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for slot in range(min(arguments.workers, trials.remaining()[1])):
-            start(slot)
+            if not stopped:
+                start(slot)
         while alive:
             connection.wait([process.sentinel for process in alive.values()])
             for slot, process in list(alive.items()):
