@@ -219,6 +219,15 @@ def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -
     assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
 
 
+def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:
+    given = settings("gru", run=str(tmp_path / "trial-0000"))
+    with pytest.raises(RuntimeError), search_workers.output_of(given):
+        print("before")
+        raise RuntimeError("the cause")
+    first, *_, last = (tmp_path / "trial-0000.log").read_text().splitlines()
+    assert (first, last) == ("before", "RuntimeError: the cause")
+
+
 def interrupted_or_late(trials: Trials, share: search_workers.Share | None) -> None:
     """The work of a worker that only a signal ends in time."""
     time.sleep(30)
