@@ -43,7 +43,7 @@ import endless_gym
 #: While an actor fills one slot, the learner may still read the other.
 SLOTS_PER_ACTOR = 2
 #: Seconds that actors have to close their environments before they are killed.
-END = 5.0
+CLOSE_TIMEOUT = 5.0
 
 
 @dataclass
@@ -246,7 +246,7 @@ def actors_of(
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         for pipe in pipes:
             pipe.close()
-        deadline = time.monotonic() + END
+        deadline = time.monotonic() + CLOSE_TIMEOUT
         for process in processes:
             process.join(max(0.0, deadline - time.monotonic()))
             if process.is_alive():
@@ -293,8 +293,7 @@ def v_trace(
     targets, trace = values.clone(), torch.zeros_like(reward[0])
     for t in reversed(range(len(reward))):
         delta = rho[t] * (reward[t] + args.gamma * goes_on[t] * values[t + 1] - values[t])
-        following = trace
-        trace = delta + args.gamma * args.trace_lambda * goes_on[t] * rho[t] * following
+        trace = delta + args.gamma * args.trace_lambda * goes_on[t] * rho[t] * trace
         targets[t] = values[t] + trace
     return targets[:-1], reward + args.gamma * goes_on * targets[1:] - values[:-1]
 

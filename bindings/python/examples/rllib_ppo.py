@@ -174,7 +174,8 @@ def main() -> None:
     if "MortarMayhemB" in args.env_id:
         parser.error(f"{args.env_id} has dict observations, which the network here does not support; choose another id")
 
-    ray.init(num_cpus=args.num_env_runners + 1, include_dashboard=False, log_to_driver=False)
+    # Never a cluster that happens to run on this machine.
+    ray.init("local", num_cpus=args.num_env_runners + 1, include_dashboard=False, log_to_driver=False)
     algorithm = make_config(args).build_algo()
     steps, mean = 0, "none yet"
     start = time.perf_counter()

@@ -42,6 +42,7 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         monkeypatch.setenv("RAY_TMPDIR", folder)
         monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # otherwise it writes a token to the home directory
         monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        monkeypatch.delenv("RAY_ADDRESS", raising=False)  # otherwise it joins that cluster
         yield folder
 
 

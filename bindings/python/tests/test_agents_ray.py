@@ -26,7 +26,6 @@ def test_search_on_ray(
     searched = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single"]
     pruning = ["--period", "1", "--warm-up", "4", "--startup-trials", "1"]
     command = ["--preset", "quick", "--folder", "search", *environments, *sizes, *searched, *pruning]
-    shared_memory = {name for name in os.listdir("/dev/shm") if "plasma" in name or "ray" in name}
     # Ray's processes are in the session of the search, which can be ended as a whole.
     with subprocess.Popen(
         [libraries_python, SCRIPT, *command, "--ray", "--workers", "2"],
@@ -39,7 +38,7 @@ def test_search_on_ray(
     ) as ran:
         try:
             output, _ = ran.communicate(timeout=280)
-        except subprocess.TimeoutExpired:
+        except BaseException:
             _kill_session(ran.pid)
             raise
     assert ran.returncode == 0, output
@@ -64,7 +63,6 @@ def test_search_on_ray(
 
     assert [file.name for file in (folder / "locks").iterdir()] == ["study"]
     assert not segments()
-    assert {name for name in os.listdir("/dev/shm") if "plasma" in name or "ray" in name} == shared_memory
     assert not [process for process in psutil.process_iter() if ray_folder in " ".join(_command_line(process))]
 
 

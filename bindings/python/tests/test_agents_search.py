@@ -1,6 +1,7 @@
 """The hyperparameter search: search space, order of the trials, pruning, and resumption."""
 
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -218,6 +219,37 @@ def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -
     assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
 
 
+def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:
+    given = settings("gru", run=str(tmp_path / "trial-0000"))
+    with pytest.raises(RuntimeError), search_workers.output_of(given):
+        print("before")
+        raise RuntimeError("the cause")
+    first, *_, last = (tmp_path / "trial-0000.log").read_text().splitlines()
+    assert (first, last) == ("before", "RuntimeError: the cause")
+
+
+def interrupted_or_late(trials: Trials, share: search_workers.Share | None) -> None:
+    """The work of a worker that only a signal ends in time."""
+    time.sleep(30)
+    (trials.folder / "late").touch()
+
+
+def test_a_signal_while_workers_are_started_stops_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    process = multiprocessing.get_context("spawn").Process
+    start, started = process.start, []
+
+    def interrupting(self: Any) -> None:
+        start(self)
+        started.append(self.name)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(process, "start", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        search_workers.run_workers(Trials(small(tmp_path, stage="single", workers=2), QUIET), interrupted_or_late)
+    assert started == ["endless-search-0"]
+    assert not (tmp_path / "late").exists()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) -> None:
     """Also if it is killed: they stop after their update, with checkpoints, as if they had been interrupted."""
@@ -225,17 +257,20 @@ def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) 
     sizes = ["--environment.num-envs", "4", "--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "100000"]
     choice = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single", "--workers", "2"]
     with subprocess.Popen([*command, *sizes, *choice], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as started:
-        runs = [tmp_path / f"trial-000{number}" for number in (0, 1)]
-        while not all((run / "progress.jsonl").exists() and read_progress(run) for run in runs):
-            assert started.poll() is None, started.communicate()[0]
-            time.sleep(0.05)
-        workers = [
-            child for child in psutil.Process(started.pid).children() if "spawn_main" in " ".join(child.cmdline())
-        ]
-        assert len(workers) == 2
-        started.send_signal(number)
-        assert started.wait(60) == (130 if number == signal.SIGINT else -number)
-        assert not psutil.wait_procs(workers, timeout=60)[1]
+        try:
+            runs = [tmp_path / f"trial-000{number}" for number in (0, 1)]
+            while not all((run / "progress.jsonl").exists() and read_progress(run) for run in runs):
+                assert started.poll() is None, started.communicate()[0]
+                time.sleep(0.05)
+            workers = [
+                child for child in psutil.Process(started.pid).children() if "spawn_main" in " ".join(child.cmdline())
+            ]
+            assert len(workers) == 2
+            started.send_signal(number)
+            assert started.wait(60) == (130 if number == signal.SIGINT else -number)
+            assert not psutil.wait_procs(workers, timeout=60)[1]
+        finally:
+            started.kill()  # its workers stop with it
     for run in runs:
         assert load_checkpoint(run, "cpu").update == read_progress(run)[-1]["update"]
     given = parse([*command[3:], *sizes, *choice])

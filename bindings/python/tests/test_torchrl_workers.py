@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from torchrl.collectors import MultiCollector
@@ -24,7 +25,6 @@ def test_environments_must_be_divisible_among_the_workers() -> None:
 @pytest.mark.slow
 def test_workers_play_the_episodes_of_one_process(segments: Callable[[], set[str]]) -> None:
     """Each plays its share of what one process plays with the same actions: no seed is used twice, and none is left out."""
-    before = set(os.listdir("/dev/shm"))
     makers = EndlessEnv.workers(ID, ENVS, WORKERS, seed=40, options={"max_steps": 5})
     collector = MultiCollector(
         makers, None, sync=True, cat_results=0, frames_per_batch=ENVS * STEPS, total_frames=2 * ENVS * STEPS
@@ -32,6 +32,7 @@ def test_workers_play_the_episodes_of_one_process(segments: Callable[[], set[str
     try:
         batches = [batch.clone() for batch in collector]
         assert segments(), "the frames come from engines"
+        processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
     finally:
         collector.shutdown()
     data = torch.cat(batches, 1)
@@ -53,4 +54,5 @@ def test_workers_play_the_episodes_of_one_process(segments: Callable[[], set[str
                 observation, _ = envs.reset(options={"reset_mask": over})
         assert ended >= ENVS, "later episodes were compared, too"
     assert not segments()
-    assert not {name for name in set(os.listdir("/dev/shm")) - before if name.startswith("torch_")}
+    tensors = tuple(f"torch_{process.pid}_" for process in processes)
+    assert not [name for name in os.listdir("/dev/shm") if name.startswith(tensors)]

@@ -31,7 +31,7 @@ from endless_gym.agents.train import choose_device
 #: Files in the folder of a search: the Optuna study, the best settings, and the folder of the locks.
 STUDY, BEST, LOCKS = "study.db", "best.json", "locks"
 #: Seconds that a process waits for another one's write to the study.
-_PATIENCE = 60.0
+_WRITE_TIMEOUT = 60.0
 #: User attributes of a trial: index of its single change, number of the trial that it resumes, folder of the run, and whether it
 #: failed in a way that would repeat itself.
 _SINGLE, _RESUMES, _FOLDER, _FAILED = "single", "goes_on", "folder", "failed"
@@ -223,7 +223,7 @@ class Trials:
             self.study = optuna.create_study(
                 study_name="search",
                 storage=optuna.storages.RDBStorage(
-                    f"sqlite:///{self.folder / STUDY}", engine_kwargs={"connect_args": {"timeout": _PATIENCE}}
+                    f"sqlite:///{self.folder / STUDY}", engine_kwargs={"connect_args": {"timeout": _WRITE_TIMEOUT}}
                 ),
                 load_if_exists=True,
                 direction="maximize",

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
@@ -44,9 +45,16 @@ class Share:
 
 @contextlib.contextmanager
 def output_of(settings: Settings) -> Iterator[None]:
-    """Context in which what is printed goes to a log beside the folder of a run, since several runs print at a time."""
+    """Context in which what is printed, and the traceback of an error, go to a log beside the folder of a run.
+
+    Several runs print at a time, and Ray shows no output of its processes.
+    """
     with open(f"{settings.run}.log", "a") as log, contextlib.redirect_stdout(log):
-        yield
+        try:
+            yield
+        except Exception:
+            traceback.print_exc(file=log)
+            raise
 
 
 def run_workers(trials: Trials, work: Work) -> None:
@@ -69,6 +77,8 @@ def run_workers(trials: Trials, work: Work) -> None:
         process = context.Process(target=_worker, args=(arguments, machine, slot, work), name=f"endless-search-{slot}")
         process.start()
         alive[slot] = process
+        if stopped:  # while it was being started, so that `stop` did not know it
+            os.kill(alive[slot].pid, signal.SIGINT)
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
@@ -82,7 +92,8 @@ def run_workers(trials: Trials, work: Work) -> None:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for slot in range(min(arguments.workers, trials.remaining()[1])):
-            start(slot)
+            if not stopped:
+                start(slot)
         while alive:
             connection.wait([process.sentinel for process in alive.values()])
             for slot, process in list(alive.items()):
