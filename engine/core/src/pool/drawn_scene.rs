@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
+use crate::batch::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
 use crate::envs::{Environment, SCREEN};
 use crate::raster::{Canvas, DirtySurface, PixelFormat};
 
@@ -56,6 +57,81 @@ impl<E: Environment> DrawnScene<E> {
             }
         }
         Ok(())
+    }
+}
+
+/// What the frames of the pool's batch before show.
+pub(super) enum Before<'a, E: Environment> {
+    /// Nothing is known.
+    Unknown,
+    /// The buffer is the same: its drawn scenes.
+    SameBuffer,
+    /// These scenes, drawn into another buffer.
+    Scenes(&'a [DrawnScene<E>]),
+}
+
+impl<E: Environment> Clone for Before<'_, E> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<E: Environment> Copy for Before<'_, E> {}
+
+impl<'a, E: Environment> Before<'a, E> {
+    /// What frame number `frame` of all environments' showed.
+    pub fn frame(self, frame: usize) -> Self {
+        match self {
+            Before::Scenes(scenes) => Before::Scenes(&scenes[frame..=frame]),
+            other => other,
+        }
+    }
+}
+
+impl<E: Environment> DrawnScene<E> {
+    /// As [`update`](Self::update). Returns what may differ in the frame from the same frame of the pool's batch before.
+    #[inline(never)]
+    pub fn update_with_changes(
+        &mut self,
+        before: Before<'_, E>,
+        assets: &Arc<E::Assets>,
+        scene: E::Scene,
+        settings: DrawSettings,
+        frame: &mut [u8],
+    ) -> Result<FrameChanges, WrongFrame> {
+        let row_major = settings.format.row_major;
+        let shown = match (before, &self.0) {
+            (Before::SameBuffer, shown) if settings.current => shown,
+            (Before::Scenes([shown]), _) => &shown.0,
+            _ => &None,
+        };
+        let changed = match shown {
+            Some((drawn_with, shown)) if Arc::ptr_eq(drawn_with, assets) => {
+                if *shown == scene {
+                    NOTHING
+                } else if matches!(before, Before::SameBuffer) && settings.format.is_canvas() && !settings.check {
+                    // What is painted is what has changed.
+                    let mut dirty = [0; SCREEN];
+                    E::repaint(
+                        assets,
+                        shown,
+                        &scene,
+                        &mut Canvas::new(frame, SCREEN, SCREEN).tracking_dirty(&mut dirty),
+                    );
+                    self.0 = Some((Arc::clone(assets), scene));
+                    return Ok(frame_changes(&dirty, row_major));
+                } else {
+                    // The frame changes from an older scene; the change of the last step is painted elsewhere.
+                    SURFACE.with_borrow_mut(|surface| {
+                        E::repaint(assets, shown, &scene, &mut surface.canvas());
+                        surface.dirty().first_chunk().map_or(EVERYTHING, |dirty| frame_changes(dirty, row_major))
+                    })
+                }
+            }
+            _ => EVERYTHING,
+        };
+        self.update(assets, scene, settings, frame)?;
+        Ok(changed)
     }
 }
 

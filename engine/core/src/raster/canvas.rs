@@ -40,7 +40,7 @@ impl<'a> Canvas<'a> {
     /// # Panics
     ///
     /// If there are more columns than masks, or more than 128 rows.
-    pub(super) fn tracking_dirty(self, dirty: &'a mut [u128]) -> Self {
+    pub(crate) fn tracking_dirty(self, dirty: &'a mut [u128]) -> Self {
         assert!(dirty.len() >= self.width && self.height <= u128::BITS as usize);
         Self { dirty: Some(dirty), ..self }
     }
