@@ -37,8 +37,8 @@ class ObservationCopy:
     in every case.
 
     Attributes:
-        array: The frames of the last update, uint8 (n, 84, 84, 3) or in the format of the environments. Only `update` may write to
-            it; it changes in place.
+        array: The frames of the last update, uint8 (n, 84, 84, 3) or in the format of the environments. It changes in place, and
+            only `update` may write to it.
     """
 
     def __init__(
@@ -93,8 +93,8 @@ class ObservationCopy:
         """Make the copy equal to an observation of the environments, without the interpreter's lock.
 
         Args:
-            observation: What `reset`, `step` or `recv` returned for one group, always the same, or a `WatchedBatch` has: the array
-                of the frames, or the dict that includes it.
+            observation: What `reset`, `step` or `recv` returned for the group, always the same one, or what a `WatchedBatch` has:
+                the array of the frames, or the dict that includes it.
 
         Returns:
             Bytes that were copied in this process.
