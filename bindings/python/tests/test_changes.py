@@ -54,7 +54,7 @@ def check(envs: endless_gym.EndlessVectorEnv, steps: int = 80) -> float:
             mask = generator.random(envs.num_envs) < 0.5
             observation, _ = envs.reset(seed=step, options={"reset_mask": mask})
         elif generator.random() < 0.1:
-            envs.restore(0, envs.snapshot(1))
+            observation, _ = envs.restore({0: envs.snapshot(1)})
         else:
             observation, *_ = envs.step(envs.action_space.sample())
     return copied / (steps - 1) / every.array.nbytes

@@ -1,6 +1,7 @@
 //! Which rows of a frame may have changed, and where.
 
 use crate::envs::SCREEN;
+use crate::raster::DirtySpans;
 
 /// Rows of a frame that are described together.
 pub(super) const BAND: usize = 8;
@@ -30,38 +31,48 @@ pub(crate) const EVERYTHING: FrameChanges = {
     changes
 };
 
-/// The changes of a frame with these dirty pixels: for each column of the screen a bit for each row. Columns of the screen are the
-/// rows of a frame's array, unless it is row-major.
-pub(crate) fn frame_changes(dirty: &[u128; SCREEN], row_major: bool) -> FrameChanges {
+/// The changes of a frame with these dirty pixels. Columns of the screen are the rows of a frame's array, unless it is row-major.
+#[inline]
+pub(crate) fn frame_changes(dirty: &DirtySpans, row_major: bool) -> FrameChanges {
     let mut changes = NOTHING;
-    for (number, change) in changes.as_chunks_mut::<BAND_BYTES>().0.iter_mut().enumerate() {
-        *change = if row_major { band_of_rows(dirty, number * BAND) } else { band_of_columns(&dirty[number * BAND..]) };
+    if row_major {
+        changes_of_rows(dirty, &mut changes);
+        return changes;
+    }
+    for (change, (firsts, ends)) in changes.as_chunks_mut::<BAND_BYTES>().0.iter_mut().zip(dirty.bands::<BAND>()) {
+        if *ends != [0; BAND] {
+            let first = firsts.iter().fold(u8::MAX, |all, first| all.min(*first));
+            let end = ends.iter().fold(0, |all, end| all.max(*end));
+            *change = [nonzero_bytes(*ends), first, end];
+        }
     }
     changes
 }
 
-/// The first of these columns of the screen as a band.
-#[inline]
-fn band_of_columns(columns: &[u128]) -> [u8; BAND_BYTES] {
-    let (mut rows, mut union) = (0, 0);
-    for (number, column) in columns.iter().take(BAND).enumerate() {
-        rows |= u8::from(*column != 0) << number;
-        union |= column;
-    }
-    if union == 0 { [0; 3] } else { [rows, union.trailing_zeros() as u8, (u128::BITS - union.leading_zeros()) as u8] }
-}
-
-/// The rows of the screen from `first` on as a band.
-fn band_of_rows(dirty: &[u128; SCREEN], first: usize) -> [u8; BAND_BYTES] {
-    let (mut rows, mut start, mut end) = (0, 0, 0);
-    for (x, column) in dirty.iter().enumerate() {
-        let bits = (column >> first) as u8;
-        if bits != 0 {
-            (start, end) = (if rows == 0 { x } else { start }, x + 1);
-            rows |= bits;
+/// The changes of a row-major frame.
+fn changes_of_rows(dirty: &DirtySpans, changes: &mut FrameChanges) {
+    let spans = dirty.bands::<1>().map(|(&[first], &[end])| (usize::from(first), usize::from(end)));
+    for (x, (first, end)) in spans.enumerate().filter(|(_, (first, end))| first < end) {
+        for band in first / BAND..end.div_ceil(BAND) {
+            let within = first.max(band * BAND) - band * BAND..end.min((band + 1) * BAND) - band * BAND;
+            let change = &mut changes[band * BAND_BYTES..][..BAND_BYTES];
+            if change[0] == 0 {
+                change[1] = x as u8;
+            }
+            change[0] |= u8::MAX >> (BAND - within.len()) << within.start;
+            change[2] = x as u8 + 1;
         }
     }
-    [rows, start as u8, end as u8]
+}
+
+/// A bit for each byte that is not 0.
+#[inline]
+fn nonzero_bytes(bytes: [u8; BAND]) -> u8 {
+    const LOW: u64 = 0x7f7f_7f7f_7f7f_7f7f;
+    let bytes = u64::from_le_bytes(bytes);
+    // The highest bit of each byte that is not 0, and the product that gathers them.
+    let highest = (((bytes & LOW) + LOW) | bytes) & !LOW;
+    ((highest >> 7).wrapping_mul(0x0102_0408_1020_4080) >> 56) as u8
 }
 
 #[cfg(test)]
@@ -69,6 +80,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::raster::Canvas;
 
     /// The pixels of a frame's array that these changes name.
     fn named(changes: &FrameChanges) -> Vec<(usize, usize)> {
@@ -84,24 +96,33 @@ mod tests {
     fn everything_and_nothing_are_what_they_say() {
         assert_eq!(named(&EVERYTHING).len(), SCREEN * SCREEN);
         for row_major in [false, true] {
-            assert_eq!(named(&frame_changes(&[u128::MAX >> (128 - SCREEN); SCREEN], row_major)).len(), SCREEN * SCREEN);
-            assert_eq!(frame_changes(&[0; SCREEN], row_major), NOTHING);
+            let all: Vec<_> = (0..SCREEN).flat_map(|x| [(x, 0), (x, SCREEN - 1)]).collect();
+            assert_eq!(named(&frame_changes(&painted(&all), row_major)).len(), SCREEN * SCREEN);
+            assert_eq!(frame_changes(&painted(&[]), row_major), NOTHING);
         }
+    }
+
+    /// What is noted when these pixels are painted.
+    fn painted(pixels: &[(usize, usize)]) -> DirtySpans {
+        let (mut frame, mut dirty) = (vec![0; SCREEN * SCREEN * 3], DirtySpans::new());
+        let mut canvas = Canvas::new(&mut frame, SCREEN, SCREEN).tracking_spans(&mut dirty);
+        pixels.iter().for_each(|(x, y)| *canvas.pixel_mut(*x, *y) = [1; 3]);
+        dirty
     }
 
     proptest! {
         /// Every dirty pixel is named; in a band, the named rows and the ends of the span have dirty pixels.
         #[test]
         fn dirty_pixels_are_named(pixels in prop::collection::vec((0..SCREEN, 0..SCREEN), 0..6), row_major: bool) {
-            let mut dirty = [0; SCREEN];
-            pixels.iter().for_each(|(x, y)| dirty[*x] |= 1 << y);
             let changed: Vec<_> = pixels.iter().map(|&(x, y)| if row_major { (y, x) } else { (x, y) }).collect();
-            let changes = frame_changes(&dirty, row_major);
+            let changes = frame_changes(&painted(&pixels), row_major);
             let named = named(&changes);
             prop_assert!(changed.iter().all(|pixel| named.contains(pixel)));
             for (row, pixel) in named {
-                let band: Vec<_> = changed.iter().filter(|changed| changed.0 / BAND == row / BAND).collect();
-                prop_assert!(band.iter().any(|changed| changed.0 == row));
+                // The pixels of a column are noted as a span.
+                let near = |changed: &(usize, usize)| changed.0 / BAND == row / BAND || row_major;
+                let band: Vec<_> = changed.iter().filter(|changed| near(changed)).collect();
+                prop_assert!(row_major || band.iter().any(|changed| changed.0 == row));
                 prop_assert!(band.iter().any(|changed| changed.1 <= pixel) && band.iter().any(|changed| changed.1 >= pixel));
             }
         }

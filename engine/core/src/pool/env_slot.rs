@@ -188,6 +188,10 @@ impl<E: Environment> EnvSlot<E> {
         changes: &mut [u8],
     ) -> Result<(), WrongFrame> {
         let assets = self.env.shared();
+        if let ([drawn], Some(changes)) = (&mut *drawn, changes.first_chunk_mut()) {
+            *changes = drawn.update_with_changes(before.frame(first), assets, self.env.scene(), settings, frames)?;
+            return Ok(());
+        }
         let frames = frames.chunks_exact_mut(frames.len() / drawn.len());
         let mut stacked = self.frames().zip(drawn).zip(frames).zip(changes.as_chunks_mut().0).enumerate();
         stacked.try_for_each(|(number, (((stacked, drawn), frame), changes))| {

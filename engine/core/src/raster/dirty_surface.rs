@@ -44,11 +44,6 @@ impl DirtySurface {
         Canvas::new(&mut self.pixels, self.width, self.height).tracking_dirty(&mut self.dirty)
     }
 
-    /// The dirty mask: for each column a bit for each row.
-    pub fn dirty(&self) -> &[u128] {
-        &self.dirty
-    }
-
     /// Calls `run` for each run of dirty pixels with its column, its rows, and its pixels.
     pub fn for_each_run(&self, mut run: impl FnMut(usize, Range<usize>, &[Rgb])) {
         let columns = self.pixels.as_chunks::<3>().0.chunks_exact(self.height.max(1));
