@@ -1,6 +1,6 @@
 //! Copies of observations that are kept up to date from a batch's changes.
 
-use endless_gym::batch::{Batch, BatchSection, Block, Layout, ObservationUpdater};
+use endless_gym::batch::{Batch, BatchSection, Block, Layout, ObservationUpdater, Section};
 use numpy::{PyArray1, PyArrayDyn, PyArrayMethods, PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -79,7 +79,7 @@ impl ObservationUpdates {
             )
         };
         let (memory, length, is_exported) = memory_of(observation).ok_or_else(foreign)?;
-        let offset = self.layout.section(BatchSection::Observation).map_or(0, |section| section.offset());
+        let offset = self.layout.section(BatchSection::Observation).map_or(0, Section::offset);
         // SAFETY: the array is borrowed, and its data pointer is only compared.
         let data = unsafe { (*observation.as_array_ptr()).fields.data };
         if data.cast::<u8>().cast_const() != memory.wrapping_byte_add(offset).cast::<u8>()

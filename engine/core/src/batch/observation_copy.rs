@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use super::block::{Block, zeroed};
+use super::block::{Block, blocks_for, zeroed};
 use super::changed_rows::{BAND, BAND_BYTES};
 use super::layout::Layout;
 use super::sections::BatchSection;
@@ -47,7 +47,7 @@ impl ObservationCopy {
     /// [`ObservationCopyError::NoObservation`] if batches of that layout have no frames.
     pub fn new(layout: &Layout) -> Result<Self, ObservationCopyError> {
         let updater = ObservationUpdater::new(layout)?;
-        Ok(ObservationCopy { blocks: zeroed(super::blocks_for(updater.bytes())), updater })
+        Ok(ObservationCopy { blocks: zeroed(blocks_for(updater.bytes())), updater })
     }
 
     /// Makes the copy equal to the batch's observations. Returns the number of bytes that were copied.
