@@ -14,7 +14,8 @@
 pub mod batch {
     pub use endless_gym_core::batch::{
         ActionLayout, ActionSection, BLOCK_BYTES, Batch, BatchSection, Block, Dtype, Element, Frames, LAYOUT_VERSION,
-        Layout, LayoutError, MAX_DIMENSIONS, MAX_STACK, RowShape, Section, SectionTable, zeroed,
+        Layout, LayoutError, MAX_DIMENSIONS, MAX_STACK, ObservationCopy, ObservationCopyError, ObservationUpdater,
+        RowShape, Section, SectionTable, zeroed,
     };
     pub use endless_gym_core::raster::PixelFormat;
 }

@@ -64,7 +64,7 @@ impl<S: SectionTable> Section<S> {
 /// use endless_gym_core::batch::{BatchSection, Contents, Frames, Layout, batch_layout, zeroed};
 /// use endless_gym_core::envs;
 ///
-/// let contents = Contents { frames: Some(Frames::default()), features: false, final_observation: false };
+/// let contents = Contents { frames: Some(Frames::default()), ..Contents::default() };
 /// let layout = batch_layout(envs::spec("MysteryPath-v0")?, 16, contents)?;
 /// let observation = layout.section(BatchSection::Observation).unwrap();
 /// assert_eq!(observation.shape(), [84, 84, 3]);
@@ -297,7 +297,7 @@ mod tests {
     use crate::envs;
 
     fn everything() -> Contents {
-        Contents { frames: Some(Frames::default()), features: true, final_observation: true }
+        Contents { frames: Some(Frames::default()), features: true, final_observation: true, changes: true }
     }
 
     fn layout(num_envs: usize) -> Layout {
@@ -333,11 +333,7 @@ mod tests {
 
     #[test]
     fn a_missing_section_wrong_type_or_short_batch_reads_as_empty() {
-        let layout = batch_layout(
-            envs::spec("MysteryPath-v0").unwrap(),
-            4,
-            Contents { frames: None, features: false, final_observation: false },
-        );
+        let layout = batch_layout(envs::spec("MysteryPath-v0").unwrap(), 4, Contents::default());
         let layout = layout.unwrap();
         let batch = zeroed(layout.blocks());
         assert_eq!(layout.read::<f64>(&batch, BatchSection::Reward).len(), 4);

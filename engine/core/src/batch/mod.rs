@@ -12,6 +12,7 @@
 //! change to the frames of a batch that a pool will write into again, call [`Layout::forget_frames`].
 
 mod block;
+mod changed_rows;
 mod dtype;
 #[cfg(test)]
 mod forged_tests;
@@ -19,16 +20,19 @@ mod frames;
 mod layout;
 mod layout_error;
 pub(crate) mod limits;
+mod observation_copy;
 mod sealed;
 mod sections;
 mod stamp;
 mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
+pub(crate) use changed_rows::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
 pub use dtype::{Dtype, Element};
 pub use frames::{Frames, MAX_STACK};
 pub use layout::{ActionLayout, Layout, MAX_DIMENSIONS, Section, action_layout, batch_layout};
 pub use layout_error::LayoutError;
+pub use observation_copy::{ObservationCopy, ObservationCopyError, ObservationUpdater};
 pub use sections::{ActionSection, BatchSection, Contents, OPTIONS_BYTES, RowShape, SNAPSHOT_BYTES, SectionTable};
 pub(crate) use stamp::Stamp;
 pub use view::Batch;
@@ -40,4 +44,6 @@ pub(crate) use view::BatchMut;
 /// seed counts the environments of all groups.
 ///
 /// Version 6: the requests that set the options of next episodes, and that ask what the running episodes follow from.
-pub const LAYOUT_VERSION: u32 = 6;
+///
+/// Version 7: the section `changed_rows`.
+pub const LAYOUT_VERSION: u32 = 7;

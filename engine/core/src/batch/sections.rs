@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use super::changed_rows::FRAME_CHANGES_BYTES;
 use super::dtype::{Dtype, Element};
 use super::frames::Frames;
 use super::sealed::Sealed;
@@ -217,6 +218,8 @@ macro_rules! batch_sections {
                 "`features` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalGroundTruth final_ground_truth: f64, Vector, optional,
                 "`ground_truth` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
+            ChangedRows changed_rows: u8, Vector, optional,
+                "what may differ in `observation` from the batch before: for each frame and each 8 rows of its array a bit for each row, the first pixel and the one behind the last; on request";
         }
     };
 }
@@ -245,8 +248,8 @@ section_table! {
         "for restoring an environment: its snapshot; for setting the options of next episodes: their JSON text; one byte string stored across all rows, at least [`SNAPSHOT_BYTES`] in all";
 }
 
-/// Which optional sections a batch has.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// Which optional sections a batch has. The default has none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Contents {
     /// Format of the frames; `None` leaves them out, and nothing is drawn.
     pub frames: Option<Frames>,
@@ -254,6 +257,8 @@ pub struct Contents {
     pub features: bool,
     /// Whether there are the `final_*` sections, for same-step autoreset.
     pub final_observation: bool,
+    /// Whether there is the description of what has changed in the frames.
+    pub changes: bool,
 }
 
 impl BatchSection {
@@ -276,6 +281,10 @@ impl BatchSection {
             BatchSection::FinalVectorObservation => final_of(BatchSection::VectorObservation),
             BatchSection::FinalFeatures => final_of(BatchSection::Features),
             BatchSection::FinalGroundTruth => final_of(BatchSection::GroundTruth),
+            BatchSection::ChangedRows => contents
+                .frames
+                .filter(|_| contents.changes)
+                .map(|frames| vec![frames.stack.saturating_mul(FRAME_CHANGES_BYTES)]),
         }
     }
 }
@@ -313,7 +322,8 @@ mod tests {
     #[test]
     fn final_sections_equal_their_originals() {
         for spec in envs::specs() {
-            let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
+            let contents =
+                Contents { frames: Some(Frames::default()), features: true, final_observation: true, changes: true };
             for section in BatchSection::ALL {
                 let Some(original) = section.name().strip_prefix("final_") else { continue };
                 let original = BatchSection::from_name(original).unwrap();
@@ -330,13 +340,13 @@ mod tests {
         for spec in envs::specs() {
             for stack in [1, 4] {
                 let frames = Some(Frames { stack, ..Frames::default() });
-                let contents = Contents { frames, features: true, final_observation: true };
+                let contents = Contents { frames, features: true, final_observation: true, changes: true };
                 for section in BatchSection::ALL {
                     let shape = section.row_shape(spec, contents);
                     assert!(shape.iter().all(|shape| section.row().admits(shape)), "{section} {shape:?}");
                     assert!(shape.is_some() || !section.is_required());
                 }
-                let none = Contents { frames: None, features: false, final_observation: false };
+                let none = Contents::default();
                 for section in BatchSection::ALL {
                     assert!(section.row_shape(spec, none).is_some() || !section.is_required(), "{section}");
                 }

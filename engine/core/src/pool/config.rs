@@ -53,6 +53,9 @@ pub struct PoolConfig {
     pub frames: Option<Frames>,
     /// Whether the batch has the feature observation.
     pub features: bool,
+    /// Whether the batch says which parts of the frames have changed since the pool's batch before, for readers that keep a copy
+    /// ([`ObservationCopy`](crate::batch::ObservationCopy)). Without effect without frames.
+    pub changes: bool,
     /// Whether every frame is drawn a second time, in full, and compared; a difference is [`PoolError::WrongFrame`]. For tests.
     pub check_drawing: bool,
     /// Number of this pool's first environment among all environments, for [`seeding`](Self::seeding) and [`ResetRequest::Seed`]:
@@ -76,6 +79,7 @@ impl PoolConfig {
             independent_episodes: false,
             frames: Some(Frames::default()),
             features: false,
+            changes: false,
             check_drawing: false,
             first_env: 0,
             total_envs: num_envs,
@@ -136,6 +140,7 @@ impl PoolConfig {
             frames: self.frames,
             features: self.features,
             final_observation: self.final_observation && self.autoreset == Autoreset::SameStep,
+            changes: self.changes,
         }
     }
 }

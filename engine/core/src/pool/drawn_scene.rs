@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::envs::{Environment, SCREEN};
-use crate::raster::{Canvas, DirtySurface, PixelFormat};
+use crate::batch::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
+use crate::envs::{Environment, FRAME_BYTES, SCREEN};
+use crate::raster::{Canvas, DirtySpans, DirtySurface, PixelFormat};
 
 /// Settings for drawing frames.
 #[derive(Clone, Copy, Debug)]
@@ -57,6 +58,102 @@ impl<E: Environment> DrawnScene<E> {
         }
         Ok(())
     }
+}
+
+/// What the frames of the pool's batch before show.
+pub(super) enum Before<'a, E: Environment> {
+    /// Nothing is known.
+    Unknown,
+    /// The buffer is the same: its drawn scenes.
+    SameBuffer,
+    /// These scenes, drawn into another buffer.
+    Scenes(&'a [DrawnScene<E>]),
+}
+
+impl<E: Environment> Clone for Before<'_, E> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<E: Environment> Copy for Before<'_, E> {}
+
+impl<'a, E: Environment> Before<'a, E> {
+    /// What frame number `frame` of all environments' showed.
+    pub fn frame(self, frame: usize) -> Self {
+        match self {
+            Before::Scenes(scenes) => Before::Scenes(&scenes[frame..=frame]),
+            other => other,
+        }
+    }
+}
+
+impl<E: Environment> DrawnScene<E> {
+    /// As [`update`](Self::update). Returns what may differ in the frame from the same frame of the pool's batch before.
+    #[inline]
+    pub fn update_with_changes(
+        &mut self,
+        before: Before<'_, E>,
+        assets: &Arc<E::Assets>,
+        scene: E::Scene,
+        settings: DrawSettings,
+        frame: &mut [u8],
+    ) -> Result<FrameChanges, WrongFrame> {
+        let format = settings.format;
+        if matches!(before, Before::SameBuffer)
+            && format.is_canvas()
+            && settings.current
+            && !settings.check
+            && let Some((drawn_with, drawn)) = &mut self.0
+            && Arc::ptr_eq(drawn_with, assets)
+        {
+            if *drawn == scene {
+                return Ok(NOTHING);
+            }
+            // What is painted is what has changed.
+            let changes = painted_changes::<E>(assets, drawn, &scene, frame, format.row_major);
+            *drawn = scene;
+            return Ok(changes);
+        }
+        let shown = match (before, &self.0) {
+            (Before::SameBuffer, shown) if settings.current => shown,
+            (Before::Scenes([shown]), _) => &shown.0,
+            _ => &None,
+        };
+        let changes = match shown {
+            Some((drawn_with, shown)) if Arc::ptr_eq(drawn_with, assets) => {
+                if *shown == scene {
+                    NOTHING
+                } else {
+                    // The frame may change from an older scene. The change of the last step is painted elsewhere.
+                    SCRATCH
+                        .with_borrow_mut(|frame| painted_changes::<E>(assets, shown, &scene, frame, format.row_major))
+                }
+            }
+            _ => EVERYTHING,
+        };
+        self.update(assets, scene, settings, frame)?;
+        Ok(changes)
+    }
+}
+
+thread_local! {
+    /// The frame that is painted for what its painting changes.
+    static SCRATCH: RefCell<Vec<u8>> = RefCell::new(vec![0; FRAME_BYTES]);
+}
+
+/// Paints the difference of two scenes. Returns what was painted.
+#[inline]
+fn painted_changes<E: Environment>(
+    assets: &E::Assets,
+    shown: &E::Scene,
+    scene: &E::Scene,
+    frame: &mut [u8],
+    row_major: bool,
+) -> FrameChanges {
+    let mut dirty = DirtySpans::new();
+    E::repaint(assets, shown, scene, &mut Canvas::new(frame, SCREEN, SCREEN).tracking_spans(&mut dirty));
+    frame_changes(&dirty, row_major)
 }
 
 /// Draws a frame in full.

@@ -1,8 +1,10 @@
 //! Borrowed pixels to draw on, and the blocks and rows that all shapes are made of.
 
+use std::fmt::Debug;
 use std::ops::Range;
 
 use super::color::Rgb;
+use super::dirty_spans::DirtySpans;
 use super::rect::Rect;
 use super::runs::{clip, copy_run, fill_run};
 
@@ -18,8 +20,38 @@ pub struct Canvas<'a> {
     /// The pixels that may change.
     columns: Range<usize>,
     rows: Range<usize>,
-    /// The dirty mask: for each column a bit for each row. `None` without dirty tracking.
-    dirty: Option<&'a mut [u128]>,
+    /// What is noted of painted pixels. `None` without dirty tracking.
+    dirty: Option<&'a mut (dyn Dirty + 'static)>,
+}
+
+/// What is noted of painted pixels.
+trait Dirty: Debug {
+    /// Whether every pixel that is not marked was not painted, and the reverse.
+    fn is_exact(&self) -> bool;
+
+    /// Marks some rows of some columns.
+    fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>);
+}
+
+/// The dirty mask: for each column a bit for each row.
+impl Dirty for Vec<u128> {
+    fn is_exact(&self) -> bool {
+        true
+    }
+
+    fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>) {
+        mark_rows(&mut self[columns], rows);
+    }
+}
+
+impl Dirty for DirtySpans {
+    fn is_exact(&self) -> bool {
+        false
+    }
+
+    fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>) {
+        self.mark_rows(columns, rows);
+    }
 }
 
 impl<'a> Canvas<'a> {
@@ -40,8 +72,18 @@ impl<'a> Canvas<'a> {
     /// # Panics
     ///
     /// If there are more columns than masks, or more than 128 rows.
-    pub(super) fn tracking_dirty(self, dirty: &'a mut [u128]) -> Self {
+    pub(super) fn tracking_dirty(self, dirty: &'a mut Vec<u128>) -> Self {
         assert!(dirty.len() >= self.width && self.height <= u128::BITS as usize);
+        Self { dirty: Some(dirty), ..self }
+    }
+
+    /// The same canvas with coarser dirty tracking: for each column, the smallest span that has all painted pixels.
+    ///
+    /// # Panics
+    ///
+    /// If the canvas has more than [`DirtySpans::COLUMNS`] columns or more than 255 rows.
+    pub fn tracking_spans(self, dirty: &'a mut DirtySpans) -> Self {
+        assert!(self.width <= DirtySpans::COLUMNS && self.height <= usize::from(u8::MAX));
         Self { dirty: Some(dirty), ..self }
     }
 
@@ -49,6 +91,12 @@ impl<'a> Canvas<'a> {
     #[inline]
     pub fn tracks_dirty(&self) -> bool {
         self.dirty.is_some()
+    }
+
+    /// Whether painted pixels are marked one by one, so that no other pixel may be marked.
+    #[inline]
+    pub(super) fn tracks_pixels(&self) -> bool {
+        self.dirty.as_ref().is_some_and(|dirty| dirty.is_exact())
     }
 
     /// Marks some rows of some columns as dirty. Nothing happens without dirty tracking.
@@ -59,7 +107,7 @@ impl<'a> Canvas<'a> {
     #[inline]
     pub fn mark_dirty(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         if let Some(dirty) = &mut self.dirty {
-            mark_rows(&mut dirty[columns], rows);
+            dirty.mark(columns, rows);
         }
     }
 

@@ -74,7 +74,7 @@ impl Model {
 }
 
 fn layout() -> Layout {
-    let contents = Contents { frames: None, features: false, final_observation: false };
+    let contents = Contents::default();
     batch_layout(envs::specs().next().unwrap(), 1, contents).unwrap()
 }
 
