@@ -237,7 +237,7 @@ def train_ranks(ranks: int, arguments: list[str], settings: Settings, cores: lis
         )
         if done.returncode:
             raise SystemExit(f"training with {ranks} ranks ended with status {done.returncode}:\n{done.stderr[-3000:]}")
-        rows = read_progress(f"{folder}/run")[1:]
+        rows = read_progress(Path(folder) / "run")[1:]
     return len(rows) / sum(1.0 / row["steps_per_second"] for row in rows)
 
 
