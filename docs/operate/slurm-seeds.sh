@@ -7,7 +7,7 @@
 
 run="runs/mortar-$SLURM_ARRAY_TASK_ID"
 arguments=(--env Endless-MortarMayhem-v0 --agent gru --seed "$SLURM_ARRAY_TASK_ID" --run "$run")
-# A job that was requeued, or submitted again, goes on.
+# A job that was requeued, or submitted again, resumes.
 if [[ -e $run/checkpoints/last.pt ]]; then
     arguments=(--resume "$run")
 fi

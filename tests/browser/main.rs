@@ -159,7 +159,7 @@ fn a_page_in_the_background_gets_no_frames() {
         )
     };
     browser.value(&hide(true));
-    // Curves go on, and the last frame is still there.
+    // The curves continue, and the last frame is still there.
     browser.wait("endless.about.batch.envs.length === 0");
     browser.value("globalThis.points = endless.curves.points.length; globalThis.shown = endless.frames; 0");
     browser.wait("endless.curves.points.length > points");

@@ -19,7 +19,7 @@ SCRIPT = Path(__file__).parent / "ray_search.py"
 def test_search_on_ray(
     tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
 ) -> None:
-    """The worst trial is pruned, and the one whose process is killed goes on from its checkpoint."""
+    """The worst trial is pruned, and the one whose process is killed resumes from its checkpoint."""
     environments = ["--environment.num-envs", "4", "--environment.engine", "process", "--agent", "gru"]
     sizes = ["--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "6", "--checkpoint-interval", "1"]
     sizes += ["--recurrence.hidden-size", "16"]

@@ -130,7 +130,7 @@ impl Observation {
                 is_news = true;
                 self.read_status(channel, with_details);
             }
-            // For a page that nobody looks at, the curves go on with one batch per status.
+            // A page in the background gets one batch per status, for its curves.
             let shown = |viewer: &&Arc<Viewer>| is_news || !viewer.is_hidden();
             let shown: Vec<_> = viewers.iter().filter(shown).collect();
             // A batch is taken only for a browser that can receive it.

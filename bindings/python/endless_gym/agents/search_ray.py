@@ -1,7 +1,7 @@
 """A hyperparameter search whose trials run on Ray Tune, on this machine or on a cluster.
 
 Tune starts the trials, and starts them again after failures. The study decides which trials there are and which are pruned, in
-the process of the search, as it does without Ray. The same search can therefore go on with Ray or without.
+the process of the search, as it does without Ray. The same search can therefore be continued with Ray or without.
 """
 
 from __future__ import annotations

@@ -400,7 +400,7 @@ class Trials:
 
 
 def resumable(settings: Settings) -> tuple[Settings, list[dict[str, Any]]]:
-    """The settings with which a trial's run goes on, or begins.
+    """The settings with which a trial's run is resumed or begun.
 
     Args:
         settings: Settings of the run, with its folder. A folder without a checkpoint, of a run that was interrupted before its
