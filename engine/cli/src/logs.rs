@@ -2,7 +2,8 @@
 
 use std::io;
 
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
 use super::failure::Failure;
@@ -21,14 +22,14 @@ pub fn start(given: Option<&str>) -> Result<(), Failure> {
         (None, Some(text)) => (VARIABLE, &**text),
         (None, None) => ("--log", DEFAULT),
     };
-    let filter = EnvFilter::try_new(text).map_err(|error| {
+    let filter = text.parse::<Targets>().map_err(|error| {
         format!(
             "{name} must be off, error, warn, info, debug, trace or a filter such as `endless_gym_service=debug`, got `{text}`: \
              {error}"
         )
     })?;
-    let subscriber = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).with_ansi(false);
+    let lines = tracing_subscriber::fmt::layer().with_writer(io::stderr).with_ansi(false);
     // An error means that the process has a subscriber, such as that of the Python package.
-    let _ = subscriber.finish().try_init();
+    let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
     Ok(())
 }
