@@ -153,7 +153,7 @@ def test_settings_round_trip_through_dicts(name: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": replace(PAPER.environment, num_envs=31)}, "got 31 environments and 2 groups"),
+        ({"environment": replace(PAPER.environment, num_envs=31, groups=2)}, "got 31 environments and 2 groups"),
         ({"environment": replace(PAPER.environment, option=("a",))}, "must be NAME=VALUE .* got `a`"),
         ({"environment": replace(PAPER.environment, option=("a=x",))}, "must be NAME=VALUE .* got `a=x`"),
         ({"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100)}, "got 100 steps and sequences of 64"),

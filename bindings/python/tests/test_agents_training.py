@@ -37,9 +37,10 @@ GRID = "MortarMayhem-Grid-v0"
 
 def small(agent: str, run: Path, updates: int = 4, **environment: Any) -> Settings:
     given = settings(agent, env=GRID, run=str(run), checkpoint_interval=2, threads=1)
+    changes = {"num_envs": 8, "groups": 2, "option": ("command_count=[1, 2]",), **environment}
     return replace(
         given,
-        environment=replace(given.environment, num_envs=8, option=("command_count=[1, 2]",), **environment),
+        environment=replace(given.environment, **changes),
         ppo=replace(given.ppo, steps=16, minibatches=2, updates=updates),
     )
 

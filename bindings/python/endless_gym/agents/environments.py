@@ -1,9 +1,8 @@
-"""The training environments, in groups: one group is stepped while the agent computes the actions of another."""
+"""The training environments, in groups: an engine process steps one group while the agent computes the actions of another."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -41,7 +40,10 @@ class StepResult:
 
 
 class Environments:
-    """Groups of environments that are stepped asynchronously: `send` a group's actions, `receive` the result later.
+    """Groups of environments: `send` a group's actions, `receive` the result later.
+
+    An engine process steps from `send` on. Environments in this process are stepped in `receive`, by their threads: a step takes
+    microseconds, less than a Python thread takes to begin one.
 
     The seed of each episode is drawn from 0 to 99,999, as in the paper's training.
 
@@ -107,9 +109,6 @@ class Environments:
             self._envs: EndlessVectorEnv | RecoverableEngine = self._engine or make()
         except RuntimeError as error:  # The engine reports why it cannot start.
             raise ValueError(str(error)) from error
-        # In this process a group is stepped in a worker thread; stepping releases the GIL.
-        self._thread = ThreadPoolExecutor(1, "environments") if in_process else None
-        self._results: dict[int, Future[Any]] = {}
 
     def reset(self, group: int) -> StepResult:
         """Start an episode in every environment of a group."""
@@ -117,15 +116,12 @@ class Environments:
         return self._start(observation, info)
 
     def send(self, actions: NDArray[np.int64], group: int) -> None:
-        """Start a step of a group with actions int64 (n, branches), without waiting for the result."""
+        """Send the actions of a group's next step, int64 (n, branches), without waiting for the result."""
         self._envs.send(self.spec.batched_actions(actions), group)
-        if self._thread is not None:
-            self._results[group] = self._thread.submit(self._envs.recv, group)
 
     def receive(self, group: int) -> StepResult:
-        """Wait for the result of a group's last `send`."""
-        result = self._results.pop(group).result() if self._thread is not None else self._envs.recv(group)
-        observation, reward, terminated, truncated, info = result
+        """The result of a group's last `send`."""
+        observation, reward, terminated, truncated, info = self._envs.recv(group)
         done = terminated | truncated
         episodes = []
         if "final_info" in info:
@@ -159,8 +155,6 @@ class Environments:
 
     def close(self) -> None:
         """Close the environments and end the engine process, if there is one."""
-        if self._thread is not None:
-            self._thread.shutdown(wait=True)
         self._end_view()
         self._envs.close()
 

@@ -53,8 +53,9 @@ class Environment:
     """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
     num_envs: int = 32
     """number of environments, in all groups and at all ranks of a data-parallel run; the number of workers in the paper"""
-    groups: int = 2
-    """groups of environments; one group is stepped while the agent computes the actions of another"""
+    groups: int = 1
+    """groups of environments. With two, an engine process steps one group while the agent computes the actions of the other; that
+    pays only where a step takes about as long as the actions"""
     engine: Literal["thread", "process"] = "thread"
     """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
     num_threads: int = 0
