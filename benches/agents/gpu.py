@@ -249,7 +249,7 @@ def main() -> int:
             settings = replace(PRESETS["paper"], env=ENV, agent=agent) if cuda else networks(agent)
             settings = replace(
                 settings,
-                environment=replace(settings.environment, num_envs=num_envs, groups=2),
+                environment=replace(settings.environment, num_envs=num_envs),
                 ppo=replace(settings.ppo, steps=steps),
             )
             if (time.monotonic() - started) / 60 > args.minutes:

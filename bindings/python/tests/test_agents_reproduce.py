@@ -175,7 +175,7 @@ def test_a_scale_makes_everything_smaller() -> None:
     small = planning.scaled(full, 0.01)
     (before, after) = (one.runs[0].settings() for one in (full, small))
     assert (before.ppo.updates, before.ppo.steps, before.environment.num_envs) == (30_000, 512, 32)
-    assert (after.ppo.updates, after.ppo.steps, after.environment.num_envs) == (300, 64, 4)
+    assert (after.ppo.updates, after.ppo.steps, after.environment.num_envs) == (300, 64, 3)
     assert (small.seeds, small.evaluation) == (1, definitions.Evaluation(5, 5, 1))
     assert after.recurrence == before.recurrence
 
