@@ -27,6 +27,12 @@ FOLDER = Path(__file__).parent / "learning"
 #: Flags, time limit in minutes, target reward, and the largest possible reward if it is known.
 TASKS = {
     "one-command": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]'", 15, 0.097, 0.1),
+    "one-command-bf16": (
+        "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --bf16",
+        15,
+        0.097,
+        0.1,
+    ),
     "one-command-pixels": (
         "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --environment.observation rgb",
         30,
