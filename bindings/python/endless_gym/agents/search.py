@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import sys
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -77,9 +76,7 @@ def run_trials(trials: Trials, given: search_workers.Share | None = None) -> Non
         trials: The trials.
         given: What this process may use of the machine; None for all of it.
     """
-    minutes = trials.arguments.minutes
-    end = time.monotonic() + 60 * minutes if minutes else float("inf")
-    while time.monotonic() < end and (trial := trials.begin()) is not None:
+    while (trial := trials.begin()) is not None:
         if given is None:
             run_trial(trial, trial.settings)
         else:

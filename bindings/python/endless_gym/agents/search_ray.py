@@ -78,7 +78,8 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
     if study.failed:
         numbers = ", ".join(map(str, study.failed))
         raise ValueError(
-            f"trials {numbers} failed more than {arguments.max_failures} times; see the logs in {trials.folder}"
+            f"trials {numbers} failed more than {arguments.max_failures} times; see the logs in {trials.folder}, and repeat the "
+            "command to resume them"
         )
 
 
@@ -185,8 +186,6 @@ class _Study:
         self.failed: list[int] = []
         self._active: dict[str, Trial] = {}
         self._ended: dict[str, str] = {}
-        minutes = trials.arguments.minutes
-        self._end = time.monotonic() + 60 * minutes if minutes else float("inf")
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles what it is given, to restore a search from its own files. This one is restored from the study.
@@ -194,7 +193,7 @@ class _Study:
 
     def begin(self, tune_id: str) -> dict[str, Any] | None:
         """The configuration of the next trial; None if none is left to begin."""
-        trial = self.trials.begin() if time.monotonic() < self._end else None
+        trial = self.trials.begin()
         if trial is None:
             return None
         self._active[tune_id] = trial
@@ -213,7 +212,7 @@ class _Study:
         trial, ended = self._active.pop(tune_id), self._ended.pop(tune_id, "")
         if is_error:
             self.failed.append(trial.number)
-            trial.fail(f"failed; its log is {trial.settings.run}.log")
+            trial.postpone(f"failed; its log is {trial.settings.run}.log")
         elif ended == "exhausted":
             trial.fail("ran out of GPU memory")
         elif trial.pruned or ended:
