@@ -63,6 +63,9 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
         given: dict[str, Any] = {"address": arguments.ray, "log_to_driver": False}
         if arguments.ray == "local":
             given |= {"include_dashboard": False, "object_store_memory": _STORE}
+            # Ray would kill the engine together with its trainer. Nobody would remove their shared memory then, which the engine
+            # does when its trainer has ended, before it ends itself.
+            os.environ.setdefault("RAY_kill_child_processes_on_worker_exit", "0")
         try:
             ray.init(**given)
         except ConnectionError as error:
