@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import optuna
 import psutil
@@ -133,6 +134,75 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
     for run, done in zip(runs, before, strict=True):
         assert checkpoint.load(run).update == done + 1
         assert [json.loads(row)["update"] for row in _rows(run)] == list(range(1, done + 2))
+
+
+#: One run of six updates, with checkpoints every second.
+EXPERIMENT: dict[str, Any] = {
+    "title": "Mine",
+    "section": "-",
+    "about": "A test.",
+    "kind": "curves",
+    "seeds": 1,
+    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
+    "runs": [
+        {
+            "name": "gru",
+            "env": "MortarMayhem-Grid-v0",
+            "flags": {
+                "preset": "quick",
+                "agent": "gru",
+                "environment.engine": "process",
+                "environment.num-envs": 8,
+                "ppo.updates": 6,
+                "ppo.steps": 256,
+                "recurrence.hidden-size": 16,
+            },
+        }
+    ],
+}
+
+
+def test_an_experiment_on_ray_is_stopped_and_resumed(
+    tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
+) -> None:
+    """Ctrl-C stops its run after an update, with a checkpoint; the same command completes it, and then has nothing to do."""
+    (tmp_path / "mine.json").write_text(json.dumps(EXPERIMENT))
+    run = tmp_path / "out" / "runs" / "MortarMayhem-Grid-v0" / "gru" / "seed-1"
+    program = [libraries_python, "-m", "endless_gym.agents.reproduce", "mine.json", "--out", "out", "--device", "cpu"]
+
+    def reproduced(is_interrupted: bool) -> str:
+        with (tmp_path / "output").open("w") as output:
+            started = subprocess.Popen(
+                [*program, "--ray", "--jobs", "1", "--nice", "0"],
+                cwd=tmp_path,
+                env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        try:
+            while is_interrupted and not ((run / "progress.jsonl").exists() and len(_rows(run)) >= 2):
+                assert started.poll() is None, (tmp_path / "output").read_text()
+                time.sleep(0.01)
+            if is_interrupted:
+                os.killpg(started.pid, signal.SIGINT)
+            assert started.wait(250) == (130 if is_interrupted else 0), (tmp_path / "output").read_text()
+        finally:
+            _kill_session(started.pid)
+        assert not _left_by(ray_folder)
+        assert not segments()
+        return (tmp_path / "output").read_text()
+
+    text, done = reproduced(True), len(_rows(run))
+    assert f"stopped at update {done} of 6" in text
+    assert 2 <= done < 6
+    assert checkpoint.load(run).update == done
+    assert f"resumed at update {done} of 6" in reproduced(False)
+    assert [json.loads(row)["update"] for row in _rows(run)] == [1, 2, 3, 4, 5, 6]
+    assert "1 of 1 runs are done" in (tmp_path / "out" / "mine" / "README.md").read_text()
+    again = reproduced(False)
+    assert "1 of 1 jobs done" in again
+    assert "Ray instance" not in again
 
 
 def _left_by(ray_folder: str) -> list[str]:
