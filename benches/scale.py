@@ -12,15 +12,19 @@ The first table is of machines like this one. The second is of machines with GPU
 change: nothing was measured on a GPU. In both, each rank has the same number of environments, the network between machines is an
 assumption (`--bandwidth`, `--latency`), and `limit` is what takes most of an update.
 
-`--check` also compares two ranks, each bound to one core, with one rank on one core; the goal is 1.7 times the steps.
+`--check` also compares two ranks, each bound to one core, with one rank on one core; the goal is 1.7 times the steps. The bound
+is what two runs at once reach that are not connected, each bound to its core: cores share memory bandwidth, and virtual cores
+perhaps a physical one. What two ranks fall short of that is communication and waiting. It is meaningful on an idle machine only.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
+import signal
 import socket
 import statistics
 import subprocess
@@ -28,7 +32,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +42,7 @@ import torch
 from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
-from endless_gym.agents.logs import read_progress
+from endless_gym.agents.logs import PROGRESS, read_progress
 from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.ranks import Ranks
 from endless_gym.agents.rollout import RolloutCollector, Segment
@@ -241,6 +245,59 @@ def train_ranks(ranks: int, arguments: list[str], settings: Settings, cores: lis
     return len(rows) / sum(1.0 / row["steps_per_second"] for row in rows)
 
 
+def unconnected_runs(number: int, arguments: list[str], settings: Settings, cores: list[int], updates: int) -> float:
+    """Environment steps per second of several runs at once that know nothing of each other.
+
+    Only updates during which all of them train are counted.
+
+    Args:
+        number: Number of runs, each of one rank.
+        arguments: Arguments of `endless-train` for one rank.
+        settings: What they mean.
+        cores: The cores of all runs, as many for each as its agent has threads.
+        updates: Timed updates of each run.
+    """
+    each = settings.threads
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder, runs = Path(name), []
+        for run in range(number):
+            program = [sys.executable, "-m", "endless_gym.agents.train", *arguments, "--run", str(folder / f"{run}")]
+            log = stack.enter_context((folder / f"{run}.log").open("w"))
+            with bound(cores[run * each :][:each]):
+                process = subprocess.Popen(
+                    [*program, "--ppo.updates", "1000000", "--no-stop-when-learnt"],
+                    env=os.environ | {"OMP_NUM_THREADS": str(each), "CUDA_VISIBLE_DEVICES": ""},
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                )
+            stack.callback(_end, process)
+            runs.append((folder / f"{run}", process))
+
+        def rows_when_all_have(least: list[int]) -> list[list[dict[str, Any]]]:
+            while True:
+                ended = [(run, process.returncode) for run, process in runs if process.poll() is not None]
+                if ended:
+                    run, status = ended[0]
+                    text = run.with_suffix(".log").read_text()[-3000:]
+                    raise SystemExit(f"an unconnected run ended with status {status}:\n{text}")
+                rows = [read_progress(run) if (run / PROGRESS).exists() else [] for run, _ in runs]
+                if all(len(found) >= wanted for found, wanted in zip(rows, least, strict=True)):
+                    return rows
+                time.sleep(0.05)
+
+        # The update after these began while another run may still have started.
+        begun = [len(rows) + 1 for rows in rows_when_all_have([1] * number)]
+        rows = rows_when_all_have([first + updates for first in begun])
+        timed = [found[first:][:updates] for found, first in zip(rows, begun, strict=True)]
+    return sum(updates / sum(1.0 / row["steps_per_second"] for row in found) for found in timed)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a run after its update, as Ctrl-C does."""
+    process.send_signal(signal.SIGINT)
+    process.wait()
+
+
 def gpu_rank(rank: RankCosts, settings: Settings, step: float, given: argparse.Namespace) -> RankCosts:
     """The costs of a rank with a GPU, from the given times; environments, sequences and gradients are those measured."""
     groups, ppo = settings.environment.groups, settings.ppo
@@ -312,32 +369,72 @@ def parser() -> argparse.ArgumentParser:
 def check(
     rank: RankCosts, link: Link, cores: list[int], arguments: list[str], settings: Settings, given: argparse.Namespace
 ) -> dict[str, Any]:
-    """Real runs beside their predictions, and the weak scaling of two ranks."""
-    rows, shown = [], Table(title="Training by torchrun on this machine", title_justify="left")
-    for name in ("ranks", "cores", "measured steps/s", "predicted steps/s", "measured / predicted"):
-        shown.add_column(name, justify="right")
+    """Real runs beside their predictions, and the weak scaling of two ranks beside that of two unconnected runs.
+
+    Returns:
+        `rows`, one for each number of ranks; `goal`; and `None` where two ranks have no cores of their own:
+
+        - `weak_scaling`: steps per second of two ranks, as a multiple of those of one.
+        - `unconnected`: the same of two runs at once that are not connected.
+        - `connected_share`: the first divided by the second. What is missing to 1 is communication and waiting.
+    """
+    rows = []
     for ranks in MEASURED:
         measured = train_ranks(ranks, arguments, settings, cores, given.updates)
         cluster = Cluster(within=link, ranks_per_machine=ranks, cores=len(cores))
         predicted = predict(rank, cluster, ranks, given.seed).steps_per_second
         used = min(len(cores), ranks * rank.cores)
         rows.append({"ranks": ranks, "cores": used, "measured": measured, "predicted": predicted})
+    scaled = unconnected = None
+    if len(cores) >= 2 * rank.cores:
+        alone, together = (row["measured"] for row in rows[:2])
+        scaled = together / alone
+        unconnected = unconnected_runs(2, arguments, settings, cores, given.updates) / alone
+    return {
+        "rows": rows,
+        "weak_scaling": scaled,
+        "unconnected": unconnected,
+        "connected_share": scaled / unconnected if scaled and unconnected else None,
+        "goal": GOAL,
+    }
+
+
+def print_check(console: Console, found: dict[str, Any], cores: int, each: int) -> None:
+    """Print what `check` returned.
+
+    Args:
+        console: Where to.
+        found: What `check` returned.
+        cores: Cores of this machine.
+        each: Cores of each rank.
+    """
+    shown = Table(title="Training by torchrun on this machine", title_justify="left")
+    for name in ("ranks", "cores", "measured steps/s", "predicted steps/s", "measured / predicted"):
+        shown.add_column(name, justify="right")
+    for row in found["rows"]:
+        measured, predicted = row["measured"], row["predicted"]
         numbers = (f"{measured:,.0f}", f"{predicted:,.0f}", f"{measured / predicted:.2f}")
-        shown.add_row(str(ranks), str(used), *numbers)
-    console = Console(width=200)
+        shown.add_row(str(row["ranks"]), str(row["cores"]), *numbers)
     console.print(shown)
-    ratio = None
-    if len(cores) < 2 * rank.cores:
-        console.print(
-            f"weak scaling: not measured, since two ranks need {2 * rank.cores} cores, and there are {len(cores)}"
-        )
-    else:
-        ratio = rows[1]["measured"] / rows[0]["measured"]
-        each = "one core" if rank.cores == 1 else f"{rank.cores} cores"
-        console.print(
-            f"weak scaling: two ranks with {each} each make {ratio:.2f} times the steps of one (goal: {GOAL})"
-        )
-    return {"rows": rows, "weak_scaling": ratio, "goal": GOAL}
+    if found["weak_scaling"] is None:
+        console.print(f"weak scaling: not measured, since two ranks need {2 * each} cores, and there are {cores}")
+        return
+    owned = "one core" if each == 1 else f"{each} cores"
+    share, ratio = found["connected_share"], found["weak_scaling"]
+    console.print(
+        f"weak scaling: two ranks with {owned} each make {ratio:.2f} times the steps of one (goal: {found['goal']})"
+    )
+    lost = f"communication and waiting cost {1 - share:.0%}" if share < 1 else "no cost of communication was found"
+    console.print(f"two unconnected runs: {found['unconnected']:.2f} times; two ranks make {share:.0%} of that: {lost}")
+
+
+def as_json(value: Any) -> Any:
+    """A value with `None` for numbers that JSON does not have, such as the bandwidth of a link that costs nothing measurable."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: as_json(part) for key, part in value.items()}
+    return [as_json(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def main() -> None:
@@ -404,9 +501,10 @@ def main() -> None:
     }
     if given.check:
         report["check"] = check(rank, link, cores, arguments, settings, given)
+        print_check(console, report["check"], len(cores), given.cores)
     report["load"] = os.getloadavg()[0]
     if given.json:
-        given.json.write_text(json.dumps(report, indent=1) + "\n")
+        given.json.write_text(json.dumps(as_json(report), indent=1, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -251,6 +251,22 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed[NAMES.index("endless")]["runs"][0]["updates"] == 50_000
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--ray", "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"),
+        ("--ray auto --job-cpus 0", "--job-cpus must be 1 or more, got 0"),
+        ("--ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
+    ],
+)
+def test_errors_of_ray(
+    arguments: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["endless-reproduce", "endless", *arguments.split()])
+    assert reproduce.main() == 1
+    assert re.match(f"endless-reproduce: {message}", capsys.readouterr().err)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["kill", "interrupt"])
 def test_stopped_run_equals_an_uninterrupted_one(how: str, tmp_path: Path) -> None:

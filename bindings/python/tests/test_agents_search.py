@@ -19,7 +19,7 @@ import pytest
 from agents_helpers import settings
 from rich.console import Console
 
-from endless_gym.agents import search, search_workers
+from endless_gym.agents import search, search_ray, search_workers
 from endless_gym.agents.command import load_checkpoint
 from endless_gym.agents.logs import read_progress
 from endless_gym.agents.search import parse
@@ -99,6 +99,59 @@ def test_search_from_start_to_end(tmp_path: Path) -> None:
         assert json.loads(lines[-1])["episode/reward"] == trial.value
     with pytest.raises(ValueError, match="started with other settings"):
         Trials(small(tmp_path, parameters=("ppo.minibatches",)), QUIET)
+
+
+def test_the_best_settings_are_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has the old file open reads it to its end."""
+
+    def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
+        watch(given.ppo.updates, {"episode/reward": float(given.ppo.epochs)})
+
+    monkeypatch.setattr(search, "train", played)
+    trials = Trials(small(tmp_path, stage="single"), QUIET)
+    first = trials.begin()
+    assert first is not None
+    search.run_trial(first, first.settings)
+    trials.report()
+    with (tmp_path / "best.json").open() as old:
+        search.run_trials(trials)
+        trials.report()
+        assert json.loads(old.read())["reward"] == 3.0
+    assert json.loads((tmp_path / "best.json").read_text())["reward"] == 4.0
+    assert {file.name for file in tmp_path.iterdir()} == {"best.json", "locks", "study.db"}
+
+
+def test_no_trial_is_begun_after_the_time_limit(tmp_path: Path) -> None:
+    trials = Trials(small(tmp_path, stage="single", minutes=1e-9), QUIET)
+    search.run_trials(trials)
+    assert states(trials) == []
+    assert Trials(small(tmp_path, stage="single"), QUIET).remaining() == (0, 3)
+
+
+def test_a_failed_trial_is_resumed_by_the_next_call_only(tmp_path: Path) -> None:
+    """Ray reports a trial that failed too often. One that ran out of memory is never resumed."""
+    first = search_ray._Study(Trials(small(tmp_path, trials=2, stage="combinations"), QUIET))
+    configuration = first.begin("a")
+    assert configuration is not None
+    run = configuration["settings"]["run"]
+    first.end("a", is_error=True)
+    assert first.begin("b") is not None
+    first._ended["b"] = "exhausted"
+    first.end("b", is_error=False)
+    # The failed trial counts as one of the combinations.
+    assert first.begin("c") is None
+    assert first.failed == [0]
+
+    trials = Trials(small(tmp_path, trials=2, stage="combinations"), QUIET)
+    assert trials.remaining() == (0, 1)
+    second = search_ray._Study(trials)
+    resumed = second.begin("d")
+    assert resumed is not None
+    assert resumed["settings"]["run"] == run
+    second.observe("d", {"update": 3, "reward": 1.0, "end": "done"})
+    second.end("d", is_error=False)
+    assert second.begin("e") is None
+    assert states(trials) == ["FAIL", "FAIL", "COMPLETE"]
 
 
 @pytest.mark.parametrize("with_checkpoint", [True, False])
@@ -217,6 +270,28 @@ def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -
     assert len(before) == 3
     assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
     assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
+
+
+def killed_and_replaced(trials: Trials, share: search_workers.Share | None) -> None:
+    """The work of a worker that is killed, once."""
+    with (trials.folder / "ends").open("a") as ends:
+        print(repr(trials.end), file=ends)
+    if len((trials.folder / "ends").read_text().splitlines()) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_the_time_limit_of_a_replaced_worker_is_that_of_the_search(tmp_path: Path) -> None:
+    trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
+    search_workers.run_workers(trials, killed_and_replaced)
+    assert (tmp_path / "ends").read_text() == f"{trials.end!r}\n" * 2
+
+
+def test_a_worker_is_not_replaced_after_the_time_limit(tmp_path: Path) -> None:
+    trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
+    trials.end = time.monotonic()
+    with pytest.raises(ValueError, match="1 of 1 workers failed; repeat the command"):
+        search_workers.run_workers(trials, killed_and_replaced)
+    assert len((tmp_path / "ends").read_text().splitlines()) == 1
 
 
 def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:

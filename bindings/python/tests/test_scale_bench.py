@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
+import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 import pytest
+from rich.console import Console
+
+from endless_gym.agents.logs import read_progress
+from endless_gym.agents.settings import PRESETS
+from endless_gym.agents.train import parse
 
 BENCHES = Path(__file__).parents[3] / "benches"
 sys.path.insert(0, str(BENCHES))
 
+import scale  # noqa: E402
 from scale_model import (  # noqa: E402
     EXCHANGES,
     Cluster,
@@ -151,6 +161,85 @@ def test_uneven_minibatches_are_those_of_a_shuffle() -> None:
         for part in generator.permutation(owner).reshape(4, -1)
     ]
     assert abs(uneven - (4 * np.mean(largest) - 1)) < 0.01
+
+
+def checked(monkeypatch: pytest.MonkeyPatch, cores: list[int], unconnected: float) -> dict[str, Any]:
+    """What `--check` finds if runs of torchrun make these steps per second."""
+    measured = {1: 10_000.0, 2: 15_000.0, 4: 14_000.0}
+    monkeypatch.setattr(scale, "train_ranks", lambda ranks, *_: measured[ranks])
+    monkeypatch.setattr(scale, "unconnected_runs", lambda number, *_: {2: unconnected}[number])
+    given = argparse.Namespace(updates=1, seed=0)
+    return scale.check(RANK, Link(1e-4, 1e9), cores, [], PRESETS["quick"], given)
+
+
+def printed(found: dict[str, Any], cores: int) -> str:
+    console = Console(width=200)
+    with console.capture() as capture:
+        scale.print_check(console, found, cores, 1)
+    return capture.get()
+
+
+def test_the_check_divides_the_loss_between_the_machine_and_communication(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = checked(monkeypatch, [0, 1], 18_750.0)
+    assert (found["weak_scaling"], found["unconnected"], found["connected_share"]) == (1.5, 1.875, 0.8)
+    assert [(row["ranks"], row["cores"], row["measured"]) for row in found["rows"]] == [
+        (1, 1, 10_000.0),
+        (2, 2, 15_000.0),
+        (4, 2, 14_000.0),
+    ]
+    text = printed(found, 2)
+    assert "two ranks with one core each make 1.50 times the steps of one (goal: 1.7)" in text
+    assert "two unconnected runs: 1.88 times; two ranks make 80% of that: communication and waiting cost 20%" in text
+    # Other processes may have disturbed the unconnected runs more.
+    noisy = printed(checked(monkeypatch, [0, 1], 12_000.0), 2)
+    assert "two unconnected runs: 1.20 times; two ranks make 125% of that: no cost of communication was found" in noisy
+
+
+def test_without_a_core_for_each_of_two_ranks_weak_scaling_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = checked(monkeypatch, [0], 1.0)
+    assert [found[name] for name in ("weak_scaling", "unconnected", "connected_share")] == [None] * 3
+    text = printed(found, 1)
+    assert "weak scaling: not measured, since two ranks need 2 cores, and there are 1" in text
+    assert "unconnected" not in text
+
+
+def test_the_report_has_only_numbers_of_json() -> None:
+    link = fitted_link(2, 1e-3, 0.9e-3, 1000)
+    report = scale.as_json({"link": asdict(link), "times": [1.5, math.nan, (-math.inf,)], 1: "inf", "none": None})
+    assert report == {
+        "link": {"latency": 0.0005, "bandwidth": None},
+        "times": [1.5, None, [None]],
+        1: "inf",
+        "none": None,
+    }
+    json.dumps(report, allow_nan=False)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+def test_unconnected_runs_train_at_once_on_cores_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = ["--environment.num-envs", "4", "--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.epochs", "1"]
+    arguments = ["--preset", "quick", "--env", "MortarMayhem-Grid-v0", "--device", "cpu", "--threads", "1", *sizes]
+    cores, seen = sorted(os.sched_getaffinity(0))[:2], {}
+
+    def reading(run: Path) -> list[dict[str, Any]]:
+        for child in psutil.Process().children():
+            if "endless_gym.agents.train" in child.cmdline():
+                seen[child.pid] = child.cpu_affinity()
+        return read_progress(run)
+
+    monkeypatch.setattr(scale, "read_progress", reading)
+    assert scale.unconnected_runs(2, arguments, parse(arguments), cores, 2) > 0
+    assert sorted(seen.values()) == [[core] for core in cores]
+    assert not any(psutil.pid_exists(pid) for pid in seen)
+    assert sorted(os.sched_getaffinity(0))[:2] == cores
+
+
+@pytest.mark.slow
+def test_an_unconnected_run_that_fails_is_an_error() -> None:
+    arguments = ["--preset", "quick", "--threads", "1"]
+    with pytest.raises(SystemExit, match=r"an unconnected run ended with status 1:\n(.|\n)*--ppo.epochs"):
+        scale.unconnected_runs(1, [*arguments, "--ppo.epochs", "0"], parse(arguments), [0], 1)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ what is done and resumes what was interrupted.
 endless-reproduce --list                       # the experiments
 endless-reproduce endless --scale 0.01         # a small version
 endless-reproduce endless --jobs 8             # the experiment, eight runs at a time
+endless-reproduce endless --ray auto           # on the machines of a Ray cluster
 ```
 """
 
@@ -14,7 +15,9 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -22,9 +25,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from endless_gym.agents import command
-from endless_gym.agents.experiments import definitions, planning, running
+from endless_gym.agents import command, on_ray
+from endless_gym.agents.experiments import definitions, planning, running, running_ray
 from endless_gym.agents.experiments.definitions import Experiment
+from endless_gym.agents.experiments.planning import Job
 
 
 @dataclass(frozen=True)
@@ -51,13 +55,21 @@ class ReproduceArguments:
     seeds: tuple[int, ...] = ()
     """seeds of the runs; by default 1 to the number that the paper uses, 5 for most"""
     jobs: int = 0
-    """runs side by side; 0 for one per GPU, or without GPUs one per core"""
+    """runs side by side; 0 for one per GPU, or without GPUs one per core. With --ray for all machines; 0 for as many as the
+    resources permit"""
     device: str = "auto"
     """`cpu`, `cuda`, ...; `auto` for CUDA if available, else the CPU. Each run sees one GPU"""
     nice: int = 19
     """added to the niceness of the runs, 0 to 19; 19 leaves the cores to all other processes"""
     keep_checkpoints: bool = False
     """keep the checkpoints of evaluated runs, some gigabytes each, and not only the last one"""
+    ray: str = ""
+    """run on Ray. The flag alone starts Ray on this machine; with an address the runs are on that cluster, whose machines must
+    share the folder --out"""
+    job_cpus: int = 1
+    """with --ray: CPU cores of a run"""
+    job_gpus: float | None = None
+    """with --ray: GPUs of a run; by default 1 if the cluster has any and the device is not `cpu`"""
 
 
 def listed(experiments: list[Experiment], scale: float) -> Table:
@@ -73,6 +85,49 @@ def listed(experiments: list[Experiment], scale: float) -> Table:
         count = f"{len(experiment.runs)} x {values['seeds']}"
         table.add_row(experiment.name, experiment.section, count, span if updates[-1] else "", experiment.title)
     return table
+
+
+def machine_of(arguments: ReproduceArguments) -> running.Machine:
+    """What the runs are started on; with `--ray` the number of jobs is that of this machine until Ray is connected.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    if not arguments.ray:
+        return running.machine(arguments.jobs, arguments.device, arguments.nice)
+    if arguments.job_cpus < 1:
+        raise ValueError(f"--job-cpus must be 1 or more, got {arguments.job_cpus}")
+    if arguments.job_gpus is not None and arguments.job_gpus < 0:
+        raise ValueError(f"--job-gpus must be 0 or more, got {arguments.job_gpus}")
+    here = running.machine(arguments.jobs, "cpu", arguments.nice)
+    # Ray gives each run its GPUs.
+    return replace(here, device=arguments.device, gpus=(), job_cores=arguments.job_cpus)
+
+
+def run(
+    planned: list[Job],
+    machine: running.Machine,
+    runner: Callable[[running.Machine, Callable[[str], None], bool], running.Runner],
+    say: Callable[[str], None],
+    keep_checkpoints: bool,
+) -> running.Outcome:
+    """Run what is left of the jobs.
+
+    Args:
+        planned: The jobs.
+        machine: What they run on.
+        runner: Makes a runner.
+        say: Called with each line of progress.
+        keep_checkpoints: As for `Runner`.
+    """
+    # Speeds are measured one at a time.
+    alone = [job for job in planned if job.experiment.kind == "simulation-speed"]
+    outcome = runner(machine, say, keep_checkpoints).run([job for job in planned if job not in alone])
+    if alone and not outcome.stopped:
+        speeds = runner(replace(machine, jobs=1), say, keep_checkpoints).run(alone)
+        outcome.failed += speeds.failed
+        outcome.stopped = speeds.stopped
+    return outcome
 
 
 def execute(arguments: ReproduceArguments) -> None:
@@ -94,8 +149,11 @@ def execute(arguments: ReproduceArguments) -> None:
             # Names and numbers are whole also where the terminal, or a pipe, is narrow.
             Console(highlight=False, width=max(console.width, 120)).print(listed(experiments, scale))
         return
-    machine = running.machine(arguments.jobs, arguments.device, arguments.nice)
-    parts = {one.name: planning.jobs(one, arguments.out, scale, arguments.seeds) for one in experiments}
+    machine, out = machine_of(arguments), arguments.out
+    if arguments.ray:
+        on_ray.check_installed()
+        out = out.resolve()  # The other processes have other working directories.
+    parts = {one.name: planning.jobs(one, out, scale, arguments.seeds) for one in experiments}
     # Runs that several experiments share are run once.
     planned = list({job.folder: job for jobs in parts.values() for job in jobs}.values())
     planning.check_folders(planned)
@@ -108,27 +166,28 @@ def execute(arguments: ReproduceArguments) -> None:
         for job in planned:
             of = f", update {min(job.updates_done(), job.updates)} of {job.updates}" if job.updates else ""
             console.print(f"{job.state():<11}  {job.title}{of}", soft_wrap=True)
-    console.print(f"{running.left(planned, machine.jobs)}, {machine.jobs} at a time", soft_wrap=True)
+    side_by_side = "on Ray" if arguments.ray else f"{machine.jobs} at a time"
+    console.print(f"{running.left(planned, machine.jobs)}, {side_by_side}", soft_wrap=True)
     if arguments.status:
         return
     outcome = running.Outcome()
     if not arguments.report:
         say = lambda line: console.print(line, soft_wrap=True)  # noqa: E731
-        # Speeds are measured one at a time.
-        alone = [job for job in planned if job.experiment.kind == "simulation-speed"]
-        outcome = running.Runner(machine, say, arguments.keep_checkpoints).run(
-            [job for job in planned if job not in alone]
-        )
-        if alone and not outcome.stopped:
-            speeds = running.Runner(replace(machine, jobs=1), say).run(alone)
-            outcome.failed += speeds.failed
-            outcome.stopped = speeds.stopped
+        if arguments.ray and any(job.state() != "done" for job in planned):
+            with on_ray.connected(arguments.ray):
+                gpus = on_ray.gpus(arguments.job_gpus, arguments.device)
+                machine = replace(machine, jobs=arguments.jobs or running_ray.jobs_that_fit(arguments.job_cpus, gpus))
+                outcome = run(
+                    planned, machine, partial(running_ray.RayRunner, gpus=gpus), say, arguments.keep_checkpoints
+                )
+        else:
+            outcome = run(planned, machine, running.Runner, say, arguments.keep_checkpoints)
     if outcome.stopped:
         console.print(f"{running.left(planned, machine.jobs)}; repeat the command to continue", soft_wrap=True)
         raise KeyboardInterrupt
     from endless_gym.agents.experiments import report
 
-    folder = planning.folder_of(arguments.out, scale)
+    folder = planning.folder_of(out, scale)
     for experiment in experiments:
         written = report.write(parts[experiment.name], folder / experiment.name, scale)
         console.print(f"{written}, with its figures and tables", soft_wrap=True)
@@ -139,8 +198,9 @@ def execute(arguments: ReproduceArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-reproduce`; returns the exit status."""
+    given = on_ray.with_address(sys.argv[1:])
     arguments = tyro.cli(
-        ReproduceArguments, prog="endless-reproduce", description=command.description(__doc__), args=sys.argv[1:]
+        ReproduceArguments, prog="endless-reproduce", description=command.description(__doc__), args=given
     )
     return command.run("endless-reproduce", lambda: execute(arguments))
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import sys
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,7 +27,7 @@ import torch
 import tyro
 from rich.console import Console
 
-from endless_gym.agents import command, search_ray, search_workers
+from endless_gym.agents import command, on_ray, search_ray, search_workers
 from endless_gym.agents.search_study import SearchArguments, Trial, Trials, resumable
 from endless_gym.agents.settings import PRESETS, Settings
 from endless_gym.agents.train import train
@@ -77,9 +76,7 @@ def run_trials(trials: Trials, given: search_workers.Share | None = None) -> Non
         trials: The trials.
         given: What this process may use of the machine; None for all of it.
     """
-    minutes = trials.arguments.minutes
-    end = time.monotonic() + 60 * minutes if minutes else float("inf")
-    while time.monotonic() < end and (trial := trials.begin()) is not None:
+    while (trial := trials.begin()) is not None:
         if given is None:
             run_trial(trial, trial.settings)
         else:
@@ -91,7 +88,8 @@ def execute(arguments: SearchArguments) -> None:
     """Run the search, and report the best settings so far, also if it is interrupted."""
     arguments = arguments.validated()
     if arguments.ray:
-        search_ray.check_installed()
+        # Tune imports pyarrow, which Ray alone does not install.
+        on_ray.check_installed("pyarrow")
     trials = Trials(arguments, Console(highlight=False))
     done, left = trials.remaining()
     trials.say(f"{done} trials done, {left} remaining, in {trials.folder}; Ctrl-C stops the search")
@@ -115,12 +113,8 @@ def parse(arguments: list[str]) -> SearchArguments:
     preset = chosen.parse_known_args(arguments)[0].preset
     default = SearchArguments(settings=PRESETS.get(preset, PRESETS["paper"]))
     text = command.description(__doc__)
-    # `--ray` may be given without an address.
-    if "--ray" in arguments:
-        after = arguments.index("--ray") + 1
-        if after == len(arguments) or arguments[after].startswith("-"):
-            arguments = [*arguments[:after], "local", *arguments[after:]]
-    return tyro.cli(SearchArguments, prog="endless-search", description=text, args=arguments, default=default)
+    given = on_ray.with_address(arguments)
+    return tyro.cli(SearchArguments, prog="endless-search", description=text, args=given, default=default)
 
 
 def main() -> int:

@@ -6,7 +6,6 @@ the process of the search, as it does without Ray. The same search can therefore
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -15,6 +14,7 @@ from typing import Any
 
 import torch
 
+from endless_gym.agents import on_ray
 from endless_gym.agents.search_study import Trial, Trials, resumable
 from endless_gym.agents.search_workers import Share, output_of
 from endless_gym.agents.settings import from_dict, to_dict
@@ -24,20 +24,6 @@ Trainer = Callable[..., Path]
 
 #: Name of the folder with Tune's own files, in the folder of the search.
 TUNE = "tune"
-#: Bytes of a local Ray's object store. The trials share only a few numbers.
-_STORE = 100_000_000
-
-
-def check_installed() -> None:
-    """Check that Ray Tune can be imported.
-
-    Raises:
-        ValueError: Ray is not installed.
-    """
-    # Tune imports pyarrow, which Ray alone does not install.
-    for name in ("ray", "pyarrow"):
-        if importlib.util.find_spec(name) is None:
-            raise ValueError(f"--ray needs Ray Tune, but {name} is not installed: pip install 'ray[tune]'")
 
 
 def run_on_ray(trials: Trials, trainer: Trainer) -> None:
@@ -51,43 +37,26 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
         KeyboardInterrupt: The search was interrupted. The trials resume from their last checkpoints.
         ValueError: There is no such cluster, or a trial failed too often.
     """
-    import ray
-
     arguments = trials.arguments
     # The runs log for themselves. Tune would take Ctrl-C for the end of the search.
     quiet = {"TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1", "TUNE_DISABLE_SIGINT_HANDLER": "1", "RAY_AIR_NEW_OUTPUT": "0"}
     for name, value in quiet.items():
         os.environ.setdefault(name, value)
-    is_running = ray.is_initialized()
-    if not is_running:
-        given: dict[str, Any] = {"address": arguments.ray, "log_to_driver": False}
-        if arguments.ray == "local":
-            given |= {"include_dashboard": False, "object_store_memory": _STORE}
-        try:
-            ray.init(**given)
-        except ConnectionError as error:
-            raise ValueError(f"--ray must be the address of a Ray cluster, got `{arguments.ray}`: {error}") from None
     study = _Study(trials)
     try:
-        _tune(study, trainer, _gpus(trials))
+        # Ray would kill the engine together with its trainer. Nobody would remove their shared memory then, which the engine
+        # does when its trainer has ended, before it ends itself.
+        with on_ray.connected(arguments.ray, spare_children=True):
+            _tune(study, trainer, on_ray.gpus(arguments.trial_gpus, arguments.settings.device))
     finally:
-        if not is_running:
-            ray.shutdown()
         # Only now, since another process may begin the trials from here on.
         study.interrupt()
     if study.failed:
         numbers = ", ".join(map(str, study.failed))
         raise ValueError(
-            f"trials {numbers} failed more than {arguments.max_failures} times; see the logs in {trials.folder}"
+            f"trials {numbers} failed more than {arguments.max_failures} times; see the logs in {trials.folder}, and repeat the "
+            "command to resume them"
         )
-
-
-def _gpus(trials: Trials) -> float:
-    import ray
-
-    if trials.arguments.trial_gpus is not None:
-        return trials.arguments.trial_gpus
-    return 1.0 if trials.arguments.settings.device != "cpu" and ray.cluster_resources().get("GPU") else 0.0
 
 
 def _tune(study: _Study, trainer: Trainer, gpus: float) -> None:
@@ -185,8 +154,6 @@ class _Study:
         self.failed: list[int] = []
         self._active: dict[str, Trial] = {}
         self._ended: dict[str, str] = {}
-        minutes = trials.arguments.minutes
-        self._end = time.monotonic() + 60 * minutes if minutes else float("inf")
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles what it is given, to restore a search from its own files. This one is restored from the study.
@@ -194,7 +161,7 @@ class _Study:
 
     def begin(self, tune_id: str) -> dict[str, Any] | None:
         """The configuration of the next trial; None if none is left to begin."""
-        trial = self.trials.begin() if time.monotonic() < self._end else None
+        trial = self.trials.begin()
         if trial is None:
             return None
         self._active[tune_id] = trial
@@ -213,7 +180,7 @@ class _Study:
         trial, ended = self._active.pop(tune_id), self._ended.pop(tune_id, "")
         if is_error:
             self.failed.append(trial.number)
-            trial.fail(f"failed; its log is {trial.settings.run}.log")
+            trial.postpone(f"failed; its log is {trial.settings.run}.log")
         elif ended == "exhausted":
             trial.fail("ran out of GPU memory")
         elif trial.pruned or ended:

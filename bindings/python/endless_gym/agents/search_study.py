@@ -11,7 +11,9 @@ import contextlib
 import fcntl
 import json
 import logging
+import os
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,12 +64,13 @@ class SearchArguments:
     period: int = 50
     """updates between two pruning decisions"""
     minutes: float = 0.0
-    """start no more trials after this time; 0 for no limit"""
+    """start no more trials after this time, nor replace workers; 0 for no limit"""
     workers: int = 0
     """trials that run at a time on this machine, each in a process of its own; 0 for one, in this process. With --ray the limit
     for all machines; 0 for as many as the resources permit"""
     max_failures: int = 3
-    """how often the search replaces a worker whose process was killed; with --ray, how often it resumes a failed trial"""
+    """how often the search replaces a worker whose process was killed; with --ray, how often it resumes a failed trial. One that
+    failed more often is resumed when the command is repeated"""
     ray: str = ""
     """run the trials on Ray Tune. The flag alone starts Ray on this machine; with an address the trials run on that cluster,
     whose machines must share the folder of the search"""
@@ -178,8 +181,14 @@ class Trial:
         """The run was interrupted: another trial resumes it."""
         self._tell("FAIL")
 
+    def postpone(self, reason: str) -> None:
+        """The run failed: another trial resumes it, but not in this call of the search, in which it would fail again."""
+        self._trials.say(f"trial {self.number} {reason}")
+        self._trials.postponed.add(self.number)
+        self._tell("FAIL")
+
     def fail(self, reason: str) -> None:
-        """The run failed in a way that would repeat itself: it is not resumed."""
+        """The run failed in a way that would repeat itself: it is never resumed."""
         self._trials.say(f"trial {self.number} {reason}")
         self._asked.set_user_attr(_FAILED, True)
         self._tell("FAIL")
@@ -201,14 +210,17 @@ class Trials:
         folder: Folder of the search.
         space: The search space.
         study: The Optuna study.
+        end: When no more trials are begun, in the time of `time.monotonic`; infinity for no limit.
+        postponed: Numbers of the trials that failed and that only a later call of the search resumes.
     """
 
-    def __init__(self, arguments: SearchArguments, console: Console) -> None:
+    def __init__(self, arguments: SearchArguments, console: Console, end: float | None = None) -> None:
         """Open the study of the folder, or create it.
 
         Args:
             arguments: The arguments, validated.
             console: Where messages are printed.
+            end: The `end` of the search that this process works for; by default `arguments.minutes` from now.
 
         Raises:
             ValueError: The study was created with other settings or parameters.
@@ -217,6 +229,9 @@ class Trials:
 
         optuna.logging.set_verbosity(logging.ERROR)
         self.arguments, self.console, self.folder = arguments, console, arguments.directory()
+        limit = 60 * arguments.minutes if arguments.minutes else float("inf")
+        self.end = time.monotonic() + limit if end is None else end
+        self.postponed: set[int] = set()
         self.space: Space = space(arguments.settings, arguments.parameters)
         (self.folder / LOCKS).mkdir(parents=True, exist_ok=True)
         with self._locked():
@@ -252,10 +267,12 @@ class Trials:
         """Begin the next trial: one that was interrupted, a single change, or a combination.
 
         Returns:
-            The trial; None if none is left to begin.
+            The trial; None if none is left to begin, or the time is over.
         """
         import optuna
 
+        if time.monotonic() >= self.end:
+            return None
         with self._locked():
             self._enqueue()
             while self._left():
@@ -318,7 +335,8 @@ class Trials:
         if self.arguments.stage == "single":
             return waiting
         combinations = sum(
-            _SINGLE not in trial.user_attrs and (trial.state.name != "FAIL" or _FAILED in trial.user_attrs)
+            _SINGLE not in trial.user_attrs
+            and (trial.state.name != "FAIL" or _FAILED in trial.user_attrs or trial.number in self.postponed)
             for trial in self.study.trials
         )
         return waiting + max(0, self.arguments.trials - combinations)
@@ -335,7 +353,8 @@ class Trials:
         for trial in self._in_states("FAIL"):
             folder = self.run_folder(trial.number, trial.user_attrs)
             # A trial that ran out of GPU memory would fail again.
-            if str(trial.number) not in resumed and trial.params and not trial.user_attrs.get(_FAILED):
+            ended = trial.user_attrs.get(_FAILED) or trial.number in self.postponed
+            if str(trial.number) not in resumed and trial.params and not ended:
                 attributes = {_RESUMES: str(trial.number), _FOLDER: folder.name}
                 if _SINGLE in trial.user_attrs:
                     attributes[_SINGLE] = trial.user_attrs[_SINGLE]
@@ -369,7 +388,15 @@ class Trials:
         return " ".join(flags)
 
     def report(self) -> None:
-        """Write the best settings and all trials to `best.json`, and print the ten best; does nothing if no trial is complete."""
+        """Write the best settings and all trials to `best.json`, and print the ten best; does nothing if no trial is complete.
+
+        The file is replaced as a whole: readers find all of the old one or all of the new one.
+        """
+        # Another process of the search writes the same files.
+        with self._locked():
+            self._report()
+
+    def _report(self) -> None:
         from optuna.trial import TrialState
 
         done = self.study.get_trials(states=(TrialState.COMPLETE,))
@@ -389,7 +416,9 @@ class Trials:
             for trial in self.study.trials
         ]
         found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
-        (self.folder / BEST).write_text(json.dumps(found, indent=1) + "\n")
+        temporary = self.folder / f"{BEST}.new"
+        temporary.write_text(json.dumps(found, indent=1) + "\n")
+        os.replace(temporary, self.folder / BEST)
         settings, changed = self.arguments.settings, self.changed(done[0].params)
         start = f"--env {settings.env} --preset {settings.preset}"
         start += "" if "--agent" in changed else f" --agent {settings.agent}"

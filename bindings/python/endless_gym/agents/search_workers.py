@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -74,7 +75,9 @@ def run_workers(trials: Trials, work: Work) -> None:
     stopped, replaced, failed = False, 0, 0
 
     def start(slot: int) -> None:
-        process = context.Process(target=_worker, args=(arguments, machine, slot, work), name=f"endless-search-{slot}")
+        process = context.Process(
+            target=_worker, args=(arguments, trials.end, machine, slot, work), name=f"endless-search-{slot}"
+        )
         process.start()
         alive[slot] = process
         if stopped:  # while it was being started, so that `stop` did not know it
@@ -102,7 +105,8 @@ def run_workers(trials: Trials, work: Work) -> None:
                 del alive[slot]
                 status: int = process.exitcode
                 process.close()
-                if status < 0 and not stopped and replaced < arguments.max_failures:
+                in_time = time.monotonic() < trials.end
+                if status < 0 and not stopped and in_time and replaced < arguments.max_failures:
                     replaced += 1
                     trials.say(f"a worker was killed by signal {-status}; its trial is resumed")
                     start(slot)
@@ -119,11 +123,11 @@ def run_workers(trials: Trials, work: Work) -> None:
         raise ValueError(f"{failed} of {arguments.workers} workers failed; repeat the command to resume their trials")
 
 
-def _worker(arguments: SearchArguments, machine: running.Machine, slot: int, work: Work) -> None:
-    """The main function of a worker."""
+def _worker(arguments: SearchArguments, end: float, machine: running.Machine, slot: int, work: Work) -> None:
+    """The main function of a worker; `end` is that of the search, whose clock is that of all processes of the machine."""
     # The terminal's Ctrl-C reaches the search alone, which passes it on.
     os.setsid()
     if machine.gpus and arguments.settings.device in ("auto", "cuda"):
         os.environ["CUDA_VISIBLE_DEVICES"] = machine.gpus[slot % len(machine.gpus)]
-    trials = Trials(arguments, Console(highlight=False, file=sys.stdout))
+    trials = Trials(arguments, Console(highlight=False, file=sys.stdout), end)
     sys.exit(command.run("endless-search", lambda: work(trials, Share(machine.engine_threads))))

@@ -10,11 +10,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import IO, Protocol
 
 import torch
 
@@ -44,17 +44,19 @@ class Machine:
         gpus: Visible GPUs, as in `CUDA_VISIBLE_DEVICES`; empty for the CPU.
         device: Device of the agents, as for `endless-train`.
         nice: Added to the niceness of the processes, 0 to 19.
+        job_cores: Cores of each job; 0 for its share of the cores of this machine.
     """
 
     jobs: int
     gpus: tuple[str, ...] = ()
     device: str = "auto"
     nice: int = 19
+    job_cores: int = 0
 
     @property
     def engine_threads(self) -> int:
         """Threads per job that step the environments."""
-        return max(1, cores() // self.jobs)
+        return self.job_cores or max(1, cores() // self.jobs)
 
     def environment(self, slot: int) -> dict[str, str]:
         """Environment variables that the job in a slot gets in addition."""
@@ -91,6 +93,16 @@ def shown(command: Sequence[str], machine: Machine, slot: int = 0) -> str:
     return f"{variables} nice -n {machine.nice} {shlex.join(command)}"
 
 
+class Process(Protocol):
+    """The process of a job, here or on another machine."""
+
+    def poll(self) -> int | None:
+        """The exit status; None before the process has ended."""
+
+    def send_signal(self, sig: int, /) -> None:
+        """Send a signal, unless the process has ended."""
+
+
 @dataclass
 class _Active:
     """A job that is running in a slot."""
@@ -100,7 +112,7 @@ class _Active:
     lock: IO[str]
     commands: list[list[str]]
     log: IO[str]
-    process: subprocess.Popen[str]
+    process: Process
     begun: float = field(default_factory=time.monotonic)
 
 
@@ -155,7 +167,7 @@ class Runner:
                     self.say(left(planned, self.machine.jobs))
         finally:
             for active in self._active:
-                _signal(active.process, signal.SIGKILL)
+                active.process.send_signal(signal.SIGKILL)
             for number, handler in before.items():
                 signal.signal(number, handler)
         return self._outcome
@@ -187,20 +199,13 @@ class Runner:
         self._active.append(_Active(job, slot, lock, commands[1:], log, process))
         return True
 
-    def _spawn(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> subprocess.Popen[str]:
-        nice = ["nice", "-n", str(self.machine.nice)] if shutil.which("nice") else []
+    def _spawn(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> Process:
         print(f"$ {shlex.join(command)}", file=log, flush=True)
-        return subprocess.Popen(
-            [*nice, sys.executable, "-m", _MODULES[command[0]], *command[1:]],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env=os.environ | self.machine.environment(slot),
-            pass_fds=(lock.fileno(),),
-            # The terminal's Ctrl-C reaches this process alone, which passes it on.
-            start_new_session=True,
-        )
+        return self._begin(command, slot, lock, log)
+
+    def _begin(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> Process:
+        """Start a command as a process."""
+        return popen(command, self.machine.nice, self.machine.environment(slot), log, (lock.fileno(),))
 
     def _look(self, active: _Active) -> None:
         """Go on with a job whose process has ended."""
@@ -236,12 +241,32 @@ class Runner:
         self._outcome.stopped = True
         self.say(f"stopping {len(self._active)} jobs with checkpoints{again or '; press Ctrl-C again to stop at once'}")
         for active in self._active:
-            _signal(active.process, signal.SIGINT)
+            active.process.send_signal(signal.SIGINT)
 
 
-def _signal(process: subprocess.Popen[str], number: signal.Signals) -> None:
-    if process.poll() is None:
-        os.kill(process.pid, number)
+def popen(
+    command: Sequence[str], nice: int, environment: Mapping[str, str], log: IO[str], inherited: Sequence[int] = ()
+) -> subprocess.Popen[bytes]:
+    """Start a command of the package as a process of this machine.
+
+    Args:
+        command: A program of the package and its arguments.
+        nice: Added to the niceness, 0 to 19.
+        environment: Environment variables in addition.
+        log: Where its output goes.
+        inherited: File descriptors that it inherits.
+    """
+    lowered = ["nice", "-n", str(nice)] if shutil.which("nice") else []
+    return subprocess.Popen(
+        [*lowered, sys.executable, "-m", _MODULES[command[0]], *command[1:]],
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, **environment},
+        pass_fds=inherited,
+        # The terminal's Ctrl-C reaches this process alone, which passes it on.
+        start_new_session=True,
+    )
 
 
 def left(planned: Sequence[Job], side_by_side: int) -> str:
