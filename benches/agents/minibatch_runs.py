@@ -33,8 +33,8 @@ from endless_gym.agents.train import parse, train
 
 FOLDER = Path(__file__).parent / "minibatch_runs"
 LENGTHS = (1, 8, 16, 64)
-#: Flags of every run. Rollouts have 64 steps, so a run of 64 steps is the whole rollout of an environment, and a minibatch consists
-#: of 16 of them.
+#: Flags of every run. Rollouts have 64 steps, so a run of 64 steps is the whole rollout of an environment, and a minibatch
+#: consists of 16 of them.
 COMMON = (
     "--agent trxl --preset quick --no-stop-when-learnt --transformer.window 32 --threads 1 --environment.num-threads 1"
 )
@@ -73,7 +73,7 @@ TASKS = {
         "--env Endless-MysteryPath-v0",
         60,
         0.25,
-        "Endless Mystery Path: the path is found by trial and remembered; episodes of about 28 steps, no upper limit of the reward",
+        "Endless Mystery Path: the path is found by trial and remembered; episodes of about 28 steps; no largest reward",
     ),
 }
 

@@ -107,7 +107,7 @@ class Transformer:
     """weight initialisation of the blocks"""
     sequence_length: int = 1
     """number of consecutive steps that are shuffled together into minibatches. 1, as in the paper: single steps. With longer
-    sequences learning is faster and needs less memory, since overlapping attention windows share their tokens"""
+    sequences learning is faster and needs less memory, but the gradients of long episodes have more noise"""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ block's query comes from its current input, and its keys and values come from th
 belong to the same episode. A block is pre-norm: LayerNorm, attention, residual connection or gate, LayerNorm, fully connected
 layer with ReLU, residual connection or gate.
 
-Keys and values are projected once for each token, not once for each window that contains it:
+Keys and values are not projected once for each window that contains a token:
 
 * Acting: a KV cache holds the keys and values of the window, in a ring of fixed size (`transformer_cache`). Each step projects
   the newest token only, for all blocks at once. The cache is recomputed when the weights have changed.
