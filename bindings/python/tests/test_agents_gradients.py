@@ -57,6 +57,26 @@ def test_every_weight_gets_a_gradient(name: str) -> None:
     assert without_gradient(agent, segment, memory) == []
 
 
+@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
+    """Sequences of one step are computed in another way than longer ones."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
+    play(agent, memory, observed, ends(STEPS, ENVS))
+    reset_mask, *_ = play(agent, memory, observed, ends(STEPS, ENVS))
+    factor, gradients = torch.randn(STEPS * ENVS), []
+    for length in (1, 4, STEPS):
+        agent.memory.settings = replace(agent.memory.settings, sequence_length=length)
+        (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+        agent.zero_grad()
+        value = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch).value
+        (value * factor[minibatch.indices]).sum().backward()
+        gradients.append({key: weight.grad for key, weight in agent.named_parameters() if weight.grad is not None})
+    for other in gradients[1:]:
+        torch.testing.assert_close(other, gradients[0], rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("kind", ["gru", "trxl"])
 def test_every_weight_of_an_agent_with_all_heads_gets_a_gradient(kind: str) -> None:
     given = settings(kind)

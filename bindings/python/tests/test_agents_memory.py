@@ -29,6 +29,10 @@ KINDS = {
     "trxl, query encoding": ("trxl", transformer(query_encoding=True)),
     "trxl, short sequences": ("trxl", transformer(sequence_length=4)),
     "trxl, one sequence": ("trxl", transformer(sequence_length=64)),
+    "trxl, single steps": ("trxl", transformer(sequence_length=1)),
+    "trxl, single steps, separate heads": ("trxl", transformer(sequence_length=1, shared_heads=False)),
+    "trxl, single steps, relative": ("trxl", transformer(sequence_length=1, positional_encoding="relative")),
+    "trxl, single steps, learned": ("trxl", transformer(sequence_length=1, positional_encoding="learned")),
     "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
 }
 WITH_STATE = [name for name in KINDS if name not in ("none", "position")]

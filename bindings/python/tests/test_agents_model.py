@@ -66,6 +66,8 @@ def test_preset_paper_equals_the_table_of_the_paper() -> None:
     }
     assert (trxl.layers, trxl.width, trxl.heads) == (3, 384, 4)
     assert (trxl.initialisation, trxl.positional_encoding) == ("xavier", "absolute")
+    # The authors shuffle single steps.
+    assert trxl.sequence_length == 1
 
 
 @pytest.mark.parametrize(
@@ -117,6 +119,7 @@ def test_preset_throughput_512_keeps_the_steps_of_the_paper() -> None:
     assert batch / given.ppo.minibatches == paper / PAPER.ppo.minibatches
     assert batch * given.ppo.updates == paper * PAPER.validated().ppo.updates
     assert batch * given.ppo.decay_updates == paper * PAPER.ppo.decay_updates
+    assert replace(given.transformer, sequence_length=1) == PAPER.transformer
 
 
 def test_preset_throughput_has_more_environments_and_equal_steps_per_update() -> None:
@@ -156,7 +159,10 @@ def test_settings_round_trip_through_dicts(name: str) -> None:
         ({"environment": replace(PAPER.environment, num_envs=31, groups=2)}, "got 31 environments and 2 groups"),
         ({"environment": replace(PAPER.environment, option=("a",))}, "must be NAME=VALUE .* got `a`"),
         ({"environment": replace(PAPER.environment, option=("a=x",))}, "must be NAME=VALUE .* got `a=x`"),
-        ({"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100)}, "got 100 steps and sequences of 64"),
+        (
+            {"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100), "transformer": Transformer(sequence_length=64)},
+            "got 100 steps and sequences of 64",
+        ),
         ({"transformer": Transformer(window=1)}, "window must be 0 .* or 2 or more, got 1"),
         (
             {"transformer": Transformer(width=100, heads=3)},

@@ -106,8 +106,9 @@ class Transformer:
     """initial bias of the gates; the larger, the closer a block is to the identity at the start. The paper uses 0 and 2"""
     initialisation: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """weight initialisation of the blocks"""
-    sequence_length: int = 64
-    """length of a training sequence in steps; keys and values are projected once for a whole sequence"""
+    sequence_length: int = 1
+    """number of consecutive steps that are shuffled together into minibatches. 1, as in the paper: single steps. With longer
+    sequences learning is faster and needs less memory, but the gradients of long episodes have more noise"""
 
 
 @dataclass(frozen=True)
@@ -376,6 +377,7 @@ def _presets() -> dict[str, Settings]:
         dataclasses.replace(paper, preset="throughput-512"),
         environment={"num_envs": 128},
         ppo={"minibatches": 32, "decay_updates": 2_500},
+        transformer={"sequence_length": 64},
     )
     quick = _replace(
         dataclasses.replace(paper, preset="quick", checkpoint_interval=50, stop_when_learnt=True),

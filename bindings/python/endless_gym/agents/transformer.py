@@ -5,12 +5,15 @@ block's query comes from its current input, and its keys and values come from th
 belong to the same episode. A block is pre-norm: LayerNorm, attention, residual connection or gate, LayerNorm, fully connected
 layer with ReLU, residual connection or gate.
 
-Keys and values are projected once for each token, not once for each window that contains it:
+Keys and values are not projected once for each window that contains a token:
 
 * Acting: a KV cache holds the keys and values of the window, in a ring of fixed size (`transformer_cache`). Each step projects
   the newest token only, for all blocks at once. The cache is recomputed when the weights have changed.
 * Learning: a sequence of C steps is processed at once with the tokens of the sequence and of the `window - 1` steps before it. A
   band mask (causal, as wide as the window, and within one episode) says which query attends to which token.
+* Learning with sequences of one step: a token is in as many sequences as there are queries that attend to it. The key projection
+  is applied to the query and the value projection to the weighted sum of the tokens instead, which is the same by associativity
+  and costs as much as the projection of one token.
 
 A query attends to the token of an earlier step if the distance in steps is at most `window - 1`, and at most the query's position
 in its episode. At the first step of an episode there is no token to attend to, and the attention output before the final
@@ -55,6 +58,11 @@ def sinusoids(positions: Tensor, width: int) -> Tensor:
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
+def normalised(tokens: Tensor) -> Tensor:
+    """Tokens with mean 0 and variance 1: layer normalisation without gain and bias, float (..., width)."""
+    return functional.layer_norm(tokens, tokens.shape[-1:])
+
+
 class Attention(nn.Module):
     """Multi-head attention with separate projection, so that the keys and values of a token are computed once and reused."""
 
@@ -83,13 +91,15 @@ class Attention(nn.Module):
         projected: Tensor = layer(x.unflatten(-1, split)) if shared else layer(x).unflatten(-1, split)
         return projected.transpose(-3, -2)
 
-    def forward(self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, distance: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, tokens: Tensor, norm: nn.LayerNorm, bias: Tensor, first: Tensor, distance: Tensor
+    ) -> Tensor:
         """Scaled dot-product attention.
 
         Args:
             x: Inputs of the queries, float (n, queries, width).
-            keys: float (n, heads, tokens, head size).
-            values: float (n, heads, tokens, head size).
+            tokens: Normalised tokens with positions added, float (n, tokens, width).
+            norm: Layer normalisation of the tokens; its gain and its bias are to be applied.
             bias: Attention mask, float32 (n, 1, queries, tokens); 0 where the query attends to the token, else `MASKED`.
             first: Whether the query attends to no token, bool (n, queries, 1).
             distance: Steps from the token to the query, int64 (queries, tokens); used by the relative encoding.
@@ -101,14 +111,48 @@ class Attention(nn.Module):
         if self.relative:
             # Relative encoding of Dai et al., 2019: a content term and a distance term, each with a learned bias. A distance is
             # at most the number of tokens.
-            encoded = self.encoded_distances(torch.arange(keys.shape[-2] + 1, device=x.device), x.dtype)
+            encoded = self.encoded_distances(torch.arange(tokens.shape[-2] + 1, device=x.device), x.dtype)
             scores = (queries + self.distance_bias) @ encoded.transpose(-2, -1)  # (n, heads, queries, distances)
             chosen = distance.clamp(min=0).expand(*scores.shape[:2], *distance.shape)
             bias = scores.gather(-1, chosen) * self.scale + bias
             queries = queries + self.content_bias
-        summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
-        out: Tensor = self.fc_out(summed.transpose(1, 2).flatten(-2).masked_fill(first, 0.0))
+        if x.shape[1] == 1:
+            summed = self._one_query(queries.squeeze(2), tokens, norm, bias.squeeze(2)).unsqueeze(1)
+        else:
+            tokens = torch.addcmul(norm.bias, tokens, norm.weight)
+            keys, values = self.project(self.keys, tokens), self.project(self.values, tokens)
+            summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
+            summed = summed.transpose(1, 2)
+        out: Tensor = self.fc_out(summed.flatten(-2).masked_fill(first, 0.0))
         return out
+
+    def _one_query(self, queries: Tensor, tokens: Tensor, norm: nn.LayerNorm, bias: Tensor) -> Tensor:
+        """Attention of one query to each sequence of tokens, without the projection of each token.
+
+        The gain and the bias of the normalisation are applied to the query and to the weighted sum as well. The bias adds the
+        same to all scores, which the softmax ignores.
+
+        Args:
+            queries: float (n, heads, head size).
+            tokens: Normalised tokens, float (n, tokens, width).
+            norm: Layer normalisation of the tokens.
+            bias: What is added to the scores, float (n, heads or 1, tokens).
+
+        Returns:
+            float (n, heads, head size).
+        """
+        tokens = tokens.to(queries.dtype)
+        queries = torch.einsum("nhs,hsw->nhw", queries, self._of_heads(self.keys)) * norm.weight
+        scores = (queries * self.scale) @ tokens.transpose(1, 2) + bias
+        summed = scores.softmax(-1).to(tokens.dtype) @ tokens * norm.weight + norm.bias
+        return torch.einsum("nhw,hsw->nhs", summed, self._of_heads(self.values))
+
+    def _of_heads(self, layer: nn.Linear) -> Tensor:
+        """The projection of a whole vector for each head, float (heads, head size, width)."""
+        if layer.in_features != self.size:
+            return layer.weight.view(self.heads, self.size, -1)
+        own = torch.eye(self.heads, device=layer.weight.device)[:, None, :, None]
+        return (own * layer.weight[None, :, None]).flatten(2)
 
     def encoded_distances(self, distances: Tensor, dtype: torch.dtype) -> Tensor:
         """Projected encodings of distances int64 (k,), float (heads, k, head size); only with the relative encoding."""
@@ -157,15 +201,9 @@ class Block(nn.Module):
         self.gate_fc = Gate(width, gate) if settings.gating else None
         self._initialise(settings.initialisation, settings.layers)
 
-    def keys_and_values(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Project tokens with positions added, (n, tokens, width), to keys and values, (n, heads, tokens, head size) each."""
-        tokens = self.norm_tokens(tokens)
-        attention = self.attention
-        return attention.project(attention.keys, tokens), attention.project(attention.values, tokens)
-
-    def forward(self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, distance: Tensor) -> Tensor:
+    def forward(self, x: Tensor, tokens: Tensor, bias: Tensor, first: Tensor, distance: Tensor) -> Tensor:
         """The block's output, float (n, queries, width); arguments as for `Attention.forward`."""
-        attended: Tensor = self.attention(self.norm_query(x), keys, values, bias, first, distance)
+        attended: Tensor = self.attention(self.norm_query(x), tokens, self.norm_tokens, bias, first, distance)
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
         added: Tensor = self.fc(self.norm_fc(x)).relu()
         out: Tensor = x + added if self.gate_fc is None else self.gate_fc(x, added)
@@ -308,7 +346,8 @@ class TransformerMinibatch(Minibatch):
     """Sequences of C steps each, with the P steps before them: `window - 1`, or fewer if all episodes are shorter.
 
     Attributes:
-        tokens: The cached inputs of each block, float32 (layers, sequences, P + C, width).
+        tokens: The cached inputs of each block, float32 (layers, sequences, P + C, width); with positions added and normalised,
+            unless the positional encoding is learned.
         position: Position of each token in its episode, int64 (sequences, P + C).
         bias: Attention mask, float32 (sequences, 1, C, P + C); 0 where the query attends to the token, else `MASKED`.
         first: Whether the query is the first step of an episode, bool (sequences, C, 1).
@@ -420,39 +459,40 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         past = max(1, min(self.past, int(longest)))
         span, skipped, sequences = past + length, self.past - past, steps // length
         # Columns that no query attends to are skipped. Then column c is step c - past, and sequence s of an environment spans the
-        # columns from s * length to s * length + span. These are views: only the tokens of a minibatch are copied.
-        inputs = [state.inputs[:, :, skipped:].unfold(2, span, length) for state in states]
-        position = torch.cat([state.position[:, skipped:].unfold(1, span, length) for state in states])
-        distance = torch.arange(past, span, device=self.device).unsqueeze(1) - torch.arange(span, device=self.device)
+        # columns from s * length to s * length + span.
+        tokens = torch.cat([self._tokens(state, skipped) for state in states], dim=1)
+        columns, tokens = tokens.shape[2], tokens.flatten(1, 2)
+        position = torch.cat([state.position[:, skipped:] for state in states]).flatten()
+        offsets = torch.arange(span, device=self.device)
+        distance = offsets[past:].unsqueeze(1) - offsets
         outside = (distance < 1) | (distance > self.past)
-        per_group = len(own) // len(states)
+        # The first column of each sequence, counted through all environments.
+        starts = torch.arange(len(own)).unsqueeze(1) * columns + torch.arange(sequences) * length
+        starts = starts.flatten().to(self.device)
+
+        def steps_of(envs: int) -> Tensor:
+            """Index of each step of each sequence in the flattened segment, int64 (envs * sequences, length)."""
+            indices = torch.arange(sequences * length * envs).view(sequences, length, envs).permute(2, 0, 1)
+            return indices.flatten(0, 1).to(self.device)
+
+        steps_here, steps_everywhere = steps_of(len(own)), steps_of(envs) if len(own) < envs else None
 
         def minibatch(chosen: Tensor) -> TransformerMinibatch:
             chosen = chosen.sort().values
-
-            def indices(env: Tensor, sequence: Tensor, envs: int) -> Tensor:
-                time = (sequence * length).unsqueeze(1) + torch.arange(length)
-                return (time * envs + env.unsqueeze(1)).flatten().to(self.device)
-
             everywhere = None
-            if len(own) < envs:
-                everywhere = indices(chosen // sequences, chosen % sequences, envs)
+            if steps_everywhere is not None:
+                everywhere = steps_everywhere[chosen.to(self.device)].flatten()
                 chosen = chosen[is_own(chosen // sequences, own)] - own.start * sequences
-            env, sequence = chosen // sequences, chosen % sequences
-            steps_here = indices(env, sequence, len(own))
-            counts = torch.bincount(env // per_group, minlength=len(states)).tolist()
-            env_, sequence_ = env.to(self.device), sequence.to(self.device)
-            tokens = [
-                group[:, rows % per_group, columns]
-                for group, rows, columns in zip(inputs, env_.split(counts), sequence_.split(counts), strict=True)
-            ]
-            positions = position[env_, sequence_]
+            chosen = chosen.to(self.device)
+            indices = steps_here[chosen].flatten()
+            rows = (starts[chosen].unsqueeze(1) + offsets).flatten()
+            positions = position[rows].unflatten(0, (-1, span))
             queries = positions[:, past:].unsqueeze(-1)
             bias = torch.zeros(len(chosen), length, span, device=self.device)
             return TransformerMinibatch(
-                indices=steps_here,
-                everywhere=steps_here if everywhere is None else everywhere,
-                tokens=torch.cat(tokens, dim=1).transpose(2, 3),
+                indices=indices,
+                everywhere=indices if everywhere is None else everywhere,
+                tokens=tokens.index_select(1, rows).unflatten(1, (-1, span)),
                 position=positions,
                 bias=bias.masked_fill_(outside | (distance > queries), MASKED).unsqueeze(1),
                 first=queries == 0,
@@ -464,13 +504,22 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
     def forward(self, x: Tensor, minibatch: TransformerMinibatch) -> Tensor:
         length, span = minibatch.distance.shape
         x = self.embedding(x).unflatten(0, (-1, length))
-        encoding = None if self.table is None else self._encoding(minibatch.position)
+        learned = isinstance(self.table, nn.Parameter)
+        encoding = self._encoding(minibatch.position) if learned or self.settings.query_encoding else None
         queries = encoding[:, span - length :] if encoding is not None and self.settings.query_encoding else None
         for block, tokens in zip(self.blocks, minibatch.tokens, strict=True):
-            keys, values = block.keys_and_values(tokens if encoding is None else tokens + encoding)
+            tokens = normalised(tokens + encoding) if learned else tokens
             x = x if queries is None else x + queries
-            x = block(x, keys, values, minibatch.bias, minibatch.first, minibatch.distance)
+            x = block(x, tokens, minibatch.bias, minibatch.first, minibatch.distance)
         return x.flatten(0, 1)
+
+    def _tokens(self, state: TransformerState, skipped: int) -> Tensor:
+        """The tokens for learning, without the first `skipped` columns; see `TransformerMinibatch.tokens`."""
+        tokens = state.inputs[:, :, skipped:]
+        if isinstance(self.table, nn.Parameter):
+            return tokens
+        # They have no gradient, so this is done once for a segment, not for each minibatch.
+        return normalised(tokens if self.table is None else tokens + self._encoding(state.position[:, skipped:]))
 
     def _encoding(self, position: Tensor) -> Tensor:
         """Encodings of positions int64 (...,), float32 (..., width). Positions beyond the table share its last row."""
