@@ -8,7 +8,7 @@ use super::layout::Layout;
 use super::sections::BatchSection;
 use super::stamp::Stamp;
 use super::view::Batch;
-use crate::raster::copy_run;
+use crate::raster::copy_columns;
 
 /// A copy of the observations of a pool's batches, of which each update copies only what has changed.
 ///
@@ -219,24 +219,20 @@ impl ObservationUpdater {
                 // The description may come from another process, which may write anything.
                 let end = (usize::from(end) * pixel).min(row);
                 let first = (usize::from(first) * pixel).min(end);
+                let in_band = (rows - band * BAND).min(BAND);
+                let bits = bits & (u8::MAX >> (BAND - in_band));
                 for plane in 0..planes {
                     let from = start + (plane * rows + band * BAND) * row;
-                    let in_band = (rows - band * BAND).min(BAND);
-                    let mut rest = bits & (u8::MAX >> (BAND - in_band));
-                    if rest.count_ones() as usize == in_band && end - first == row {
-                        let bytes = from..from + in_band * row;
-                        copy[bytes.clone()].copy_from_slice(&observations[bytes.clone()]);
-                        sum += bytes.len();
-                        copied(bytes);
-                        continue;
-                    }
+                    // The changed rows of a band are almost always consecutive.
+                    let mut rest = u32::from(bits);
                     while rest != 0 {
-                        let from = from + rest.trailing_zeros() as usize * row;
-                        let bytes = from + first..from + end;
-                        copy_run(&observations[bytes.clone()], &mut copy[bytes.clone()]);
-                        sum += bytes.len();
-                        copied(bytes);
-                        rest &= rest - 1;
+                        let run = rest.trailing_zeros() as usize;
+                        let length = (rest >> run).trailing_ones() as usize;
+                        rest &= u32::MAX << (run + length);
+                        let lines = from + run * row..from + (run + length) * row;
+                        copy_columns(&observations[lines.clone()], &mut copy[lines.clone()], row, first..end);
+                        sum += length * (end - first);
+                        copied(lines.start + first..lines.end - (row - end));
                     }
                 }
             }

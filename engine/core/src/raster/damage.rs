@@ -55,10 +55,12 @@ impl Damage {
         &self.rects[..self.count]
     }
 
-    /// Calls `paint` for each rectangle, with the canvas clipped to it.
+    /// Calls `paint` for each rectangle, with the canvas clipped to it. Without pixels the rectangles are only marked as dirty.
     #[inline]
     pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
-        self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
+        if let Some(mut canvas) = canvas.repaired(self.rects()) {
+            self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
+        }
     }
 }
 

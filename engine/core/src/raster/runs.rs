@@ -69,6 +69,38 @@ pub fn copy_run(source: &[u8], target: &mut [u8]) {
     }
 }
 
+/// Copies the bytes `within` of each row of `row` bytes, between slices of whole rows of the same length. The size of the blocks is
+/// chosen once for all rows.
+///
+/// # Panics
+///
+/// If `within` is reversed or ends beyond a row, or the lengths differ.
+#[inline]
+pub fn copy_columns(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>) {
+    match within.len() {
+        length if length == row => target.copy_from_slice(source),
+        4..8 => copy_columns_of::<4>(source, target, row, within),
+        8..16 => copy_columns_of::<8>(source, target, row, within),
+        16..32 => copy_columns_of::<16>(source, target, row, within),
+        32..64 => copy_columns_of::<32>(source, target, row, within),
+        64..128 => copy_columns_of::<64>(source, target, row, within),
+        128..256 => copy_columns_of::<128>(source, target, row, within),
+        _ => {
+            for (source, target) in source.chunks_exact(row).zip(target.chunks_exact_mut(row)) {
+                copy_run(&source[within.clone()], &mut target[within.clone()]);
+            }
+        }
+    }
+}
+
+/// The same for a range of `N` to `2 * N` bytes.
+#[inline]
+fn copy_columns_of<const N: usize>(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>) {
+    for (source, target) in source.chunks_exact(row).zip(target.chunks_exact_mut(row)) {
+        copy_ends::<N>(&source[within.clone()], &mut target[within.clone()]);
+    }
+}
+
 /// Copies the first `N` bytes and the last.
 #[inline]
 fn copy_ends<const N: usize>(source: &[u8], target: &mut [u8]) {
