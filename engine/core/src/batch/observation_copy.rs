@@ -210,8 +210,9 @@ impl ObservationUpdater {
             return Ok(self.bytes);
         };
         let FrameShape { frame, planes, rows, row, pixel } = self.frames;
-        let (mut sum, mut start) = (0, 0);
-        for changes in changes.chunks_exact(size) {
+        let mut sum = 0;
+        let frames = observations.chunks_exact(frame).zip(copy.chunks_exact_mut(frame)).zip(changes.chunks_exact(size));
+        for (number, ((source, target), changes)) in frames.enumerate() {
             for (band, &[bits, first, end]) in changes.as_chunks::<BAND_BYTES>().0.iter().enumerate() {
                 if bits == 0 {
                     continue;
@@ -220,23 +221,23 @@ impl ObservationUpdater {
                 let end = (usize::from(end) * pixel).min(row);
                 let first = (usize::from(first) * pixel).min(end);
                 let in_band = (rows - band * BAND).min(BAND);
-                let bits = bits & (u8::MAX >> (BAND - in_band));
+                let bits = u32::from(bits) & (u32::from(u8::MAX) >> (BAND - in_band));
                 for plane in 0..planes {
-                    let from = start + (plane * rows + band * BAND) * row;
+                    let from = plane * rows + band * BAND;
                     // The changed rows of a band are almost always consecutive.
-                    let mut rest = u32::from(bits);
+                    let mut rest = bits;
                     while rest != 0 {
-                        let run = rest.trailing_zeros() as usize;
-                        let length = (rest >> run).trailing_ones() as usize;
-                        rest &= u32::MAX << (run + length);
-                        let lines = from + run * row..from + (run + length) * row;
-                        copy_columns(&observations[lines.clone()], &mut copy[lines.clone()], row, first..end);
-                        sum += length * (end - first);
-                        copied(lines.start + first..lines.end - (row - end));
+                        let start = rest.trailing_zeros();
+                        let length = (rest >> start).trailing_ones();
+                        rest &= u32::MAX << (start + length);
+                        let start = from + start as usize;
+                        let lines = start * row..(start + length as usize) * row;
+                        copy_columns(&source[lines.clone()], &mut target[lines.clone()], row, first..end);
+                        sum += length as usize * (end - first);
+                        copied(number * frame + lines.start + first..number * frame + lines.end - (row - end));
                     }
                 }
             }
-            start += frame;
         }
         Ok(sum)
     }

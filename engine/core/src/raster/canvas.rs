@@ -153,20 +153,20 @@ impl<'a> Canvas<'a> {
         }
     }
 
-    /// The same canvas, to paint every pixel of some rectangles on it. If dirty tracking is not exact, they are marked at once, and not
-    /// when they are painted. `None` if there are no pixels to paint.
-    #[inline]
-    pub(super) fn repaired(&mut self, rects: &[Rect]) -> Option<Canvas<'_>> {
+    /// Marks rectangles, of which every pixel will be painted, as dirty. Returns `false` without a mark if the tracking is exact, and
+    /// so needs those that are painted.
+    pub(super) fn mark_rects(&mut self, rects: &[Rect]) -> bool {
         let exact = self.tracks_pixels();
-        if self.tracks_dirty() && !exact {
+        if !exact {
             rects.iter().for_each(|rect| self.mark_rect(*rect));
-            if !self.has_pixels() {
-                return None;
-            }
         }
-        let (columns, rows) = (self.columns(), self.rows());
-        let dirty = self.dirty.as_deref_mut().filter(|_| exact);
-        Some(Canvas { pixels: self.pixels, width: self.width, height: self.height, columns, rows, dirty })
+        !exact
+    }
+
+    /// Ends dirty tracking.
+    #[inline]
+    pub(super) fn stop_tracking(&mut self) {
+        self.dirty = None;
     }
 
     /// Marks the part of a rectangle that may change as dirty. Nothing happens without dirty tracking.

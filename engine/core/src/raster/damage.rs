@@ -58,8 +58,16 @@ impl Damage {
     /// Calls `paint` for each rectangle, with the canvas clipped to it. Without pixels the rectangles are only marked as dirty.
     #[inline]
     pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
-        if let Some(mut canvas) = canvas.repaired(self.rects()) {
-            self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
+        let marked = canvas.tracks_dirty() && canvas.mark_rects(self.rects());
+        if marked && !canvas.has_pixels() {
+            return;
+        }
+        for rect in self.rects() {
+            let mut clipped = canvas.clipped(*rect);
+            if marked {
+                clipped.stop_tracking();
+            }
+            paint(&mut clipped);
         }
     }
 }

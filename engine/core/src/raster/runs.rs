@@ -69,35 +69,34 @@ pub fn copy_run(source: &[u8], target: &mut [u8]) {
     }
 }
 
-/// Copies the bytes `within` of each row of `row` bytes, between slices of whole rows of the same length. The size of the blocks is
-/// chosen once for all rows.
+/// Copies `within`, a range of the first row's bytes, and the same bytes of all further rows of `row` bytes, between slices of whole
+/// rows of the same length. The size of the blocks is chosen once for all rows.
 ///
 /// # Panics
 ///
-/// If `within` is reversed or ends beyond a row, or the lengths differ.
+/// If `within` is reversed or the lengths differ.
 #[inline]
 pub fn copy_columns(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>) {
     match within.len() {
         length if length == row => target.copy_from_slice(source),
-        4..8 => copy_columns_of::<4>(source, target, row, within),
-        8..16 => copy_columns_of::<8>(source, target, row, within),
-        16..32 => copy_columns_of::<16>(source, target, row, within),
-        32..64 => copy_columns_of::<32>(source, target, row, within),
-        64..128 => copy_columns_of::<64>(source, target, row, within),
-        128..256 => copy_columns_of::<128>(source, target, row, within),
-        _ => {
-            for (source, target) in source.chunks_exact(row).zip(target.chunks_exact_mut(row)) {
-                copy_run(&source[within.clone()], &mut target[within.clone()]);
-            }
-        }
+        4..8 => for_each_row(source, target, row, within, copy_ends::<4>),
+        8..16 => for_each_row(source, target, row, within, copy_ends::<8>),
+        16..32 => for_each_row(source, target, row, within, copy_ends::<16>),
+        32..64 => for_each_row(source, target, row, within, copy_ends::<32>),
+        64..128 => for_each_row(source, target, row, within, copy_ends::<64>),
+        128..256 => for_each_row(source, target, row, within, copy_ends::<128>),
+        _ => for_each_row(source, target, row, within, copy_run),
     }
 }
 
-/// The same for a range of `N` to `2 * N` bytes.
+/// Calls `copy` with these bytes of each row.
 #[inline]
-fn copy_columns_of<const N: usize>(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>) {
-    for (source, target) in source.chunks_exact(row).zip(target.chunks_exact_mut(row)) {
-        copy_ends::<N>(&source[within.clone()], &mut target[within.clone()]);
+fn for_each_row(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>, copy: impl Fn(&[u8], &mut [u8])) {
+    let target = &mut target[..source.len()];
+    let mut bytes = within;
+    while bytes.end <= source.len() {
+        copy(&source[bytes.clone()], &mut target[bytes.clone()]);
+        bytes = bytes.start + row..bytes.end + row;
     }
 }
 
