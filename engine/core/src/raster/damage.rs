@@ -95,6 +95,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::raster::DirtyBands;
 
     fn covers(rects: &[Rect], x: i32, y: i32) -> usize {
         rects.iter().filter(|rect| rect.overlaps(&Rect::new(x, y, 1, 1))).count()
@@ -115,6 +116,22 @@ mod tests {
                 prop_assert!(painted == 1 || !on_canvas || covers(&added, x, y) == 0);
             }
         }
+    }
+
+    #[test]
+    fn repaired_rectangles_are_marked() {
+        let mut damage = Damage::new(84, 84);
+        [Rect::new(3, 5, 4, 6), Rect::new(20, 80, 2, 9)].map(|rect| damage.add(rect));
+        let (mut painted, mut noted, mut pixels) =
+            (DirtyBands::new(false), DirtyBands::new(false), vec![0; 84 * 84 * 3]);
+        let mut calls = 0;
+        damage.repair(&mut Canvas::new(&mut pixels, 84, 84).tracking_bands(&mut painted), |canvas| {
+            canvas.fill([1; 3]);
+            calls += 1;
+        });
+        damage.repair(&mut Canvas::without_pixels(84, 84, &mut noted), |_| panic!("there is nothing to paint"));
+        assert_eq!((calls, painted.bands()), (2, noted.bands()));
+        assert_eq!(painted.bands()[..3], [[0b0111_1000, 5, 11], [0; 3], [0b0011_0000, 80, 84]]);
     }
 
     #[test]
