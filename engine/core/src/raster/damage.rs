@@ -58,7 +58,16 @@ impl Damage {
     /// Calls `paint` for each rectangle, with the canvas clipped to it. Without pixels the rectangles are only marked as dirty.
     #[inline]
     pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
-        let marked = canvas.tracks_dirty() && canvas.mark_rects(self.rects());
+        if canvas.tracks_dirty() {
+            return self.repair_tracked(canvas, &mut paint);
+        }
+        self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
+    }
+
+    /// Apart from [`repair`](Self::repair), which most pools need without dirty tracking.
+    #[inline(never)]
+    fn repair_tracked(&self, canvas: &mut Canvas<'_>, paint: &mut dyn FnMut(&mut Canvas<'_>)) {
+        let marked = canvas.mark_rects(self.rects());
         if marked && !canvas.has_pixels() {
             return;
         }
@@ -121,7 +130,8 @@ mod tests {
     #[test]
     fn repaired_rectangles_are_marked() {
         let mut damage = Damage::new(84, 84);
-        [Rect::new(3, 5, 4, 6), Rect::new(20, 80, 2, 9)].map(|rect| damage.add(rect));
+        damage.add(Rect::new(3, 5, 4, 6));
+        damage.add(Rect::new(20, 80, 2, 9));
         let (mut painted, mut noted, mut pixels) =
             (DirtyBands::new(false), DirtyBands::new(false), vec![0; 84 * 84 * 3]);
         let mut calls = 0;

@@ -104,7 +104,9 @@ mod tests {
     fn spans_have_all_circles() {
         let mut spans = LightSpans::new();
         assert_eq!(spans.on_screen().1, [0; SCREEN]);
-        [(20, 30), (20, 60), (70, 40)].map(|(x, y)| spans.add(&Circle { x, y, radius: 8 }));
+        for (x, y) in [(20, 30), (20, 60), (70, 40)] {
+            spans.add(&Circle { x, y, radius: 8 });
+        }
         let (firsts, ends) = spans.on_screen();
         assert_eq!((firsts[20], ends[20]), (22, 68));
         assert_eq!((firsts[70], ends[70]), (32, 48));
