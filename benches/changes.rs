@@ -1,5 +1,6 @@
-//! What descriptions of an observation's changed pixels cost a reader that keeps a copy: bytes and cache lines to copy, by id.
-//! Deterministic counts over whole episodes with random actions. `cargo bench --bench changes`.
+//! What descriptions of an observation's painted pixels cost a reader that keeps a copy: bytes and cache lines to copy, by id; also
+//! those of what a pool notes, and of the pixels that differ. Deterministic counts over whole episodes with random actions and
+//! next-step autoreset. `cargo bench --bench changes`.
 
 mod actions;
 
@@ -8,9 +9,9 @@ use std::sync::Arc;
 use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
 use endless_gym_core::envs::mystery_path::MysteryPath;
 use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
-use endless_gym_core::envs::{self, EnvSpec, Environment, Family, ResetParameters, SCREEN};
+use endless_gym_core::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters, SCREEN};
 use endless_gym_core::random::Generator;
-use endless_gym_core::raster::DirtySurface;
+use endless_gym_core::raster::{Canvas, DirtyBands, DirtySurface};
 use serde_json::Map;
 
 use actions::Actions;
@@ -70,6 +71,26 @@ const DESCRIPTIONS: [Description; 9] = [
     ("pixels", 882, |mask| *mask),
 ];
 
+/// What a pool notes of a change from one scene to another.
+fn noted<E: Environment>(assets: &E::Assets, shown: &E::Scene, scene: &E::Scene) -> Mask {
+    let mut dirty = DirtyBands::new(false);
+    E::repaint(assets, shown, scene, &mut Canvas::without_pixels(SCREEN, SCREEN, &mut dirty));
+    let mut mask: Mask = [0; SCREEN];
+    for (rows, [bits, first, end]) in mask.chunks_mut(DirtyBands::BAND).zip(dirty.bands()) {
+        let span = (u128::MAX << first) & !u128::MAX.unbounded_shl(u32::from(*end));
+        rows.iter_mut().enumerate().filter(|(row, _)| bits >> row & 1 != 0).for_each(|(_, row)| *row = span);
+    }
+    mask
+}
+
+/// The pixels in which two frames differ.
+fn differing(one: &[u8], other: &[u8]) -> Mask {
+    let mut mask: Mask = [0; SCREEN];
+    let pixels = one.as_chunks::<3>().0.iter().zip(other.as_chunks::<3>().0).enumerate();
+    pixels.filter(|(_, (one, other))| one != other).for_each(|(at, _)| mask[at / SCREEN] |= 1 << (at % SCREEN));
+    mask
+}
+
 /// Bytes, runs and distinct cache lines of these pixels.
 fn count(mask: &Mask) -> [usize; 3] {
     let (mut bytes, mut runs, mut lines, mut last_line) = (0, 0, 0, usize::MAX);
@@ -96,31 +117,36 @@ fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
     let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1));
     env.reset(&assets, &mut random);
     let (mut actions, mut surface, mut shown) = (Actions::new(spec, 1), DirtySurface::new(SCREEN, SCREEN), env.scene());
-    let (mut sums, mut steps) = ([[0; 3]; DESCRIPTIONS.len()], 0);
-    loop {
-        let ended = env.step(actions.next(), &mut random).terminated;
-        steps += 1;
+    let mut frame = vec![0; FRAME_BYTES];
+    E::paint(&assets, &shown, &mut Canvas::new(&mut frame, SCREEN, SCREEN));
+    let (mut sums, mut steps, mut ended) = ([[0; 3]; DESCRIPTIONS.len() + 2], 0, false);
+    while !ended || steps < STEPS {
         if ended {
             env.reset(&assets, &mut random);
+            ended = false;
+        } else {
+            ended = env.step(actions.next(), &mut random).terminated;
         }
+        steps += 1;
         let scene = env.scene();
-        let mut mask: Mask = [0; SCREEN];
-        if shown != scene {
-            E::repaint(&assets, &shown, &scene, &mut surface.canvas());
-            surface.for_each_run(|x, rows, _| mask[x] |= u128::MAX >> (128 - rows.len()) << rows.start);
+        if shown == scene {
+            continue;
         }
-        shown = scene;
-        for ((_, _, describe), sum) in DESCRIPTIONS.iter().zip(&mut sums) {
-            let named = describe(&mask);
-            assert!(named.iter().zip(&mask).all(|(named, changed)| changed & !named == 0), "a change is missed");
+        E::repaint(&assets, &shown, &scene, &mut surface.canvas());
+        let (mut painted, before): (Mask, _) = ([0; SCREEN], frame.clone());
+        surface.for_each_run(|x, rows, _| painted[x] |= u128::MAX >> (128 - rows.len()) << rows.start);
+        E::repaint(&assets, &shown, &scene, &mut Canvas::new(&mut frame, SCREEN, SCREEN));
+        let (noted, differing) = (noted::<E>(&assets, &shown, &scene), differing(&before, &frame));
+        let described = DESCRIPTIONS.iter().map(|(_, _, describe)| describe(&painted));
+        for (named, sum) in described.chain([noted, differing]).zip(&mut sums) {
+            assert!(named.iter().zip(&differing).all(|(named, differs)| differs & !named == 0), "a change is missed");
             sum.iter_mut().zip(count(&named)).for_each(|(sum, counted)| *sum += counted);
         }
-        if ended && steps >= STEPS {
-            break;
-        }
+        shown = scene;
     }
     println!("{}", spec.id);
-    for ((name, size, _), sum) in DESCRIPTIONS.iter().zip(sums) {
+    let names = DESCRIPTIONS.iter().map(|(name, size, _)| (*name, *size)).chain([("noted", 33), ("that differ", 882)]);
+    for ((name, size), sum) in names.zip(sums) {
         let [bytes, runs, lines] = sum.map(|sum| sum as f64 / f64::from(steps as u32));
         println!("    {name:24} {size:6} {bytes:8.0} {runs:8.1} {lines:8.1}");
     }

@@ -23,10 +23,13 @@ fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
     let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1));
     env.reset(&assets, &mut random);
     let (mut actions, mut surface, mut shown) = (Actions::new(spec, 1), DirtySurface::new(SCREEN, SCREEN), env.scene());
-    let (mut bytes, mut lines) = (0, 0);
+    let (mut bytes, mut lines, mut ended) = (0, 0, false);
     for _ in 0..STEPS {
-        if env.step(actions.next(), &mut random).terminated {
+        if ended {
             env.reset(&assets, &mut random);
+            ended = false;
+        } else {
+            ended = env.step(actions.next(), &mut random).terminated;
         }
         let scene = env.scene();
         if shown != scene {

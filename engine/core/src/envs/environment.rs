@@ -52,7 +52,8 @@ pub trait Environment: Send + Sync {
     /// Paints every pixel of a scene within the canvas' clip, independent of what the canvas showed before.
     fn paint(assets: &Self::Assets, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
-    /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ.
+    /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ. On a canvas
+    /// [without pixels](Canvas::without_pixels), that is only marked as dirty.
     fn repaint(assets: &Self::Assets, shown: &Self::Scene, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
     /// Draws the observation in full. `frame` has [`FRAME_BYTES`](super::FRAME_BYTES) bytes, indexed

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use thiserror::Error;
 
 use crate::batch::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
-use crate::envs::{Environment, FRAME_BYTES, SCREEN};
-use crate::raster::{Canvas, DirtySpans, DirtySurface, PixelFormat};
+use crate::envs::{Environment, SCREEN};
+use crate::raster::{Canvas, DirtyBands, DirtySurface, PixelFormat};
 
 /// Settings for drawing frames.
 #[derive(Clone, Copy, Debug)]
@@ -111,9 +111,10 @@ impl<E: Environment> DrawnScene<E> {
                 return Ok(NOTHING);
             }
             // What is painted is what has changed.
-            let changes = painted_changes::<E>(assets, drawn, &scene, frame, format.row_major);
+            let mut dirty = DirtyBands::new(format.row_major);
+            E::repaint(assets, drawn, &scene, &mut Canvas::new(frame, SCREEN, SCREEN).tracking_bands(&mut dirty));
             *drawn = scene;
-            return Ok(changes);
+            return Ok(frame_changes(&dirty));
         }
         let shown = match (before, &self.0) {
             (Before::SameBuffer, shown) if settings.current => shown,
@@ -125,9 +126,10 @@ impl<E: Environment> DrawnScene<E> {
                 if *shown == scene {
                     NOTHING
                 } else {
-                    // The frame may change from an older scene. The change of the last step is painted elsewhere.
-                    SCRATCH
-                        .with_borrow_mut(|frame| painted_changes::<E>(assets, shown, &scene, frame, format.row_major))
+                    // The frame may change from an older scene. The change of the last step is noted alone.
+                    let mut dirty = DirtyBands::new(format.row_major);
+                    E::repaint(assets, shown, &scene, &mut Canvas::without_pixels(SCREEN, SCREEN, &mut dirty));
+                    frame_changes(&dirty)
                 }
             }
             _ => EVERYTHING,
@@ -135,25 +137,6 @@ impl<E: Environment> DrawnScene<E> {
         self.update(assets, scene, settings, frame)?;
         Ok(changes)
     }
-}
-
-thread_local! {
-    /// The frame that is painted for what its painting changes.
-    static SCRATCH: RefCell<Vec<u8>> = RefCell::new(vec![0; FRAME_BYTES]);
-}
-
-/// Paints the difference of two scenes. Returns what was painted.
-#[inline]
-fn painted_changes<E: Environment>(
-    assets: &E::Assets,
-    shown: &E::Scene,
-    scene: &E::Scene,
-    frame: &mut [u8],
-    row_major: bool,
-) -> FrameChanges {
-    let mut dirty = DirtySpans::new();
-    E::repaint(assets, shown, scene, &mut Canvas::new(frame, SCREEN, SCREEN).tracking_spans(&mut dirty));
-    frame_changes(&dirty, row_major)
 }
 
 /// Draws a frame in full.

@@ -4,7 +4,7 @@ use std::fmt::Debug;
 use std::ops::Range;
 
 use super::color::Rgb;
-use super::dirty_spans::DirtySpans;
+use super::dirty_bands::DirtyBands;
 use super::rect::Rect;
 use super::runs::{clip, copy_run, fill_run};
 
@@ -31,6 +31,9 @@ trait Dirty: Debug {
 
     /// Marks some rows of some columns.
     fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>);
+
+    /// Marks in each column the rows from `firsts` to the one before `ends`, which is 0 where there are none.
+    fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]);
 }
 
 /// The dirty mask: for each column a bit for each row.
@@ -42,15 +45,25 @@ impl Dirty for Vec<u128> {
     fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         mark_rows(&mut self[columns], rows);
     }
+
+    fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
+        for ((column, first), end) in self.iter_mut().zip(firsts).zip(ends) {
+            mark_rows(std::slice::from_mut(column), &(usize::from(*first)..usize::from(*end)));
+        }
+    }
 }
 
-impl Dirty for DirtySpans {
+impl Dirty for DirtyBands {
     fn is_exact(&self) -> bool {
         false
     }
 
     fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>) {
-        self.mark_rows(columns, rows);
+        DirtyBands::mark(self, &columns, rows);
+    }
+
+    fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
+        DirtyBands::mark_spans(self, firsts, ends);
     }
 }
 
@@ -77,14 +90,30 @@ impl<'a> Canvas<'a> {
         Self { dirty: Some(dirty), ..self }
     }
 
-    /// The same canvas with coarser dirty tracking: for each column, the smallest span that has all painted pixels.
+    /// The same canvas with coarser dirty tracking: for each band of a frame's rows, one span that has all painted pixels.
     ///
     /// # Panics
     ///
-    /// If the canvas has more than [`DirtySpans::COLUMNS`] columns or more than 255 rows.
-    pub fn tracking_spans(self, dirty: &'a mut DirtySpans) -> Self {
-        assert!(self.width <= DirtySpans::COLUMNS && self.height <= usize::from(u8::MAX));
+    /// If the canvas has more than [`DirtyBands::SIDE`] columns or rows.
+    pub fn tracking_bands(self, dirty: &'a mut DirtyBands) -> Self {
+        assert!(self.width <= DirtyBands::SIDE && self.height <= DirtyBands::SIDE);
         Self { dirty: Some(dirty), ..self }
+    }
+
+    /// A canvas without pixels, for a repaint of which only the dirty tracking is wanted. Painting on it panics.
+    ///
+    /// # Panics
+    ///
+    /// If there are more than [`DirtyBands::SIDE`] columns or rows.
+    pub fn without_pixels(width: usize, height: usize, dirty: &'a mut DirtyBands) -> Self {
+        let canvas = Self { pixels: &mut [], width, height, columns: 0..width, rows: 0..height, dirty: None };
+        canvas.tracking_bands(dirty)
+    }
+
+    /// Whether there are pixels to paint. Otherwise what would be painted is only to be marked as dirty.
+    #[inline]
+    pub fn has_pixels(&self) -> bool {
+        !self.pixels.is_empty()
     }
 
     /// Whether painted pixels are marked as dirty.
@@ -95,7 +124,7 @@ impl<'a> Canvas<'a> {
 
     /// Whether painted pixels are marked one by one, so that no other pixel may be marked.
     #[inline]
-    pub(super) fn tracks_pixels(&self) -> bool {
+    pub fn tracks_pixels(&self) -> bool {
         self.dirty.as_ref().is_some_and(|dirty| dirty.is_exact())
     }
 
@@ -108,6 +137,44 @@ impl<'a> Canvas<'a> {
     pub fn mark_dirty(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         if let Some(dirty) = &mut self.dirty {
             dirty.mark(columns, rows);
+        }
+    }
+
+    /// Marks in each column the rows from `firsts` to the one before `ends`, which is 0 where there are none. Nothing happens without
+    /// dirty tracking.
+    ///
+    /// # Panics
+    ///
+    /// With dirty tracking, if a column or row lies beyond the canvas.
+    #[inline]
+    pub fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
+        if let Some(dirty) = &mut self.dirty {
+            dirty.mark_spans(firsts, ends);
+        }
+    }
+
+    /// Marks rectangles, of which every pixel will be painted, as dirty. Returns `false` without a mark if the tracking is exact, and
+    /// so needs those that are painted.
+    pub(super) fn mark_rects(&mut self, rects: &[Rect]) -> bool {
+        let exact = self.tracks_pixels();
+        if !exact {
+            rects.iter().for_each(|rect| self.mark_rect(*rect));
+        }
+        !exact
+    }
+
+    /// Ends dirty tracking.
+    #[inline]
+    pub(super) fn stop_tracking(&mut self) {
+        self.dirty = None;
+    }
+
+    /// Marks the part of a rectangle that may change as dirty. Nothing happens without dirty tracking.
+    #[inline]
+    pub fn mark_rect(&mut self, rect: Rect) {
+        if self.tracks_dirty() {
+            let mut clipped = self.clipped(rect);
+            clipped.mark_dirty(clipped.columns(), &clipped.rows());
         }
     }
 

@@ -79,11 +79,12 @@ impl Scene {
         let same_light = self.darkness == shown.darkness && self.blacked_out == shown.blacked_out;
         // In full darkness every background is black.
         let same_background = self.background == shown.background || self.darkness == 255;
+        let mut damage = Damage::new(SCREEN, SCREEN);
         let many = self.circles.len().max(shown.circles.len()) > MANY;
         if many || !same_light || !same_background || self.coins_visible != shown.coins_visible {
-            return self.paint(assets, canvas);
+            damage.add(Rect::new(0, 0, SCREEN as i32, SCREEN as i32));
+            return damage.repair(canvas, |canvas| self.paint(assets, canvas));
         }
-        let mut damage = Damage::new(SCREEN, SCREEN);
         let change = LightChange::new(shown, self);
         if self.outlined || shown.outlined {
             change.bounds().for_each(|rect| damage.add(rect));
@@ -94,6 +95,8 @@ impl Scene {
         if self.bar != shown.bar {
             if self.visible_in_dark(assets).any() {
                 self.bar.changes_since(&shown.bar).for_each(|field| damage.add(field));
+            } else if !canvas.has_pixels() {
+                self.bar.changes_since(&shown.bar).for_each(|field| canvas.mark_rect(field));
             } else {
                 // No object is above the bar.
                 self.bar.repaint(&shown.bar, assets.config.variant, canvas);

@@ -9,6 +9,7 @@ use smallvec::SmallVec;
 
 use super::circle::Circle;
 use super::config::BAR_HEIGHT;
+use super::light_spans::LightSpans;
 use super::pictures::Assets;
 use super::scene::Scene;
 use super::shape::{Crescent, REACH, Shape};
@@ -88,8 +89,13 @@ impl<'a> LightChange<'a> {
         if self.changes.is_empty() {
             return;
         }
-        if canvas.tracks_dirty() {
-            self.note(canvas);
+        if canvas.tracks_pixels() {
+            self.note_pixels(canvas);
+        } else if canvas.tracks_dirty() {
+            self.note_spans(canvas);
+            if !canvas.has_pixels() {
+                return;
+            }
         }
         let frame: &mut Frame = canvas.pixels_mut().try_into().expect("the canvas is a frame");
         let lit = assets.lit.background_frame(self.scene.background);
@@ -129,8 +135,21 @@ impl<'a> LightChange<'a> {
 }
 
 impl LightChange<'_> {
+    /// Marks in each column a span around the circles that have changed.
+    fn note_spans(&self, canvas: &mut Canvas<'_>) {
+        let mut spans = LightSpans::new();
+        for change in &self.changes {
+            match change {
+                CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => spans.add(circle),
+                CircleChange::Moved(from, to) => [from, to].into_iter().for_each(|circle| spans.add(circle)),
+            }
+        }
+        let (firsts, ends) = spans.on_screen();
+        canvas.mark_spans(&firsts, &ends);
+    }
+
     /// Marks the pixels to be painted as dirty.
-    fn note(&self, canvas: &mut Canvas<'_>) {
+    fn note_pixels(&self, canvas: &mut Canvas<'_>) {
         for change in &self.changes {
             match change {
                 CircleChange::Appeared(circle) | CircleChange::Disappeared(circle) => {

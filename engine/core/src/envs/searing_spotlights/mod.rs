@@ -33,6 +33,7 @@ mod drawing;
 pub mod expert;
 mod features;
 mod light;
+mod light_spans;
 mod parameters;
 mod pictures;
 mod position_sampler;

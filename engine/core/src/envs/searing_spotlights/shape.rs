@@ -13,12 +13,15 @@ pub(super) const REACH: i16 = 3;
 const MOVES: usize = 2 * REACH as usize + 1;
 
 /// Largest radius whose crescents are precomputed. Larger circles are repainted in full.
-const MAX_MOVED_RADIUS: i16 = 24;
+pub(super) const MAX_MOVED_RADIUS: i16 = 24;
 
 /// The shape of all circles of one radius.
 #[derive(Debug)]
 pub(super) struct Shape {
     pub disc: Disc,
+    /// How far the disc's column of that number begins below the top of a disc of [`MAX_MOVED_RADIUS`] about the same centre, and
+    /// ends above its bottom; [`u8::MAX`] for a column without a pixel.
+    pub margins: [u8; 2 * MAX_MOVED_RADIUS as usize],
     outline: Vec<(i32, i32)>,
     /// By the move along both axes.
     crescents: Vec<Crescent>,
@@ -119,7 +122,13 @@ impl Shape {
         } else {
             moves.map(|to| Crescent::new(&disc, to)).collect()
         };
-        Shape { disc, outline: circle_outline(radius), crescents }
+        let mut margins = [u8::MAX; 2 * MAX_MOVED_RADIUS as usize];
+        if !crescents.is_empty() {
+            for (margin, x) in margins.iter_mut().zip(-radius..radius) {
+                *margin = (i32::from(MAX_MOVED_RADIUS) - disc.half_height(x.into())) as u8;
+            }
+        }
+        Shape { disc, margins, outline: circle_outline(radius), crescents }
     }
 
     /// Whether the crescent of a move is precomputed.
