@@ -30,27 +30,14 @@ from endless_gym.agents.settings import PRESETS, Settings
 from rich.console import Console
 from rich.table import Table
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
+from torch.utils.flop_counter import flop_registry, sdpa_flop_count
 
 #: Operations with fewer seconds than this share of the phase are shown together.
 SMALL = 0.02
 
 
-def attention_flop(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
-    """FLOP of PyTorch's attention on the CPU, whose formula its registry lacks."""
-    return int(sdpa_flop_count(query.shape, key.shape, value.shape))
-
-
-def attention_backward_flop(grad: Any, query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
-    """As `attention_flop`, of its backward pass."""
-    return int(sdpa_backward_flop_count(grad.shape, query.shape, key.shape, value.shape))
-
-
-#: Formulas on tensors by name of the operation.
-ATTENTION = {
-    "_scaled_dot_product_flash_attention_for_cpu": attention_flop,
-    "_scaled_dot_product_flash_attention_for_cpu_backward": attention_backward_flop,
-}
+#: PyTorch's attention on the CPU, which its registry of formulas lacks.
+ATTENTION = "_scaled_dot_product_flash_attention_for_cpu"
 
 
 @dataclass
@@ -102,8 +89,8 @@ class Meter(TorchDispatchMode):
         cost.seconds += time.perf_counter() - start
         cost.calls += 1
         name, packet = operation.overloadpacket.__name__, operation.overloadpacket
-        if name in ATTENTION:
-            cost.flop += ATTENTION[name](*args, **(kwargs or {}))
+        if name == ATTENTION:
+            cost.flop += int(sdpa_flop_count(*(tensor.shape for tensor in args[:3])))
         elif packet in flop_registry:
             cost.flop += int(flop_registry[packet](*args, **(kwargs or {}), out_val=out))
         return out
