@@ -173,7 +173,9 @@ def main() -> None:
     parser.add_argument("--agents", nargs="+", default=["gru", "trxl"], help="agents (default: gru trxl)")
     parser.add_argument("--num-envs", type=int, default=8, help="number of environments (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=256, help="steps of a rollout (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch and the engine (default: %(default)s)")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="threads of PyTorch and the engine (default: %(default)s)"
+    )
     parser.add_argument("--updates", type=int, default=2, help="updates that are timed (default: %(default)s)")
     parser.add_argument("--bf16", action="store_true", help="compute in bfloat16; the peak is that of bfloat16, too")
     parser.add_argument("--json", type=Path, help="also write the results to this file")
