@@ -15,7 +15,7 @@ use crate::group::chunk_blocks;
 use crate::message::{PayloadBlock, ResponseContent, ResponseHeader, copied, read_text};
 use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
-use crate::ports::{self, EngineServices, ResponseSubscriber};
+use crate::ports::{self, BlockService, EngineServices, ResponseSubscriber};
 use crate::specification::ServiceSpecification;
 
 /// A lease on a group's batch in shared memory.
@@ -132,6 +132,47 @@ impl Response {
     }
 }
 
+/// The service of one group's responses, opened by a process that receives them.
+pub(crate) struct ResponseService {
+    // Closed before the node.
+    service: ForkGuard<BlockService<ResponseHeader>>,
+    group: usize,
+    engine: UniqueNodeId,
+    node: Arc<NamespaceNode>,
+}
+
+impl ResponseService {
+    pub(crate) fn open(
+        services: &EngineServices<'_>,
+        node: &Arc<NamespaceNode>,
+        group: usize,
+        specification: &ServiceSpecification,
+    ) -> Result<Self, ServiceError> {
+        let service = services.responses(group, specification.lease_limits())?;
+        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+        let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
+        Ok(ResponseService { service: ForkGuard::new(service), group, engine, node: Arc::clone(node) })
+    }
+
+    /// A port, which receives what is sent from now on.
+    pub(crate) fn port(&self, specification: &ServiceSpecification) -> Result<ResponsePort, ServiceError> {
+        let subscriber = self.service.subscriber_builder().create().map_err(|e| match e {
+            SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
+                service: specification.service.clone(),
+                limit: specification.observers,
+            },
+            e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
+        })?;
+        let (group, engine, node) = (self.group, self.engine, Arc::clone(&self.node));
+        Ok(ResponsePort { subscriber: ForkGuard::new(subscriber), group, engine, _node: node })
+    }
+
+    /// The engine's node.
+    pub(crate) fn engine(&self) -> UniqueNodeId {
+        self.engine
+    }
+}
+
 /// The port that receives one group's responses.
 pub(crate) struct ResponsePort {
     subscriber: ForkGuard<ResponseSubscriber>,
@@ -147,17 +188,7 @@ impl ResponsePort {
         group: usize,
         specification: &ServiceSpecification,
     ) -> Result<Self, ServiceError> {
-        let service = services.responses(group, specification.lease_limits())?;
-        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
-        let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
-        let subscriber = service.subscriber_builder().create().map_err(|e| match e {
-            SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
-                service: specification.service.clone(),
-                limit: specification.observers,
-            },
-            e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
-        })?;
-        Ok(ResponsePort { subscriber: ForkGuard::new(subscriber), group, engine, _node: Arc::clone(node) })
+        ResponseService::open(services, node, group, specification)?.port(specification)
     }
 
     /// The engine's node.
