@@ -7,6 +7,7 @@ use endless_gym_core::batch::{Batch, Block, LAYOUT_VERSION};
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::ReceiveError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::prelude::PortName;
 use iceoryx2::sample::Sample;
 
 use crate::error::ServiceError;
@@ -154,9 +155,16 @@ impl ResponseService {
         Ok(ResponseService { service: ForkGuard::new(service), group, engine, node: Arc::clone(node) })
     }
 
-    /// A port, which receives what is sent from now on.
-    pub(crate) fn port(&self, specification: &ServiceSpecification) -> Result<ResponsePort, ServiceError> {
-        let subscriber = self.service.subscriber_builder().create().map_err(|e| match e {
+    /// A port, which receives what is sent from now on. For that of an observer that has paused, an idle engine sends the last batch
+    /// again.
+    pub(crate) fn port(
+        &self,
+        specification: &ServiceSpecification,
+        is_resumed: bool,
+    ) -> Result<ResponsePort, ServiceError> {
+        let name = PortName::new(if is_resumed { ports::RESUMED } else { "" });
+        let name = name.map_err(|e| ServiceError::middleware("cannot name a port")(e.to_string()))?;
+        let subscriber = self.service.subscriber_builder().name(&name).create().map_err(|e| match e {
             SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
                 service: specification.service.clone(),
                 limit: specification.observers,
@@ -188,7 +196,7 @@ impl ResponsePort {
         group: usize,
         specification: &ServiceSpecification,
     ) -> Result<Self, ServiceError> {
-        ResponseService::open(services, node, group, specification)?.port(specification)
+        ResponseService::open(services, node, group, specification)?.port(specification, false)
     }
 
     /// The engine's node.

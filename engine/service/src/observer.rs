@@ -49,6 +49,8 @@ pub struct Observer {
     last_port: Weak<ResponsePort>,
     service: ResponseService,
     group: usize,
+    /// The number of the last batch that was received.
+    last_step: Option<u64>,
     /// The engine's status; `None` if it cannot be read.
     engine: Option<StatusReader>,
     status: Option<ObserverStatusWriter>,
@@ -81,7 +83,7 @@ impl Observer {
             let _lock = node.lock()?;
             reservation::reserve_for_observer(&services, group, specification)?;
             let service = ResponseService::open(&services, node, group, specification)?;
-            Ok((service.port(specification)?, service))
+            Ok((service.port(specification, false)?, service))
         })?;
         let status = status_file::path(node.prefix(), &specification.service, specification.incarnation);
         let port = Arc::new(port);
@@ -90,6 +92,7 @@ impl Observer {
             port: Some(port),
             service,
             group,
+            last_step: None,
             engine: StatusReader::open(&status),
             status: ObserverStatusWriter::create(&node, &specification, group),
             specification: Arc::new(specification),
@@ -111,6 +114,9 @@ impl Observer {
     pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
         let Some(port) = self.connected()? else { return Ok(None) };
         let batch = port.receive(&self.specification)?.and_then(Response::into_batch);
+        // The engine repeats a batch for an observer that has resumed.
+        let batch = batch.filter(|batch| self.last_step < Some(batch.step()));
+        self.last_step = batch.as_ref().map(BatchLease::step).or(self.last_step);
         if let (Some(status), Some(_)) = (&mut self.status, &batch) {
             // Each lease holds the port, and so do this observer and this call.
             status.received(Arc::strong_count(&port) - 2);
@@ -123,13 +129,13 @@ impl Observer {
         let port = match self.port.take().or_else(|| self.last_port.upgrade()) {
             Some(port) => port,
             None => {
-                let _creating = self.node.creating()?;
+                let creating = self.node.creating()?;
                 memory::check_free(memory::MARGIN)?;
-                match self.service.port(&self.specification) {
+                match self.service.port(&self.specification, true) {
                     Ok(port) => Arc::new(port),
                     // The place of this observer is taken by what a dead process has left.
                     Err(ServiceError::TooManyObservers { .. }) => {
-                        drop(_creating);
+                        drop(creating);
                         self.node.remove_dead_nodes();
                         return Ok(None);
                     }
@@ -142,8 +148,9 @@ impl Observer {
         Ok(Some(port))
     }
 
-    /// Receives nothing until the next call of [`newest`](Observer::newest) or [`next`](Observer::next), which then see the
-    /// batches that the engine writes after the call. The place of the observer and the memory that is reserved for it remain.
+    /// Receives nothing until the next call of [`newest`](Observer::newest) or [`next`](Observer::next), which ask for the next batch
+    /// that the engine writes. If the trainer pauses, the engine sends the last one again within two tenths of a second. The
+    /// place of the observer and the memory that is reserved for it remain.
     ///
     /// The queue of an observer that is not paused always holds the newest batch, so that the engine cannot write the next one to
     /// the same memory, which is in its cache. A paused observer costs the engine nothing. A lease that is held remains valid, and

@@ -132,7 +132,8 @@ impl Observation {
             let shown = |viewer: &&Arc<Viewer>| is_news || !viewer.is_hidden();
             let shown: Vec<_> = viewers.iter().filter(shown).collect();
             // A batch is taken only for a browser that can receive it, and one that no browser shows only for the curves.
-            let ready: Vec<_> = shown.iter().filter(|viewer| viewer.is_ready()).map(|viewer| viewer.selection()).collect();
+            let ready: Vec<_> =
+                shown.iter().filter(|viewer| viewer.is_ready()).map(|viewer| viewer.selection()).collect();
             for (number, group) in self.groups.iter_mut().enumerate() {
                 let is_shown = ready.iter().any(|selection| selection.group == number && !selection.envs.is_empty());
                 if is_shown || (is_news && !ready.is_empty()) {
