@@ -12,9 +12,11 @@ use crate::engines::{self, Details};
 use crate::message;
 use crate::watched_group::WatchedGroup;
 
-/// Time between two frames that a browser gets, and so between two batches that are taken. Episodes that end in other batches are not
-/// part of the means.
-const FRAME_INTERVAL: Duration = Duration::from_millis(33);
+/// Time between two looks at what the browsers want.
+const INTERVAL: Duration = Duration::from_millis(33);
+
+/// The same while the newest batch keeps a busy engine from writing to its memory.
+const URGENT_INTERVAL: Duration = Duration::from_millis(2);
 
 /// Time between two readings of the engine's status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -54,7 +56,7 @@ pub(crate) fn run(channel: &Channel) {
                 viewer.give(|selection| message::encode(state.about(channel), None, selection, None));
             }
             is_news = false;
-            thread::sleep(FRAME_INTERVAL);
+            thread::sleep(INTERVAL);
         }
     }
 }
@@ -149,7 +151,8 @@ impl Observation {
             }
             self.show(channel, &shown, is_news);
             self.groups.iter_mut().for_each(WatchedGroup::release);
-            thread::sleep(FRAME_INTERVAL);
+            let is_urgent = self.groups.iter().any(WatchedGroup::is_urgent);
+            thread::sleep(if is_urgent { URGENT_INTERVAL } else { INTERVAL });
         }
     }
 
