@@ -4,7 +4,7 @@ mod page_support;
 mod program_support;
 
 use std::io::{BufRead, BufReader, Read};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym::batch::{Batch, Frames, PixelFormat, zeroed};
@@ -366,6 +366,49 @@ fn a_batch_is_taken_only_for_a_message() {
         }
         let taken = taken(&room) - begin;
         assert!(taken <= messages && taken > 0, "{taken} batches for {messages} messages, {shown:?}");
+    }
+}
+
+#[test]
+fn a_busy_engine_writes_to_one_buffer_while_a_page_shows_it() {
+    let room = Room::new("view-one");
+    let _engine = Engine::start(&room, &["--env", "MortarMayhem-Grid-v0", "--num-envs", "100"]);
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let mut trainer = room.connect("endless");
+    trainer.reset(0, ResetRequest::Seed(1)).unwrap();
+    trainer.receive(0, TIMEOUT).unwrap();
+    let mut socket = server.show("endless");
+    wait_for_observers(&room, 1);
+    for shown in [&[0, 99][..], &[]] {
+        socket.select(0, shown);
+        let messages = AtomicUsize::new(0);
+        let last = std::thread::scope(|scope| {
+            let training = scope.spawn(|| {
+                // Batches in a row that have come in the same memory. With an observer that can receive there are no two.
+                let (mut address, mut in_a_row, start) = (0, 0, Instant::now());
+                loop {
+                    assert!(start.elapsed() < TIMEOUT, "{in_a_row} batches in one buffer, {shown:?}");
+                    trainer.send_with(0, |actions| actions.fill(1)).unwrap();
+                    let lease = trainer.receive(0, TIMEOUT).unwrap();
+                    let before = std::mem::replace(&mut address, lease.blocks().as_ptr().addr());
+                    in_a_row = if before == address { in_a_row + 1 } else { 0 };
+                    if in_a_row >= 50 && messages.load(Ordering::Relaxed) >= 3 {
+                        return lease.step();
+                    }
+                }
+            });
+            while !training.is_finished() {
+                socket.next();
+                messages.fetch_add(1, Ordering::Relaxed);
+            }
+            training.join().unwrap()
+        });
+        // The last batch is shown, also of other environments than before.
+        socket.wait(|about| about["batch"]["step"] == last);
+        socket.select(0, &[7, 50, 98]);
+        socket.wait(|about| {
+            about["batch"]["step"] == last && about["batch"]["envs"].as_array().is_some_and(|envs| envs.len() == 3)
+        });
     }
 }
 
