@@ -254,7 +254,7 @@ impl Engine {
                 None => {}
             }
             if is_idle {
-                self.groups.iter_mut().try_for_each(Group::repeat_batch)?;
+                self.groups.iter_mut().for_each(Group::repeat_batch);
             }
             if let Some(checkpointer) = &mut self.checkpointer {
                 checkpointer.poll(&self.groups, &mut self.status);

@@ -107,7 +107,7 @@ impl Group {
 
     /// Sends the last batch again if an observer has resumed since: while the trainer pauses, there is no other for it. All who have
     /// it ignore it by its numbers.
-    pub(crate) fn repeat_batch(&mut self) -> Result<(), ServiceError> {
+    pub(crate) fn repeat_batch(&mut self) {
         let mut resumed = Vec::new();
         self.response_service.dynamic_config().list_subscribers(|subscriber| {
             if subscriber.subscriber_name.as_str() == ports::RESUMED {
@@ -117,8 +117,11 @@ impl Group {
         });
         let has_new = resumed.iter().any(|port| !self.resumed.contains(port));
         self.resumed = resumed;
-        let Some(last) = self.last.filter(|_| has_new) else { return Ok(()) };
-        let mut batch = self.loan()?;
+        let Some(last) = self.last.filter(|_| has_new) else { return };
+        let mut batch = match self.loan() {
+            Ok(batch) => batch,
+            Err(error) => return tracing::warn!(%error, "cannot send a batch again"),
+        };
         *batch.user_header_mut() = last.header;
         let payload: &mut [Block] = bytemuck::cast_slice_mut(batch.payload_mut());
         // Usually it is the same chunk, unless the trainer holds it.
@@ -134,7 +137,6 @@ impl Group {
         if let Err(e) = self.send_batch(batch) {
             tracing::warn!(error = %e, "cannot deliver a batch again");
         }
-        Ok(())
     }
 
     /// The next request, if there is one.
