@@ -110,12 +110,14 @@ impl Observer {
     /// # Errors
     ///
     /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held, and
-    /// [`ServiceError::IncompatibleTypes`] for a malformed message.
+    /// [`ServiceError::IncompatibleTypes`] for a malformed message. After a [pause](Observer::pause) also
+    /// [`ServiceError::SharedMemoryTooSmall`], [`ServiceError::RootRemoved`] and [`ServiceError::Middleware`], if this observer cannot
+    /// receive again.
     pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
         let Some(port) = self.connected()? else { return Ok(None) };
         let batch = port.receive(&self.specification)?.and_then(Response::into_batch);
         // The engine repeats a batch for an observer that has resumed.
-        let batch = batch.filter(|batch| self.last_step < Some(batch.step()));
+        let batch = batch.filter(|batch| self.last_step != Some(batch.step()));
         self.last_step = batch.as_ref().map(BatchLease::step).or(self.last_step);
         if let (Some(status), Some(_)) = (&mut self.status, &batch) {
             // Each lease holds the port, and so do this observer and this call.
@@ -174,7 +176,7 @@ impl Observer {
     }
 
     /// Whether [`newest`](Observer::newest) would return a batch: whether the engine has written one since the last call. Nothing
-    /// is received.
+    /// is received. False while this observer is [paused](Observer::pause).
     pub fn has_newer(&self) -> bool {
         self.port.as_ref().is_some_and(|port| port.has_response())
     }
