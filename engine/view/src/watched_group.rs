@@ -48,8 +48,9 @@ pub(crate) struct WatchedGroup {
 
 impl WatchedGroup {
     pub fn new(observer: Observer) -> Self {
+        // At first a batch is taken for whoever has come: a port that is open and not used keeps the engine from its one buffer.
         let last = (observer.step().unwrap_or(0), Instant::now());
-        WatchedGroup { observer, newest: None, last, is_wanted: false, is_shown: false, is_busy: false }
+        WatchedGroup { observer, newest: None, last, is_wanted: true, is_shown: true, is_busy: false }
     }
 
     /// Asks for the next batch, for a browser that shows the group or only for its curves. Ignored while no other frame is due.
