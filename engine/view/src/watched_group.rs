@@ -47,8 +47,9 @@ pub(crate) struct WatchedGroup {
 }
 
 impl WatchedGroup {
-    pub fn new(observer: Observer) -> Self {
-        // At first a batch is taken for whoever has come: a port that is open and not used keeps the engine from its one buffer.
+    pub fn new(mut observer: Observer) -> Self {
+        // Until it is known what the browsers want: an open port keeps the engine from its one buffer.
+        observer.pause();
         let last = (observer.step().unwrap_or(0), Instant::now());
         WatchedGroup { observer, newest: None, last, is_wanted: true, is_shown: true, is_busy: false }
     }
