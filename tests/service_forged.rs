@@ -185,8 +185,8 @@ fn a_forged_length_is_cut() {
     engine.end();
     let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
     let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
-    for blocks in [1 << 24, 1 << 40] {
-        foreign.send(5).overwrite(0, 5, blocks);
+    for (step, blocks) in [(5, 1 << 24), (6, 1 << 40)] {
+        foreign.send(step).overwrite(0, step, blocks);
         let received = observer.newest().unwrap().unwrap();
         assert!(received.blocks().len() < 1 << 20, "{}", received.blocks().len());
         assert_eq!(received.batch().reward(), [0.0]);

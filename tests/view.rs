@@ -4,7 +4,7 @@ mod page_support;
 mod program_support;
 
 use std::io::{BufRead, BufReader, Read};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym::batch::{Batch, Frames, PixelFormat, zeroed};
@@ -369,14 +369,69 @@ fn a_batch_is_taken_only_for_a_message() {
     }
 }
 
-/// Environment steps per second over a while.
-fn steps_per_second(trainer: &mut Trainer, num_envs: usize) -> f64 {
-    let (begin, mut steps) = (Instant::now(), 0);
+#[test]
+fn a_busy_engine_writes_to_one_buffer_while_a_page_shows_it() {
+    let room = Room::new("view-one");
+    let _engine = Engine::start(&room, &["--env", "MortarMayhem-Grid-v0", "--num-envs", "100"]);
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let mut trainer = room.connect("endless");
+    trainer.reset(0, ResetRequest::Seed(1)).unwrap();
+    trainer.receive(0, TIMEOUT).unwrap();
+    let mut socket = server.show("endless");
+    wait_for_observers(&room, 1);
+    for shown in [&[0, 99][..], &[]] {
+        socket.select(0, shown);
+        let messages = AtomicUsize::new(0);
+        let last = std::thread::scope(|scope| {
+            let training = scope.spawn(|| {
+                // Batches in a row that have come in the same memory. With an observer that can receive there are no two.
+                let (mut address, mut in_a_row, start) = (0, 0, Instant::now());
+                loop {
+                    assert!(start.elapsed() < TIMEOUT, "{in_a_row} batches in one buffer, {shown:?}");
+                    trainer.send_with(0, |actions| actions.fill(1)).unwrap();
+                    let lease = trainer.receive(0, TIMEOUT).unwrap();
+                    let before = std::mem::replace(&mut address, lease.blocks().as_ptr().addr());
+                    in_a_row = if before == address { in_a_row + 1 } else { 0 };
+                    if in_a_row >= 50 && messages.load(Ordering::Relaxed) >= 3 {
+                        return lease.step();
+                    }
+                }
+            });
+            while !training.is_finished() {
+                socket.next();
+                messages.fetch_add(1, Ordering::Relaxed);
+            }
+            training.join().unwrap()
+        });
+        // The last batch is shown, also of other environments than before.
+        socket.wait(|about| about["batch"]["step"] == last);
+        socket.select(0, &[7, 50, 98]);
+        socket.wait(|about| {
+            about["batch"]["step"] == last && about["batch"]["envs"].as_array().is_some_and(|envs| envs.len() == 3)
+        });
+    }
+}
+
+/// Environment steps per second over a while, and the batches per second that come in other memory than the one before.
+fn steps_per_second(trainer: &mut Trainer, num_envs: usize) -> (f64, f64) {
+    let (begin, mut steps, mut address, mut moved) = (Instant::now(), 0, 0, 0);
     while begin.elapsed() < Duration::from_secs(1) {
-        step(trainer, 0);
+        trainer.send_with(0, |actions| actions.fill(1)).unwrap();
+        let lease = trainer.receive(0, TIMEOUT).unwrap();
+        let before = std::mem::replace(&mut address, lease.blocks().as_ptr().addr());
+        moved += usize::from(before != address);
         steps += num_envs;
     }
-    steps as f64 / begin.elapsed().as_secs_f64()
+    let seconds = begin.elapsed().as_secs_f64();
+    (steps as f64 / seconds, moved as f64 / seconds)
+}
+
+/// Processor time that a process has used, in the kernel's ticks of 10 milliseconds.
+fn processor_ticks(pid: u32) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+    // The name may have spaces.
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
+    fields[11..13].iter().map(|ticks| ticks.parse::<f64>().unwrap()).sum()
 }
 
 /// The middle of an odd number of values.
@@ -390,7 +445,8 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 /// `cargo test --release --test view -- --ignored --exact --nocapture measure_the_cost_of_a_page`
 ///
 /// Alone, with a page of 16 environments, and with one in the background take turns, and each is compared with the mean of the times
-/// alone before and after it. The reader is this process and draws nothing: a browser's own work is not part of it.
+/// alone before and after it. Two counts depend less on the load of the machine: batches that the engine wrote to other memory than the
+/// one before, and the processor time of the page's server. The reader is this process and draws nothing: a browser's own work is not part of it.
 #[test]
 #[ignore = "a measurement"]
 fn measure_the_cost_of_a_page() {
@@ -405,10 +461,10 @@ fn measure_the_cost_of_a_page() {
         trainer.reset(0, ResetRequest::Seed(1)).unwrap();
         trainer.receive(0, TIMEOUT).unwrap();
         steps_per_second(&mut trainer, num_envs);
-        let mut alone = vec![steps_per_second(&mut trainer, num_envs)];
+        let mut alone = vec![steps_per_second(&mut trainer, num_envs).0];
         let sixteen: Vec<usize> = (0..16).collect();
         let pages = [("16 environments", &sixteen[..]), ("in the background", &[])];
-        let mut shown = [Vec::new(), Vec::new()];
+        let (mut shown, mut moved, mut ticks) = ([Vec::new(), Vec::new()], [0.0; 2], [0.0; 2]);
         for round in 0..2 * ROUNDS {
             let mut socket = server.show("endless");
             socket.select(0, pages[round % 2].1);
@@ -421,12 +477,16 @@ fn measure_the_cost_of_a_page() {
                         socket.next();
                     }
                 });
-                shown[round % 2].push(steps_per_second(&mut trainer, num_envs));
+                let before = processor_ticks(server.child.id());
+                let (rate, moves) = steps_per_second(&mut trainer, num_envs);
+                shown[round % 2].push(rate);
+                moved[round % 2] += moves / ROUNDS as f64;
+                ticks[round % 2] += (processor_ticks(server.child.id()) - before) / ROUNDS as f64;
                 done.store(true, Ordering::Relaxed);
             });
             drop(socket);
             wait_for_observers(&room, 0);
-            alone.push(steps_per_second(&mut trainer, num_envs));
+            alone.push(steps_per_second(&mut trainer, num_envs).0);
         }
         println!("{num_envs:5} environments: {:.0} steps/s alone", median(alone.iter().copied()));
         for (which, ((page, _), rates)) in pages.iter().zip(&shown).enumerate() {
@@ -437,11 +497,14 @@ fn measure_the_cost_of_a_page() {
             let mut ratios: Vec<f64> = ratios.collect();
             ratios.sort_by(f64::total_cmp);
             println!(
-                "    page with {page:17}: {:.0} steps/s, ratio {:.4} (quartiles {:.4} to {:.4})",
+                "    page with {page:17}: {:.0} steps/s, ratio {:.4} (quartiles {:.4} to {:.4}); each second {:.0} \
+                 batches in other memory, {:.0} ms of the page's server",
                 median(rates.iter().copied()),
                 ratios[ROUNDS / 2],
                 ratios[ROUNDS / 4],
-                ratios[ROUNDS - 1 - ROUNDS / 4]
+                ratios[ROUNDS - 1 - ROUNDS / 4],
+                moved[which],
+                10.0 * ticks[which]
             );
         }
     }

@@ -237,6 +237,7 @@ impl Engine {
                 }
                 Ok(None)
             })?;
+            let is_idle = request.is_none();
             match request {
                 Some((group, sample)) => {
                     next = (group + 1) % self.groups.len();
@@ -251,6 +252,9 @@ impl Engine {
                     last_cleanup = Instant::now();
                 }
                 None => {}
+            }
+            if is_idle {
+                self.groups.iter_mut().for_each(Group::repeat_batch);
             }
             if let Some(checkpointer) = &mut self.checkpointer {
                 checkpointer.poll(&self.groups, &mut self.status);
@@ -280,14 +284,7 @@ impl Engine {
         let read = group.read(&self.specification.action, &request, bytemuck::cast_slice(sample.payload()));
         // The chunk returns to the trainer before the step.
         drop(sample);
-        let mut batch = group
-            .responses
-            .loan_slice_uninit(chunk_blocks(&self.specification.batch))
-            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
-        group.memory.prefault(batch.payload_mut())?;
-        // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
-        // memory, and a recycled chunk holds an earlier response.
-        let mut batch = unsafe { batch.assume_init() };
+        let mut batch = group.loan()?;
         let read_kind = read.as_ref().ok().copied();
         let outcome =
             read.and_then(|kind| group.execute(kind, &request, bytemuck::cast_slice_mut(batch.payload_mut())));
@@ -319,7 +316,11 @@ impl Engine {
         // Before the response, so that a trainer that has received it reads a status that includes it.
         self.status.end(number, step, outcome.as_ref().ok());
         // A trainer that dies at this moment must not end the engine.
-        let receivers = batch.send().unwrap_or_else(|e| {
+        let sent = match outcome {
+            Ok(Outcome::Batch { .. }) => self.groups[number].send_batch(batch),
+            _ => batch.send(),
+        };
+        let receivers = sent.unwrap_or_else(|e| {
             tracing::warn!(error = %e, group = number, "cannot deliver a response");
             0
         });

@@ -4,18 +4,23 @@ use endless_gym_core::batch::{
     ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, Layout, SNAPSHOT_BYTES, blocks_for,
 };
 use endless_gym_core::pool::{NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError};
-use iceoryx2::port::ReceiveError;
+use iceoryx2::port::{ReceiveError, SendError};
+use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
 use serde_json::{Map, Value as Json};
 
 use crate::error::{Rejection, ServiceError};
 use crate::memory::PrefaultedChunks;
-use crate::message::{PayloadBlock, RequestHeader, RequestKind, write_text};
+use crate::message::{PayloadBlock, RequestHeader, RequestKind, ResponseHeader, write_text};
 use crate::namespace::Ipc;
-use crate::ports::{self, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
+use crate::ports::{self, BlockService, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
 
 /// A request in shared memory.
 pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
+
+/// A response that is being written.
+pub(crate) type ResponseLoan = SampleMut<Ipc, [PayloadBlock], ResponseHeader>;
 
 /// Why a request is rejected, and an explanation.
 pub(crate) type Rejected = (Rejection, String);
@@ -26,12 +31,25 @@ pub(crate) enum Outcome {
     Snapshot { bytes: usize },
 }
 
+/// A batch that was sent, and is still where it was written.
+#[derive(Clone, Copy)]
+struct SentBatch {
+    header: ResponseHeader,
+    /// Exposed address of its first block.
+    address: usize,
+}
+
 /// One group of an engine.
 pub(crate) struct Group {
     pool: Pool,
     requests: RequestSubscriber,
-    pub responses: ResponsePublisher,
-    pub memory: PrefaultedChunks,
+    responses: ResponsePublisher,
+    memory: PrefaultedChunks,
+    response_service: BlockService<ResponseHeader>,
+    /// The batch that was sent last, until the next chunk is written.
+    last: Option<SentBatch>,
+    /// The ports of observers that had resumed when the engine was last idle.
+    resumed: Vec<u128>,
     request: RequestData,
     /// The trainer that last reset all environments.
     trainer: Option<u64>,
@@ -53,7 +71,72 @@ impl Group {
         // An observer reserves its chunks when it connects.
         let publisher = ports::publisher(&service, chunk_blocks(pool.layout()), limits.trainer_chunks());
         let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
-        Ok(Group { pool, requests, responses, memory, request: RequestData::default(), trainer: None })
+        let (last, resumed, request) = (None, Vec::new(), RequestData::default());
+        Ok(Group {
+            pool,
+            requests,
+            responses,
+            memory,
+            response_service: service,
+            last,
+            resumed,
+            request,
+            trainer: None,
+        })
+    }
+
+    /// A chunk for a response, with unspecified content.
+    pub(crate) fn loan(&mut self) -> Result<ResponseLoan, ServiceError> {
+        let mut chunk = self
+            .responses
+            .loan_slice_uninit(chunk_blocks(self.pool.layout()))
+            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
+        self.memory.prefault(chunk.payload_mut())?;
+        self.last = None;
+        // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
+        // memory, and a recycled chunk holds an earlier response.
+        Ok(unsafe { chunk.assume_init() })
+    }
+
+    /// Sends a batch, and returns how many processes receive it.
+    pub(crate) fn send_batch(&mut self, batch: ResponseLoan) -> Result<usize, SendError> {
+        self.last =
+            Some(SentBatch { header: *batch.user_header(), address: batch.payload().as_ptr().expose_provenance() });
+        batch.send()
+    }
+
+    /// Sends the last batch again if an observer has resumed since: while the trainer pauses, there is no other for it. All who have
+    /// it ignore it by its numbers.
+    pub(crate) fn repeat_batch(&mut self) {
+        let mut resumed = Vec::new();
+        self.response_service.dynamic_config().list_subscribers(|subscriber| {
+            if subscriber.subscriber_name.as_str() == ports::RESUMED {
+                resumed.push(subscriber.subscriber_id.value());
+            }
+            CallbackProgression::Continue
+        });
+        let has_new = resumed.iter().any(|port| !self.resumed.contains(port));
+        self.resumed = resumed;
+        let Some(last) = self.last.filter(|_| has_new) else { return };
+        let mut batch = match self.loan() {
+            Ok(batch) => batch,
+            Err(error) => return tracing::warn!(%error, "cannot send a batch again"),
+        };
+        *batch.user_header_mut() = last.header;
+        let payload: &mut [Block] = bytemuck::cast_slice_mut(batch.payload_mut());
+        // Usually it is the same chunk, unless the trainer holds it.
+        if payload.as_ptr().addr() != last.address {
+            // SAFETY: the address is that of a chunk of the publisher's segment, which has this size and stays mapped. Only `loan`
+            // gives access for writing; it has given another chunk, and none since that one was sent. Every byte pattern is a
+            // valid block.
+            let written = unsafe {
+                std::slice::from_raw_parts(std::ptr::with_exposed_provenance::<Block>(last.address), payload.len())
+            };
+            payload.copy_from_slice(written);
+        }
+        if let Err(e) = self.send_batch(batch) {
+            tracing::warn!(error = %e, "cannot deliver a batch again");
+        }
     }
 
     /// The next request, if there is one.

@@ -7,6 +7,7 @@ use endless_gym_core::batch::{Batch, Block, LAYOUT_VERSION};
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::ReceiveError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::prelude::PortName;
 use iceoryx2::sample::Sample;
 
 use crate::error::ServiceError;
@@ -15,7 +16,7 @@ use crate::group::chunk_blocks;
 use crate::message::{PayloadBlock, ResponseContent, ResponseHeader, copied, read_text};
 use crate::namespace::Ipc;
 use crate::node::NamespaceNode;
-use crate::ports::{self, EngineServices, ResponseSubscriber};
+use crate::ports::{self, BlockService, EngineServices, ResponseSubscriber};
 use crate::specification::ServiceSpecification;
 
 /// A lease on a group's batch in shared memory.
@@ -132,6 +133,54 @@ impl Response {
     }
 }
 
+/// The service of one group's responses, opened by a process that receives them.
+pub(crate) struct ResponseService {
+    // Closed before the node.
+    service: ForkGuard<BlockService<ResponseHeader>>,
+    group: usize,
+    engine: UniqueNodeId,
+    node: Arc<NamespaceNode>,
+}
+
+impl ResponseService {
+    pub(crate) fn open(
+        services: &EngineServices<'_>,
+        node: &Arc<NamespaceNode>,
+        group: usize,
+        specification: &ServiceSpecification,
+    ) -> Result<Self, ServiceError> {
+        let service = services.responses(group, specification.lease_limits())?;
+        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+        let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
+        Ok(ResponseService { service: ForkGuard::new(service), group, engine, node: Arc::clone(node) })
+    }
+
+    /// A port, which receives what is sent from now on. For that of an observer that has paused, an idle engine sends the last batch
+    /// again.
+    pub(crate) fn port(
+        &self,
+        specification: &ServiceSpecification,
+        is_resumed: bool,
+    ) -> Result<ResponsePort, ServiceError> {
+        let name = PortName::new(if is_resumed { ports::RESUMED } else { "" });
+        let name = name.map_err(|e| ServiceError::middleware("cannot name a port")(e.to_string()))?;
+        let subscriber = self.service.subscriber_builder().name(&name).create().map_err(|e| match e {
+            SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
+                service: specification.service.clone(),
+                limit: specification.observers,
+            },
+            e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
+        })?;
+        let (group, engine, node) = (self.group, self.engine, Arc::clone(&self.node));
+        Ok(ResponsePort { subscriber: ForkGuard::new(subscriber), group, engine, _node: node })
+    }
+
+    /// The engine's node.
+    pub(crate) fn engine(&self) -> UniqueNodeId {
+        self.engine
+    }
+}
+
 /// The port that receives one group's responses.
 pub(crate) struct ResponsePort {
     subscriber: ForkGuard<ResponseSubscriber>,
@@ -147,17 +196,7 @@ impl ResponsePort {
         group: usize,
         specification: &ServiceSpecification,
     ) -> Result<Self, ServiceError> {
-        let service = services.responses(group, specification.lease_limits())?;
-        let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
-        let engine = ports::publisher_node(&service).ok_or_else(restarted)?;
-        let subscriber = service.subscriber_builder().create().map_err(|e| match e {
-            SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
-                service: specification.service.clone(),
-                limit: specification.observers,
-            },
-            e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
-        })?;
-        Ok(ResponsePort { subscriber: ForkGuard::new(subscriber), group, engine, _node: Arc::clone(node) })
+        ResponseService::open(services, node, group, specification)?.port(specification, false)
     }
 
     /// The engine's node.

@@ -40,6 +40,8 @@
 //! | a trainer dies | the engine removes its resources when idle, or the next trainer does when it connects |
 //! | an engine dies or ends | the liveness check of its trainer and its observers reports it; a trainer may reconnect to a new engine |
 //! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
+//! | an observer is paused | it has no port and receives nothing; its place and its memory remain its own |
+//! | an observer resumes while the trainer pauses | the idle engine sends the last batch of the group again, with the same header; the trainer skips it, since it answers no pending request, and an observer does not return a step twice |
 //! | an observer holds batches | it has reserved their memory in the engine's segment when it connected, or was refused; engine and trainer have reserved theirs when the engine started |
 //! | a request names another incarnation | the engine ignores it |
 //! | any process wants to know what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects no other process |

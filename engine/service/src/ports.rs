@@ -36,6 +36,9 @@ pub(crate) struct ServiceNames {
     incarnation: u64,
 }
 
+/// Name of the port of an observer that has paused. Others have none.
+pub(crate) const RESUMED: &str = "resumed";
+
 /// Prefix of the names of all specification services.
 pub(crate) const SPECIFICATION_PREFIX: &str = "endless-gym/";
 

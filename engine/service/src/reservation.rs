@@ -21,6 +21,7 @@ use crate::group::chunk_blocks;
 use crate::memory;
 use crate::ports::{self, EngineServices};
 use crate::specification::ServiceSpecification;
+use crate::status_file;
 
 /// Allocates the memory of the batches that one more observer of a group may hold. The caller holds the namespace's lock, so that
 /// no other observer connects meanwhile.
@@ -32,11 +33,15 @@ pub(crate) fn reserve_for_observer(
     let limits = specification.lease_limits();
     let responses = services.responses(group, limits)?;
     let trainer = services.requests(group).ok().and_then(|requests| ports::publisher_node(&requests));
-    let mut observers = 1;
+    let mut ports = 0;
     responses.dynamic_config().list_subscribers(|subscriber| {
-        observers += usize::from(Some(subscriber.node_id) != trainer);
+        ports += usize::from(Some(subscriber.node_id) != trainer);
         CallbackProgression::Continue
     });
+    // An observer that is paused has a status and no port. A dead one may have a port, and one without a status has one, too.
+    let statuses = status_file::running_observers(services.node.prefix(), specification.incarnation);
+    let statuses = statuses.iter().filter(|observer| observer.group as usize == group).count();
+    let observers = 1 + statuses.max(ports);
     if observers > specification.observers {
         let (service, limit) = (specification.service.clone(), specification.observers);
         return Err(ServiceError::TooManyObservers { service, limit });

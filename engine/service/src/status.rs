@@ -121,8 +121,7 @@ impl EngineStatus {
     fn read(reader: &StatusReader, prefix: &str) -> Option<Self> {
         let engine = reader.engine()?;
         let groups: Option<Vec<_>> = (0..engine.groups as usize).map(|group| reader.group(group)).collect();
-        let observers = status_file::observer_paths(prefix, engine.incarnation);
-        let observers: Vec<_> = observers.iter().filter_map(|path| StatusReader::running_observer(path)).collect();
+        let observers = status_file::running_observers(prefix, engine.incarnation);
         Some(EngineStatus::new(&engine, &groups?, &observers, now()))
     }
 

@@ -56,8 +56,13 @@ pub(crate) fn paths(prefix: &str) -> Vec<PathBuf> {
     paths_with(prefix, SUFFIX)
 }
 
+/// The records of an engine's observers that are running.
+pub(crate) fn running_observers(prefix: &str, incarnation: u64) -> Vec<ObserverRecord> {
+    observer_paths(prefix, incarnation).iter().filter_map(|path| StatusReader::running_observer(path)).collect()
+}
+
 /// The files of an engine's observers.
-pub(crate) fn observer_paths(prefix: &str, incarnation: u64) -> Vec<PathBuf> {
+fn observer_paths(prefix: &str, incarnation: u64) -> Vec<PathBuf> {
     paths_with(&format!("{prefix}{incarnation:016x}."), OBSERVER_SUFFIX)
 }
 
@@ -205,7 +210,7 @@ impl StatusReader {
     }
 
     /// The record of an observer that is running; `None` if it cannot be read.
-    pub(crate) fn running_observer(path: &Path) -> Option<ObserverRecord> {
+    fn running_observer(path: &Path) -> Option<ObserverRecord> {
         let reader = StatusReader { file: open(path)? };
         if reader.is_alive() { reader.read(0) } else { None }
     }

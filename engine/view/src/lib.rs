@@ -14,6 +14,7 @@ mod message;
 mod play;
 mod statistics;
 mod view;
+mod watched_group;
 mod watcher;
 
 pub use error::ViewError;

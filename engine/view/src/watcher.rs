@@ -4,16 +4,19 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{BatchLease, ConnectConfig, EngineStatus, Observer, ServiceError, ServiceSpecification};
+use endless_gym_service::{ConnectConfig, EngineStatus, Observer, ServiceError, ServiceSpecification};
 use serde_json::{Value as Json, json};
 
 use crate::channel::{Channel, Viewer};
 use crate::engines::{self, Details};
 use crate::message;
+use crate::watched_group::WatchedGroup;
 
-/// Time between two frames that a browser gets, and so between two batches that are taken. Episodes that end in other batches are not
-/// part of the means.
-const FRAME_INTERVAL: Duration = Duration::from_millis(33);
+/// Time between two looks at what the browsers want.
+const INTERVAL: Duration = Duration::from_millis(33);
+
+/// The same while the newest batch keeps a busy engine from writing to its memory.
+const URGENT_INTERVAL: Duration = Duration::from_millis(2);
 
 /// Time between two readings of the engine's status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -53,7 +56,7 @@ pub(crate) fn run(channel: &Channel) {
                 viewer.give(|selection| message::encode(state.about(channel), None, selection, None));
             }
             is_news = false;
-            thread::sleep(FRAME_INTERVAL);
+            thread::sleep(INTERVAL);
         }
     }
 }
@@ -85,9 +88,7 @@ impl State {
 /// A connection to one run of the engine.
 struct Observation {
     specification: Arc<ServiceSpecification>,
-    observers: Vec<Observer>,
-    /// The newest batch of each group, if it is held.
-    newest: Vec<Option<BatchLease>>,
+    groups: Vec<WatchedGroup>,
     status: Json,
     details: Details,
 }
@@ -98,17 +99,16 @@ impl Observation {
         let config = ConnectConfig { service, namespace, timeout: Duration::ZERO };
         let first = Observer::connect(&config, 0)?;
         let specification = Arc::new(first.specification().clone());
-        let mut observers = vec![first];
+        let mut groups = vec![WatchedGroup::new(first)];
         for group in 1..specification.groups {
             let observer = Observer::connect(&config, group)?;
             if observer.specification().incarnation != specification.incarnation {
                 return Err(ServiceError::EngineRestarted { service: config.service });
             }
-            observers.push(observer);
+            groups.push(WatchedGroup::new(observer));
         }
         channel.history().begin(specification.incarnation);
-        let newest = observers.iter().map(|_| None).collect();
-        Ok(Observation { specification, observers, newest, status: Json::Null, details: Details::default() })
+        Ok(Observation { specification, groups, status: Json::Null, details: Details::default() })
     }
 
     /// Until the last browser has left, or the engine is lost.
@@ -133,8 +133,16 @@ impl Observation {
             // A page in the background gets one batch per status, for its curves.
             let shown = |viewer: &&Arc<Viewer>| is_news || !viewer.is_hidden();
             let shown: Vec<_> = viewers.iter().filter(shown).collect();
-            // A batch is taken only for a browser that can receive it.
-            if shown.iter().any(|viewer| viewer.is_ready()) && self.take(channel)? {
+            // A batch is taken only for a browser that can receive it, and one that no browser shows only for the curves.
+            let ready: Vec<_> =
+                shown.iter().filter(|viewer| viewer.is_ready()).map(|viewer| viewer.selection()).collect();
+            for (number, group) in self.groups.iter_mut().enumerate() {
+                let is_shown = ready.iter().any(|selection| selection.group == number && !selection.envs.is_empty());
+                if is_shown || (is_news && !ready.is_empty()) {
+                    group.want(is_shown);
+                }
+            }
+            if self.take(channel)? {
                 (is_news, heard) = (true, Instant::now());
             }
             if heard.elapsed() >= LIVENESS_INTERVAL {
@@ -142,42 +150,27 @@ impl Observation {
                 heard = Instant::now();
             }
             self.show(channel, &shown, is_news);
-            self.release();
-            thread::sleep(FRAME_INTERVAL);
+            self.groups.iter_mut().for_each(WatchedGroup::release);
+            let is_urgent = self.groups.iter().any(WatchedGroup::is_urgent);
+            thread::sleep(if is_urgent { URGENT_INTERVAL } else { INTERVAL });
         }
     }
 
-    /// Takes the newest batch of each group in place of the one before. Returns whether there was any.
+    /// Takes the newest batch of each group from which one is wanted, in place of the one before. Returns whether there was any.
     fn take(&mut self, channel: &Channel) -> Result<bool, ServiceError> {
         let mut is_new = false;
-        for (observer, newest) in self.observers.iter_mut().zip(&mut self.newest) {
-            if !observer.has_newer() {
-                continue;
-            }
-            // First, since the engine may permit only one.
-            *newest = None;
-            *newest = observer.newest()?;
-            if let Some(lease) = newest {
-                channel.history().add(&lease.batch());
+        for group in &mut self.groups {
+            if let Some(batch) = group.take()? {
+                channel.history().add(&batch);
                 is_new = true;
             }
         }
         Ok(is_new)
     }
 
-    /// Releases the batches that others have followed. While the trainer pauses, a browser may still select other environments of the
-    /// newest one.
-    fn release(&mut self) {
-        for (observer, newest) in self.observers.iter().zip(&mut self.newest) {
-            if observer.has_newer() {
-                *newest = None;
-            }
-        }
-    }
-
     /// An error if the engine has ended.
     fn check_alive(&self) -> Result<(), ServiceError> {
-        self.observers.first().map_or(Ok(()), Observer::check_alive)
+        self.groups.first().map_or(Ok(()), WatchedGroup::check_alive)
     }
 
     fn read_status(&mut self, channel: &Channel, with_details: bool) {
@@ -203,7 +196,7 @@ impl Observation {
                     "num_envs": self.specification.num_envs,
                     "status": self.status,
                 });
-                let lease = self.newest.get(selection.group).and_then(Option::as_ref);
+                let lease = self.groups.get(selection.group).and_then(WatchedGroup::newest);
                 message::encode(about, Some(&self.specification), selection, lease)
             });
         }
