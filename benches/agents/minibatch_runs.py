@@ -24,9 +24,8 @@ import tempfile
 import time
 from pathlib import Path
 
-import torch
-
 import endless_gym
+import torch
 from endless_gym.agents import checkpoint
 from endless_gym.agents.evaluate import evaluate, mean
 from endless_gym.agents.train import parse, train
