@@ -8,15 +8,19 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::Batch;
+use endless_gym_core::batch::{Batch, Block};
 use endless_gym_service::{BatchLease, Observer, ServiceError};
 
 /// Time between two frames that a browser gets, and so between two batches that are taken. Episodes that end in other batches are not
 /// part of the means.
 const FRAME_INTERVAL: Duration = Duration::from_millis(33);
 
-/// The same while the engine is busy: the end of a pause creates files and mappings.
+/// The same while the engine is busy, at least: the end of a pause creates files and mappings.
 const BUSY_FRAME_INTERVAL: Duration = Duration::from_millis(100);
+
+/// The same for each megabyte of a batch: two batches for each frame are written to memory that is not in the engine's cache, which
+/// takes about 75 microseconds longer for each of their megabytes.
+const BUSY_INTERVAL_OF_A_MEGABYTE: Duration = Duration::from_millis(10);
 
 /// An engine that returns this number of batches in a second, or more, is busy.
 const BUSY_RATE: f64 = 60.0;
@@ -34,6 +38,8 @@ const LONGEST_NAP: Duration = Duration::from_millis(3);
 /// A group and its newest batch.
 pub(crate) struct WatchedGroup {
     observer: Observer,
+    /// Time between two frames while the engine is busy.
+    busy_interval: Duration,
     /// The newest batch, if it is held.
     newest: Option<BatchLease>,
     /// The number of the last batch that was taken, and when.
@@ -51,12 +57,14 @@ impl WatchedGroup {
         // Until it is known what the browsers want: an open port keeps the engine from its one buffer.
         observer.pause();
         let last = (observer.step().unwrap_or(0), Instant::now());
-        WatchedGroup { observer, newest: None, last, is_wanted: true, is_shown: true, is_busy: false }
+        let megabytes = (observer.specification().batch.blocks() * size_of::<Block>()) as f64 / 1e6;
+        let busy_interval = BUSY_INTERVAL_OF_A_MEGABYTE.mul_f64(megabytes).max(BUSY_FRAME_INTERVAL);
+        WatchedGroup { observer, busy_interval, newest: None, last, is_wanted: true, is_shown: true, is_busy: false }
     }
 
     /// Asks for the next batch, for a browser that shows the group or only for its curves. Ignored while no other frame is due.
     pub fn want(&mut self, is_shown: bool) {
-        let interval = if self.is_busy { BUSY_FRAME_INTERVAL } else { FRAME_INTERVAL };
+        let interval = if self.is_busy { self.busy_interval } else { FRAME_INTERVAL };
         if self.last.1.elapsed() >= interval {
             (self.is_wanted, self.is_shown) = (true, is_shown);
         }
