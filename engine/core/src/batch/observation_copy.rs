@@ -8,7 +8,7 @@ use super::layout::Layout;
 use super::sections::BatchSection;
 use super::stamp::Stamp;
 use super::view::Batch;
-use crate::raster::copy_columns;
+use crate::raster::copy_run;
 
 /// A copy of the observations of a pool's batches, of which each update copies only what has changed.
 ///
@@ -210,9 +210,8 @@ impl ObservationUpdater {
             return Ok(self.bytes);
         };
         let FrameShape { frame, planes, rows, row, pixel } = self.frames;
-        let mut sum = 0;
-        let frames = observations.chunks_exact(frame).zip(copy.chunks_exact_mut(frame)).zip(changes.chunks_exact(size));
-        for (number, ((source, target), changes)) in frames.enumerate() {
+        let (mut sum, mut start) = (0, 0);
+        for changes in changes.chunks_exact(size) {
             for (band, &[bits, first, end]) in changes.as_chunks::<BAND_BYTES>().0.iter().enumerate() {
                 if bits == 0 {
                     continue;
@@ -220,24 +219,28 @@ impl ObservationUpdater {
                 // The description may come from another process, which may write anything.
                 let end = (usize::from(end) * pixel).min(row);
                 let first = (usize::from(first) * pixel).min(end);
-                let in_band = (rows - band * BAND).min(BAND);
-                let bits = u32::from(bits) & (u32::from(u8::MAX) >> (BAND - in_band));
                 for plane in 0..planes {
-                    let from = plane * rows + band * BAND;
-                    // The changed rows of a band are almost always consecutive.
-                    let mut rest = bits;
+                    let from = start + (plane * rows + band * BAND) * row;
+                    let in_band = (rows - band * BAND).min(BAND);
+                    let mut rest = bits & (u8::MAX >> (BAND - in_band));
+                    if rest.count_ones() as usize == in_band && end - first == row {
+                        let bytes = from..from + in_band * row;
+                        copy[bytes.clone()].copy_from_slice(&observations[bytes.clone()]);
+                        sum += bytes.len();
+                        copied(bytes);
+                        continue;
+                    }
                     while rest != 0 {
-                        let start = rest.trailing_zeros();
-                        let length = (rest >> start).trailing_ones();
-                        rest &= u32::MAX << (start + length);
-                        let start = from + start as usize;
-                        let lines = start * row..(start + length as usize) * row;
-                        copy_columns(&source[lines.clone()], &mut target[lines.clone()], row, first..end);
-                        sum += length as usize * (end - first);
-                        copied(number * frame + lines.start + first..number * frame + lines.end - (row - end));
+                        let from = from + rest.trailing_zeros() as usize * row;
+                        let bytes = from + first..from + end;
+                        copy_run(&observations[bytes.clone()], &mut copy[bytes.clone()]);
+                        sum += bytes.len();
+                        copied(bytes);
+                        rest &= rest - 1;
                     }
                 }
             }
+            start += frame;
         }
         Ok(sum)
     }

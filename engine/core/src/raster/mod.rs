@@ -48,6 +48,6 @@ pub use dirty_bands::DirtyBands;
 pub use dirty_surface::DirtySurface;
 pub use format::PixelFormat;
 pub use rect::{CornerRadii, Rect};
-pub(crate) use runs::{copy_columns, copy_run};
+pub(crate) use runs::copy_run;
 pub use sprite::Sprite;
 pub use surface::Surface;

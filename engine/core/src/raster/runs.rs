@@ -69,37 +69,6 @@ pub fn copy_run(source: &[u8], target: &mut [u8]) {
     }
 }
 
-/// Copies `within`, a range of the first row's bytes, and the same bytes of all further rows of `row` bytes, between slices of whole
-/// rows of the same length. The size of the blocks is chosen once for all rows.
-///
-/// # Panics
-///
-/// If `within` is reversed or the lengths differ.
-#[inline]
-pub fn copy_columns(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>) {
-    match within.len() {
-        length if length == row => target.copy_from_slice(source),
-        4..8 => for_each_row(source, target, row, within, copy_ends::<4>),
-        8..16 => for_each_row(source, target, row, within, copy_ends::<8>),
-        16..32 => for_each_row(source, target, row, within, copy_ends::<16>),
-        32..64 => for_each_row(source, target, row, within, copy_ends::<32>),
-        64..128 => for_each_row(source, target, row, within, copy_ends::<64>),
-        128..256 => for_each_row(source, target, row, within, copy_ends::<128>),
-        _ => for_each_row(source, target, row, within, copy_run),
-    }
-}
-
-/// Calls `copy` with these bytes of each row.
-#[inline]
-fn for_each_row(source: &[u8], target: &mut [u8], row: usize, within: Range<usize>, copy: impl Fn(&[u8], &mut [u8])) {
-    let target = &mut target[..source.len()];
-    let mut bytes = within;
-    while bytes.end <= source.len() {
-        copy(&source[bytes.clone()], &mut target[bytes.clone()]);
-        bytes = bytes.start + row..bytes.end + row;
-    }
-}
-
 /// Copies the first `N` bytes and the last.
 #[inline]
 fn copy_ends<const N: usize>(source: &[u8], target: &mut [u8]) {
