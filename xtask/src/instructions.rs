@@ -12,6 +12,11 @@ const STEPS: u64 = 250 * 16;
 /// Allowed deviation: processors of other kinds copy memory with other instructions.
 const MARGIN_PERCENT: u64 = 10;
 
+/// Settings of the C library's `memcpy` and `memset`: no `rep movsb` and `rep stosb`, of which callgrind counts every byte as an
+/// instruction.
+const NO_REPEATED_MOVES: &str =
+    "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
+
 /// Counts and compares with the budgets; with `record`, writes the counts as the new budgets.
 pub fn run(record: bool) -> Result<(), String> {
     let file = budgets_file();
@@ -51,6 +56,7 @@ fn count(id: &str) -> Result<u64, String> {
     let output = cargo::command()
         .args(["bench", "--locked", "--package", "endless-gym", "--bench", "instructions", "--", id])
         .env(target, VALGRIND)
+        .env("GLIBC_TUNABLES", NO_REPEATED_MOVES)
         .output()
         .map_err(|error| format!("cargo bench cannot be run: {error}"))?;
     let printed = String::from_utf8_lossy(&output.stderr);

@@ -23,6 +23,15 @@ impl<'a, T> RowsMut<'a, T> {
         &mut self.numbers[env * self.width..(env + 1) * self.width]
     }
 
+    /// Sets the number of one environment in a section of one number for each.
+    ///
+    /// # Panics
+    ///
+    /// If there are not so many numbers.
+    pub fn set(&mut self, env: usize, number: T) {
+        self.numbers[env] = number;
+    }
+
     fn split_at(self, env: usize) -> (Self, Self) {
         let (left, right) = self.numbers.split_at_mut(env * self.width);
         (RowsMut { numbers: left, width: self.width }, RowsMut { numbers: right, width: self.width })

@@ -138,11 +138,11 @@ impl<E: Environment> EnvSlot<E> {
     }
 
     fn write_transition(&self, out: &mut BatchMut<'_>, row: usize, reward: f64, terminated: bool) {
-        out.reward.row(row)[0] = reward;
-        out.terminated.row(row)[0] = u8::from(terminated);
-        out.truncated.row(row)[0] = 0;
-        out.episode_return.row(row)[0] = self.episode_return;
-        out.episode_length.row(row)[0] = self.episode_length;
+        out.reward.set(row, reward);
+        out.terminated.set(row, u8::from(terminated));
+        out.truncated.set(row, 0);
+        out.episode_return.set(row, self.episode_return);
+        out.episode_length.set(row, self.episode_length);
     }
 
     /// Writes the observations other than the frames.
