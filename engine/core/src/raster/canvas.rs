@@ -264,13 +264,13 @@ impl<'a> Canvas<'a> {
     /// Copies every pixel from a picture of the canvas' size.
     #[inline]
     pub fn paste(&mut self, picture: &[u8]) {
-        if self.is_whole() {
-            self.mark_dirty(0..self.width, &(0..self.height));
-            self.pixels.copy_from_slice(picture);
-            return;
-        }
         self.mark_dirty(self.columns.clone(), &self.rows.clone());
         let height = self.height;
+        if self.rows.len() == height {
+            // Whole columns are one run.
+            let bytes = self.columns.start * height * 3..self.columns.end * height * 3;
+            return self.pixels[bytes.clone()].copy_from_slice(&picture[bytes]);
+        }
         let length = self.rows.len() * 3;
         for x in self.columns.clone() {
             let start = (x * height + self.rows.start) * 3;

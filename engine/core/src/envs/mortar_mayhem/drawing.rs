@@ -128,11 +128,14 @@ impl Scene {
         }
     }
 
-    /// The rectangles in which this scene's frame differs from `shown`'s.
-    pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets) -> Damage {
+    /// The rectangles in which this scene's frame differs from `shown`'s. Unless they are `noted` for readers, they may be larger
+    /// where that is faster to paint.
+    pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets, noted: bool) -> Damage {
         let mut damage = Damage::new(SCREEN, SCREEN);
         if self.safe_tile != shown.safe_tile {
             let (left, top, right, bottom) = assets.config.arena;
+            // Whole columns are copied as one run.
+            let (top, bottom) = if noted { (top, bottom) } else { (0, SCREEN as i32) };
             damage.add(Rect::new(left, top, right - left, bottom - top));
         }
         if self.command != shown.command {

@@ -82,7 +82,7 @@ impl Environment for MortarMayhem {
     }
 
     fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
-        scene.damage_since(shown, assets).repair(canvas, |canvas| scene.paint(assets, canvas));
+        scene.damage_since(shown, assets, canvas.tracks_dirty()).repair(canvas, |canvas| scene.paint(assets, canvas));
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
