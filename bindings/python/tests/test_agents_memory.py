@@ -30,12 +30,19 @@ KINDS = {
     "trxl, short sequences": ("trxl", transformer(sequence_length=4)),
     "trxl, one sequence": ("trxl", transformer(sequence_length=64)),
     "trxl, single steps": ("trxl", transformer(sequence_length=1)),
+    "trxl, single steps, short window": ("trxl", transformer(sequence_length=1, window=6)),
     "trxl, single steps, separate heads": ("trxl", transformer(sequence_length=1, shared_heads=False)),
     "trxl, single steps, relative": ("trxl", transformer(sequence_length=1, positional_encoding="relative")),
     "trxl, single steps, learned": ("trxl", transformer(sequence_length=1, positional_encoding="learned")),
     "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
 }
 WITH_STATE = [name for name in KINDS if name not in ("none", "position")]
+
+
+@pytest.fixture(autouse=True)
+def short_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of single steps from several parts of a segment; with the short window, the last part is longer than the segment."""
+    monkeypatch.setattr("endless_gym.agents.transformer.SHORTEST_PART", 5)
 
 
 @pytest.fixture(params=KINDS)

@@ -32,7 +32,7 @@ BUDGETS = {
     "lstm": (34, 385),
     "trxl": (54, 315),
     # The gain and the bias of the normalisation, and the projections, are applied to queries and sums one by one.
-    "trxl, single steps": (54, 360),
+    "trxl, single steps": (54, 400),
     "gtrxl": (114, 465),
 }
 

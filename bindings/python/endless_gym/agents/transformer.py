@@ -11,9 +11,10 @@ Keys and values are not projected once for each window that contains a token:
   the newest token only, for all blocks at once. The cache is recomputed when the weights have changed.
 * Learning: a sequence of C steps is processed at once with the tokens of the sequence and of the `window - 1` steps before it. A
   band mask (causal, as wide as the window, and within one episode) says which query attends to which token.
-* Learning with sequences of one step: a token is in as many sequences as there are queries that attend to it. The key projection
-  is applied to the query and the value projection to the weighted sum of the tokens instead, which is the same by associativity
-  and costs as much as the projection of one token.
+* Learning with sequences of one step: the steps of a minibatch are grouped by the environment and the part of the segment that
+  they lie in, and all queries of a group attend to the same tokens under a mask (`Groups`). The key projection is applied to the
+  query and the value projection to the weighted sum of the tokens instead. That is the same by associativity, and faster with
+  few queries for each token.
 
 A query attends to the token of an earlier step if the distance in steps is at most `window - 1`, and at most the query's position
 in its episode. At the first step of an episode there is no token to attend to, and the attention output before the final
@@ -22,9 +23,10 @@ projection is 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +43,8 @@ SPARE_COLUMNS = 64
 #: What is added to the score of a token that a query does not attend to. Finite, so that the softmax of a fully masked row and
 #: its gradient are finite with every attention kernel; the output of such a row is set to 0.
 MASKED = -1e30
+#: Least number of steps in a part of a segment whose single steps attend to the same tokens.
+SHORTEST_PART = 32
 
 
 def sinusoids(positions: Tensor, width: int) -> Tensor:
@@ -61,6 +65,31 @@ def sinusoids(positions: Tensor, width: int) -> Tensor:
 def normalised(tokens: Tensor) -> Tensor:
     """Tokens with mean 0 and variance 1: layer normalisation without gain and bias, float (..., width)."""
     return functional.layer_norm(tokens, tokens.shape[-1:])
+
+
+@dataclass
+class Groups:
+    """Where the queries of single steps lie in G groups of K places, of which some are empty.
+
+    Attributes:
+        query: Number of the query in each place, int64 (G * K,); of any query in an empty place.
+        place: Place of each query, int64 (n,).
+        size: K.
+    """
+
+    query: Tensor
+    place: Tensor
+    size: int
+
+    def gather(self, x: Tensor) -> Tensor:
+        """Put the queries, float (n, heads, 1, size), into their places: float (G, heads, K, size)."""
+        gathered: Tensor = x.squeeze(2).index_select(0, self.query).unflatten(0, (-1, self.size)).transpose(1, 2)
+        return gathered
+
+    def scatter(self, x: Tensor) -> Tensor:
+        """The inverse of `gather`, without the empty places: float (n, 1, heads, size)."""
+        scattered: Tensor = x.transpose(1, 2).flatten(0, 1).index_select(0, self.place).unsqueeze(1)
+        return scattered
 
 
 class Attention(nn.Module):
@@ -92,7 +121,14 @@ class Attention(nn.Module):
         return projected.transpose(-3, -2)
 
     def forward(
-        self, x: Tensor, tokens: Tensor, norm: nn.LayerNorm, bias: Tensor, first: Tensor, distance: Tensor
+        self,
+        x: Tensor,
+        tokens: Tensor,
+        norm: nn.LayerNorm,
+        bias: Tensor,
+        first: Tensor,
+        distance: Tensor,
+        groups: Groups | None,
     ) -> Tensor:
         """Scaled dot-product attention.
 
@@ -103,21 +139,25 @@ class Attention(nn.Module):
             bias: Attention mask, float32 (n, 1, queries, tokens); 0 where the query attends to the token, else `MASKED`.
             first: Whether the query attends to no token, bool (n, queries, 1).
             distance: Steps from the token to the query, int64 (queries, tokens); used by the relative encoding.
+            groups: Where the single queries of x, float (n, 1, width), lie in groups of K. Then `tokens` is (G, tokens, width),
+                `bias` (G, 1, K, tokens), and `distance` (G, 1, K, tokens).
 
         Returns:
             float (n, queries, width).
         """
         queries = self.project(self.queries, x)
+        if groups is not None:
+            queries = groups.gather(queries)
         if self.relative:
             # Relative encoding of Dai et al., 2019: a content term and a distance term, each with a learned bias. A distance is
             # at most the number of tokens.
             encoded = self.encoded_distances(torch.arange(tokens.shape[-2] + 1, device=x.device), x.dtype)
             scores = (queries + self.distance_bias) @ encoded.transpose(-2, -1)  # (n, heads, queries, distances)
-            chosen = distance.clamp(min=0).expand(*scores.shape[:2], *distance.shape)
+            chosen = distance.clamp(min=0).expand(*scores.shape[:2], *distance.shape[-2:])
             bias = scores.gather(-1, chosen) * self.scale + bias
             queries = queries + self.content_bias
-        if x.shape[1] == 1:
-            summed = self._one_query(queries.squeeze(2), tokens, norm, bias.squeeze(2)).unsqueeze(1)
+        if groups is not None:
+            summed = groups.scatter(self._few_queries(queries, tokens, norm, bias))
         else:
             tokens = torch.addcmul(norm.bias, tokens, norm.weight)
             keys, values = self.project(self.keys, tokens), self.project(self.values, tokens)
@@ -126,26 +166,27 @@ class Attention(nn.Module):
         out: Tensor = self.fc_out(summed.flatten(-2).masked_fill(first, 0.0))
         return out
 
-    def _one_query(self, queries: Tensor, tokens: Tensor, norm: nn.LayerNorm, bias: Tensor) -> Tensor:
-        """Attention of one query to each sequence of tokens, without the projection of each token.
+    def _few_queries(self, queries: Tensor, tokens: Tensor, norm: nn.LayerNorm, bias: Tensor) -> Tensor:
+        """Attention of a few queries to each group of tokens, without the projection of each token.
 
         The gain and the bias of the normalisation are applied to the query and to the weighted sum as well. The bias adds the
         same to all scores, which the softmax ignores.
 
         Args:
-            queries: float (n, heads, head size).
-            tokens: Normalised tokens, float (n, tokens, width).
+            queries: float (G, heads, K, head size).
+            tokens: Normalised tokens, float (G, tokens, width).
             norm: Layer normalisation of the tokens.
-            bias: What is added to the scores, float (n, heads or 1, tokens).
+            bias: What is added to the scores, float (G, heads or 1, K, tokens).
 
         Returns:
-            float (n, heads, head size).
+            float (G, heads, K, head size).
         """
-        tokens = tokens.to(queries.dtype)
-        queries = torch.einsum("nhs,hsw->nhw", queries, self._of_heads(self.keys)) * norm.weight
-        scores = (queries * self.scale) @ tokens.transpose(1, 2) + bias
-        summed = scores.softmax(-1).to(tokens.dtype) @ tokens * norm.weight + norm.bias
-        return torch.einsum("nhw,hsw->nhs", summed, self._of_heads(self.values))
+        tokens, heads = tokens.to(queries.dtype), queries.shape[1:3]
+        queries = torch.einsum("ghks,hsw->ghkw", queries, self._of_heads(self.keys)) * (norm.weight * self.scale)
+        scores = (queries.flatten(1, 2) @ tokens.transpose(1, 2)).unflatten(1, heads) + bias
+        weights = scores.softmax(-1).to(tokens.dtype)
+        summed = (weights.flatten(1, 2) @ tokens).unflatten(1, heads) * norm.weight + norm.bias
+        return torch.einsum("ghkw,hsw->ghks", summed, self._of_heads(self.values))
 
     def _of_heads(self, layer: nn.Linear) -> Tensor:
         """The projection of a whole vector for each head, float (heads, head size, width)."""
@@ -201,9 +242,11 @@ class Block(nn.Module):
         self.gate_fc = Gate(width, gate) if settings.gating else None
         self._initialise(settings.initialisation, settings.layers)
 
-    def forward(self, x: Tensor, tokens: Tensor, bias: Tensor, first: Tensor, distance: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, tokens: Tensor, bias: Tensor, first: Tensor, distance: Tensor, groups: Groups | None
+    ) -> Tensor:
         """The block's output, float (n, queries, width); arguments as for `Attention.forward`."""
-        attended: Tensor = self.attention(self.norm_query(x), tokens, self.norm_tokens, bias, first, distance)
+        attended: Tensor = self.attention(self.norm_query(x), tokens, self.norm_tokens, bias, first, distance, groups)
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
         added: Tensor = self.fc(self.norm_fc(x)).relu()
         out: Tensor = x + added if self.gate_fc is None else self.gate_fc(x, added)
@@ -349,16 +392,23 @@ class TransformerMinibatch(Minibatch):
         tokens: The cached inputs of each block, float32 (layers, sequences, P + C, width); with positions added and normalised,
             unless the positional encoding is learned.
         position: Position of each token in its episode, int64 (sequences, P + C).
+        query_position: Position of each query in its episode, int64 (sequences, C).
         bias: Attention mask, float32 (sequences, 1, C, P + C); 0 where the query attends to the token, else `MASKED`.
-        first: Whether the query is the first step of an episode, bool (sequences, C, 1).
         distance: Steps from each token to each query, int64 (C, P + C).
+        groups: With C = 1, where the queries lie in groups of K. Then `tokens`, `position`, `bias` and `distance` have G groups
+            in place of sequences, K queries in place of C, and the tokens that any query of the group may attend to.
     """
 
     tokens: Tensor
     position: Tensor
+    query_position: Tensor
     bias: Tensor
-    first: Tensor
     distance: Tensor
+    groups: Groups | None = None
+
+
+#: Makes a minibatch of the chosen sequences, sorted and on the CPU, and of `indices` and `everywhere` of `Minibatch`.
+MakeMinibatch: TypeAlias = Callable[[Tensor, Tensor, Tensor], TransformerMinibatch]
 
 
 class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerMinibatch]):
@@ -457,18 +507,11 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         length = min(self.settings.sequence_length, steps)
         longest = torch.stack([state.position[:, self.past :].max() for state in states]).max()
         past = max(1, min(self.past, int(longest)))
-        span, skipped, sequences = past + length, self.past - past, steps // length
-        # Columns that no query attends to are skipped. Then column c is step c - past, and sequence s of an environment spans the
-        # columns from s * length to s * length + span.
+        # Columns that no query attends to are skipped. Then column c is step c - past.
+        skipped, sequences = self.past - past, steps // length
         tokens = torch.cat([self._tokens(state, skipped) for state in states], dim=1)
-        columns, tokens = tokens.shape[2], tokens.flatten(1, 2)
-        position = torch.cat([state.position[:, skipped:] for state in states]).flatten()
-        offsets = torch.arange(span, device=self.device)
-        distance = offsets[past:].unsqueeze(1) - offsets
-        outside = (distance < 1) | (distance > self.past)
-        # The first column of each sequence, counted through all environments.
-        starts = torch.arange(len(own)).unsqueeze(1) * columns + torch.arange(sequences) * length
-        starts = starts.flatten().to(self.device)
+        position = torch.cat([state.position[:, skipped:] for state in states])
+        parts = (self._groups if length == 1 else self._sequences)(tokens, position, past, steps, length)
 
         def steps_of(envs: int) -> Tensor:
             """Index of each step of each sequence in the flattened segment, int64 (envs * sequences, length)."""
@@ -483,34 +526,90 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             if steps_everywhere is not None:
                 everywhere = steps_everywhere[chosen.to(self.device)].flatten()
                 chosen = chosen[is_own(chosen // sequences, own)] - own.start * sequences
-            chosen = chosen.to(self.device)
-            indices = steps_here[chosen].flatten()
-            rows = (starts[chosen].unsqueeze(1) + offsets).flatten()
-            positions = position[rows].unflatten(0, (-1, span))
-            queries = positions[:, past:].unsqueeze(-1)
-            bias = torch.zeros(len(chosen), length, span, device=self.device)
-            return TransformerMinibatch(
-                indices=indices,
-                everywhere=indices if everywhere is None else everywhere,
-                tokens=tokens.index_select(1, rows).unflatten(1, (-1, span)),
-                position=positions,
-                bias=bias.masked_fill_(outside | (distance > queries), MASKED).unsqueeze(1),
-                first=queries == 0,
-                distance=distance,
-            )
+            indices = steps_here[chosen.to(self.device)].flatten()
+            return parts(chosen, indices, indices if everywhere is None else everywhere)
 
         return LazyMinibatches(balanced_split([length] * (envs * sequences), num_minibatches, generator), minibatch)
 
+    def _sequences(self, tokens: Tensor, position: Tensor, past: int, steps: int, length: int) -> MakeMinibatch:
+        """Makes minibatches of sequences, each with its own tokens.
+
+        Args:
+            tokens: See `_tokens`, float32 (layers, envs, past + steps, width).
+            position: Position of each token, int64 (envs, past + steps).
+            past: Number of tokens before the segment.
+            steps: Steps of the segment.
+            length: Steps of a sequence. Sequence s of an environment spans the columns s * length to (s + 1) * length + past.
+        """
+        envs, columns = position.shape
+        tokens, position = tokens.flatten(1, 2), position.flatten()
+        offsets = torch.arange(past + length, device=self.device)
+        distance = offsets[past:].unsqueeze(1) - offsets
+        outside = (distance < 1) | (distance > self.past)
+        # The first column of each sequence, counted through all environments.
+        starts = torch.arange(envs).unsqueeze(1) * columns + torch.arange(steps // length) * length
+        starts = starts.flatten().to(self.device)
+
+        def minibatch(chosen: Tensor, indices: Tensor, everywhere: Tensor) -> TransformerMinibatch:
+            rows = (starts[chosen.to(self.device)].unsqueeze(1) + offsets).flatten()
+            positions = position[rows].unflatten(0, (-1, len(offsets)))
+            queries = positions[:, past:]
+            bias = torch.zeros(len(chosen), *distance.shape, device=self.device)
+            bias.masked_fill_(outside | (distance > queries.unsqueeze(-1)), MASKED)
+            chosen_tokens = tokens.index_select(1, rows).unflatten(1, (-1, len(offsets)))
+            return TransformerMinibatch(
+                indices, everywhere, chosen_tokens, positions, queries, bias.unsqueeze(1), distance
+            )
+
+        return minibatch
+
+    def _groups(self, tokens: Tensor, position: Tensor, past: int, steps: int, length: int) -> MakeMinibatch:
+        """Makes minibatches of single steps, grouped by environment and part of the segment; arguments as for `_sequences`.
+
+        A sequence of one step would need a copy of `past` tokens for each step. The parts are about as long as the past, so that
+        a query attends to half of its group's tokens.
+        """
+        del length
+        envs = len(position)
+        parts = math.ceil(steps / max(past, SHORTEST_PART))
+        part = math.ceil(steps / parts)
+        padding = parts * part - steps
+        query_position = position[:, past:].flatten()
+        tokens = functional.pad(tokens, (0, 0, 0, padding)).unfold(2, past + part, part).mT.flatten(1, 2)
+        position = functional.pad(position, (0, padding)).unfold(1, past + part, part).flatten(0, 1)
+        columns = torch.arange(past + part, device=self.device)
+
+        def minibatch(chosen: Tensor, indices: Tensor, everywhere: Tensor) -> TransformerMinibatch:
+            step = chosen % steps
+            group = chosen // steps * parts + step // part
+            count = torch.bincount(group, minlength=envs * parts)
+            size, number = int(count.max()), torch.arange(len(chosen))
+            place = group * size + number - (count.cumsum(0) - count)[group]
+            query = torch.zeros(envs * parts * size, dtype=torch.long).index_copy_(0, place, number)
+            column = (past + step % part).to(self.device)
+            chosen, place, query = chosen.to(self.device), place.to(self.device), query.to(self.device)
+            queries = query_position[chosen].unsqueeze(-1)
+            groups = Groups(query, place, size)
+            distance = column[query].view(-1, 1, size, 1) - columns
+            bias = torch.zeros(distance.shape, device=self.device)
+            masked = (distance < 1) | (distance > self.past) | (distance > queries[query].view(-1, 1, size, 1))
+            return TransformerMinibatch(
+                indices, everywhere, tokens, position, queries, bias.masked_fill_(masked, MASKED), distance, groups
+            )
+
+        return minibatch
+
     def forward(self, x: Tensor, minibatch: TransformerMinibatch) -> Tensor:
-        length, span = minibatch.distance.shape
-        x = self.embedding(x).unflatten(0, (-1, length))
+        queries = minibatch.query_position
+        x = self.embedding(x).unflatten(0, queries.shape)
         learned = isinstance(self.table, nn.Parameter)
-        encoding = self._encoding(minibatch.position) if learned or self.settings.query_encoding else None
-        queries = encoding[:, span - length :] if encoding is not None and self.settings.query_encoding else None
+        encoding = self._encoding(minibatch.position) if learned else None
+        query_encoding = self._encoding(queries) if self.settings.query_encoding else None
+        first = (queries == 0).unsqueeze(-1)
         for block, tokens in zip(self.blocks, minibatch.tokens, strict=True):
-            tokens = normalised(tokens + encoding) if learned else tokens
-            x = x if queries is None else x + queries
-            x = block(x, tokens, minibatch.bias, minibatch.first, minibatch.distance)
+            tokens = tokens if encoding is None else normalised(tokens + encoding)
+            x = x if query_encoding is None else x + query_encoding
+            x = block(x, tokens, minibatch.bias, first, minibatch.distance, minibatch.groups)
         return x.flatten(0, 1)
 
     def _tokens(self, state: TransformerState, skipped: int) -> Tensor:
