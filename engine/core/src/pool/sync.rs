@@ -3,7 +3,11 @@
 use std::sync::PoisonError;
 
 #[cfg(loom)]
+pub(super) use loom::sync::atomic::{AtomicBool, Ordering};
+#[cfg(loom)]
 pub(super) use loom::sync::{Mutex, MutexGuard};
+#[cfg(not(loom))]
+pub(super) use std::sync::atomic::{AtomicBool, Ordering};
 #[cfg(not(loom))]
 pub(super) use std::sync::{Mutex, MutexGuard};
 
@@ -16,7 +20,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 #[cfg(all(feature = "threads", not(loom)))]
 pub(super) mod threads {
     pub(in crate::pool) use std::sync::Arc;
-    pub(in crate::pool) use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+    pub(in crate::pool) use std::sync::atomic::{AtomicPtr, AtomicU64, AtomicUsize, fence};
     pub(in crate::pool) use std::thread;
 
     pub(in crate::pool) use crossbeam_utils::Backoff;
@@ -29,7 +33,7 @@ pub(super) mod threads {
 #[cfg(all(feature = "threads", loom))]
 pub(super) mod threads {
     pub(in crate::pool) use loom::sync::Arc;
-    pub(in crate::pool) use loom::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+    pub(in crate::pool) use loom::sync::atomic::{AtomicPtr, AtomicU64, AtomicUsize, fence};
     pub(in crate::pool) use loom::thread;
 
     /// Workers park at once: a model has no time, and a worker that spins cannot miss a call.

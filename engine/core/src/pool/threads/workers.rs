@@ -3,6 +3,9 @@
 //! A step takes tens of microseconds, less than waking a thread takes. So the caller starts at once and waits only for workers
 //! that have joined: a running worker joins, one that wakes too late finds the call closed. After a call, a worker spins, then
 //! yields, then parks.
+//!
+//! With many workers nothing is done for one after the other: each joins by a flag of its own, and wakes a few others, which wake
+//! others in turn.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -11,14 +14,16 @@ use std::time::Instant;
 use crossbeam_utils::CachePadded;
 use crossbeam_utils::sync::{Parker, Unparker};
 
-use crate::pool::sync::threads::{Arc, AtomicBool, AtomicU64, AtomicUsize, Backoff, Ordering, PARK_AFTER, thread};
-use crate::pool::sync::{Mutex, lock};
+use crate::pool::sync::threads::{Arc, AtomicPtr, AtomicU64, AtomicUsize, Backoff, PARK_AFTER, fence, thread};
+use crate::pool::sync::{AtomicBool, Mutex, Ordering, lock};
+
+/// Workers that each thread wakes.
+const WAKES: usize = 3;
 
 /// Threads that wait for calls. They end when this is dropped.
 #[derive(Debug)]
 pub(super) struct Workers {
     shared: Arc<Shared>,
-    unparkers: Vec<Unparker>,
     /// Held during a call, so that callers take turns.
     turn: Mutex<()>,
 }
@@ -26,17 +31,17 @@ pub(super) struct Workers {
 /// A function of the thread's number. It is borrowed for the time of one call.
 type Task = &'static (dyn Fn(usize) + Sync);
 
-/// What the caller and its workers share. Counters that different threads write have separate cache lines.
-#[derive(Default)]
+/// What the caller and its workers share. What different threads write lies on separate cache lines.
 struct Shared {
     /// Generation counter of calls: incremented when a call opens and when it closes, so odd while workers may join.
     generation: CachePadded<AtomicU64>,
     /// Number of the last worker that may join the open call.
     helpers: AtomicUsize,
-    /// The open call's task.
-    open: Mutex<Option<Task>>,
-    /// Workers that have joined and not finished.
-    joined: CachePadded<AtomicUsize>,
+    /// The open call's task; valid while a worker has joined.
+    task: AtomicPtr<Task>,
+    /// For each worker, whether it has joined a call and not finished, or is about to find the call closed.
+    joined: Vec<CachePadded<AtomicBool>>,
+    unparkers: Vec<Unparker>,
     panic: Mutex<Option<Box<dyn Any + Send>>>,
     stop: AtomicBool,
 }
@@ -53,11 +58,19 @@ impl std::fmt::Debug for Shared {
 impl Workers {
     /// Starts `count` workers, numbered from 1.
     pub(super) fn new(count: usize) -> std::io::Result<Self> {
-        let mut workers = Workers { shared: Arc::default(), unparkers: Vec::new(), turn: Mutex::default() };
-        for number in 1..=count {
+        let parkers: Vec<Parker> = (0..count).map(|_| Parker::new()).collect();
+        let shared = Arc::new(Shared {
+            generation: CachePadded::default(),
+            helpers: AtomicUsize::new(0),
+            task: AtomicPtr::new(std::ptr::null_mut()),
+            joined: parkers.iter().map(|_| CachePadded::default()).collect(),
+            unparkers: parkers.iter().map(|parker| parker.unparker().clone()).collect(),
+            panic: Mutex::default(),
+            stop: AtomicBool::new(false),
+        });
+        let workers = Workers { shared, turn: Mutex::default() };
+        for (number, parker) in (1..).zip(parkers) {
             let shared = Arc::clone(&workers.shared);
-            let parker = Parker::new();
-            workers.unparkers.push(parker.unparker().clone());
             let name = format!("endless-worker-{number}");
             thread::Builder::new().name(name).spawn(move || shared.serve(number, &parker))?;
         }
@@ -66,17 +79,17 @@ impl Workers {
 
     /// How many workers there are.
     pub(super) fn count(&self) -> usize {
-        self.unparkers.len()
+        self.shared.joined.len()
     }
 
     /// See [`Threads::run`](super::Threads::run).
     pub(super) fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
         let _turn = lock(&self.turn);
-        // SAFETY: only the lifetime changes. Workers take the reference only from `open`, and increment `joined` before they
-        // release its lock; dropping `Call` clears `open` and waits until `joined` is 0 before this function returns or unwinds.
-        let task = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Task>(work) };
-        let call = Call::open(&self.shared, task, helpers);
-        self.unparkers.iter().take(helpers).for_each(Unparker::unpark);
+        // SAFETY: only the lifetime changes. Workers copy the reference only after they have joined an open call, and dropping `Call`
+        // closes the call and waits until no worker has joined before this function returns or unwinds.
+        let mut task = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Task>(work) };
+        let call = Call::open(&self.shared, &mut task, helpers.min(self.count()));
+        self.shared.wake(0, call.helpers);
         work(0);
         drop(call);
         if let Some(panic) = lock(&self.shared.panic).take() {
@@ -89,41 +102,47 @@ impl Workers {
 impl Drop for Workers {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::SeqCst);
-        self.unparkers.iter().for_each(Unparker::unpark);
+        self.shared.unparkers.iter().for_each(Unparker::unpark);
     }
 }
 
 /// A call that workers may join until it is dropped.
-struct Call<'a>(&'a Shared);
+struct Call<'a> {
+    shared: &'a Shared,
+    helpers: usize,
+}
 
 impl<'a> Call<'a> {
-    fn open(shared: &'a Shared, task: Task, helpers: usize) -> Self {
+    fn open(shared: &'a Shared, task: &'a mut Task, helpers: usize) -> Self {
         // An earlier call's panic is still here if its caller panicked as well.
         *lock(&shared.panic) = None;
-        shared.helpers.store(helpers, Ordering::SeqCst);
-        *lock(&shared.open) = Some(task);
+        shared.helpers.store(helpers, Ordering::Release);
+        shared.task.store(task, Ordering::Release);
         shared.generation.fetch_add(1, Ordering::SeqCst);
-        Call(shared)
+        Call { shared, helpers }
     }
 }
 
 impl Drop for Call<'_> {
     fn drop(&mut self) {
-        self.0.generation.fetch_add(1, Ordering::SeqCst);
-        *lock(&self.0.open) = None;
-        let backoff = Backoff::new();
-        while self.0.joined.load(Ordering::Acquire) > 0 {
-            backoff.snooze();
+        self.shared.generation.fetch_add(1, Ordering::SeqCst);
+        // Either this thread sees the worker's flag, or the worker sees that the call is closed: see `join`.
+        fence(Ordering::SeqCst);
+        for joined in &self.shared.joined[..self.helpers] {
+            let backoff = Backoff::new();
+            while joined.load(Ordering::Acquire) {
+                backoff.snooze();
+            }
         }
     }
 }
 
-/// A worker that has joined a call.
-struct Joined<'a>(&'a Shared);
+/// A worker's flag, until it has finished.
+struct Joined<'a>(&'a AtomicBool);
 
 impl Drop for Joined<'_> {
     fn drop(&mut self) {
-        self.0.joined.fetch_sub(1, Ordering::Release);
+        self.0.store(false, Ordering::Release);
     }
 }
 
@@ -133,16 +152,24 @@ impl Shared {
         let (mut last, mut since) = (0, Instant::now());
         while let Some(generation) = self.next_call(last, since, parker) {
             last = generation;
-            if number > self.helpers.load(Ordering::SeqCst) {
+            let helpers = self.helpers.load(Ordering::Acquire);
+            if number > helpers {
                 continue;
             }
-            if let Some((task, _joined)) = self.join(generation)
-                && let Err(panic) = catch_unwind(AssertUnwindSafe(|| task(number)))
-            {
-                *lock(&self.panic) = Some(panic);
+            if let Some((task, _joined)) = self.join(number, generation) {
+                self.wake(number, helpers);
+                if let Err(panic) = catch_unwind(AssertUnwindSafe(|| task(number))) {
+                    *lock(&self.panic) = Some(panic);
+                }
             }
             since = Instant::now();
         }
+    }
+
+    /// Wakes the workers, of those that may join, that are this thread's to wake.
+    fn wake(&self, number: usize, helpers: usize) {
+        let first = (number * WAKES).min(helpers);
+        self.unparkers[first..(first + WAKES).min(helpers)].iter().for_each(Unparker::unpark);
     }
 
     /// Waits for a call other than `last` and returns its generation; `None` after `stop`. The worker parks
@@ -164,11 +191,18 @@ impl Shared {
     }
 
     /// The task of the call of that generation, if it still is open; the worker then has joined.
-    fn join(&self, generation: u64) -> Option<(Task, Joined<'_>)> {
-        let open = lock(&self.open);
-        let task = open.filter(|_| self.generation.load(Ordering::SeqCst) == generation)?;
-        self.joined.fetch_add(1, Ordering::Relaxed);
-        Some((task, Joined(self)))
+    fn join(&self, number: usize, generation: u64) -> Option<(Task, Joined<'_>)> {
+        let flag = &self.joined[number - 1];
+        flag.store(true, Ordering::Relaxed);
+        let joined = Joined(flag);
+        fence(Ordering::SeqCst);
+        if self.generation.load(Ordering::Relaxed) != generation {
+            return None;
+        }
+        // SAFETY: the call is open, and the caller that closes it sees the flag after its own fence. So it waits for this worker, and
+        // until then the task lies in its stack frame.
+        let task = unsafe { *self.task.load(Ordering::Acquire) };
+        Some((task, joined))
     }
 }
 
