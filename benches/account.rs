@@ -322,10 +322,14 @@ fn instructions(spec: &EnvSpec) {
     let rules = &counts[0];
     let [random, resets] = [rules.random, rules.resets].map(|count| count as f64 / steps);
     println!(
-        "| {} | {:.0} | {random:.0} | {resets:.0} | {:.0} | {:.0} | {:.0} | {:.0} | {:.0} | {:.0} |",
+        "| {} | {:.0} | {random:.0} | {resets:.0} | {} | {:.0} | {:.0} | {:.0} | {:.0} | {:.0} |",
         spec.id,
         each[0],
-        steps / rules.num_resets.max(1) as f64,
+        if rules.num_resets == 0 {
+            "-".to_owned()
+        } else {
+            (COUNTED_ENVS * COUNTED_STEPS / rules.num_resets as usize).to_string()
+        },
         each[1] - each[0],
         each[2] - each[1],
         each[3] - each[2],
