@@ -1,6 +1,6 @@
 //! Where the time of a step goes, by id and number of environments: `cargo bench --bench account`.
 //!
-//! Phases are cumulative variants of a step, each with environments of its own that play the same episodes, and a phase's cost is the
+//! Phases are cumulative variants of a step, each with environments of its own, and a phase's cost is the
 //! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
 //!
 //! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--memory` measures the memory.
