@@ -261,6 +261,9 @@ fn bench_measures_every_method() {
         assert!(methods.contains(&method), "{methods:?}");
     }
     assert!(measurements.iter().all(|m| m["steps_per_second"].as_f64().unwrap() > 0.0));
+    assert!(measurements.iter().all(|m| m["batch_bytes"].as_u64().unwrap() > 16 * 84 * 84 * 3));
+    // No batch of 16 environments is large enough for huge pages in process.
+    assert!(measurements.iter().all(|m| m["huge_page_bytes"].as_u64().unwrap() <= m["batch_bytes"].as_u64().unwrap()));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use endless_gym::batch::{Block, Layout, zeroed};
+use endless_gym::batch::{BatchBuffer, Block, Layout};
 use numpy::{PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
@@ -11,7 +11,7 @@ use crate::arrays::Owner;
 
 /// The memory of one batch.
 pub struct Buffer {
-    blocks: Vec<Block>,
+    blocks: BatchBuffer,
     /// The address of `blocks`, which arrays and tensors use.
     address: *mut Block,
     /// A writable tensor of this memory was exported since the pool last wrote to it.
@@ -26,7 +26,7 @@ unsafe impl Sync for Buffer {}
 
 impl Buffer {
     fn new(blocks: usize) -> Self {
-        let mut blocks = zeroed(blocks);
+        let mut blocks = BatchBuffer::new(blocks);
         let address = blocks.as_mut_ptr();
         Buffer { blocks, address, exported: AtomicBool::new(false) }
     }

@@ -4,13 +4,14 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{Batch, zeroed};
+use endless_gym_core::batch::{BLOCK_BYTES, Batch, BatchBuffer};
 use endless_gym_core::envs::{self, DEFAULT_ENV_ID, EnvSpec};
 use endless_gym_core::pool::{Pool, ResetRequest, Threads};
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;
 use super::failure::Failure;
+use super::huge_pages::{self, Kind};
 use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
 use super::play::RandomPolicy;
@@ -80,6 +81,18 @@ struct Measurement {
     steps_per_second: f64,
     lowest: f64,
     highest: f64,
+    /// Bytes of one batch.
+    batch_bytes: Option<usize>,
+    /// Bytes of batches in huge pages, of all batches of the engine with the service. `None` if the system does not report them.
+    huge_page_bytes: Option<u64>,
+}
+
+/// The result of one round.
+#[derive(Clone, Copy)]
+struct Round {
+    steps_per_second: f64,
+    batch_bytes: Option<usize>,
+    huge_page_bytes: Option<u64>,
 }
 
 /// Runs `endless bench`.
@@ -136,10 +149,17 @@ fn name(method: Method) -> String {
 }
 
 impl Measurement {
-    fn new(method: Method, mut results: Vec<f64>) -> Self {
-        results.sort_by(f64::total_cmp);
-        let (lowest, highest) = (results[0], results[results.len() - 1]);
-        Measurement { method: name(method), steps_per_second: results[results.len() / 2], lowest, highest }
+    fn new(method: Method, mut rounds: Vec<Round>) -> Self {
+        rounds.sort_by(|a, b| a.steps_per_second.total_cmp(&b.steps_per_second));
+        let median = rounds[rounds.len() / 2];
+        Measurement {
+            method: name(method),
+            steps_per_second: median.steps_per_second,
+            lowest: rounds[0].steps_per_second,
+            highest: rounds[rounds.len() - 1].steps_per_second,
+            batch_bytes: median.batch_bytes,
+            huge_page_bytes: median.huge_page_bytes,
+        }
     }
 }
 
@@ -161,7 +181,7 @@ fn show(args: &Args, rows: &[Row]) -> Result<(), Failure> {
                 original.map_or("not measured".to_owned(), |original| format!("{:.0} x", speed / original)),
             ]);
         }
-        print(format_args!("{shown}\n"))?;
+        print(format_args!("{shown}\n{}\n", memory(row)))?;
     }
     let service = rows.first().map_or(1, |row| row.service_threads);
     let threads = if service == 1 { "1 thread".to_owned() } else { format!("{service} threads") };
@@ -171,13 +191,31 @@ fn show(args: &Args, rows: &[Row]) -> Result<(), Failure> {
     ))
 }
 
-/// Steps per second of one method.
-fn measure(args: &Args, spec: &'static EnvSpec, method: Method, stop: &AtomicBool) -> Result<f64, Failure> {
+/// How much memory the batches of the first measurement in process, and of the first with the service, have in huge pages.
+fn memory(row: &Row) -> String {
+    let megabytes = |bytes: Option<u64>| {
+        bytes.map_or("an unknown number of".to_owned(), |bytes| format!("{:.1}", bytes as f64 / 1e6))
+    };
+    let of = |method: Method| row.measurements.iter().find(|measurement| measurement.method == name(method));
+    let huge = |method: Method| megabytes(of(method).and_then(|measurement| measurement.huge_page_bytes));
+    let in_process = Method::InProcess { threads: 1 };
+    format!(
+        "A batch has {} MB. In huge pages: {} MB of it in process, {} MB of the engine's shared memory.",
+        megabytes(of(in_process).and_then(|measurement| measurement.batch_bytes).map(|bytes| bytes as u64)),
+        huge(in_process),
+        huge(Method::ServiceReceives)
+    )
+}
+
+/// One round of one method.
+fn measure(args: &Args, spec: &'static EnvSpec, method: Method, stop: &AtomicBool) -> Result<Round, Failure> {
     match method {
         Method::InProcess { threads } => in_process(args, spec, threads, stop),
         Method::ServiceReceives => through_service(args, spec, false, stop),
         Method::ServiceReads => through_service(args, spec, true, stop),
-        Method::Original => original(args, spec),
+        Method::Original => {
+            Ok(Round { steps_per_second: original(args, spec)?, batch_bytes: None, huge_page_bytes: None })
+        }
     }
 }
 
@@ -195,18 +233,25 @@ fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Fai
     Ok((batches * args.num_envs) as f64 / start.elapsed().as_secs_f64())
 }
 
-fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &AtomicBool) -> Result<f64, Failure> {
+fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &AtomicBool) -> Result<Round, Failure> {
     let mut pool = Pool::new(&args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
-    let mut blocks = zeroed(pool.layout().blocks());
-    pool.reset(ResetRequest::All, &mut blocks)?;
     let mut actions = Actions::new(spec, args.num_envs);
-    time(args, stop, || {
+    let before = huge_pages::bytes(std::process::id(), Kind::Anonymous);
+    let mut blocks = BatchBuffer::new(pool.layout().blocks());
+    pool.reset(ResetRequest::All, &mut blocks)?;
+    let after = huge_pages::bytes(std::process::id(), Kind::Anonymous);
+    let steps_per_second = time(args, stop, || {
         pool.step(actions.next(), &mut blocks)?;
         Ok(())
+    })?;
+    Ok(Round {
+        steps_per_second,
+        batch_bytes: Some(blocks.len() * BLOCK_BYTES),
+        huge_page_bytes: after.zip(before).map(|(after, before)| after.saturating_sub(before)),
     })
 }
 
-fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &AtomicBool) -> Result<f64, Failure> {
+fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &AtomicBool) -> Result<Round, Failure> {
     let mut arguments = vec![
         format!("--env={}", spec.id),
         format!("--num-envs={}", args.num_envs),
@@ -217,8 +262,10 @@ fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &Atom
     let mut trainer = engine.connect(stop)?;
     let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;
-    time(args, stop, || {
+    let mut batch_bytes = None;
+    let steps_per_second = time(args, stop, || {
         let received = trainer.receive(0, STEP_TIMEOUT)?;
+        batch_bytes = Some(received.batch().bytes().len());
         if reads {
             std::hint::black_box(sum(&received.batch()));
         }
@@ -226,7 +273,8 @@ fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &Atom
         drop(received);
         trainer.send(0, actions.next())?;
         Ok(())
-    })
+    })?;
+    Ok(Round { steps_per_second, batch_bytes, huge_page_bytes: huge_pages::bytes(engine.id(), Kind::Shared) })
 }
 
 /// Random actions that are drawn before the measurement, as `original.py` does.

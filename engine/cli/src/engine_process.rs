@@ -74,6 +74,11 @@ impl EngineProcess {
         &self.config.service
     }
 
+    /// Its process id.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Connects as the engine's trainer, and waits for the engine to start. Setting `stop` ends the wait with an error.
     pub fn connect(&mut self, stop: &AtomicBool) -> Result<Trainer, Failure> {
         self.connect_within(START_TIMEOUT, stop)

@@ -10,6 +10,7 @@ mod film_file;
 mod film_picture;
 mod film_webp;
 mod frames;
+mod huge_pages;
 mod list;
 mod logs;
 mod metrics;

@@ -12,6 +12,7 @@
 //! change to the frames of a batch that a pool will write into again, call [`Layout::forget_frames`].
 
 mod block;
+mod buffer;
 mod changed_rows;
 mod dtype;
 #[cfg(test)]
@@ -27,6 +28,7 @@ mod stamp;
 mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
+pub use buffer::BatchBuffer;
 pub(crate) use changed_rows::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
 pub use dtype::{Dtype, Element};
 pub use frames::{Frames, MAX_STACK};

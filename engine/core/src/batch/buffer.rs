@@ -1,0 +1,166 @@
+//! Process memory for a batch, on huge pages where the system has them.
+
+use std::ops::{Deref, DerefMut};
+
+use super::block::{Block, zeroed};
+
+/// The memory of one batch in this process, zeroed. It dereferences to `[Block]`.
+///
+/// With the feature `huge-pages`, on Linux, a buffer of at least 4 MiB is a mapping of its own for which transparent huge pages are
+/// requested: a step writes a few cache lines of each environment's frame, so that with pages of 4 KiB nearly every environment
+/// costs misses of the TLB. A smaller buffer, or one that the kernel refuses, is a `Vec<Block>`, as that of
+/// [`zeroed`].
+///
+/// ```
+/// use endless_gym_core::batch::BatchBuffer;
+/// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+///
+/// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 256), &Threads::new(1)?)?;
+/// let mut blocks = BatchBuffer::new(pool.layout().blocks());
+/// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
+/// # Ok::<(), endless_gym_core::pool::PoolError>(())
+/// ```
+#[derive(Debug)]
+pub struct BatchBuffer(Memory);
+
+#[derive(Debug)]
+enum Memory {
+    Heap(Vec<Block>),
+    #[cfg(all(feature = "huge-pages", target_os = "linux"))]
+    Mapped(mapped::Mapped),
+}
+
+impl BatchBuffer {
+    /// A zeroed buffer of `blocks` blocks. Its pages are allocated when they are written for the first time.
+    pub fn new(blocks: usize) -> Self {
+        #[cfg(all(feature = "huge-pages", target_os = "linux"))]
+        if let Some(mapped) = mapped::Mapped::new(blocks) {
+            return BatchBuffer(Memory::Mapped(mapped));
+        }
+        BatchBuffer(Memory::Heap(zeroed(blocks)))
+    }
+}
+
+impl Deref for BatchBuffer {
+    type Target = [Block];
+
+    fn deref(&self) -> &[Block] {
+        match &self.0 {
+            Memory::Heap(blocks) => blocks,
+            #[cfg(all(feature = "huge-pages", target_os = "linux"))]
+            Memory::Mapped(mapped) => mapped.blocks(),
+        }
+    }
+}
+
+impl DerefMut for BatchBuffer {
+    fn deref_mut(&mut self) -> &mut [Block] {
+        match &mut self.0 {
+            Memory::Heap(blocks) => blocks,
+            #[cfg(all(feature = "huge-pages", target_os = "linux"))]
+            Memory::Mapped(mapped) => mapped.blocks_mut(),
+        }
+    }
+}
+
+#[cfg(all(feature = "huge-pages", target_os = "linux"))]
+mod mapped {
+    use memmap2::{Advice, MmapMut};
+
+    use super::super::block::{BLOCK_BYTES, Block};
+
+    /// Size of a huge page on x86-64, and on ARM with pages of 4 KiB.
+    const HUGE_PAGE: usize = 2 << 20;
+
+    /// Buffers below this size stay on the heap: they need few entries of the TLB.
+    pub const LEAST_BYTES: usize = 4 << 20;
+
+    /// An anonymous mapping that is advised to use huge pages.
+    #[derive(Debug)]
+    pub struct Mapped {
+        map: MmapMut,
+        /// Bytes of the blocks; the mapping is longer.
+        bytes: usize,
+    }
+
+    impl Mapped {
+        /// `None` below [`LEAST_BYTES`], or if the kernel has no huge pages or refuses the mapping.
+        pub fn new(blocks: usize) -> Option<Self> {
+            let bytes = blocks.checked_mul(BLOCK_BYTES)?;
+            if bytes < LEAST_BYTES {
+                return None;
+            }
+            // Linux aligns a mapping to huge pages if its length is a multiple of them (6.7 and later).
+            let map = MmapMut::map_anon(bytes.checked_next_multiple_of(HUGE_PAGE)?).ok()?;
+            // Only whole huge pages, so that the rest of the last one takes no memory.
+            map.advise_range(Advice::HugePage, 0, bytes - bytes % HUGE_PAGE).ok()?;
+            Some(Mapped { map, bytes })
+        }
+
+        pub fn blocks(&self) -> &[Block] {
+            bytemuck::cast_slice(&self.map[..self.bytes])
+        }
+
+        pub fn blocks_mut(&mut self) -> &mut [Block] {
+            bytemuck::cast_slice_mut(&mut self.map[..self.bytes])
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::block::{BLOCK_BYTES, blocks_for};
+    use super::super::view::Batch;
+    use super::*;
+    use crate::pool::{Pool, PoolConfig, ResetRequest, Threads};
+
+    /// Sizes around 4 MiB and around a multiple of a huge page.
+    const SIZES: [usize; 8] = [0, 64, 4096, (4 << 20) - 64, 4 << 20, (4 << 20) + 64, (6 << 20) - 64, 21_700_000];
+
+    #[test]
+    fn a_buffer_is_zeroed_aligned_and_of_the_length_asked_for() {
+        for bytes in SIZES {
+            let blocks = blocks_for(bytes);
+            let mut buffer = BatchBuffer::new(blocks);
+            assert_eq!(buffer.len(), blocks);
+            assert_eq!(buffer.as_ptr().addr() % BLOCK_BYTES, 0);
+            assert!(bytemuck::cast_slice::<_, u8>(&buffer).iter().all(|byte| *byte == 0), "{bytes} bytes");
+            let address = buffer.as_mut_ptr();
+            bytemuck::cast_slice_mut::<_, u8>(&mut buffer).fill(7);
+            let moved = buffer;
+            assert_eq!(moved.as_ptr(), address.cast_const());
+            assert!(bytemuck::cast_slice::<_, u8>(&moved).iter().all(|byte| *byte == 7), "{bytes} bytes");
+        }
+    }
+
+    #[test]
+    #[cfg(all(feature = "huge-pages", target_os = "linux"))]
+    fn only_large_buffers_are_mapped() {
+        // A kernel without huge pages refuses the advice.
+        let has_huge_pages = std::path::Path::new("/sys/kernel/mm/transparent_hugepage").exists();
+        for bytes in SIZES {
+            let large = bytes >= mapped::LEAST_BYTES;
+            let buffer = BatchBuffer::new(blocks_for(bytes));
+            assert_eq!(matches!(buffer.0, Memory::Mapped(_)), large && has_huge_pages, "{bytes} bytes");
+        }
+    }
+
+    #[test]
+    fn a_pool_writes_the_same_into_a_small_and_a_large_buffer_as_into_a_vec() {
+        for num_envs in [2, 256] {
+            let config = PoolConfig::new("MortarMayhem-Grid-v0", num_envs);
+            let mut pools = [(); 2].map(|()| Pool::new(&config, &Threads::new(1).unwrap()).unwrap());
+            let layout = pools[0].layout().clone();
+            let (mut buffer, mut vec) = (BatchBuffer::new(layout.blocks()), zeroed(layout.blocks()));
+            pools[0].reset(ResetRequest::Seed(5), &mut buffer).unwrap();
+            pools[1].reset(ResetRequest::Seed(5), &mut vec).unwrap();
+            for step in 0..20 {
+                let actions: Vec<i32> = (0..num_envs).map(|env| ((env + step) % 4) as i32).collect();
+                pools[0].step(&actions, &mut buffer).unwrap();
+                pools[1].step(&actions, &mut vec).unwrap();
+                let (mapped, plain) = (Batch::new(&layout, &buffer), Batch::new(&layout, &vec));
+                assert!(mapped.bytes() == plain.bytes(), "{num_envs} environments, step {step}");
+            }
+        }
+    }
+}
