@@ -310,6 +310,11 @@ fn instructions(spec: &EnvSpec) {
             .arg(format!("--callgrind-out-file={}", file.display()))
             .arg(std::env::current_exe().unwrap())
             .args(["--count", spec.id, &phase.to_string()])
+            // No `rep movsb` and `rep stosb`, of which callgrind counts every byte as an instruction.
+            .env(
+                "GLIBC_TUNABLES",
+                "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000",
+            )
             .output()
             .expect("valgrind must be installed");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
