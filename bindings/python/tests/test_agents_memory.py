@@ -74,6 +74,23 @@ def test_forward_equals_act(agent: Agent, minibatches: int) -> None:
         )
 
 
+@pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
+def test_minibatches_without_a_step_of_the_rank(name: str) -> None:
+    """A rank with one of three environments: its steps are in some of the minibatches, and the others can be made, too."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, done = agent.initial_memory(1), ends(STEPS, 1)
+    reset_mask, *_ = play(agent, memory, observations(STEPS, 1), done)
+    everywhere = reset_mask.expand(STEPS, ENVS)
+    many = STEPS * ENVS
+    batches = agent.memory.minibatches(
+        [memory.state], everywhere, many, torch.Generator().manual_seed(0), own=range(1, 2)
+    )
+    indices = [minibatch.indices for minibatch in batches]
+    assert not all(len(part) for part in indices)
+    assert sorted(torch.cat(indices).tolist()) == list(range(STEPS))
+
+
 def test_groups_are_concatenated_along_the_environments() -> None:
     for kind in ("gru", "lstm", "trxl"):
         agent, observed, done = make(kind), observations(STEPS, 4), ends(STEPS, 4)

@@ -570,7 +570,6 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         a query attends to half of its group's tokens.
         """
         del length
-        envs = len(position)
         parts = math.ceil(steps / max(past, SHORTEST_PART))
         part = math.ceil(steps / parts)
         padding = parts * part - steps
@@ -578,21 +577,23 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         tokens = functional.pad(tokens, (0, 0, 0, padding)).unfold(2, past + part, part).mT.flatten(1, 2)
         position = functional.pad(position, (0, padding)).unfold(1, past + part, part).flatten(0, 1)
         columns = torch.arange(past + part, device=self.device)
+        num_groups = len(position)
 
         def minibatch(chosen: Tensor, indices: Tensor, everywhere: Tensor) -> TransformerMinibatch:
             step = chosen % steps
             group = chosen // steps * parts + step // part
-            count = torch.bincount(group, minlength=envs * parts)
+            count = torch.bincount(group, minlength=num_groups)
             size, number = int(count.max()), torch.arange(len(chosen))
             place = group * size + number - (count.cumsum(0) - count)[group]
-            query = torch.zeros(envs * parts * size, dtype=torch.long).index_copy_(0, place, number)
+            query = torch.zeros(num_groups * size, dtype=torch.long).index_copy_(0, place, number)
             column = (past + step % part).to(self.device)
             chosen, place, query = chosen.to(self.device), place.to(self.device), query.to(self.device)
             queries = query_position[chosen].unsqueeze(-1)
             groups = Groups(query, place, size)
-            distance = column[query].view(-1, 1, size, 1) - columns
+            places = (num_groups, 1, size, 1)
+            distance = column[query].view(places) - columns
             bias = torch.zeros(distance.shape, device=self.device)
-            masked = (distance < 1) | (distance > self.past) | (distance > queries[query].view(-1, 1, size, 1))
+            masked = (distance < 1) | (distance > self.past) | (distance > queries[query].view(places))
             return TransformerMinibatch(
                 indices, everywhere, tokens, position, queries, bias.masked_fill_(masked, MASKED), distance, groups
             )
