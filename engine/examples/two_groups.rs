@@ -49,5 +49,9 @@ fn play() -> Result<Duration, ServiceError> {
         std::thread::sleep(INFERENCE_TIME);
         trainer.send(group, &actions)?;
     }
+    // The engine is stopped after the answers to the last actions, not before.
+    for _ in 0..2 {
+        trainer.receive_any(TIMEOUT)?;
+    }
     Ok(start.elapsed())
 }
