@@ -28,7 +28,14 @@ SCRIPT = Path(__file__).parent / "ray_search.py"
 def test_search_on_ray(
     tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
 ) -> None:
-    """The worst trial is pruned, and the one whose process is killed resumes from its checkpoint."""
+    """The worst trial is pruned, and the one whose process is killed resumes from its checkpoint.
+
+    The path of the interpreter has a space.
+    """
+    spaced = tmp_path / "with a space"
+    folder_of_environments = Path(libraries_python).parents[2]
+    spaced.symlink_to(folder_of_environments)
+    python = spaced / Path(libraries_python).relative_to(folder_of_environments)
     environments = ["--environment.num-envs", "4", "--environment.engine", "process", "--agent", "gru"]
     sizes = ["--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "6", "--checkpoint-interval", "1"]
     sizes += ["--recurrence.hidden-size", "16"]
@@ -37,7 +44,7 @@ def test_search_on_ray(
     command = ["--preset", "quick", "--folder", "search", *environments, *sizes, *searched, *pruning]
     # Ray's processes are in the session of the search, which can be ended as a whole.
     with subprocess.Popen(
-        [libraries_python, SCRIPT, *command, "--ray", "--workers", "2"],
+        [python, SCRIPT, *command, "--ray", "--workers", "2"],
         cwd=tmp_path,
         env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
         stdout=subprocess.PIPE,

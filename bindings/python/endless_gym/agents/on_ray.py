@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shlex
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -54,6 +56,9 @@ def connected(address: str, spare_children: bool = False) -> Iterator[None]:
     given: dict[str, Any] = {"address": address, "log_to_driver": False}
     if address == "local":
         given |= {"include_dashboard": False, "object_store_memory": _STORE}
+        if (quoted := shlex.quote(sys.executable)) != sys.executable:
+            # Ray starts its processes by a shell, to which it gives the interpreter's path without quotes.
+            given["runtime_env"] = {"py_executable": quoted}
         if spare_children:
             os.environ.setdefault(_KILL_CHILDREN, "0")
     try:
