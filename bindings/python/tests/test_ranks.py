@@ -201,6 +201,28 @@ def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(
 
 
 @pytest.mark.slow
+def test_no_thread_outlives_the_connection(tmp_path: Path) -> None:
+    """A thread of gloo that runs while the interpreter ends can end the process by a signal."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        f"""
+from pathlib import Path
+from endless_gym.agents.train import parse, train
+
+train(parse({[*ARGUMENTS, "--agent", "gru", "--run", str(tmp_path / "run")]!r}))
+names = [file.read_text() for file in Path("/proc/self/task").glob("*/comm")]
+assert not any("gloo" in name for name in names), names
+"""
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", program]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=250, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(rows(tmp_path / "run")) == 3
+
+
+@pytest.mark.slow
 def test_environments_that_cannot_be_divided_are_an_error(tmp_path: Path) -> None:
     process = start(tmp_path / "run", 2, "--environment.num-envs", "6")
     assert process.wait(timeout=200) != 0

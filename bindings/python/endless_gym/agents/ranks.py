@@ -73,6 +73,10 @@ class Ranks:
         if self.size == 1:
             yield
             return
+        # Its functions have the process group of the time of the import as a default argument. If it were imported later (as
+        # torch._dynamo does, which optimizers import), it would keep the group and its threads until the interpreter ends.
+        import torch.distributed.nn.functional  # noqa: F401
+
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
         with self._watched("could not be reached"):
             store, rank, size = next(rendezvous("env://", timeout=TIMEOUT))
