@@ -20,6 +20,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import endless_gym
+
 HERE = Path(__file__).parent
 
 
@@ -91,7 +93,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2, help="runs of each program (default: %(default)s)")
     parser.add_argument("--output", type=Path, help="also write the results to this JSON file")
     args = parser.parse_args()
-    batch, rows = args.num_envs * args.steps, []
+    batch, rows, branches = args.num_envs * args.steps, [], endless_gym.spec(args.env).branches
     for name in ("trxl", "gru") if args.cleanrl else ("gru",):
         sides: dict[str, list[tuple[float, float]]] = {"endless": [], "other": []}
         shares: dict[str, float] = {}
@@ -121,7 +123,7 @@ def main() -> None:
                     other = [
                         *(args.original, str(HERE / "plain_recurrent.py"), "--env", args.env),
                         *(f"--num-envs={args.num_envs}", f"--steps={args.steps}", f"--updates={args.updates}"),
-                        f"--threads={args.threads}",
+                        *(f"--threads={args.threads}", f"--branches={','.join(map(str, branches))}"),
                     ]
                     pattern = r"steps="
                 sides["other"].append(rate(timed(other, args.threads, pattern, folder), batch))

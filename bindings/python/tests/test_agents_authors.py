@@ -83,13 +83,15 @@ def test_recurrent_layers(name: str) -> None:
     memory = RecurrentMemory("lstm" if name == "lstm" else "gru", x.shape[1], given, CPU)
     transplanted(memory, recorded)
     with torch.no_grad():
-        acted, after = memory.step(x[::length], RecurrentState(hidden), torch.zeros(sequences, dtype=torch.bool))
+        acted, after = memory.step(
+            memory.embed(x[::length]), RecurrentState(hidden), torch.zeros(sequences, dtype=torch.bool)
+        )
     assert_close(acted, tensors(recorded["acted"]))
     assert_close(after, tensors(recorded["after"]).transpose(1, 2))
     # Packed: step by step.
     order = torch.arange(len(x)).view(sequences, length).t().flatten()
     batch_sizes = torch.full((length,), sequences)
-    output = memory(x[order], RecurrentMinibatch(order, order, batch_sizes, hidden.contiguous()))
+    output = memory(memory.embed(x[order]), RecurrentMinibatch(order, order, batch_sizes, hidden.contiguous()))
     assert_close(output, tensors(recorded["output"])[order])
     assert_gradients(memory, output, factor[order], recorded)
 
@@ -121,12 +123,12 @@ def test_transformer(name: str) -> None:
     memory.begin_segment(state, 1)
     no_reset = torch.zeros(len(x), dtype=torch.bool)
     with torch.no_grad():
-        acted, update = memory.step(x, state, no_reset)
+        acted, update = memory.step(memory.embed(x), state, no_reset)
         memory.update_state(state, update)
     assert_close(acted, tensors(recorded["output"]))
     assert_close(state.inputs[:, :, state.fill - 1].transpose(0, 1), tensors(recorded["inputs"]))
     (minibatch,) = memory.minibatches([state], no_reset.unsqueeze(0), 1, torch.Generator().manual_seed(0))
-    output = memory(x[minibatch.indices], minibatch)
+    output = memory(memory.embed(x[minibatch.indices]), minibatch)
     assert_close(output, tensors(recorded["output"])[minibatch.indices])
     assert_gradients(memory, output, factor[minibatch.indices], recorded)
 

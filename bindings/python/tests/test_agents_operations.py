@@ -30,9 +30,9 @@ BUDGETS = {
     "none": (15, 200),
     "gru": (31, 345),
     "lstm": (34, 385),
-    "trxl": (54, 315),
+    "trxl": (55, 315),
     # The gain and the bias of the normalisation, and the projections, are applied to queries and sums one by one.
-    "trxl, single steps": (54, 400),
+    "trxl, single steps": (55, 400),
     "gtrxl": (114, 465),
 }
 

@@ -1,7 +1,7 @@
 """The dense layers of the agent for acting, with weights in the form that needs the fewest operations.
 
 While acting, batches are small and the cost of a step is the number of operations. The layers here are single `addmm` calls on
-transposed views of the agent's parameters; the policy and the value head are computed together. `Agent.refresh` says when
+transposed copies of the agent's parameters; the policy and the value head are computed together. `Agent.refresh` says when
 `ActingWeights` are made again.
 """
 
@@ -26,9 +26,9 @@ _version = attrgetter("_version")
 
 
 def transposed(layer: nn.Module, dtype: torch.dtype) -> Affine:
-    """Bias and transposed weight of a layer: views of its parameters if `dtype` is theirs, else copies."""
+    """Bias and transposed weight of a layer; the weight is contiguous, which a product with few rows needs to be fast."""
     assert isinstance(layer, nn.Linear)
-    return layer.bias.detach().to(dtype), layer.weight.detach().t().to(dtype)
+    return layer.bias.detach().to(dtype), layer.weight.detach().t().to(dtype).contiguous()
 
 
 def linear_relu(x: Tensor, layer: Affine) -> Tensor:
@@ -48,6 +48,7 @@ class ActingWeights:
     Attributes:
         version: `weights_version` of the parameters that they were made from.
         vector: Layer of the vector observations; None without any.
+        embedding: Layer before the memory; None without one.
         body: Layer after the memory.
         hidden: Hidden layers of the policy and the value head side by side.
         output: Output layers of both heads: the logits of all branches, each padded to the largest one, and the value.
@@ -57,6 +58,7 @@ class ActingWeights:
 
     version: int
     vector: Affine | None
+    embedding: Affine | None
     body: Affine
     hidden: Affine
     output: Affine
@@ -83,6 +85,7 @@ def acting_weights(
     version: int,
     dtype: torch.dtype,
     vector: nn.Sequential | None,
+    embedding: nn.Sequential | None,
     body: nn.Sequential,
     policy: PolicyHead,
     value: ValueHead,
@@ -106,6 +109,7 @@ def acting_weights(
     return ActingWeights(
         version=version,
         vector=None if vector is None else transposed(vector[0], dtype),
+        embedding=None if embedding is None else transposed(embedding[0], dtype),
         body=transposed(body[0], dtype),
         hidden=(torch.cat([policy_bias, value_bias]), torch.cat([policy_weight, value_weight], dim=1)),
         output=(bias, weight),

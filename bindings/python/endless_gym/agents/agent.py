@@ -279,17 +279,29 @@ class Agent(nn.Module):
         return self.transform.apply(observation, memory.transform_state, memory.reset_mask)
 
     @torch.no_grad()
-    def decide(self, observed: Observation, memory: AgentMemory, noise: Tensor | None) -> Decision:
+    def embed(self, observed: Observation) -> Tensor:
+        """Encode and embed what `observe` returned, for `decide`: float (n, width). The memory has no influence."""
+        weights = self.acting_weights()
+        with self._autocast():
+            encoded = self._encode(observed, weights)
+            return encoded if weights.embedding is None else linear_relu(encoded, weights.embedding)
+
+    @torch.no_grad()
+    def decide(
+        self, observed: Observation, memory: AgentMemory, noise: Tensor | None, embedded: Tensor | None = None
+    ) -> Decision:
         """Choose actions, without updating the memory.
 
         Args:
             observed: What `observe` returned.
             memory: Memory of the same n environments.
             noise: Gumbel noise, float32 (n, branches, choices), as `noise` returns it; None for the most likely choices.
+            embedded: What `embed` returns for `observed`, if it is known.
         """
         weights = self.acting_weights()
+        embedded = self.embed(observed) if embedded is None else embedded
         with self._autocast():
-            hidden, memory_update = self.memory.step(self._encode(observed, weights), memory.state, memory.reset_mask)
+            hidden, memory_update = self.memory.step(embedded, memory.state, memory.reset_mask)
             outputs = weights.heads(hidden)
         logits = weights.logits(outputs)
         # The Gumbel-max trick: the largest of the logits with independent Gumbel noise is a sample of the policy.
@@ -331,22 +343,25 @@ class Agent(nn.Module):
         if self._weights is None or self._weights.version != version:
             dtype = torch.bfloat16 if self.settings.bf16 else torch.float32
             with torch.no_grad():
-                layers = (self.encoder.vector, self.body, self.policy, self.value)
+                layers = (self.encoder.vector, self.memory.embedding, self.body, self.policy, self.value)
                 self._weights = acting_weights(version, dtype, *layers)
                 self.memory.refresh(dtype)
         return self._weights
 
-    def forward(self, observation: Observation, minibatch: Minibatch) -> AgentOutput:
+    def forward(self, observation: Observation, minibatch: Minibatch, rows: Tensor | None = None) -> AgentOutput:
         """Compute the network's outputs for a minibatch, with gradients.
 
         Args:
-            observation: Transformed observations of the steps `minibatch.indices`, tensors (M, ...) on the agent's device.
+            observation: Transformed observations of the steps `minibatch.indices`, tensors (M, ...) on the agent's device; with
+                `rows`, (rows, ...).
             minibatch: A minibatch that `memory.minibatches` returned.
+            rows: Row of each step's observation, int64 (M,), if equal observations are given once; see `Segment.distinct`.
         """
         if torch.is_grad_enabled():
             self.refresh()
         with self._autocast():
-            memory_output = self.memory(self.encoder(observation), minibatch)
+            embedded = self.memory.embed(self.encoder(observation))
+            memory_output = self.memory(embedded if rows is None else embedded.index_select(0, rows), minibatch)
             hidden = self.body(memory_output)
             logits, value = self.policy(hidden), self.value(hidden)
             frame = self.reconstruction(memory_output) if self.reconstruction is not None else None

@@ -63,6 +63,12 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
 
     #: Size of the output vectors.
     width: int
+    #: Fully connected layer between the encoder and the memory; None without one.
+    embedding: nn.Sequential | None
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Apply `embedding` to encoded observations, float (n, encoder's width), for `step` and `forward`."""
+        return x if self.embedding is None else self.embedding(x)
 
     @abstractmethod
     def initial_state(self, num_envs: int) -> StateT:
@@ -80,7 +86,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         """Compute the output of one step without changing the state.
 
         Args:
-            x: Encoded observations, float (n, input width).
+            x: Encoded and embedded observations, float (n, input width).
             state: State of the same n environments.
             reset_mask: Whether the observation is the first of an episode, bool (n,).
 
@@ -116,7 +122,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         """Compute the outputs of a minibatch, with gradients.
 
         Args:
-            x: Encoded observations of the steps `minibatch.indices`, float (M, input width).
+            x: Encoded and embedded observations of the steps `minibatch.indices`, float (M, input width).
             minibatch: A minibatch that `minibatches` returned.
 
         Returns:
@@ -190,7 +196,7 @@ class NoMemory(Memory[NoState, None, Minibatch]):
     def __init__(self, input_width: int, device: torch.device) -> None:
         """Make the memory for encoded observations of size `input_width`; `device` is the device of the minibatches."""
         super().__init__()
-        self.width = input_width
+        self.width, self.embedding = input_width, None
         self.device = device
 
     def initial_state(self, num_envs: int) -> NoState:

@@ -56,22 +56,27 @@ def minibatch_loss(
         divergence from the policy that collected the rollout, and the fraction of clipped probability ratios.
     """
     indices = minibatch.indices
-    observation = {key: part[indices] for key, part in segment.observation.items()}
-    output: AgentOutput = agent(observation, minibatch)
-    log_prob, old_log_prob = output.log_prob(segment.action[indices]), segment.log_prob[indices]
-    advantage = advantages[indices]
+    observation, rows = segment.distinct(indices)
+    output: AgentOutput = agent(observation, minibatch, rows)
+
+    def chosen(tensor: Tensor) -> Tensor:
+        return tensor.index_select(0, indices)
+
+    log_prob, old_log_prob = output.log_prob(chosen(segment.action)), chosen(segment.log_prob)
+    advantage = chosen(advantages)
     if settings.advantage_normalisation == "minibatch":
         advantage = losses.normalised(advantage, reference)
     policy = losses.policy_loss(log_prob, old_log_prob, advantage, settings.clip_range)
-    value = losses.value_loss(output.value, segment.value[indices], returns[indices], settings.clip_range)
+    value = losses.value_loss(output.value, chosen(segment.value), chosen(returns), settings.clip_range)
     entropy = output.entropy().mean()
     loss = policy + settings.value_coefficient * value - entropy_coefficient * entropy
     parts = {"policy_loss": policy, "value_loss": value, "entropy": entropy}
     if output.frame is not None:
-        parts["reconstruction_loss"] = losses.reconstruction_loss(output.frame, observation[FRAME])
+        frames = chosen(segment.observation[FRAME])
+        parts["reconstruction_loss"] = losses.reconstruction_loss(output.frame, frames)
         loss = loss + settings.reconstruction_coefficient * parts["reconstruction_loss"]
     if output.ground_truth is not None and segment.ground_truth is not None:
-        parts["ground_truth_loss"] = losses.ground_truth_loss(output.ground_truth, segment.ground_truth[indices])
+        parts["ground_truth_loss"] = losses.ground_truth_loss(output.ground_truth, chosen(segment.ground_truth))
         loss = loss + settings.ground_truth_coefficient * parts["ground_truth_loss"]
     with torch.no_grad():
         log_ratio = log_prob - old_log_prob
@@ -138,7 +143,7 @@ def learn(
             parts: dict[str, Tensor] = {}
             if len(minibatch.indices):
                 is_minibatch = settings.advantage_normalisation == "minibatch"
-                reference = advantages[minibatch.everywhere] if is_minibatch else None
+                reference = advantages.index_select(0, minibatch.everywhere) if is_minibatch else None
                 loss, parts = minibatch_loss(
                     agent, flat, minibatch, own_advantages, returns, settings, entropy_coefficient, reference
                 )

@@ -127,7 +127,7 @@ def record(agent: Agent, seeds: Sequence[int], max_steps: int = 512, action_seed
             agent.acting_weights()
             with torch.autocast(agent.device.type, torch.bfloat16, enabled=settings.bf16):
                 encoded = agent.encoder(agent.observe(agent.to_tensors(observation), memory)[0])
-                output, _ = agent.memory.step(encoded, memory.state, memory.reset_mask)
+                output, _ = agent.memory.step(agent.memory.embed(encoded), memory.state, memory.reset_mask)
             parts["memory"].append(output[running.to(output.device)].float().cpu())
             parts["observation"].append(encoded[running.to(encoded.device)].float().cpu())
             parts["truth"].append(torch.tensor(info["ground_truth"], dtype=torch.float32)[running])

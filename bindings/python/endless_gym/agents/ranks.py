@@ -75,7 +75,7 @@ class Ranks:
             return
         # Its functions have the process group of the time of the import as a default argument. If it were imported later (as
         # torch._dynamo does, which optimizers import), it would keep the group and its threads until the interpreter ends.
-        import torch.distributed.nn.functional  # noqa: F401
+        import torch.distributed.nn.functional
 
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
         with self._watched("could not be reached"):

@@ -46,7 +46,9 @@ class PackedGRU(torch.autograd.Function):
         reset_update, reset, update, candidate = (
             gates[:, part].split(sizes) for part in (both, slice(None, width), slice(width, 2 * width), last)
         )
-        rows, rows_projected, transposed, before = outputs.split(sizes), projected.split(sizes), weight.t(), []
+        # A product of few rows with a matrix that is not contiguous is slow.
+        transposed = weight.t().contiguous()
+        rows, rows_projected, before = outputs.split(sizes), projected.split(sizes), []
         for t, size in enumerate(sizes):
             hidden = hidden[:size]
             before.append(hidden)
@@ -111,7 +113,8 @@ class PackedLSTM(torch.autograd.Function):
         entry, forget, candidate, exit_ = (gates[:, start : start + width].split(sizes) for start in starts)
         entry_forget, rows_gates = gates[:, : 2 * width].split(sizes), gates.split(sizes)
         rows_inputs, rows_cells, rows_squashed, rows = (x.split(sizes) for x in (inputs, cells, squashed, outputs))
-        transposed, before, cells_before = weight.t(), [], []
+        transposed = weight.t().contiguous()
+        before, cells_before = [], []
         for t, size in enumerate(sizes):
             hidden, cell = hidden[:size], cell[:size]
             before.append(hidden)

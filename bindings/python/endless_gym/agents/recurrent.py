@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
-from endless_gym.agents.acting import Affine, linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
 from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split, is_own
 from endless_gym.agents.recurrence import packed_layers
@@ -101,7 +100,6 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             else:
                 nn.init.zeros_(parameter)
 
-        self._embedding: Affine | None = None
         self._cells: list[list[Tensor]] = []
 
     def initial_state(self, num_envs: int) -> RecurrentState:
@@ -112,12 +110,12 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         state.stored, state.time, state.steps = [], 0, steps
 
     def refresh(self, dtype: torch.dtype) -> None:
-        self._embedding = None if self.embedding is None else transposed(self.embedding[0], dtype)
+        del dtype  # The recurrent layers compute in float32.
         self._cells = [[weight.detach() for weight in layer] for layer in self.recurrent.all_weights]
 
     def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor) -> tuple[Tensor, Tensor]:
         hidden = state.hidden.masked_fill(reset_mask.unsqueeze(-1), 0.0)
-        x = x.float() if self._embedding is None else linear_relu(x, self._embedding).float()
+        x = x.float()
         y = x
         after: list[tuple[Tensor, ...]] = []
         with self._float32():
@@ -178,7 +176,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         return minibatches
 
     def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
-        x = self._embed(x).float()
+        x = x.float()
         with self._float32():
             if x.device.type == "cpu":
                 sizes, weights = minibatch.batch_sizes.tolist(), self.recurrent.all_weights
@@ -194,11 +192,6 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         if not torch.is_autocast_enabled(self.device.type):
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, enabled=False)
-
-    def _embed(self, x: Tensor) -> Tensor:
-        if self.embedding is not None:
-            x = self.embedding(x)
-        return x
 
     def _split(self, hidden: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Convert (parts, layers, n, hidden size) to what `nn.GRU` or `nn.LSTM` takes."""

@@ -24,6 +24,7 @@ from endless_gym.agents.environments import Environments, StepResult
 from endless_gym.agents.host import HostCopy, Outcome, Upload
 from endless_gym.agents.naive import Identity
 from endless_gym.agents.ranks import Ranks
+from endless_gym.agents.repeats import EmbeddedFrames
 
 
 @dataclass
@@ -40,6 +41,7 @@ class Segment:
         done: Whether the step ended its episode, bool (T, N).
         ground_truth: Ground truth of the observation, float32 (T, N, entries); None if the agent does not estimate it.
         last_value: Bootstrap value: the value estimate of the observation after the last step, float32 (N,).
+        first_occurrence: Index t * N + n of the first step with an equal observation, int64 (T, N); None if it is not known.
     """
 
     observation: Observation
@@ -51,6 +53,7 @@ class Segment:
     done: Tensor
     ground_truth: Tensor | None
     last_value: Tensor
+    first_occurrence: Tensor | None = None
 
     def flat(self) -> Segment:
         """The segment with steps and environments in one dimension, (T * N, ...); step t of environment n has index t * N + n."""
@@ -68,7 +71,22 @@ class Segment:
             done=flatten(self.done),
             ground_truth=None if self.ground_truth is None else flatten(self.ground_truth),
             last_value=self.last_value,
+            first_occurrence=None if self.first_occurrence is None else flatten(self.first_occurrence),
         )
+
+    def distinct(self, indices: Tensor) -> tuple[Observation, Tensor | None]:
+        """The observations of steps of a flattened segment; equal ones once, if it is known which are equal.
+
+        Args:
+            indices: Indices of M steps, int64 (M,).
+
+        Returns:
+            The observations, (rows, ...) each, and the row of each step, int64 (M,); `None` if each step has a row of its own.
+        """
+        rows = None
+        if self.first_occurrence is not None:
+            indices, rows = self.first_occurrence.index_select(0, indices).unique(return_inverse=True)
+        return {key: part.index_select(0, indices) for key, part in self.observation.items()}, rows
 
 
 @dataclass
@@ -134,6 +152,11 @@ class RolloutCollector:
         self._ground_truth: Tensor | None = None
         if agent.ground_truth is not None:
             self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
+        # `torch.compile` would compile the encoder again for each number of frames.
+        encodes_once = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
+        self._frames: EmbeddedFrames | None = None
+        if encodes_once and device.type == "cpu" and not agent.settings.compile:
+            self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
         self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]
         self._outcomes = [Outcome(per_group, device) for _ in range(groups)]
@@ -150,6 +173,8 @@ class RolloutCollector:
         """
         episodes: list[dict[str, float]] = []
         self.agent.refresh()
+        if self._frames is not None:
+            self._frames.clear()
         # Drawn for the environments of all ranks, so that actions do not depend on how these are divided.
         noise = self.agent.noise((self.steps, self._envs_everywhere), self.generator)
         noise = noise[:, self._own.start : self._own.stop]
@@ -208,7 +233,7 @@ class RolloutCollector:
                 observed = slots
             else:
                 observed, update = agent.observe(agent.to_tensors(current.observation), memory)
-            decision = agent.decide(observed, memory, noise)
+            decision = agent.decide(observed, memory, noise, self._embedded(group, step))
             actions = self._actions[group]
             actions.start(decision.action)
             actions.wait()
@@ -224,6 +249,15 @@ class RolloutCollector:
             part.outputs[step].copy_(decision.outputs)
             if part.ground_truth and current.ground_truth is not None:
                 self._uploads[group].copy("ground truth", current.ground_truth, part.ground_truth[step])
+
+    def _embedded(self, group: int, step: int) -> Tensor | None:
+        """What `Agent.embed` returns for an observation in the segment; None if equal observations are not encoded once."""
+        if self._frames is None:
+            return None
+        columns = self._slice(group)
+        start = step * self._action.shape[1]
+        frames = range(start + columns.start, start + columns.stop)
+        return self._frames.embed(frames, lambda new: self.agent.embed({FRAME: new}))
 
     def _receive(self, group: int, step: int) -> list[dict[str, float]]:
         result = self.environments.receive(group)
@@ -247,6 +281,7 @@ class RolloutCollector:
             done=done,
             ground_truth=self._ground_truth,
             last_value=self._last_value,
+            first_occurrence=None if self._frames is None else self._frames.first.view(self._action.shape[:2]),
         )
 
     def _slice(self, group: int) -> slice:

@@ -32,7 +32,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endless_gym.agents.acting import Affine, linear_relu, transposed
+from endless_gym.agents.acting import linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
 from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, balanced_split, is_own
 from endless_gym.agents.settings import Transformer
@@ -440,7 +440,6 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         else:
             self.register_buffer("table", None)
         self._dtype, self._generation = torch.float32, 0
-        self._embedding: Affine | None = None
         self._acting: list[ActingBlock] = []
         self._ages = ring_ages(settings.window, device)
         self._attended, self._masked = torch.zeros((), device=device), torch.full((), MASKED, device=device)
@@ -459,11 +458,9 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
 
     def refresh(self, dtype: torch.dtype) -> None:
         self._dtype, self._generation = dtype, self._generation + 1
-        self._embedding = transposed(self.embedding[0], dtype)
         self._acting = [ActingBlock(block, dtype) for block in self.blocks]
 
     def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor) -> tuple[Tensor, TransformerUpdate]:
-        assert self._embedding is not None, "refresh was not called"
         cache = self._cache(state)
         position = state.next_position.masked_fill(reset_mask, 0)
         # On the CPU the largest position is known without waiting for a device, and the attention is as short as the episodes.
@@ -475,7 +472,6 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         first = (position == 0).unsqueeze(-1)
         keys, values = cache.keys_and_values(start, length)
         encoding = self._encoding(position) if self.settings.query_encoding else None
-        x = linear_relu(x, self._embedding)
         inputs = []
         for layer, block in enumerate(self._acting):
             inputs.append(x)
@@ -602,7 +598,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
 
     def forward(self, x: Tensor, minibatch: TransformerMinibatch) -> Tensor:
         queries = minibatch.query_position
-        x = self.embedding(x).unflatten(0, queries.shape)
+        x = x.unflatten(0, queries.shape)
         learned = isinstance(self.table, nn.Parameter)
         encoding = self._encoding(minibatch.position) if learned else None
         query_encoding = self._encoding(queries) if self.settings.query_encoding else None
