@@ -24,11 +24,13 @@ def test_the_operations_are_those_of_the_network(tmp_path: Path) -> None:
         operations = row["operations"]
         # One call for each step and one for the value after the last; three epochs of learning.
         frames = 2 * (64 + 1) if phase == "rollout" else 3 * 2 * 64
-        assert operations["convolution"]["flop"] == frames * ENCODER, (agent, phase)
+        # Equal frames are encoded once.
+        encoded, rest = divmod(operations["convolution"]["flop"], ENCODER)
+        assert rest == 0 and frames / 4 < encoded < frames, (agent, phase)
         if phase == "learning":
             # The gradients of the weights cost as much as the outputs; so do those of the inputs, which the frames do not need.
             first = 2 * 20 * 20 * 32 * (8 * 8 * 3)
-            assert operations["convolution_backward"]["flop"] == frames * (2 * ENCODER - first), (agent, phase)
+            assert operations["convolution_backward"]["flop"] == encoded * (2 * ENCODER - first), (agent, phase)
         assert f"{agent}, {phase}, 2 x 64 steps" in done.stdout
     # The preset `paper` learns from single steps, whose attention is matrix products.
     acting, learning = (results["trxl", phase]["operations"] for phase in ("rollout", "learning"))
