@@ -19,6 +19,7 @@ use crate::raster::{Canvas, DiscColumn, Rect, copy_run};
 /// Where the light is visible: below the bar.
 const COLUMNS: Range<usize> = 0..SCREEN;
 const ROWS: Range<usize> = BAR_HEIGHT..SCREEN;
+const SIGNED_ROWS: Range<i32> = BAR_HEIGHT as i32..SCREEN as i32;
 
 /// Number of circles that are searched for one that has moved.
 const WINDOW: usize = 3;
@@ -199,35 +200,19 @@ fn copy_rows(x: usize, rows: Range<usize>, from: &Frame, to: &mut Frame) {
 /// Copies a crescent of a circle.
 #[inline]
 fn copy_crescent(crescent: &Crescent, circle: &Circle, from: &Frame, to: &mut Frame) {
+    let bounds = circle.bounds();
     if circle.has_all_rows() {
-        let bounds = circle.bounds();
         crescent.copy((bounds.x, bounds.y), from, to);
     } else {
-        for pixel in &crescent.pixels {
-            copy_pixel(pixel, circle, from, to);
-        }
+        crescent.copy_rows((bounds.x, bounds.y), &SIGNED_ROWS, from, to);
     }
 }
 
 /// Copies the part of a circle's crescent that lies in another circle.
 #[inline]
 fn copy_crescent_within(crescent: &Crescent, circle: &Circle, other: &Circle, from: &Frame, to: &mut Frame) {
-    let disc = &Shape::of(other.radius).disc;
-    let (x, y) = (i32::from(circle.x - other.x), i32::from(circle.y - other.y));
-    for pixel in &crescent.pixels {
-        if disc.contains((x + i32::from(pixel.0), y + i32::from(pixel.1))) {
-            copy_pixel(pixel, circle, from, to);
-        }
-    }
-}
-
-/// Copies a pixel at an offset from a circle's centre, if the light is visible there.
-#[inline]
-fn copy_pixel(pixel: &(i8, i8), circle: &Circle, from: &Frame, to: &mut Frame) {
-    if let Some((x, y)) = on_screen(pixel, circle) {
-        let byte = (x * SCREEN + y) * 3;
-        to[byte..byte + 3].copy_from_slice(&from[byte..byte + 3]);
-    }
+    let (bounds, disc) = (circle.bounds(), &Shape::of(other.radius).disc);
+    crescent.copy_within((bounds.x, bounds.y), (disc, other.centre()), &SIGNED_ROWS, from, to);
 }
 
 /// The pixel at an offset from a circle's centre, if the light is visible there.

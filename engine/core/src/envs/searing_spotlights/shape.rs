@@ -1,5 +1,6 @@
 //! Precomputed shapes of the lit circles, created once per process.
 
+use std::ops::Range;
 use std::sync::OnceLock;
 
 use super::parameters::MAX_SPOT_RADIUS;
@@ -30,7 +31,7 @@ pub(super) struct Shape {
 /// The pixels that a circle leaves when it moves.
 #[derive(Debug, Default)]
 pub(super) struct Crescent {
-    /// Relative to the circle's centre.
+    /// Relative to the circle's centre, by row and then by column.
     pub pixels: Vec<(i8, i8)>,
     /// The smallest rectangle around them, relative to the circle's centre.
     pub bounds: Rect,
@@ -39,6 +40,10 @@ pub(super) struct Crescent {
     blocks: Vec<u16>,
     /// The end of the blocks of each length in `blocks`.
     ends: [usize; LONGEST],
+    /// The offset of each of `pixels`, as in `blocks`.
+    offsets: Vec<u16>,
+    /// For each row of the circle's bounds, and the one behind the last, the number of pixels above it.
+    above: Vec<u16>,
 }
 
 /// Length of the longest block in pixels. A longer run is several blocks, the last of which may overlap the one before
@@ -56,7 +61,6 @@ impl Crescent {
         for x in columns.clone() {
             let rows: Vec<i32> = columns.clone().filter(|y| left(x, y)).collect();
             for run in rows.chunk_by(|above, below| above + 1 == *below) {
-                crescent.pixels.extend(run.iter().map(|y| (x as i8, *y as i8)));
                 crescent.bounds = match crescent.bounds {
                     Rect { width: 0, .. } => Rect::new(x, run[0], 1, run.len() as i32),
                     bounds => bounds.union(&Rect::new(x, run[0], 1, run.len() as i32)),
@@ -72,6 +76,14 @@ impl Crescent {
             crescent.blocks.extend(blocks);
             *end = crescent.blocks.len();
         }
+        for y in columns.clone() {
+            crescent.above.push(crescent.pixels.len() as u16);
+            for x in columns.clone().filter(|x| left(*x, &y)) {
+                crescent.pixels.push((x as i8, y as i8));
+                crescent.offsets.push(((x + radius) as usize * SCREEN + (y + radius) as usize) as u16 * 3);
+            }
+        }
+        crescent.above.push(crescent.pixels.len() as u16);
         crescent
     }
 
@@ -87,6 +99,45 @@ impl Crescent {
         copy_blocks::<6>(&self.blocks[ones..twos], corner, from, to);
         copy_blocks::<9>(&self.blocks[twos..threes], corner, from, to);
         copy_blocks::<12>(&self.blocks[threes..fours], corner, from, to);
+    }
+
+    /// As [`copy`](Self::copy), only the pixels in some rows of the screen, for a circle whose other rows may be off the screen.
+    #[inline]
+    pub fn copy_rows(&self, (x, y): (i32, i32), rows: &Range<i32>, from: &Frame, to: &mut Frame) {
+        let corner = ((x * SCREEN as i32 + y) * 3) as usize;
+        copy_blocks::<3>(&self.offsets[self.in_rows(y, rows)], corner, from, to);
+    }
+
+    /// As [`copy_rows`](Self::copy_rows), only the pixels in another disc with the given centre.
+    #[inline]
+    pub fn copy_within(
+        &self,
+        (x, y): (i32, i32),
+        (disc, centre): (&Disc, (i32, i32)),
+        rows: &Range<i32>,
+        from: &Frame,
+        to: &mut Frame,
+    ) {
+        let radius = self.above.len() as i32 / 2;
+        let (right, down) = (x + radius - centre.0, y + radius - centre.1);
+        let first = rows.start.max(centre.1 - disc.radius());
+        let range = self.in_rows(y, &(first..rows.end.min(centre.1 + disc.radius()).max(first)));
+        let corner = ((x * SCREEN as i32 + y) * 3) as usize;
+        for (pixel, offset) in self.pixels[range.clone()].iter().zip(&self.offsets[range]) {
+            if disc.contains((right + i32::from(pixel.0), down + i32::from(pixel.1))) {
+                copy_blocks::<3>(std::slice::from_ref(offset), corner, from, to);
+            }
+        }
+    }
+
+    /// The pixels in some rows of the screen, for a circle whose bounds begin at the row `y`.
+    #[inline]
+    fn in_rows(&self, y: i32, rows: &Range<i32>) -> Range<usize> {
+        let above = |row: i32| {
+            let row = (row - y).clamp(0, self.above.len() as i32 - 1);
+            usize::from(self.above[row as usize])
+        };
+        above(rows.start)..above(rows.end)
     }
 }
 
@@ -192,6 +243,18 @@ mod tests {
                         }
                     }
                     assert!(found == expected, "radius {radius} at {corner:?}");
+                }
+                for corner in [(5, 9), (-5, 30), (SCREEN as i32 - 4, -7), (20, SCREEN as i32 - 9)] {
+                    let (rows, mut found, mut expected) = (10..SCREEN - 3, [0; FRAME_BYTES], [0; FRAME_BYTES]);
+                    crescent.copy_rows(corner, &(rows.start as i32..rows.end as i32), &white, &mut found);
+                    for (x, y) in &crescent.pixels {
+                        let x = (corner.0 + i32::from(radius) + i32::from(*x)) as usize;
+                        let y = (corner.1 + i32::from(radius) + i32::from(*y)) as usize;
+                        if x < SCREEN && rows.contains(&y) {
+                            expected.as_chunks_mut::<3>().0[x * SCREEN + y] = [255; 3];
+                        }
+                    }
+                    assert!(found == expected, "radius {radius} at {corner:?}, cut");
                 }
             }
         }
