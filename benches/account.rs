@@ -3,7 +3,8 @@
 //! Phases are cumulative variants of a step, each with environments of its own, and a phase's cost is the
 //! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
 //!
-//! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--memory` measures the memory.
+//! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--caches` simulates caches and the
+//! translation of addresses; `--memory` measures the memory.
 
 mod actions;
 
@@ -32,6 +33,9 @@ const ROUNDS: usize = 9;
 const ROUND_STEPS: usize = 16384;
 /// Steps before the first round: episodes that began together have spread.
 const WARM_UP: usize = 150;
+/// Numbers of environments, and environment steps of each, whose caches are simulated.
+const SIMULATED_SIZES: [usize; 3] = [64, 1024, 4096];
+const SIMULATED_STEPS: usize = 16384;
 
 /// The rules with their random draws, and resets.
 const RULES: u8 = 0;
@@ -220,22 +224,76 @@ const COUNTED_STEPS: usize = 250;
 /// What callgrind counts; the caller is this program under valgrind.
 fn count<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant, phase: u8) {
     if phase == POOL {
-        return counted(&mut pool_step(spec, COUNTED_ENVS, false));
+        return counted(&mut pool_step(spec, COUNTED_ENVS, false), COUNTED_STEPS);
     }
     let mut players = Players::<E>::new(spec, variant, COUNTED_ENVS, WARM_UP);
     let mut frame = vec![0; FRAME_BYTES];
-    counted(&mut || match phase {
+    let mut step = || match phase {
         RULES => players.step::<RULES>(&mut frame),
         SCENE => players.step::<SCENE>(&mut frame),
         COMPARED => players.step::<COMPARED>(&mut frame),
         _ => players.step::<PAINTED>(&mut frame),
-    });
+    };
+    counted(&mut step, COUNTED_STEPS);
 }
 
 #[inline(never)]
-fn counted(step: &mut dyn FnMut()) {
-    for _ in 0..COUNTED_STEPS {
+fn counted(step: &mut dyn FnMut(), steps: usize) {
+    for _ in 0..steps {
         step();
+    }
+}
+
+/// Runs this program under callgrind, which counts what happens in [`counted`], and returns its output.
+fn callgrind(options: &[&str], arguments: &[&str]) -> String {
+    let file = std::env::temp_dir().join(format!("endless-account-{}", std::process::id()));
+    let output = Command::new("valgrind")
+        .args(["--tool=callgrind", "--toggle-collect=account::counted"])
+        .arg(format!("--callgrind-out-file={}", file.display()))
+        .args(options)
+        .arg(std::env::current_exe().unwrap())
+        .args(arguments)
+        // No `rep movsb` and `rep stosb`, of which callgrind counts every byte as an instruction.
+        .env(
+            "GLIBC_TUNABLES",
+            "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000",
+        )
+        .output()
+        .expect("valgrind must be installed");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::remove_file(&file).unwrap();
+    text
+}
+
+/// A cache of 48 KiB and one of 2 MiB, with lines of 64 bytes.
+const CACHES: [&str; 2] = ["--D1=49152,12,64", "--LL=2097152,16,64"];
+/// The translation of addresses as caches with a page for a line: 64 and 2,048 entries, for pages of 4 KiB.
+const PAGES: [&str; 2] = ["--D1=262144,4,4096", "--LL=8388608,16,4096"];
+
+/// Prints the rows of one id: simulated misses in the two caches, and in the tables of address translations.
+fn caches(spec: &EnvSpec) {
+    for num_envs in SIMULATED_SIZES {
+        let steps = SIMULATED_STEPS / num_envs;
+        let misses = [CACHES, PAGES].map(|sizes| {
+            // What the first steps miss because nothing was simulated before them is in both runs.
+            let [less, more] = [steps, 2 * steps].map(|steps| {
+                let text = callgrind(
+                    &["--cache-sim=yes", "--I1=65536,8,64", sizes[0], sizes[1]],
+                    &["--touch", spec.id, &num_envs.to_string(), &steps.to_string()],
+                );
+                let totals = text.lines().find_map(|line| line.strip_prefix("totals: ")).expect("totals");
+                // Ir Dr Dw I1mr D1mr D1mw ILmr DLmr DLmw, of which zeros at the end are left out.
+                let mut counts = [0.0; 9];
+                for (count, text) in counts.iter_mut().zip(totals.split(' ')) {
+                    *count = text.parse::<f64>().unwrap();
+                }
+                [counts[4] + counts[5], counts[7] + counts[8]]
+            });
+            [0, 1].map(|level| (more[level] - less[level]) / (num_envs * steps) as f64)
+        });
+        let columns: Vec<String> = misses.as_flattened().iter().map(|misses| format!("{misses:.2}")).collect();
+        println!("| {} | {num_envs} | {} |", spec.id, columns.join(" | "));
     }
 }
 
@@ -303,25 +361,8 @@ fn name<'a>(names: &mut HashMap<&'a str, &'a str>, value: &'a str) -> &'a str {
 
 /// Prints the row of one id: instructions of an environment's step, by phase.
 fn instructions(spec: &EnvSpec) {
-    let file = std::env::temp_dir().join(format!("endless-account-{}", std::process::id()));
-    let counts = [RULES, SCENE, COMPARED, PAINTED, POOL].map(|phase| {
-        let output = Command::new("valgrind")
-            .args(["--tool=callgrind", "--toggle-collect=account::counted"])
-            .arg(format!("--callgrind-out-file={}", file.display()))
-            .arg(std::env::current_exe().unwrap())
-            .args(["--count", spec.id, &phase.to_string()])
-            // No `rep movsb` and `rep stosb`, of which callgrind counts every byte as an instruction.
-            .env(
-                "GLIBC_TUNABLES",
-                "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000",
-            )
-            .output()
-            .expect("valgrind must be installed");
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let counts = Counts::read(&std::fs::read_to_string(&file).unwrap());
-        std::fs::remove_file(&file).unwrap();
-        counts
-    });
+    let counts = [RULES, SCENE, COMPARED, PAINTED, POOL]
+        .map(|phase| Counts::read(&callgrind(&[], &["--count", spec.id, &phase.to_string()])));
     let steps = (COUNTED_ENVS * COUNTED_STEPS) as f64;
     let each = counts.each_ref().map(|counts| counts.all as f64 / steps);
     let rules = &counts[0];
@@ -411,6 +452,10 @@ fn main() {
         let spec = envs::spec(id).unwrap();
         return for_family!(spec, count(phase.parse().unwrap()));
     }
+    if let ["--touch", id, num_envs, steps] = arguments[..] {
+        let mut step = pool_step(envs::spec(id).unwrap(), num_envs.parse().unwrap(), false);
+        return counted(&mut step, steps.parse().unwrap());
+    }
     if arguments == ["--memory"] {
         return memory_speed();
     }
@@ -420,6 +465,11 @@ fn main() {
         println!("| id | rules | of these: random | resets | steps a reset | scene | compare | paint | pool | all |");
         println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
         return specs.for_each(instructions);
+    }
+    if arguments.contains(&"--caches") {
+        println!("| id | environments | first cache | second | first table of pages | second |");
+        println!("| --- | ---: | ---: | ---: | ---: | ---: |");
+        return specs.for_each(caches);
     }
     println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
