@@ -60,6 +60,7 @@ class EmbeddedFrames:
         return self._embeddings.index_select(0, self.first[indices.start : indices.stop])
 
     def _find(self, index: int) -> int:
+        """Note and return the index of the first frame with the same bytes as the frame `index`."""
         frame = self._bytes[index]
         first = self._by_hash.setdefault(hash(frame.tobytes()), index)
         if first != index and not np.array_equal(self._bytes[first], frame):

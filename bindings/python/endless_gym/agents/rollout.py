@@ -152,10 +152,10 @@ class RolloutCollector:
         self._ground_truth: Tensor | None = None
         if agent.ground_truth is not None:
             self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
-        # `torch.compile` would compile the encoder again for each number of frames.
-        encodes_once = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
+        are_frames = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
         self._frames: EmbeddedFrames | None = None
-        if encodes_once and device.type == "cpu" and not agent.settings.compile:
+        # `torch.compile` would compile the encoder again for each number of frames.
+        if are_frames and device.type == "cpu" and not agent.settings.compile:
             self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
         self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]

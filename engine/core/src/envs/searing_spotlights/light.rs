@@ -19,6 +19,7 @@ use crate::raster::{Canvas, DiscColumn, Rect, copy_run};
 /// Where the light is visible: below the bar.
 const COLUMNS: Range<usize> = 0..SCREEN;
 const ROWS: Range<usize> = BAR_HEIGHT..SCREEN;
+/// The same rows, to be compared with those of circles that begin above the screen.
 const SIGNED_ROWS: Range<i32> = BAR_HEIGHT as i32..SCREEN as i32;
 
 /// Number of circles that are searched for one that has moved.
