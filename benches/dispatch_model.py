@@ -17,7 +17,7 @@ from dataclasses import dataclass
 WORK = {
     "MysteryPath-Grid-v0": (1_670, 15),
     "Endless-MortarMayhem-v0": (2_280, 55),
-    "SearingSpotlights-v0": (6_280, 113),
+    "SearingSpotlights-v0": (6_570, 113),
 }
 
 

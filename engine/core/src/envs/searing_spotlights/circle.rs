@@ -7,7 +7,7 @@ use crate::envs::screen::SCREEN;
 use crate::raster::Rect;
 
 /// A lit circle, in pixels of the screen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Circle {
     /// Horizontal centre.
     pub x: i16,
@@ -38,30 +38,24 @@ impl Circle {
         is_within(self.x, low) && is_within(self.y, BAR_HEIGHT as i16 + low) && self.radius > 0
     }
 
-    /// Whether all of its rows are on the screen below the bar.
-    #[inline]
-    pub fn has_all_rows(&self) -> bool {
-        (BAR_HEIGHT as i16 + self.radius..=SCREEN as i16 - self.radius).contains(&self.y)
-    }
-
     /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius.
     #[inline]
     pub fn reaches(&self, rect: &Rect) -> bool {
         self.comes_within(0, rect)
     }
 
-    /// Whether it would reach a rectangle if its radius was larger by `more` pixels.
+    /// Whether it would reach a rectangle if its radius was larger by `more` pixels. Without a branch, since none could be
+    /// predicted.
     #[inline]
     pub fn comes_within(&self, more: i32, rect: &Rect) -> bool {
         let radius = i32::from(self.radius) + more;
-        // Negative if the centre is within.
-        let gap = |at: i16, low: i32, length: i32| (low - i32::from(at)).max(i32::from(at) - low - length);
-        let x = gap(self.x, rect.x, rect.width);
-        if x >= radius {
-            return false;
-        }
-        let y = gap(self.y, rect.y, rect.height);
-        y < radius && x.max(0).pow(2) + y.max(0).pow(2) < radius * radius
+        // The distance outside of the rectangle along one axis; one of `radius` is too far already.
+        let gap = |at: i16, low: i32, length: i32| {
+            let at = i32::from(at);
+            (low - at).max(at - low - length).min(radius).max(0)
+        };
+        let (x, y) = (gap(self.x, rect.x, rect.width), gap(self.y, rect.y, rect.height));
+        x * x + y * y < radius * radius
     }
 
     /// Whether a position is within its radius.
@@ -87,8 +81,6 @@ mod tests {
             assert!(!circle(x, y).is_on_screen(), "{x}, {y}");
         }
         assert!(!Circle { x: 40, y: 40, radius: 0 }.is_on_screen());
-        assert!(circle(0, 14).has_all_rows() && circle(84, 74).has_all_rows());
-        assert!(!circle(40, 13).has_all_rows() && !circle(40, 75).has_all_rows());
         assert!(circle(40, 40).contains((49, 40)));
         assert!(!circle(40, 40).contains((50, 40)));
     }

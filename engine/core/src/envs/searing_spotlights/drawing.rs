@@ -5,7 +5,7 @@
 //! twice.
 
 use super::config::BAR_HEIGHT;
-use super::light::LightChange;
+use super::light::{LightChange, MANY};
 use super::pictures::{Assets, Pictures};
 use super::scene::Scene;
 use super::shape::Shape;
@@ -13,8 +13,8 @@ use super::state::State;
 use crate::envs::screen::SCREEN;
 use crate::raster::{Canvas, Damage, Rect, Sprite};
 
-/// With more circles than these, a full repaint is faster than the search for changes.
-const MANY: usize = 64;
+/// Where light and objects that are hidden in the dark are visible.
+const BELOW_BAR: Rect = Rect { x: 0, y: BAR_HEIGHT as i32, width: SCREEN as i32, height: (SCREEN - BAR_HEIGHT) as i32 };
 
 /// A selection of the objects on the background.
 #[derive(Clone, Copy)]
@@ -26,6 +26,7 @@ struct Objects {
 
 impl Objects {
     const NONE: Objects = Objects { coins: false, exit: false, agent: false };
+    const ALL: Objects = Objects { coins: true, exit: true, agent: true };
 
     fn any(self) -> bool {
         self.coins || self.exit || self.agent
@@ -91,9 +92,14 @@ impl Scene {
         } else {
             change.paint(assets, canvas);
         }
-        self.add_objects(shown, assets, &change, &mut damage);
+        let visible = self.visible_in_dark(assets).any();
+        if visible || self.darkness < 255 || self.outlined || shown.outlined || canvas.tracks_dirty() {
+            self.add_objects(shown, assets, &change, &mut damage);
+        } else {
+            self.repaint_hidden_objects(shown, assets, &change, canvas);
+        }
         if self.bar != shown.bar {
-            if self.visible_in_dark(assets).any() {
+            if visible {
                 self.bar.changes_since(&shown.bar).for_each(|field| damage.add(field));
             } else if !canvas.has_pixels() {
                 self.bar.changes_since(&shown.bar).for_each(|field| canvas.mark_rect(field));
@@ -108,13 +114,16 @@ impl Scene {
     /// Adds the bounds of visible objects that have changed or whose light has changed.
     fn add_objects(&self, shown: &Scene, assets: &Assets, change: &LightChange<'_>, damage: &mut Damage) {
         let visible = self.visible_in_dark(assets);
-        let add = |objects: Objects, in_dark: bool, changed: bool, damage: &mut Damage| {
+        for (objects, changed) in self.objects_since(shown) {
+            let in_dark = self.darkness < 255
+                || (objects.coins && visible.coins)
+                || (objects.exit && visible.exit)
+                || (objects.agent && visible.agent);
             if changed {
                 for scene in [shown, self] {
                     scene.for_each_object(assets, &assets.lit, objects, |sprite, corner| {
                         let bounds = sprite.bounds_at(corner);
-                        if in_dark || self.darkness < 255 || scene.circles.iter().any(|circle| circle.reaches(&bounds))
-                        {
+                        if in_dark || scene.lights(&bounds) {
                             damage.add(bounds);
                         }
                     });
@@ -127,11 +136,59 @@ impl Scene {
                     }
                 });
             }
-        };
+        }
+    }
+
+    /// Changes the objects on a frame whose background has been changed already: in full darkness, with all objects hidden in the
+    /// dark. What of them is not lit is dark already.
+    fn repaint_hidden_objects(
+        &self,
+        shown: &Scene,
+        assets: &Assets,
+        change: &LightChange<'_>,
+        canvas: &mut Canvas<'_>,
+    ) {
+        let mut canvas = canvas.clipped(BELOW_BAR);
+        let mut differ = false;
+        for (objects, changed) in self.objects_since(shown) {
+            if changed {
+                shown.for_each_object(assets, &assets.lit, objects, |sprite, corner| {
+                    let bounds = sprite.bounds_at(corner);
+                    for circle in self.circles.iter().filter(|circle| circle.reaches(&bounds)) {
+                        differ = true;
+                        let background = assets.lit.background(self.background);
+                        let disc = &Shape::of(circle.radius).disc;
+                        background.paint_disc(&mut canvas.clipped(bounds), disc, circle.centre());
+                    }
+                });
+            }
+            self.for_each_object(assets, &assets.lit, objects, |sprite, corner| {
+                if !differ {
+                    let bounds = sprite.bounds_at(corner);
+                    differ = if changed { self.lights(&bounds) } else { change.reaches(&bounds) };
+                }
+            });
+        }
+        if !differ {
+            return;
+        }
+        for circle in &self.circles {
+            self.for_each_object(assets, &assets.lit, Objects::ALL, |sprite, (x, y)| {
+                if circle.reaches(&sprite.bounds_at((x, y))) {
+                    sprite.blit_within(&mut canvas, x, y, &Shape::of(circle.radius).disc, circle.centre());
+                }
+            });
+        }
+    }
+
+    /// Each kind of objects, and whether objects of that kind have changed.
+    fn objects_since(&self, shown: &Scene) -> [(Objects, bool); 3] {
         let nothing = Objects::NONE;
-        add(Objects { coins: true, ..nothing }, visible.coins, self.coins != shown.coins, damage);
-        add(Objects { exit: true, ..nothing }, visible.exit, self.exit != shown.exit, damage);
-        add(Objects { agent: true, ..nothing }, visible.agent, self.agent != shown.agent, damage);
+        [
+            (Objects { coins: true, ..nothing }, self.coins != shown.coins),
+            (Objects { exit: true, ..nothing }, self.exit != shown.exit),
+            (Objects { agent: true, ..nothing }, self.agent != shown.agent),
+        ]
     }
 
     /// The objects that are visible in the dark.

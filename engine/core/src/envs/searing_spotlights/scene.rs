@@ -6,6 +6,7 @@ use super::circle::Circle;
 use super::config::{Config, HEALTH_WIDTH};
 use super::state::{Background, Exit, State};
 use crate::envs::character::Character;
+use crate::raster::Rect;
 
 /// What a frame shows. The circles and coins of most frames fit without an allocation.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,6 +79,12 @@ impl Scene {
             agent: state.ground_truth_agent(),
             ..Scene::without_circles(state, config)
         }
+    }
+
+    /// Whether a circle may light a pixel of a rectangle. All are compared without a branch, since most are far away.
+    #[inline]
+    pub(super) fn lights(&self, rect: &Rect) -> bool {
+        self.circles.iter().fold(false, |lit, circle| lit | circle.reaches(rect))
     }
 
     #[inline]

@@ -35,50 +35,24 @@ pub(super) struct Crescent {
     pub pixels: Vec<(i8, i8)>,
     /// The smallest rectangle around them, relative to the circle's centre.
     pub bounds: Rect,
-    /// The same pixels as vertical blocks of 1 to [`LONGEST`] pixels, grouped by length. A block is the byte offset of
-    /// its first pixel in a frame whose corner is the corner of the circle's bounds.
-    blocks: Vec<u16>,
-    /// The end of the blocks of each length in `blocks`.
-    ends: [usize; LONGEST],
-    /// The offset of each of `pixels`, as in `blocks`.
+    /// The byte offset of each of `pixels` in a frame whose corner is the corner of the circle's bounds.
     offsets: Vec<u16>,
     /// For each row of the circle's bounds, and the one behind the last, the number of pixels above it.
     above: Vec<u16>,
 }
-
-/// Length of the longest block in pixels. A longer run is several blocks, the last of which may overlap the one before
-/// it.
-const LONGEST: usize = 4;
 
 impl Crescent {
     /// The pixels that a disc leaves when it moves by `to`.
     fn new(disc: &Disc, to: (i32, i32)) -> Self {
         let radius = disc.radius();
         let columns = -radius..radius;
-        let left = |x: i32, y: &i32| disc.contains((x, *y)) && !disc.contains((x - to.0, y - to.1));
+        let left = |x: i32, y: i32| disc.contains((x, y)) && !disc.contains((x - to.0, y - to.1));
         let mut crescent = Crescent::default();
-        let mut blocks: [Vec<u16>; LONGEST] = Default::default();
-        for x in columns.clone() {
-            let rows: Vec<i32> = columns.clone().filter(|y| left(x, y)).collect();
-            for run in rows.chunk_by(|above, below| above + 1 == *below) {
-                crescent.bounds = match crescent.bounds {
-                    Rect { width: 0, .. } => Rect::new(x, run[0], 1, run.len() as i32),
-                    bounds => bounds.union(&Rect::new(x, run[0], 1, run.len() as i32)),
-                };
-                let length = run.len().min(LONGEST);
-                for start in (0..run.len()).step_by(length).map(|start| start.min(run.len() - length)) {
-                    let place = (x + radius) as usize * SCREEN + (run[start] + radius) as usize;
-                    blocks[length - 1].push(place as u16 * 3);
-                }
-            }
-        }
-        for (end, blocks) in crescent.ends.iter_mut().zip(blocks) {
-            crescent.blocks.extend(blocks);
-            *end = crescent.blocks.len();
-        }
         for y in columns.clone() {
             crescent.above.push(crescent.pixels.len() as u16);
-            for x in columns.clone().filter(|x| left(*x, &y)) {
+            for x in columns.clone().filter(|x| left(*x, y)) {
+                let pixel = Rect::new(x, y, 1, 1);
+                crescent.bounds = if crescent.pixels.is_empty() { pixel } else { crescent.bounds.union(&pixel) };
                 crescent.pixels.push((x as i8, y as i8));
                 crescent.offsets.push(((x + radius) as usize * SCREEN + (y + radius) as usize) as u16 * 3);
             }
@@ -87,28 +61,21 @@ impl Crescent {
         crescent
     }
 
-    /// Copies the pixels from one frame to another, for a circle whose bounds have the given corner and whose rows are
-    /// all on the screen. Columns off the screen are skipped, since their offsets are outside of the frame.
+    /// Copies the pixels in some rows of the screen from one frame to another, for a circle whose bounds have the given corner.
+    /// Columns off the screen are skipped, since their offsets are outside of the frame.
+    ///
+    /// One loop over single pixels: with blocks of several lengths there are fewer copies, and more loops whose ends no processor
+    /// predicts.
     #[inline]
-    pub fn copy(&self, (x, y): (i32, i32), from: &Frame, to: &mut Frame) {
-        // A negative offset wraps around to a value outside of the frame, and back for the blocks that are on the
-        // screen.
+    pub fn copy(&self, (x, y): (i32, i32), rows: &Range<i32>, from: &Frame, to: &mut Frame) {
+        // A negative offset wraps around to a value outside of the frame, and back for the pixels that are on the screen.
         let corner = ((x * SCREEN as i32 + y) * 3) as usize;
-        let [ones, twos, threes, fours] = self.ends;
-        copy_blocks::<3>(&self.blocks[..ones], corner, from, to);
-        copy_blocks::<6>(&self.blocks[ones..twos], corner, from, to);
-        copy_blocks::<9>(&self.blocks[twos..threes], corner, from, to);
-        copy_blocks::<12>(&self.blocks[threes..fours], corner, from, to);
+        for offset in &self.offsets[self.in_rows(y, rows)] {
+            copy_pixel(*offset, corner, from, to);
+        }
     }
 
-    /// As [`copy`](Self::copy), only the pixels in some rows of the screen, for a circle whose other rows may be off the screen.
-    #[inline]
-    pub fn copy_rows(&self, (x, y): (i32, i32), rows: &Range<i32>, from: &Frame, to: &mut Frame) {
-        let corner = ((x * SCREEN as i32 + y) * 3) as usize;
-        copy_blocks::<3>(&self.offsets[self.in_rows(y, rows)], corner, from, to);
-    }
-
-    /// As [`copy_rows`](Self::copy_rows), only the pixels in another disc with the given centre.
+    /// As [`copy`](Self::copy), only the pixels in another disc with the given centre.
     #[inline]
     pub fn copy_within(
         &self,
@@ -125,7 +92,7 @@ impl Crescent {
         let corner = ((x * SCREEN as i32 + y) * 3) as usize;
         for (pixel, offset) in self.pixels[range.clone()].iter().zip(&self.offsets[range]) {
             if disc.contains((right + i32::from(pixel.0), down + i32::from(pixel.1))) {
-                copy_blocks::<3>(std::slice::from_ref(offset), corner, from, to);
+                copy_pixel(*offset, corner, from, to);
             }
         }
     }
@@ -142,12 +109,10 @@ impl Crescent {
 }
 
 #[inline]
-fn copy_blocks<const N: usize>(blocks: &[u16], corner: usize, from: &Frame, to: &mut Frame) {
-    for block in blocks {
-        let block = corner.wrapping_add(usize::from(*block));
-        if block <= FRAME_BYTES - N {
-            to[block..block + N].copy_from_slice(&from[block..block + N]);
-        }
+fn copy_pixel(offset: u16, corner: usize, from: &Frame, to: &mut Frame) {
+    let pixel = corner.wrapping_add(usize::from(offset));
+    if pixel <= FRAME_BYTES - 3 {
+        to[pixel..pixel + 3].copy_from_slice(&from[pixel..pixel + 3]);
     }
 }
 
@@ -185,8 +150,8 @@ impl Shape {
     /// Whether the crescent of a move is precomputed.
     #[inline]
     pub fn is_precomputed(radius: i16, (x, y): (i16, i16)) -> bool {
-        let is_near = |distance: i16| (-REACH..=REACH).contains(&distance);
-        is_near(x) && is_near(y) && radius <= MAX_MOVED_RADIUS
+        let is_near = |distance: i16| (distance + REACH) as u16 <= 2 * REACH as u16;
+        is_near(x) & is_near(y) & (radius <= MAX_MOVED_RADIUS)
     }
 
     /// The pixels that the circle leaves when it moves. The caller must have checked
@@ -227,36 +192,41 @@ mod tests {
     }
 
     #[test]
-    fn the_blocks_of_a_crescent_are_its_pixels() {
+    fn crescents_are_copied_where_they_are_on_the_screen() {
         let white = [255; FRAME_BYTES];
+        let rows = 10..SCREEN as i32 - 3;
         for radius in 0..=MAX_MOVED_RADIUS {
             for crescent in &Shape::of(radius).crescents {
-                for corner in [(5, 9), (-5, 9), (SCREEN as i32 - 4, 9)] {
-                    let mut found = [0; FRAME_BYTES];
-                    crescent.copy(corner, &white, &mut found);
-                    let mut expected = [0; FRAME_BYTES];
+                for corner in [(5, 12), (-5, 30), (SCREEN as i32 - 4, -7), (20, SCREEN as i32 - 9)] {
+                    let (mut found, mut expected) = ([0; FRAME_BYTES], [0; FRAME_BYTES]);
+                    crescent.copy(corner, &rows, &white, &mut found);
                     for (x, y) in crescent.pixels.iter().map(|(x, y)| (i32::from(*x), i32::from(*y))) {
                         assert!(crescent.bounds.overlaps(&Rect::new(x, y, 1, 1)));
                         let (x, y) = (corner.0 + i32::from(radius) + x, corner.1 + i32::from(radius) + y);
-                        if (0..SCREEN as i32).contains(&x) {
+                        if (0..SCREEN as i32).contains(&x) && rows.contains(&y) {
                             expected.as_chunks_mut::<3>().0[x as usize * SCREEN + y as usize] = [255; 3];
                         }
                     }
                     assert!(found == expected, "radius {radius} at {corner:?}");
                 }
-                for corner in [(5, 9), (-5, 30), (SCREEN as i32 - 4, -7), (20, SCREEN as i32 - 9)] {
-                    let (rows, mut found, mut expected) = (10..SCREEN - 3, [0; FRAME_BYTES], [0; FRAME_BYTES]);
-                    crescent.copy_rows(corner, &(rows.start as i32..rows.end as i32), &white, &mut found);
-                    for (x, y) in &crescent.pixels {
-                        let x = (corner.0 + i32::from(radius) + i32::from(*x)) as usize;
-                        let y = (corner.1 + i32::from(radius) + i32::from(*y)) as usize;
-                        if x < SCREEN && rows.contains(&y) {
-                            expected.as_chunks_mut::<3>().0[x * SCREEN + y] = [255; 3];
-                        }
-                    }
-                    assert!(found == expected, "radius {radius} at {corner:?}, cut");
+            }
+        }
+    }
+
+    #[test]
+    fn a_part_of_a_crescent_is_copied_within_another_disc() {
+        let white = [255; FRAME_BYTES];
+        let (rows, disc) = (0..SCREEN as i32, &Shape::of(8).disc);
+        let crescent = Shape::of(11).crescent((2, -1));
+        for centre in [(30, 30), (38, 22), (24, 41), (60, 60)] {
+            let (mut found, mut expected) = ([0; FRAME_BYTES], [0; FRAME_BYTES]);
+            crescent.copy_within((20, 20), (disc, centre), &rows, &white, &mut found);
+            for (x, y) in crescent.pixels.iter().map(|(x, y)| (31 + i32::from(*x), 31 + i32::from(*y))) {
+                if disc.contains((x - centre.0, y - centre.1)) {
+                    expected.as_chunks_mut::<3>().0[x as usize * SCREEN + y as usize] = [255; 3];
                 }
             }
+            assert!(found == expected, "{centre:?}");
         }
     }
 }
