@@ -21,12 +21,16 @@ WORK = {
 }
 
 
+#: Shares that are divided together.
+SHARES_IN_GROUP = 8
+
+
 @dataclass(frozen=True)
 class Costs:
     """Costs of a machine.
 
     `line`, `next_line` and `lock` are those of `cargo bench --bench handover` on two cores of an Intel Granite Rapids, and
-    `instructions_per_ns` is what Searing Spotlights reaches there in the caches. The others are assumed.
+    `instructions_per_ns` is what Searing Spotlights reached there in the caches. The others are assumed.
     """
 
     #: A cache line that another core has written.
@@ -39,6 +43,8 @@ class Costs:
     unpark: float = 10.0
     #: Dividing a range into two.
     split: float = 20.0
+    #: Making a share that has not been divided yet.
+    share: float = 5.0
     #: Instructions of one core.
     instructions_per_ns: float = 8.0
     #: Bytes that all cores together read and write, in a nanosecond (GB/s).
@@ -132,25 +138,35 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
     resources = Resources()
     left = [envs * (share + 1) // threads - envs * share // threads for share in range(threads)]
     pieces = [min(max(share // 8, 8), 16) for share in left]
-    begin = threads * (costs.split + costs.lock) + 2 * costs.lock + costs.line + 3 * costs.unpark
+    groups = -(-threads // SHARES_IN_GROUP)
+    begin = threads * costs.share + groups * (costs.split + costs.lock)
+    begin += 2 * costs.lock + costs.line + 3 * costs.unpark
     # A worker writes that it has joined into a line that the caller has read, and wakes three others.
     joins = 2 * costs.line + 3 * costs.unpark
     events = [(begin + (joins + thread * costs.next_line if thread else 0), thread) for thread in range(threads)]
     heapq.heapify(events)
     holder: dict[int, int] = {}
+    # When each group of shares is divided, by the first thread that needs one of them.
+    divided: dict[int, float] = {}
     ended, last = 0.0, 0.0
     while events:
         now, thread = heapq.heappop(events)
         share = thread
         if not left[share]:
-            # It reads of each share whether it is empty; these lines are read at once.
+            # It reads of 64 shares at once whether they are empty. Writing that one is empty does not wait for the line.
+            now += costs.line + threads // 64 * costs.next_line
             order = [(thread + distance) % threads for distance in range(1, threads)]
             share = next((other for other in order if left[other]), -1)
-            passed = len(order) if share < 0 else order.index(share) + 1
-            now += costs.line + passed * costs.next_line
         if share < 0:
             ended = max(ended, now)
             continue
+        group = share // SHARES_IN_GROUP
+        if group not in divided:
+            shares_of_group = min(SHARES_IN_GROUP, threads - group * SHARES_IN_GROUP)
+            read = costs.line + 4 * costs.next_line if thread else 0.0
+            divided[group] = now + read + costs.lock + shares_of_group * (costs.split + costs.lock)
+        resources.waiting += max(divided[group] - now, 0.0)
+        now = max(now, divided[group])
         moved = holder.get(share, 0) != thread
         holder[share] = thread
         now = resources.use(

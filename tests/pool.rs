@@ -73,7 +73,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
         let config = PoolConfig {
             seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
             features: true,
-            ..PoolConfig::new(spec.id, 131)
+            ..PoolConfig::new(spec.id, 331)
         };
         let mut players: Vec<Player> = [1, 2, 3, 64].map(|threads| Player::new(&config, threads)).into();
         for step in 0..80 {

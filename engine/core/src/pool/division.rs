@@ -51,13 +51,13 @@ impl<'a, E: Environment> EnvRange<'a, E> {
         if count < 2 || self.slots.len() < ENVS_FOR_THREADS {
             return work(self);
         }
-        let shares = self.shares(count);
+        let shares = Shares::new(self, count);
         let outcome = Mutex::new(Ok(()));
         threads.run(count - 1, &|thread| {
             // A share is not refilled, so each is left once it is empty.
             let mut passed = 0;
             while passed < count {
-                let Some(piece) = shares[(thread + passed) % count].take(passed == 0) else {
+                let Some(piece) = shares.take((thread + passed) % count, passed == 0) else {
                     passed += 1;
                     continue;
                 };
@@ -69,20 +69,6 @@ impl<'a, E: Environment> EnvRange<'a, E> {
             }
         });
         outcome.into_inner().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Divides the range into `count` shares, each of at least one environment.
-    fn shares(self, count: usize) -> Shares<'a, E> {
-        let mut shares = Shares::with_capacity(count);
-        let mut rest = self;
-        for left in (1..count).rev() {
-            let share = rest.slots.len() / (left + 1);
-            let (first, others) = rest.split_at(share);
-            shares.push(Share::new(first));
-            rest = others;
-        }
-        shares.push(Share::new(rest));
-        shares
     }
 
     /// Divides everything before environment `middle`.
@@ -98,38 +84,82 @@ impl<'a, E: Environment> EnvRange<'a, E> {
     }
 }
 
-/// Shares that need no allocation. The threads of loom's models have small stacks.
-const SHARES_ON_STACK: usize = if cfg!(loom) { 2 } else { 64 };
+/// Shares that are divided together. While the caller divides, no other thread can work, so it only divides the range into groups
+/// of shares. Who first needs a share of a group divides the group.
+const SHARES_IN_GROUP: usize = if cfg!(loom) { 2 } else { 8 };
+
+/// Groups that need no allocation. The threads of loom's models have small stacks.
+const GROUPS_ON_STACK: usize = if cfg!(loom) { 1 } else { 8 };
+
+/// Shares that need no allocation.
+const SHARES_ON_STACK: usize = SHARES_IN_GROUP * GROUPS_ON_STACK;
 
 /// The shares of all threads.
-type Shares<'a, E> = SmallVec<[Share<'a, E>; SHARES_ON_STACK]>;
-
-/// What is left of the environments that one thread starts with; on cache lines of its own.
-#[repr(align(128))]
-struct Share<'a, E: Environment> {
-    /// Nothing is left. Read before the lock is taken, so that threads at the end of a step do not wait for each other.
-    is_empty: AtomicBool,
-    rest: Mutex<Option<EnvRange<'a, E>>>,
+struct Shares<'a, E: Environment> {
+    groups: SmallVec<[Group<'a, E>; GROUPS_ON_STACK]>,
+    shares: SmallVec<[Share<'a, E>; SHARES_ON_STACK]>,
+    is_empty: EmptyShares,
+    num_envs: usize,
     /// Environments to take at a time.
     piece: usize,
 }
 
-impl<'a, E: Environment> Share<'a, E> {
-    fn new(range: EnvRange<'a, E>) -> Self {
-        let piece = (range.slots.len() / PIECES_OF_SHARE).clamp(*ENVS_IN_PIECE.start(), *ENVS_IN_PIECE.end());
-        Share { is_empty: AtomicBool::new(false), rest: Mutex::new(Some(range)), piece }
+/// Several shares that may not have been divided yet.
+struct Group<'a, E: Environment> {
+    is_divided: AtomicBool,
+    undivided: Mutex<Option<EnvRange<'a, E>>>,
+}
+
+/// What is left of the environments that one thread starts with; on cache lines of its own.
+#[repr(align(128))]
+struct Share<'a, E: Environment> {
+    /// `None` if nothing is left, and until the group is divided.
+    rest: Mutex<Option<EnvRange<'a, E>>>,
+}
+
+/// For each share, whether nothing is left of it. Read before a lock is taken, so that threads at the end of a step do not wait for
+/// each other. They lie side by side: a thread without work reads one cache line or two, instead of one of each share.
+#[repr(align(128))]
+struct EmptyShares(SmallVec<[AtomicBool; SHARES_ON_STACK]>);
+
+impl<'a, E: Environment> Shares<'a, E> {
+    /// Divides a range into `count` shares, each of at least one environment.
+    fn new(range: EnvRange<'a, E>, count: usize) -> Self {
+        let num_envs = range.slots.len();
+        let mut shares = Shares {
+            groups: SmallVec::with_capacity(count.div_ceil(SHARES_IN_GROUP)),
+            shares: (0..count).map(|_| Share { rest: Mutex::new(None) }).collect(),
+            is_empty: EmptyShares((0..count).map(|_| AtomicBool::new(false)).collect()),
+            num_envs,
+            piece: (num_envs / count / PIECES_OF_SHARE).clamp(*ENVS_IN_PIECE.start(), *ENVS_IN_PIECE.end()),
+        };
+        let mut rest = range;
+        for end in (SHARES_IN_GROUP..count).step_by(SHARES_IN_GROUP) {
+            let (group, others) = rest.split_at(shares.start(end) - shares.start(end - SHARES_IN_GROUP));
+            shares.groups.push(Group::new(group));
+            rest = others;
+        }
+        shares.groups.push(Group::new(rest));
+        shares
     }
 
-    /// Takes the first or the last piece.
-    fn take(&self, from_front: bool) -> Option<EnvRange<'a, E>> {
-        if self.is_empty.load(Ordering::Relaxed) {
+    /// Number of the first environment of a share, counted from the first of the range.
+    fn start(&self, share: usize) -> usize {
+        self.num_envs * share / self.shares.len()
+    }
+
+    /// Takes the first or the last piece of a share.
+    fn take(&self, number: usize, from_front: bool) -> Option<EnvRange<'a, E>> {
+        let is_empty = &self.is_empty.0[number];
+        if is_empty.load(Ordering::Relaxed) {
             return None;
         }
-        let mut rest = lock(&self.rest);
+        self.divide_group(number / SHARES_IN_GROUP);
+        let mut rest = lock(&self.shares[number].rest);
         let range = rest.take()?;
         let num_envs = range.slots.len();
         if num_envs <= self.piece {
-            self.is_empty.store(true, Ordering::Relaxed);
+            is_empty.store(true, Ordering::Relaxed);
             return Some(range);
         }
         let (piece, others) = if from_front {
@@ -140,5 +170,28 @@ impl<'a, E: Environment> Share<'a, E> {
         };
         *rest = Some(others);
         Some(piece)
+    }
+
+    /// Fills the shares of a group, unless that has been done. Other threads that need them wait for it.
+    fn divide_group(&self, number: usize) {
+        let group = &self.groups[number];
+        if group.is_divided.load(Ordering::Acquire) {
+            return;
+        }
+        let mut undivided = lock(&group.undivided);
+        let Some(mut range) = undivided.take() else { return };
+        let first = number * SHARES_IN_GROUP;
+        for (number, share) in (first..).zip(self.shares[first..].iter().take(SHARES_IN_GROUP)) {
+            let (envs, others) = range.split_at(self.start(number + 1) - self.start(number));
+            *lock(&share.rest) = Some(envs);
+            range = others;
+        }
+        group.is_divided.store(true, Ordering::Release);
+    }
+}
+
+impl<'a, E: Environment> Group<'a, E> {
+    fn new(range: EnvRange<'a, E>) -> Self {
+        Group { is_divided: AtomicBool::new(false), undivided: Mutex::new(Some(range)) }
     }
 }
