@@ -58,7 +58,7 @@ class Step:
     envs: int
     threads: int
     total: float
-    #: Time of the caller before its first environment and after the last environment of all, in which no other thread is needed.
+    #: Time before the caller's first environment and after the last environment of all.
     serial: float
     #: Time that all threads together wait for a lock or a line that another one uses.
     waiting: float
@@ -148,7 +148,7 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
     holder: dict[int, int] = {}
     # When each group of shares is divided, by the first thread that needs one of them.
     divided: dict[int, float] = {}
-    ended, last = 0.0, 0.0
+    first, ended, last = 0.0, 0.0, 0.0
     while events:
         now, thread = heapq.heappop(events)
         share = thread
@@ -172,12 +172,14 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
         now = resources.use(
             ("share", share), now, costs.lock + costs.split + moved * (costs.line + 4 * costs.next_line)
         )
+        if thread == 0 and not first:
+            first = now
         taken = min(pieces[share], left[share])
         left[share] -= taken
         last = max(last, now + taken * env) if taken else last
         heapq.heappush(events, (now + taken * env, thread))
     total = ended + costs.line + threads * costs.next_line
-    return Step(envs, threads, total, begin + total - last, resources.waiting, envs * env)
+    return Step(envs, threads, total, first + total - last, resources.waiting, envs * env)
 
 
 def alone(env: float, envs: int) -> Step:

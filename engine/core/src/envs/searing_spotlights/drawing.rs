@@ -139,8 +139,8 @@ impl Scene {
         }
     }
 
-    /// Changes the objects on a frame whose background has been changed already: in full darkness, with all objects hidden in the
-    /// dark. What of them is not lit is dark already.
+    /// Repaints the objects after [`LightChange::paint`] has painted the background. Only for full darkness with all objects hidden in
+    /// it: what is not lit of them is black already.
     fn repaint_hidden_objects(
         &self,
         shown: &Scene,
