@@ -10,6 +10,7 @@ nanoseconds.
 from __future__ import annotations
 
 import heapq
+import math
 from collections import defaultdict
 from dataclasses import dataclass
 
@@ -148,7 +149,7 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
     holder: dict[int, int] = {}
     # When each group of shares is divided, by the first thread that needs one of them.
     divided: dict[int, float] = {}
-    first, ended, last = 0.0, 0.0, 0.0
+    first, ended, last = math.inf, 0.0, 0.0
     while events:
         now, thread = heapq.heappop(events)
         share = thread
@@ -172,8 +173,8 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
         now = resources.use(
             ("share", share), now, costs.lock + costs.split + moved * (costs.line + 4 * costs.next_line)
         )
-        if thread == 0 and not first:
-            first = now
+        if thread == 0:
+            first = min(first, now)
         taken = min(pieces[share], left[share])
         left[share] -= taken
         last = max(last, now + taken * env) if taken else last

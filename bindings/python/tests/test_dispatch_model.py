@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "benches"))
 from dispatch_model import WORK, Costs, Step, env_time, one_queue, shares
 
 #: Threads cost nothing.
-FREE = Costs(line=0, next_line=0, lock=0, unpark=0, split=0, bandwidth=math.inf)
+FREE = Costs(line=0, next_line=0, lock=0, unpark=0, split=0, share=0, bandwidth=math.inf)
 DIVISIONS = [one_queue, shares]
 
 Division = Callable[[Costs, float, int, int], Step]
