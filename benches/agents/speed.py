@@ -90,6 +90,9 @@ def main() -> None:
     parser.add_argument(
         "--threads", type=int, default=1, help="CPU threads of PyTorch and of the engine (default: %(default)s)"
     )
+    parser.add_argument(
+        "--bf16", action="store_true", help="`endless-train` computes in bfloat16, the others in float32"
+    )
     parser.add_argument("--rounds", type=int, default=2, help="runs of each program (default: %(default)s)")
     parser.add_argument("--output", type=Path, help="also write the results to this JSON file")
     args = parser.parse_args()
@@ -104,6 +107,7 @@ def main() -> None:
                     *(f"--environment.num-envs={args.num_envs}", "--environment.groups=1", f"--ppo.steps={args.steps}"),
                     *(f"--ppo.updates={args.updates}", f"--transformer.window={args.window}", "--device=cpu"),
                     *(f"--threads={args.threads}", f"--environment.num-threads={args.threads}", f"--run={folder}/run"),
+                    *(["--bf16"] if args.bf16 else []),
                 ]
                 sides["endless"].append(rate(timed(ours, args.threads, r"steps/s|/s  ", folder), batch))
                 lines = Path(f"{folder}/run/progress.jsonl").read_text().splitlines()

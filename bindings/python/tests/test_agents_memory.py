@@ -74,6 +74,20 @@ def test_forward_equals_act(agent: Agent, minibatches: int) -> None:
         )
 
 
+def test_epochs_follow_one_another(agent: Agent) -> None:
+    """The minibatches of two epochs are those of two divisions with the same generator."""
+    memory = agent.initial_memory(ENVS)
+    reset_mask, *_ = play(agent, memory, observations(STEPS, ENVS), ends(STEPS, ENVS))
+
+    def divided(generator: torch.Generator, epochs: int) -> list[list[int]]:
+        batches = agent.memory.minibatches([memory.state], reset_mask, 2, generator, epochs=epochs)
+        return [minibatch.indices.tolist() for minibatch in batches]
+
+    generator = torch.Generator().manual_seed(0)
+    apart = [divided(generator, 1), divided(generator, 1)]
+    assert divided(torch.Generator().manual_seed(0), 2) == apart[0] + apart[1]
+
+
 @pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
 def test_minibatches_without_a_step_of_the_rank(name: str) -> None:
     """A rank with one of three environments: its steps are in some of the minibatches, and the others can be made, too."""

@@ -106,15 +106,17 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         num_minibatches: int,
         generator: torch.Generator,
         own: range | None = None,
+        epochs: int = 1,
     ) -> Sequence[MinibatchT]:
         """Shuffle a recorded segment and divide it into minibatches, of which every rank has the same number.
 
         Args:
             states: The state of each group of environments after the segment, in the order of their columns in the segment.
             reset_mask: Whether each step is the first of an episode, bool (T, N), on the CPU; with the columns of all ranks.
-            num_minibatches: Number of minibatches; there are fewer if the segment has fewer sequences.
+            num_minibatches: Number of minibatches of an epoch; there are fewer if the segment has fewer sequences.
             generator: Generator of the shuffle, on the CPU; in the same state at every rank.
             own: The columns of this rank's environments; `None` for all.
+            epochs: How often the segment is shuffled and divided; the minibatches follow one another.
         """
 
     @abstractmethod
@@ -151,6 +153,11 @@ def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Genera
     middle = size.cumsum(0) - size / 2
     part = (middle * num_parts / size.sum()).long()
     return [order[part == number] for number in range(num_parts) if bool((part == number).any())]
+
+
+def shuffled(sizes: Sequence[int], num_parts: int, epochs: int, generator: torch.Generator) -> list[Tensor]:
+    """`balanced_split` for each epoch."""
+    return [part for _ in range(epochs) for part in balanced_split(sizes, num_parts, generator)]
 
 
 def is_own(envs: Tensor, own: range) -> Tensor:
@@ -220,18 +227,22 @@ class NoMemory(Memory[NoState, None, Minibatch]):
         num_minibatches: int,
         generator: torch.Generator,
         own: range | None = None,
+        epochs: int = 1,
     ) -> Sequence[Minibatch]:
         del states
         envs = reset_mask.shape[1]
         own = range(envs) if own is None else own
-        minibatches = []
-        for everywhere in torch.randperm(reset_mask.numel(), generator=generator).chunk(num_minibatches):
+
+        def minibatch(everywhere: Tensor) -> Minibatch:
             indices = everywhere
             if len(own) < envs:
                 here = everywhere[is_own(everywhere % envs, own)]
                 indices = here // envs * len(own) + here % envs - own.start
-            minibatches.append(Minibatch(indices.to(self.device), everywhere.to(self.device)))
-        return minibatches
+            return Minibatch(indices.to(self.device), everywhere.to(self.device))
+
+        permutations = [torch.randperm(reset_mask.numel(), generator=generator) for _ in range(epochs)]
+        parts = [part for permutation in permutations for part in permutation.chunk(num_minibatches)]
+        return LazyMinibatches(parts, minibatch)
 
     def forward(self, x: Tensor, minibatch: Minibatch) -> Tensor:
         del minibatch

@@ -136,28 +136,26 @@ def learn(
     if settings.advantage_normalisation == "batch":
         own_advantages = losses.normalised(own_advantages, advantages)
     sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros((), device=agent.device))
-    count = 0
-    for _ in range(settings.epochs):
-        for minibatch in agent.memory.minibatches(states, reset_mask, settings.minibatches, generator, own):
-            optimizer.zero_grad(set_to_none=True)
-            parts: dict[str, Tensor] = {}
-            if len(minibatch.indices):
-                is_minibatch = settings.advantage_normalisation == "minibatch"
-                reference = advantages.index_select(0, minibatch.everywhere) if is_minibatch else None
-                loss, parts = minibatch_loss(
-                    agent, flat, minibatch, own_advantages, returns, settings, entropy_coefficient, reference
-                )
-                loss.backward()
-            share = len(minibatch.indices) / len(minibatch.everywhere)
-            add_gradients(agent, ranks, share)
-            norm = nn.utils.clip_grad_norm_(agent.parameters(), settings.max_gradient_norm)
-            optimizer.step()
-            for name, part in parts.items():
-                sums[name].add_(part, alpha=share)
-            sums["gradient_norm"].add_(norm, alpha=1.0 / ranks.size)
-            count += 1
+    minibatches = agent.memory.minibatches(states, reset_mask, settings.minibatches, generator, own, settings.epochs)
+    for minibatch in minibatches:
+        optimizer.zero_grad(set_to_none=True)
+        parts: dict[str, Tensor] = {}
+        if len(minibatch.indices):
+            is_minibatch = settings.advantage_normalisation == "minibatch"
+            reference = advantages.index_select(0, minibatch.everywhere) if is_minibatch else None
+            loss, parts = minibatch_loss(
+                agent, flat, minibatch, own_advantages, returns, settings, entropy_coefficient, reference
+            )
+            loss.backward()
+        share = len(minibatch.indices) / len(minibatch.everywhere)
+        add_gradients(agent, ranks, share)
+        norm = nn.utils.clip_grad_norm_(agent.parameters(), settings.max_gradient_norm)
+        optimizer.step()
+        for name, part in parts.items():
+            sums[name].add_(part, alpha=share)
+        sums["gradient_norm"].add_(norm, alpha=1.0 / ranks.size)
     ranks.add(sums[name] for name in sorted(sums))
-    metrics |= {name: total / count for name, total in sums.items()}
+    metrics |= {name: total / len(minibatches) for name, total in sums.items()}
     # One copy to the host for all metrics.
     numbers = torch.stack(list(metrics.values())).cpu().tolist()
     rates = {"learning_rate": learning_rate, "entropy_coefficient": entropy_coefficient}

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym.agents.encoders import orthogonal
-from endless_gym.agents.memory import Memory, MemoryState, Minibatch, balanced_split, is_own
+from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
 from endless_gym.agents.recurrence import packed_layers
 from endless_gym.agents.settings import Recurrence
 
@@ -145,6 +145,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         num_minibatches: int,
         generator: torch.Generator,
         own: range | None = None,
+        epochs: int = 1,
     ) -> Sequence[RecurrentMinibatch]:
         length, (steps, envs) = self.settings.sequence_length, reset_mask.shape
         own = range(envs) if own is None else own
@@ -157,8 +158,8 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         env, time = starts.nonzero(as_tuple=True)
         start = env * steps + time
         lengths = torch.cat([start[1:], torch.tensor([envs * steps])]) - start
-        minibatches = []
-        for chosen in balanced_split(lengths.tolist(), num_minibatches, generator):
+
+        def minibatch(chosen: Tensor) -> RecurrentMinibatch:
             everywhere = None
             if len(own) < envs:
                 everywhere, _ = packed(time[chosen], env[chosen], lengths[chosen], envs)
@@ -172,8 +173,9 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             starts_episode = reset_mask[t, e].to(stored.device)[:, None]
             hidden = hidden.permute(1, 2, 0, 3).masked_fill(starts_episode, 0.0).contiguous()
             everywhere = indices if everywhere is None else everywhere
-            minibatches.append(RecurrentMinibatch(indices, everywhere, batch_sizes, hidden))
-        return minibatches
+            return RecurrentMinibatch(indices, everywhere, batch_sizes, hidden)
+
+        return LazyMinibatches(shuffled(lengths.tolist(), num_minibatches, epochs, generator), minibatch)
 
     def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
         x = x.float()

@@ -34,7 +34,7 @@ from torch.nn import functional
 
 from endless_gym.agents.acting import linear_relu, transposed
 from endless_gym.agents.encoders import orthogonal
-from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, balanced_split, is_own
+from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
 from endless_gym.agents.settings import Transformer
 from endless_gym.agents.transformer_cache import Projection, RingCache, ring_ages
 
@@ -69,27 +69,26 @@ def normalised(tokens: Tensor) -> Tensor:
 
 @dataclass
 class Groups:
-    """Where the queries of single steps lie in G groups of K places, of which some are empty.
+    """Where the queries of single steps lie in G groups of K places for each head. Some places are empty.
 
     Attributes:
-        query: Number of the query in each place, int64 (G * K,); of any query in an empty place.
-        place: Place of each query, int64 (n,).
-        size: K.
+        shape: G, heads and K.
+        query: Row of the query in each place among float (heads * n, size), int64 (G * heads * K,); of any query in an
+            empty place.
+        place: Place of each query, int64 (heads * n,).
     """
 
+    shape: tuple[int, int, int]
     query: Tensor
     place: Tensor
-    size: int
 
     def gather(self, x: Tensor) -> Tensor:
-        """Put the queries, float (n, heads, 1, size), into their places: float (G, heads, K, size)."""
-        gathered: Tensor = x.squeeze(2).index_select(0, self.query).unflatten(0, (-1, self.size)).transpose(1, 2)
-        return gathered
+        """Put the queries, float (heads, n, size), into their places: float (G, heads, K, size)."""
+        return x.flatten(0, 1).index_select(0, self.query).unflatten(0, self.shape)
 
     def scatter(self, x: Tensor) -> Tensor:
-        """The inverse of `gather`, without the empty places: float (n, 1, heads, size)."""
-        scattered: Tensor = x.transpose(1, 2).flatten(0, 1).index_select(0, self.place).unsqueeze(1)
-        return scattered
+        """The inverse of `gather`, without the empty places: float (heads, n, size)."""
+        return x.flatten(0, 2).index_select(0, self.place).unflatten(0, (self.shape[1], -1))
 
 
 class Attention(nn.Module):
@@ -147,53 +146,79 @@ class Attention(nn.Module):
         """
         queries = self.project(self.queries, x)
         if groups is not None:
-            queries = groups.gather(queries)
+            queries = queries.squeeze(2).transpose(0, 1)  # (heads, n, head size)
         if self.relative:
             # Relative encoding of Dai et al., 2019: a content term and a distance term, each with a learned bias. A distance is
             # at most the number of tokens.
             encoded = self.encoded_distances(torch.arange(tokens.shape[-2] + 1, device=x.device), x.dtype)
-            scores = (queries + self.distance_bias) @ encoded.transpose(-2, -1)  # (n, heads, queries, distances)
+            placed = queries if groups is None else groups.gather(queries)
+            scores = (placed + self.distance_bias) @ encoded.transpose(-2, -1)  # (n or G, heads, queries, distances)
             chosen = distance.clamp(min=0).expand(*scores.shape[:2], *distance.shape[-2:])
             bias = scores.gather(-1, chosen) * self.scale + bias
             queries = queries + self.content_bias
-        if groups is not None:
-            summed = groups.scatter(self._few_queries(queries, tokens, norm, bias))
-        else:
-            tokens = torch.addcmul(norm.bias, tokens, norm.weight)
-            keys, values = self.project(self.keys, tokens), self.project(self.values, tokens)
+        keys, values = self._folded(self.keys, norm), self._folded(self.values, norm)
+        tokens = tokens.to(queries.dtype)
+        if groups is None:
+            keys, values = self._projected(tokens, keys), self._projected(tokens, values)
             summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
             summed = summed.transpose(1, 2)
+        else:
+            summed = self._few_queries(queries, tokens, keys, values, bias, groups).transpose(0, 1).unsqueeze(1)
+        # The bias of the normalisation adds the same to all scores of a query, which the softmax ignores, and to all values.
+        summed = summed + self.project(self.values, norm.bias.unsqueeze(0)).squeeze(1)
         out: Tensor = self.fc_out(summed.flatten(-2).masked_fill(first, 0.0))
         return out
 
-    def _few_queries(self, queries: Tensor, tokens: Tensor, norm: nn.LayerNorm, bias: Tensor) -> Tensor:
+    def _folded(self, layer: nn.Linear, norm: nn.LayerNorm) -> Tensor:
+        """The projection of normalised tokens, with the gain of the normalisation: float (heads, head size, inputs).
+
+        The inputs are the whole token, or with shared heads the head's slice of it. Tokens have no gradient, except with learned
+        positions, so no operation for the gain or its gradient has the size of the tokens.
+        """
+        if layer.in_features != self.size:
+            return layer.weight.view(self.heads, self.size, -1) * norm.weight
+        return layer.weight * norm.weight.view(self.heads, 1, self.size)
+
+    def _projected(self, tokens: Tensor, projection: Tensor) -> Tensor:
+        """Project tokens, float (n, tokens, width), by what `_folded` returned: float (n, heads, tokens, head size)."""
+        if projection.shape[-1] != self.size:
+            projected: Tensor = functional.linear(tokens, projection.flatten(0, 1)).unflatten(
+                -1, (self.heads, self.size)
+            )
+            return projected.transpose(1, 2)
+        slices = tokens.flatten(0, 1).unflatten(-1, (self.heads, self.size)).transpose(0, 1)
+        return torch.bmm(slices, projection.mT).unflatten(1, tokens.shape[:2]).transpose(0, 1)
+
+    def _few_queries(
+        self, queries: Tensor, tokens: Tensor, keys: Tensor, values: Tensor, bias: Tensor, groups: Groups
+    ) -> Tensor:
         """Attention of a few queries to each group of tokens, without the projection of each token.
 
-        The gain and the bias of the normalisation are applied to the query and to the weighted sum as well. The bias adds the
-        same to all scores, which the softmax ignores.
-
         Args:
-            queries: float (G, heads, K, head size).
+            queries: float (heads, n, head size).
             tokens: Normalised tokens, float (G, tokens, width).
-            norm: Layer normalisation of the tokens.
+            keys: What `_folded` returned.
+            values: What `_folded` returned.
             bias: What is added to the scores, float (G, heads or 1, K, tokens).
+            groups: The places of the queries.
 
         Returns:
-            float (G, heads, K, head size).
+            float (heads, n, head size).
         """
-        tokens, heads = tokens.to(queries.dtype), queries.shape[1:3]
-        queries = torch.einsum("ghks,hsw->ghkw", queries, self._of_heads(self.keys)) * (norm.weight * self.scale)
-        scores = (queries.flatten(1, 2) @ tokens.transpose(1, 2)).unflatten(1, heads) + bias
+        keys, values = self._of_whole_tokens(keys), self._of_whole_tokens(values)
+        placed = groups.gather(torch.bmm(queries, keys))
+        heads = placed.shape[1:3]
+        scores = torch.add(bias, (placed.flatten(1, 2) @ tokens.mT).unflatten(1, heads), alpha=self.scale)
         weights = scores.softmax(-1).to(tokens.dtype)
-        summed = (weights.flatten(1, 2) @ tokens).unflatten(1, heads) * norm.weight + norm.bias
-        return torch.einsum("ghkw,hsw->ghks", summed, self._of_heads(self.values))
+        summed = (weights.flatten(1, 2) @ tokens).unflatten(1, heads)
+        return torch.bmm(groups.scatter(summed), values.mT)
 
-    def _of_heads(self, layer: nn.Linear) -> Tensor:
-        """The projection of a whole vector for each head, float (heads, head size, width)."""
-        if layer.in_features != self.size:
-            return layer.weight.view(self.heads, self.size, -1)
-        own = torch.eye(self.heads, device=layer.weight.device)[:, None, :, None]
-        return (own * layer.weight[None, :, None]).flatten(2)
+    def _of_whole_tokens(self, projection: Tensor) -> Tensor:
+        """What `_folded` returned, as the projections of whole tokens: float (heads, head size, width)."""
+        if projection.shape[-1] != self.size:
+            return projection
+        own = torch.eye(self.heads, device=projection.device)[:, None, :, None]
+        return (own * projection[:, :, None]).flatten(2)
 
     def encoded_distances(self, distances: Tensor, dtype: torch.dtype) -> Tensor:
         """Projected encodings of distances int64 (k,), float (heads, k, head size); only with the relative encoding."""
@@ -389,8 +414,8 @@ class TransformerMinibatch(Minibatch):
     """Sequences of C steps each, with the P steps before them: `window - 1`, or fewer if all episodes are shorter.
 
     Attributes:
-        tokens: The cached inputs of each block, float32 (layers, sequences, P + C, width); with positions added and normalised,
-            unless the positional encoding is learned.
+        tokens: The cached inputs of each block, float (layers, sequences, P + C, width); with positions added, normalised and in
+            the type to compute in, or float32 without all this if the positional encoding is learned.
         position: Position of each token in its episode, int64 (sequences, P + C).
         query_position: Position of each query in its episode, int64 (sequences, C).
         bias: Attention mask, float32 (sequences, 1, C, P + C); 0 where the query attends to the token, else `MASKED`.
@@ -497,6 +522,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         num_minibatches: int,
         generator: torch.Generator,
         own: range | None = None,
+        epochs: int = 1,
     ) -> Sequence[TransformerMinibatch]:
         steps, envs = reset_mask.shape
         own = range(envs) if own is None else own
@@ -525,13 +551,14 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             indices = steps_here[chosen.to(self.device)].flatten()
             return parts(chosen, indices, indices if everywhere is None else everywhere)
 
-        return LazyMinibatches(balanced_split([length] * (envs * sequences), num_minibatches, generator), minibatch)
+        split = shuffled([length] * (envs * sequences), num_minibatches, epochs, generator)
+        return LazyMinibatches(split, minibatch)
 
     def _sequences(self, tokens: Tensor, position: Tensor, past: int, steps: int, length: int) -> MakeMinibatch:
         """Makes minibatches of sequences, each with its own tokens.
 
         Args:
-            tokens: See `_tokens`, float32 (layers, envs, past + steps, width).
+            tokens: See `_tokens`, float (layers, envs, past + steps, width).
             position: Position of each token, int64 (envs, past + steps).
             past: Number of tokens before the segment.
             steps: Steps of the segment.
@@ -580,12 +607,17 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             group = chosen // steps * parts + step // part
             count = torch.bincount(group, minlength=num_groups)
             size, number = int(count.max()), torch.arange(len(chosen))
-            place = group * size + number - (count.cumsum(0) - count)[group]
-            query = torch.zeros(num_groups * size, dtype=torch.long).index_copy_(0, place, number)
-            column = (past + step % part).to(self.device)
-            chosen, place, query = chosen.to(self.device), place.to(self.device), query.to(self.device)
-            queries = query_position[chosen].unsqueeze(-1)
-            groups = Groups(query, place, size)
+            # The place of each query among the places (group, size), and the query in each of them.
+            in_group = number - (count.cumsum(0) - count)[group]
+            query = torch.zeros(num_groups, size, dtype=torch.long).index_put_((group, in_group), number)
+            head = torch.arange(self.settings.heads).unsqueeze(-1)
+            groups = Groups(
+                (num_groups, len(head), size),
+                (query.unsqueeze(1) + head * len(chosen)).flatten().to(self.device),
+                (group * (len(head) * size) + in_group + head * size).flatten().to(self.device),
+            )
+            column, query = (past + step % part).to(self.device), query.flatten().to(self.device)
+            queries = query_position[chosen.to(self.device)].unsqueeze(-1)
             places = (num_groups, 1, size, 1)
             distance = column[query].view(places) - columns
             bias = torch.zeros(distance.shape, device=self.device)
@@ -615,7 +647,8 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         if isinstance(self.table, nn.Parameter):
             return tokens
         # They have no gradient, so this is done once for a segment, not for each minibatch.
-        return normalised(tokens if self.table is None else tokens + self._encoding(state.position[:, skipped:]))
+        encoded = tokens if self.table is None else tokens + self._encoding(state.position[:, skipped:])
+        return normalised(encoded).to(self._dtype)
 
     def _encoding(self, position: Tensor) -> Tensor:
         """Encodings of positions int64 (...,), float32 (..., width). Positions beyond the table share its last row."""
