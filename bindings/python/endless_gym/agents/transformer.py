@@ -84,11 +84,13 @@ class Groups:
 
     def gather(self, x: Tensor) -> Tensor:
         """Put the queries, float (heads, n, size), into their places: float (G, heads, K, size)."""
-        return x.flatten(0, 1).index_select(0, self.query).unflatten(0, self.shape)
+        gathered: Tensor = x.flatten(0, 1).index_select(0, self.query).unflatten(0, self.shape)
+        return gathered
 
     def scatter(self, x: Tensor) -> Tensor:
         """The inverse of `gather`, without the empty places: float (heads, n, size)."""
-        return x.flatten(0, 2).index_select(0, self.place).unflatten(0, (self.shape[1], -1))
+        scattered: Tensor = x.flatten(0, 2).index_select(0, self.place).unflatten(0, (self.shape[1], -1))
+        return scattered
 
 
 class Attention(nn.Module):
@@ -181,13 +183,13 @@ class Attention(nn.Module):
 
     def _projected(self, tokens: Tensor, projection: Tensor) -> Tensor:
         """Project tokens, float (n, tokens, width), by what `_folded` returned: float (n, heads, tokens, head size)."""
+        projected: Tensor
         if projection.shape[-1] != self.size:
-            projected: Tensor = functional.linear(tokens, projection.flatten(0, 1)).unflatten(
-                -1, (self.heads, self.size)
-            )
+            projected = functional.linear(tokens, projection.flatten(0, 1)).unflatten(-1, (self.heads, self.size))
             return projected.transpose(1, 2)
         slices = tokens.flatten(0, 1).unflatten(-1, (self.heads, self.size)).transpose(0, 1)
-        return torch.bmm(slices, projection.mT).unflatten(1, tokens.shape[:2]).transpose(0, 1)
+        projected = torch.bmm(slices, projection.mT).unflatten(1, tokens.shape[:2])
+        return projected.transpose(0, 1)
 
     def _few_queries(
         self, queries: Tensor, tokens: Tensor, keys: Tensor, values: Tensor, bias: Tensor, groups: Groups
