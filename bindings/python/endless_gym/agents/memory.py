@@ -156,7 +156,7 @@ def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Genera
 
 
 def shuffled(sizes: Sequence[int], num_parts: int, epochs: int, generator: torch.Generator) -> list[Tensor]:
-    """`balanced_split` for each epoch."""
+    """What `balanced_split` returns for each of the epochs, one after another; arguments as there."""
     return [part for _ in range(epochs) for part in balanced_split(sizes, num_parts, generator)]
 
 
