@@ -13,6 +13,7 @@ use endless_gym::pool::{
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
+use serde_json::json;
 
 const NUM_ENVS: usize = 3;
 
@@ -77,6 +78,21 @@ fn every_environment_is_drawn_alike_in_irregular_buffers() {
         let (mut one, mut other) = (pool(&config(spec)), pool(&config(spec)));
         let played = play_irregularly(&mut one, &mut other, 1000, &mut random);
         assert!(played.is_ok(), "{}: {}", spec.id, played.unwrap_err());
+    }
+}
+
+/// Circles of light are tested in blocks of 16, and up to 32 are searched for moves: numbers on both sides of each.
+#[test]
+fn many_circles_of_light_are_drawn_alike_in_irregular_buffers() {
+    let spec = envs::spec("SearingSpotlights-v0").unwrap();
+    for spotlights in [15, 24, 34] {
+        let options =
+            [("initial_spawns", json!(spotlights)), ("spot_min_speed", json!(0.002)), ("spot_damage", json!(0.0))];
+        let options = options.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+        let config = PoolConfig { options: ResetOptions::Shared(options), ..config(spec) };
+        let mut random = SmallRng::seed_from_u64(spotlights);
+        let played = play_irregularly(&mut pool(&config), &mut pool(&config), 300, &mut random);
+        assert!(played.is_ok(), "{spotlights} spotlights: {}", played.unwrap_err());
     }
 }
 

@@ -4,8 +4,9 @@
 //! darkened background, and each circle repaints the lit scene within it, so that nothing that stays dark is painted
 //! twice.
 
+use super::circles::Circles;
 use super::config::BAR_HEIGHT;
-use super::light::{LightChange, MANY};
+use super::light::LightChange;
 use super::pictures::{Assets, Pictures};
 use super::scene::Scene;
 use super::shape::Shape;
@@ -81,7 +82,7 @@ impl Scene {
         // In full darkness every background is black.
         let same_background = self.background == shown.background || self.darkness == 255;
         let mut damage = Damage::new(SCREEN, SCREEN);
-        let many = self.circles.len().max(shown.circles.len()) > MANY;
+        let many = self.circles.len().max(shown.circles.len()) > Circles::MAX_NUMBERED;
         if many || !same_light || !same_background || self.coins_visible != shown.coins_visible {
             damage.add(Rect::new(0, 0, SCREEN as i32, SCREEN as i32));
             return damage.repair(canvas, |canvas| self.paint(assets, canvas));
@@ -154,8 +155,9 @@ impl Scene {
             if changed {
                 shown.for_each_object(assets, &assets.lit, objects, |sprite, corner| {
                     let bounds = sprite.bounds_at(corner);
-                    for circle in self.circles.iter().filter(|circle| circle.reaches(&bounds)) {
+                    for circle in self.circles.reaching(&bounds) {
                         differ = true;
+                        let circle = self.circles.get(circle);
                         let background = assets.lit.background(self.background);
                         let disc = &Shape::of(circle.radius).disc;
                         background.paint_disc(&mut canvas.clipped(bounds), disc, circle.centre());
@@ -172,13 +174,12 @@ impl Scene {
         if !differ {
             return;
         }
-        for circle in &self.circles {
-            self.for_each_object(assets, &assets.lit, Objects::ALL, |sprite, (x, y)| {
-                if circle.reaches(&sprite.bounds_at((x, y))) {
-                    sprite.blit_within(&mut canvas, x, y, &Shape::of(circle.radius).disc, circle.centre());
-                }
-            });
-        }
+        self.for_each_object(assets, &assets.lit, Objects::ALL, |sprite, (x, y)| {
+            for circle in self.circles.reaching(&sprite.bounds_at((x, y))) {
+                let circle = self.circles.get(circle);
+                sprite.blit_within(&mut canvas, x, y, &Shape::of(circle.radius).disc, circle.centre());
+            }
+        });
     }
 
     /// Each kind of objects, and whether objects of that kind have changed.

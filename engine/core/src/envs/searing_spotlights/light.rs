@@ -8,6 +8,7 @@ use std::ops::Range;
 use smallvec::SmallVec;
 
 use super::circle::Circle;
+use super::circles::{Circles, Numbers};
 use super::config::BAR_HEIGHT;
 use super::light_spans::LightSpans;
 use super::pictures::Assets;
@@ -19,9 +20,6 @@ use crate::raster::{Canvas, DiscColumn, Rect, copy_run};
 /// Where the light is visible: below the bar.
 const COLUMNS: Range<usize> = 0..SCREEN;
 const ROWS: Range<i32> = BAR_HEIGHT as i32..SCREEN as i32;
-
-/// The most circles of a frame whose changes are searched; with more, the whole frame is painted.
-pub(super) const MANY: usize = 32;
 
 /// Number of circles that are searched for one that has moved.
 const WINDOW: usize = 3;
@@ -41,79 +39,83 @@ impl Replaced {
     }
 }
 
-/// A circle that has moved, and the crescents of the move are precomputed.
-#[derive(Clone, Copy, Debug, Default)]
-struct Moved {
-    from: Circle,
-    to: Circle,
-    /// Its number among the circles of the scene.
-    number: u8,
-}
-
 /// The circles that differ between two frames of the same darkness.
 #[derive(Debug)]
 pub(super) struct LightChange<'a> {
     scene: &'a Scene,
-    moved: [Moved; MANY],
-    num_moved: usize,
+    shown: &'a Scene,
+    /// The circles of the scene that have moved, and the crescents of the move are precomputed.
+    moved: Numbers,
+    /// For each of them, its number in the scene that was shown.
+    former: [u8; Circles::MAX_NUMBERED],
     replaced: SmallVec<[Replaced; 8]>,
 }
 
 impl<'a> LightChange<'a> {
-    /// The differences between a frame that shows `shown` and one that shows `scene`, with at most [`MANY`] circles each.
-    pub fn new(shown: &Scene, scene: &'a Scene) -> Self {
-        let (mut moved, mut num_moved, mut replaced) = ([Moved::default(); MANY], 0, SmallVec::new());
-        let new_background = scene.background != shown.background;
-        // Circles keep their order from frame to frame.
-        let (circles, mut number) = (scene.circles.as_slice(), 0);
-        for from in shown.circles.as_slice() {
-            let Some(skipped) = circles[number..].iter().take(WINDOW).position(|to| is_moved(from, to)) else {
-                replaced.push(Replaced::Disappeared(*from));
-                continue;
-            };
-            if skipped > 0 {
-                replaced.extend(circles[number..][..skipped].iter().map(|to| Replaced::Appeared(*to)));
-                number += skipped;
-            }
-            let to = circles[number];
-            // Written in any case: no processor predicts which circles have moved to another pixel.
-            moved[num_moved] = Moved { from: *from, to, number: number as u8 };
-            num_moved += usize::from((from.x != to.x) | (from.y != to.y));
-            if new_background {
-                replaced.push(Replaced::Appeared(to));
-            }
-            number += 1;
+    /// The differences between a frame that shows `shown` and one that shows `scene`, with at most [`Circles::MAX_NUMBERED`] circles
+    /// each.
+    #[inline]
+    pub fn new(shown: &'a Scene, scene: &'a Scene) -> Self {
+        let former = const { same_numbers() };
+        let mut change = LightChange { scene, shown, moved: Numbers::NONE, former, replaced: SmallVec::new() };
+        match scene.circles.moved_since(&shown.circles) {
+            Some(moved) if scene.background == shown.background => change.moved = moved,
+            _ => change.search(),
         }
-        if number < circles.len() {
-            replaced.extend(circles[number..].iter().map(|to| Replaced::Appeared(*to)));
-        }
-        LightChange { scene, moved, num_moved, replaced }
+        change
     }
 
-    fn moved(&self) -> &[Moved] {
-        &self.moved[..self.num_moved]
+    /// Finds the circles that have moved where others have appeared or disappeared.
+    #[inline(never)]
+    fn search(&mut self) {
+        let new_background = self.scene.background != self.shown.background;
+        let (circles, mut number) = (&self.scene.circles, 0);
+        // Circles keep their order from frame to frame.
+        for (former, from) in self.shown.circles.iter().enumerate() {
+            let mut window = number..circles.len().min(number + WINDOW);
+            let Some(found) = window.find(|to| is_moved(&from, &circles.get(*to))) else {
+                self.replaced.push(Replaced::Disappeared(from));
+                continue;
+            };
+            self.replaced.extend((number..found).map(|to| Replaced::Appeared(circles.get(to))));
+            let to = circles.get(found);
+            self.former[found] = former as u8;
+            self.moved.set(found, (from.x, from.y) != (to.x, to.y));
+            if new_background {
+                self.replaced.push(Replaced::Appeared(to));
+            }
+            number = found + 1;
+        }
+        self.replaced.extend((number..circles.len()).map(|to| Replaced::Appeared(circles.get(to))));
+    }
+
+    /// The circles that have moved, before and after.
+    #[inline]
+    fn moved(&self) -> impl Iterator<Item = (usize, Circle, Circle)> {
+        let former = |number: usize| self.shown.circles.get(self.former[number].into());
+        self.moved.map(move |number| (number, former(number), self.scene.circles.get(number)))
     }
 
     /// Rectangles around everything that changes.
     #[inline]
     pub fn bounds(&self) -> impl Iterator<Item = Rect> {
-        let moved = self.moved().iter().map(|moved| moved.from.bounds().union(&moved.to.bounds()));
+        let moved = self.moved().map(|(_, from, to)| from.bounds().union(&to.bounds()));
         self.replaced.iter().map(|replaced| replaced.circle().bounds()).chain(moved)
     }
 
     /// Whether anything within `rect` may change.
     #[inline]
     pub fn reaches(&self, rect: &Rect) -> bool {
-        // The diagonal of the longest precomputed move.
-        let near = |moved: &Moved| moved.to.comes_within(3 * i32::from(REACH) / 2, rect);
-        // All of them without a branch, since most are far away.
-        self.moved().iter().fold(false, |reached, moved| reached | near(moved))
+        // A circle that reached the rectangle before its move is now at most that far away.
+        let reach = i32::from(REACH);
+        let near = Rect::new(rect.x - reach, rect.y - reach, rect.width + 2 * reach, rect.height + 2 * reach);
+        !self.moved.and(self.scene.circles.reaching(&near)).is_empty()
             || self.replaced.iter().any(|replaced| replaced.circle().reaches(rect))
     }
 
     /// Paints the changes of the background, without objects and outlines.
     pub fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
-        if self.num_moved == 0 && self.replaced.is_empty() {
+        if self.moved.is_empty() && self.replaced.is_empty() {
             return;
         }
         if canvas.tracks_pixels() {
@@ -127,28 +129,26 @@ impl<'a> LightChange<'a> {
         let frame: &mut Frame = canvas.pixels_mut().try_into().expect("the canvas is a frame");
         let lit = assets.lit.background_frame(self.scene.background);
         let dark = assets.dark(self.scene.darkness).background_frame(self.scene.background);
-        let circles = self.scene.circles.as_slice();
         // What becomes dark is lit again within the circles of the scene, so that the order of the changes does not matter.
-        for Moved { from, to, number } in self.moved() {
-            let (left, entered) = crescents(from, to);
-            left.copy(corner(from), &ROWS, dark, frame);
+        for (number, from, to) in self.moved() {
+            let (left, entered) = crescents(&from, &to);
+            left.copy(corner(&from), &ROWS, dark, frame);
             let bounds = Rect { x: left.bounds.x + i32::from(from.x), ..left.bounds };
             let bounds = Rect { y: bounds.y + i32::from(from.y), ..bounds };
-            for (other, circle) in circles.iter().enumerate() {
-                if (other != usize::from(*number)) & circle.reaches(&bounds) {
-                    let disc = &Shape::of(circle.radius).disc;
-                    left.copy_within(corner(from), (disc, circle.centre()), &ROWS, lit, frame);
-                }
+            for other in self.scene.circles.reaching(&bounds).without(number) {
+                let other = self.scene.circles.get(other);
+                let disc = &Shape::of(other.radius).disc;
+                left.copy_within(corner(&from), (disc, other.centre()), &ROWS, lit, frame);
             }
-            entered.copy(corner(to), &ROWS, lit, frame);
+            entered.copy(corner(&to), &ROWS, lit, frame);
         }
         for replaced in &self.replaced {
             match replaced {
                 Replaced::Appeared(circle) => for_each_run(circle, |x, rows| copy_rows(x, rows, lit, frame)),
                 Replaced::Disappeared(circle) => {
                     for_each_run(circle, |x, rows| copy_rows(x, rows, dark, frame));
-                    let bounds = circle.bounds();
-                    for other in circles.iter().filter(|other| other.reaches(&bounds)) {
+                    for other in self.scene.circles.reaching(&circle.bounds()) {
+                        let other = self.scene.circles.get(other);
                         let disc = &Shape::of(other.radius).disc;
                         for_each_run(circle, |x, rows| copy_rows(x, disc.rows(other.centre(), x, &rows), lit, frame));
                     }
@@ -163,7 +163,7 @@ impl LightChange<'_> {
     fn note_spans(&self, canvas: &mut Canvas<'_>) {
         let mut spans = LightSpans::new();
         self.replaced.iter().for_each(|replaced| spans.add(replaced.circle()));
-        self.moved().iter().for_each(|moved| [moved.from, moved.to].iter().for_each(|circle| spans.add(circle)));
+        self.moved().for_each(|(_, from, to)| [from, to].iter().for_each(|circle| spans.add(circle)));
         let (firsts, ends) = spans.on_screen();
         canvas.mark_spans(&firsts, &ends);
     }
@@ -173,15 +173,26 @@ impl LightChange<'_> {
         for replaced in &self.replaced {
             for_each_run(replaced.circle(), |x, rows| canvas.mark_dirty(x..x + 1, &rows));
         }
-        for Moved { from, to, .. } in self.moved() {
-            let (left, entered) = crescents(from, to);
-            for (crescent, circle) in [(left, from), (entered, to)] {
+        for (_, from, to) in self.moved() {
+            let (left, entered) = crescents(&from, &to);
+            for (crescent, circle) in [(left, &from), (entered, &to)] {
                 for (x, y) in crescent.pixels.iter().filter_map(|pixel| on_screen(pixel, circle)) {
                     canvas.mark_dirty(x..x + 1, &(y..y + 1));
                 }
             }
         }
     }
+}
+
+/// Circles that have the same number in both scenes.
+const fn same_numbers() -> [u8; Circles::MAX_NUMBERED] {
+    let mut numbers = [0; Circles::MAX_NUMBERED];
+    let mut number = 0;
+    while number < numbers.len() {
+        numbers[number] = number as u8;
+        number += 1;
+    }
+    numbers
 }
 
 /// Whether `to` may be the same circle as `from`, a few frames later.

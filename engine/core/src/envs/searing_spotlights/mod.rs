@@ -28,6 +28,7 @@
 //! The number of spotlights is limited to [`MAX_SPOTLIGHTS`] and their radius to [`MAX_SPOT_RADIUS`].
 
 mod circle;
+mod circles;
 mod config;
 mod drawing;
 pub mod expert;

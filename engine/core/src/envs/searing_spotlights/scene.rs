@@ -2,7 +2,7 @@
 
 use smallvec::SmallVec;
 
-use super::circle::Circle;
+use super::circles::Circles;
 use super::config::{Config, HEALTH_WIDTH};
 use super::state::{Background, Exit, State};
 use crate::envs::character::Character;
@@ -21,7 +21,7 @@ pub struct Scene {
     /// Coins are visible in the dark.
     pub(super) coins_visible: bool,
     /// The lit circles on the screen; empty if there is no darkness.
-    pub(super) circles: SmallVec<[Circle; 12]>,
+    pub(super) circles: Circles,
     pub(super) coins: SmallVec<[(i32, i32); 2]>,
     pub(super) exit: Option<Exit>,
     pub(super) agent: Character,
@@ -66,7 +66,7 @@ impl Scene {
             background: if blank { Background::Black } else { state.background },
             coins_visible,
             blacked_out,
-            circles: if blacked_out { SmallVec::new() } else { state.shown_circles() },
+            circles: if blacked_out { Circles::default() } else { state.shown_circles() },
             agent: state.shown_agent(),
             ..Scene::without_circles(state, config)
         }
@@ -81,10 +81,10 @@ impl Scene {
         }
     }
 
-    /// Whether a circle may light a pixel of a rectangle. All are compared without a branch, since most are far away.
+    /// Whether a circle may light a pixel of a rectangle. Only for at most [`Circles::MAX_NUMBERED`] circles.
     #[inline]
     pub(super) fn lights(&self, rect: &Rect) -> bool {
-        self.circles.iter().fold(false, |lit, circle| lit | circle.reaches(rect))
+        !self.circles.reaching(rect).is_empty()
     }
 
     #[inline]
@@ -95,7 +95,7 @@ impl Scene {
             blacked_out: false,
             outlined: state.darkness > 0 && state.outlined,
             coins_visible: false,
-            circles: SmallVec::new(),
+            circles: Circles::default(),
             coins: SmallVec::from_slice(&state.coins),
             exit: state.exit,
             agent: Character::default(),
@@ -106,11 +106,11 @@ impl Scene {
 
 impl State {
     /// The lit circles on the screen; none if there is no darkness.
-    fn shown_circles(&self) -> SmallVec<[Circle; 12]> {
-        let mut circles = SmallVec::new();
+    fn shown_circles(&self) -> Circles {
+        let mut circles = Circles::default();
         if self.darkness > 0 {
             for circle in self.lit.iter().filter(|circle| circle.is_on_screen()) {
-                circles.push(*circle);
+                circles.push(circle);
             }
         }
         circles
