@@ -38,17 +38,11 @@ impl Circle {
         is_within(self.x, low) && is_within(self.y, BAR_HEIGHT as i16 + low) && self.radius > 0
     }
 
-    /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius.
+    /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius. Without a branch, since none
+    /// could be predicted.
     #[inline]
     pub fn reaches(&self, rect: &Rect) -> bool {
-        self.comes_within(0, rect)
-    }
-
-    /// Whether it would reach a rectangle if its radius was larger by `more` pixels. Without a branch, since none could be
-    /// predicted.
-    #[inline]
-    pub fn comes_within(&self, more: i32, rect: &Rect) -> bool {
-        let radius = i32::from(self.radius) + more;
+        let radius = i32::from(self.radius);
         // The distance outside of the rectangle along one axis; one of `radius` is too far already.
         let gap = |at: i16, low: i32, length: i32| {
             let at = i32::from(at);

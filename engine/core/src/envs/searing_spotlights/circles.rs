@@ -31,8 +31,8 @@ impl Block {
     /// A bit for each circle that may light a pixel from `left` and `top` to `right` and `bottom`.
     #[inline]
     fn reaching(&self, [left, top, right, bottom]: [i16; 4]) -> u16 {
-        // The distance outside of the rectangle along one axis. One of 255, and a sum of squares of 65,535, is too far for every
-        // radius below 256; circles of that radius are never missed.
+        // The distance outside of the rectangle along one axis, at most 255, so that squares fit into 16 bits. That and the saturated
+        // sum of squares change nothing for radii below 256. With 256, the largest, a circle just out of reach may be reported.
         let gap =
             |at: i16, low: i16, high: i16| low.saturating_sub(at).max(at.saturating_sub(high)).clamp(0, 255) as u16;
         let mut bits = [0; LANES];

@@ -56,7 +56,8 @@ impl<'a> LightChange<'a> {
     /// each.
     #[inline]
     pub fn new(shown: &'a Scene, scene: &'a Scene) -> Self {
-        let former = const { same_numbers() };
+        // Without a circle that has appeared or disappeared, the numbers are the same.
+        let former = std::array::from_fn(|number| number as u8);
         let mut change = LightChange { scene, shown, moved: Numbers::NONE, former, replaced: SmallVec::new() };
         match scene.circles.moved_since(&shown.circles) {
             Some(moved) if scene.background == shown.background => change.moved = moved,
@@ -182,17 +183,6 @@ impl LightChange<'_> {
             }
         }
     }
-}
-
-/// Circles that have the same number in both scenes.
-const fn same_numbers() -> [u8; Circles::MAX_NUMBERED] {
-    let mut numbers = [0; Circles::MAX_NUMBERED];
-    let mut number = 0;
-    while number < numbers.len() {
-        numbers[number] = number as u8;
-        number += 1;
-    }
-    numbers
 }
 
 /// Whether `to` may be the same circle as `from`, a few frames later.
