@@ -8,7 +8,7 @@ use super::shape::{MAX_MOVED_RADIUS, REACH};
 use crate::raster::Rect;
 
 /// Circles of a block.
-const LANES: usize = 16;
+const LANES: usize = 8;
 
 /// Up to [`LANES`] circles. The lanes behind the last circle are 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -8,12 +8,16 @@ use super::scene::Bar;
 use crate::envs::screen::SCREEN;
 use crate::raster::{Canvas, Rect, Rgb};
 
-const BLACK: Rgb = [0, 0, 0];
-const GREY: Rgb = [50, 50, 50];
-const HEALTH: Rgb = [0, 255, 0];
-const DAMAGE: Rgb = [255, 0, 0];
-const POSITIVE_REWARD: Rgb = [255, 255, 0];
-const ACTIONS: [Rgb; 3] = [[120, 120, 120], [116, 1, 113], [255, 94, 14]];
+/// A column of the bar, of one colour.
+type Column = [Rgb; BAR_HEIGHT];
+
+// In memory and not made from a colour, so that a column is two loads and two stores, not one store for each byte.
+static BLACK: Column = [[0, 0, 0]; BAR_HEIGHT];
+static GREY: Column = [[50, 50, 50]; BAR_HEIGHT];
+static HEALTH: Column = [[0, 255, 0]; BAR_HEIGHT];
+static DAMAGE: Column = [[255, 0, 0]; BAR_HEIGHT];
+static POSITIVE_REWARD: Column = [[255, 255, 0]; BAR_HEIGHT];
+static ACTIONS: [Column; 3] = [[[120, 120, 120]; BAR_HEIGHT], [[116, 1, 113]; BAR_HEIGHT], [[255, 94, 14]; BAR_HEIGHT]];
 
 /// The health takes the left half, and each branch of the action one of the other quarters.
 const QUARTER: usize = SCREEN / 4;
@@ -31,21 +35,21 @@ impl Bar {
     pub fn paint(&self, variant: Variant, canvas: &mut Canvas<'_>) {
         // In the original's drawing order.
         let damage = usize::from(self.damage);
-        fill(canvas, HALF.min(damage)..HALF, HEALTH);
+        fill(canvas, HALF.min(damage)..HALF, &HEALTH);
         match self.action {
             Some(action) => {
-                fill(canvas, 0..HALF.min(damage), DAMAGE);
+                fill(canvas, 0..HALF.min(damage), &DAMAGE);
                 for (branch, field) in action.into_iter().zip(ACTION_FIELDS) {
-                    fill(canvas, field, ACTIONS[usize::from(branch)]);
+                    fill(canvas, field, &ACTIONS[usize::from(branch)]);
                 }
             }
             None => {
-                fill(canvas, HALF..SCREEN, if variant.endless { BLACK } else { GREY });
-                fill(canvas, 0..damage, DAMAGE);
+                fill(canvas, HALF..SCREEN, if variant.endless { &BLACK } else { &GREY });
+                fill(canvas, 0..damage, &DAMAGE);
             }
         }
         if self.overflows {
-            fill(canvas, HALF..damage, DAMAGE);
+            fill(canvas, HALF..damage, &DAMAGE);
         }
         self.paint_reward(canvas);
     }
@@ -57,14 +61,14 @@ impl Bar {
             return self.paint(variant, canvas);
         };
         let (damage, shown_damage) = (usize::from(self.damage), usize::from(shown.damage));
-        fill(canvas, damage..shown_damage.min(HALF), HEALTH);
-        fill(canvas, shown_damage..damage.min(HALF), DAMAGE);
+        fill(canvas, damage..shown_damage.min(HALF), &HEALTH);
+        fill(canvas, shown_damage..damage.min(HALF), &DAMAGE);
         // The field of the reward covers a part of both fields.
         let covered = if self.reward.is_some() { REWARD_BETWEEN } else { HALF + QUARTER..HALF + QUARTER };
         let fields = [HALF..covered.start, covered.end..SCREEN];
         for ((now, before), field) in action.into_iter().zip(shown_action).zip(fields) {
             if now != before {
-                fill(canvas, field, ACTIONS[usize::from(now)]);
+                fill(canvas, field, &ACTIONS[usize::from(now)]);
             }
         }
         if self.reward != shown.reward {
@@ -74,7 +78,7 @@ impl Bar {
 
     fn paint_reward(&self, canvas: &mut Canvas<'_>) {
         if let Some(positive) = self.reward {
-            fill(canvas, self.reward_field(), if positive { POSITIVE_REWARD } else { GREY });
+            fill(canvas, self.reward_field(), if positive { &POSITIVE_REWARD } else { &GREY });
         }
     }
 
@@ -107,7 +111,7 @@ impl Bar {
 
 /// Paints columns of the bar within the canvas' clip.
 #[inline]
-fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: Rgb) {
+fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: &Column) {
     let (clip, rows) = (canvas.columns(), canvas.rows());
     let rows = rows.start..rows.end.min(BAR_HEIGHT);
     let columns = columns.start.max(clip.start)..columns.end.min(clip.end);
@@ -117,10 +121,8 @@ fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: Rgb) {
     canvas.mark_dirty(columns.clone(), &rows);
     let columns = &mut canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0[columns];
     if rows.len() == BAR_HEIGHT {
-        // A block of constant size compiles to one or two stores for each column.
-        let block: [Rgb; BAR_HEIGHT] = [color; BAR_HEIGHT];
-        columns.iter_mut().for_each(|column| column[..BAR_HEIGHT].copy_from_slice(&block));
+        columns.iter_mut().for_each(|column| column[..BAR_HEIGHT].copy_from_slice(color));
     } else if !rows.is_empty() {
-        columns.iter_mut().for_each(|column| column[rows.clone()].fill(color));
+        columns.iter_mut().for_each(|column| column[rows.clone()].copy_from_slice(&color[rows.clone()]));
     }
 }
