@@ -10,16 +10,16 @@ use smallvec::SmallVec;
 use super::circle::Circle;
 use super::circles::{Circles, Numbers};
 use super::config::BAR_HEIGHT;
+use super::crescents::Crescents;
 use super::light_spans::LightSpans;
 use super::pictures::Assets;
 use super::scene::Scene;
-use super::shape::{Crescent, REACH, Shape};
+use super::shape::{REACH, Shape};
 use crate::envs::screen::{Frame, SCREEN};
 use crate::raster::{Canvas, DiscColumn, Rect, copy_run};
 
 /// Where the light is visible: below the bar.
 const COLUMNS: Range<usize> = 0..SCREEN;
-const ROWS: Range<i32> = BAR_HEIGHT as i32..SCREEN as i32;
 
 /// Number of circles that are searched for one that has moved.
 const WINDOW: usize = 3;
@@ -132,16 +132,9 @@ impl<'a> LightChange<'a> {
         let dark = assets.dark(self.scene.darkness).background_frame(self.scene.background);
         // What becomes dark is lit again within the circles of the scene, so that the order of the changes does not matter.
         for (number, from, to) in self.moved() {
-            let (left, entered) = crescents(&from, &to);
-            left.copy(corner(&from), &ROWS, dark, frame);
-            let bounds = Rect { x: left.bounds.x + i32::from(from.x), ..left.bounds };
-            let bounds = Rect { y: bounds.y + i32::from(from.y), ..bounds };
-            for other in self.scene.circles.reaching(&bounds).without(number) {
-                let other = self.scene.circles.get(other);
-                let disc = &Shape::of(other.radius).disc;
-                left.copy_within(corner(&from), (disc, other.centre()), &ROWS, lit, frame);
-            }
-            entered.copy(corner(&to), &ROWS, lit, frame);
+            let crescents = crescents(&from, &to);
+            let others = self.scene.circles.reaching(&crescents.bounds_of_left(&from)).without(number);
+            crescents.paint(&from, others.map(|other| self.scene.circles.get(other)), [dark, lit], frame);
         }
         for replaced in &self.replaced {
             match replaced {
@@ -175,12 +168,7 @@ impl LightChange<'_> {
             for_each_run(replaced.circle(), |x, rows| canvas.mark_dirty(x..x + 1, &rows));
         }
         for (_, from, to) in self.moved() {
-            let (left, entered) = crescents(&from, &to);
-            for (crescent, circle) in [(left, &from), (entered, &to)] {
-                for (x, y) in crescent.pixels.iter().filter_map(|pixel| on_screen(pixel, circle)) {
-                    canvas.mark_dirty(x..x + 1, &(y..y + 1));
-                }
-            }
+            crescents(&from, &to).on_screen(&from).for_each(|(x, y)| canvas.mark_dirty(x..x + 1, &(y..y + 1)));
         }
     }
 }
@@ -192,19 +180,10 @@ fn is_moved(from: &Circle, to: &Circle) -> bool {
     (from.radius == to.radius) & (Shape::is_precomputed(from.radius, (x, y)) | (x | y == 0))
 }
 
-/// The pixels that a circle leaves when it moves, and those that it enters, which are those that the opposite move would leave. The
-/// caller must have checked with [`is_moved`] that they are precomputed.
+/// The pixels that change when a circle moves. The caller must have checked with [`is_moved`] that they are precomputed.
 #[inline]
-fn crescents(from: &Circle, to: &Circle) -> (&'static Crescent, &'static Crescent) {
-    let (shape, x, y) = (Shape::of(from.radius), to.x - from.x, to.y - from.y);
-    (shape.crescent((x, y)), shape.crescent((-x, -y)))
-}
-
-/// The corner of a circle's bounds.
-#[inline]
-fn corner(circle: &Circle) -> (i32, i32) {
-    let Rect { x, y, .. } = circle.bounds();
-    (x, y)
+fn crescents(from: &Circle, to: &Circle) -> &'static Crescents {
+    Shape::of(from.radius).crescents((to.x - from.x, to.y - from.y))
 }
 
 /// Calls `paint` with each column that a circle covers, and its rows there.
@@ -221,12 +200,4 @@ fn copy_rows(x: usize, rows: Range<usize>, from: &Frame, to: &mut Frame) {
         let bytes = (x * SCREEN + rows.start) * 3..(x * SCREEN + rows.end) * 3;
         copy_run(&from[bytes.clone()], &mut to[bytes]);
     }
-}
-
-/// The pixel at an offset from a circle's centre, if the light is visible there.
-#[inline]
-fn on_screen((right, down): &(i8, i8), circle: &Circle) -> Option<(usize, usize)> {
-    let (x, y) = (i32::from(circle.x) + i32::from(*right), i32::from(circle.y) + i32::from(*down));
-    let (x, y) = (x as usize, y as usize);
-    (COLUMNS.contains(&x) && (BAR_HEIGHT..SCREEN).contains(&y)).then_some((x, y))
 }

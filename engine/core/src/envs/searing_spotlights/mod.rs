@@ -30,6 +30,7 @@
 mod circle;
 mod circles;
 mod config;
+mod crescents;
 mod drawing;
 pub mod expert;
 mod features;

@@ -1,0 +1,173 @@
+//! The pixels whose light changes when a circle moves: the crescent that it leaves and the one that it enters.
+
+use smallvec::SmallVec;
+
+use super::circle::Circle;
+use super::config::BAR_HEIGHT;
+use super::shape::Shape;
+use crate::envs::screen::{FRAME_BYTES, Frame, SCREEN};
+use crate::raster::{Disc, Rect};
+
+/// Pixels of a block. Most moves change fewer.
+const LANES: usize = 64;
+
+/// The largest byte offset of a pixel in a frame.
+const LAST_PIXEL: u16 = (FRAME_BYTES - 3) as u16;
+
+/// Pixels side by side, relative to a circle's centre, so that vector instructions find where all of them are and whether they are
+/// lit.
+#[derive(Clone, Copy, Debug)]
+struct Block {
+    x: [i8; LANES],
+    y: [i8; LANES],
+}
+
+/// The pixels that change when a circle moves.
+#[derive(Debug)]
+pub(super) struct Crescents {
+    /// Relative to the centre before the move: the pixels that the circle leaves, and then those that it enters. Around the circle, so
+    /// that an edge of the screen cuts off few runs of them.
+    blocks: SmallVec<[Block; 1]>,
+    /// Number of pixels that the circle leaves.
+    left: usize,
+    /// Number of all pixels.
+    len: usize,
+    /// The smallest rectangle around the pixels that the circle leaves, relative to the centre before the move.
+    bounds: Rect,
+}
+
+impl Crescents {
+    /// The changes when a disc moves by `to`.
+    pub fn new(disc: &Disc, to: (i32, i32)) -> Self {
+        let reach = disc.radius() + to.0.abs().max(to.1.abs());
+        let square = (-reach..reach).flat_map(|x| (-reach..reach).map(move |y| (x, y)));
+        let (mut left, mut entered) = (Vec::new(), Vec::new());
+        for (x, y) in square {
+            match (disc.contains((x, y)), disc.contains((x - to.0, y - to.1))) {
+                (true, false) => left.push((x, y)),
+                (false, true) => entered.push((x, y)),
+                _ => {}
+            }
+        }
+        let direction = |(x, y): &(i32, i32)| f64::from(2 * y + 1).atan2(f64::from(2 * x + 1));
+        for (pixels, away) in [(&mut left, (-to.0, -to.1)), (&mut entered, to)] {
+            // From the direction that the crescent is farthest from, in which it has no pixel.
+            let start = f64::from(-away.1).atan2(f64::from(-away.0));
+            let turn = |pixel: &(i32, i32)| (direction(pixel) - start).rem_euclid(std::f64::consts::TAU);
+            pixels.sort_by(|one, other| turn(one).total_cmp(&turn(other)));
+        }
+        let pixel = |(x, y): &(i32, i32)| Rect::new(*x, *y, 1, 1);
+        let bounds = left.iter().map(pixel).reduce(|all, pixel| all.union(&pixel)).unwrap_or_default();
+        let all: Vec<_> = left.iter().chain(&entered).collect();
+        let block = |pixels: &[&(i32, i32)]| {
+            let mut block = Block { x: [0; LANES], y: [0; LANES] };
+            for (lane, (x, y)) in pixels.iter().enumerate() {
+                (block.x[lane], block.y[lane]) = (*x as i8, *y as i8);
+            }
+            block
+        };
+        Crescents { blocks: all.chunks(LANES).map(block).collect(), left: left.len(), len: all.len(), bounds }
+    }
+
+    /// The smallest rectangle around the pixels that a circle leaves.
+    #[inline]
+    pub fn bounds_of_left(&self, circle: &Circle) -> Rect {
+        let (x, y) = circle.centre();
+        Rect { x: self.bounds.x + x, y: self.bounds.y + y, ..self.bounds }
+    }
+
+    /// Paints the background of the pixels on the screen below the bar.
+    ///
+    /// Left pixels that are lit by none of `others` are copied from the frame `dark`, all others from `lit`.
+    #[inline]
+    pub fn paint(
+        &self,
+        from: &Circle,
+        others: impl Iterator<Item = Circle> + Clone,
+        [dark, lit]: [&Frame; 2],
+        frame: &mut Frame,
+    ) {
+        for (number, block) in self.blocks.iter().enumerate() {
+            let first = number * LANES;
+            let mut is_lit = from_number(self.left.saturating_sub(first));
+            others.clone().for_each(|other| block.add_lit_by(from, &other, &mut is_lit));
+            let pixels = block.offsets(from);
+            let count = LANES.min(self.len - first);
+            for (pixel, is_lit) in pixels[..count].iter().zip(&is_lit[..count]) {
+                if *pixel <= LAST_PIXEL {
+                    let pixel = usize::from(*pixel)..usize::from(*pixel) + 3;
+                    let source = if *is_lit != 0 { lit } else { dark };
+                    frame[pixel.clone()].copy_from_slice(&source[pixel]);
+                }
+            }
+        }
+    }
+
+    /// The pixels on the screen below the bar.
+    pub fn on_screen(&self, from: &Circle) -> impl Iterator<Item = (usize, usize)> {
+        let pixels = self.blocks.iter().flat_map(|block| block.offsets(from)).take(self.len);
+        pixels.filter(|pixel| *pixel <= LAST_PIXEL).map(|pixel| {
+            let pixel = usize::from(pixel) / 3;
+            (pixel / SCREEN, pixel % SCREEN)
+        })
+    }
+}
+
+/// [`u16::MAX`] in the lanes from a number on, 0 in those before.
+#[inline]
+fn from_number(first: usize) -> [u16; LANES] {
+    const STEP: [u16; 2 * LANES] = {
+        let mut step = [0; 2 * LANES];
+        let mut lane = LANES;
+        while lane < 2 * LANES {
+            step[lane] = u16::MAX;
+            lane += 1;
+        }
+        step
+    };
+    *STEP[LANES - first.min(LANES)..].first_chunk().expect("as many lanes are left")
+}
+
+impl Block {
+    /// The byte offset of each pixel in a frame; more than [`LAST_PIXEL`] if it is not on the screen below the bar.
+    #[inline]
+    fn offsets(&self, from: &Circle) -> [u16; LANES] {
+        const HEIGHT: u16 = (SCREEN - BAR_HEIGHT) as u16;
+        let mut offsets = [0; LANES];
+        for (lane, offset) in offsets.iter_mut().enumerate() {
+            let (x, y) = (from.x + i16::from(self.x[lane]), from.y + i16::from(self.y[lane]));
+            // Columns to the left of the screen wrap around to offsets beyond those of any column to the right of it.
+            *offset = (x as u16).wrapping_mul(3 * SCREEN as u16).wrapping_add((y as u16).wrapping_mul(3));
+            let is_visible = (y as u16).wrapping_sub(BAR_HEIGHT as u16) < HEIGHT;
+            *offset |= if is_visible { 0 } else { u16::MAX };
+        }
+        offsets
+    }
+
+    /// Sets the lanes of the pixels that a circle lights to [`u16::MAX`].
+    #[inline]
+    fn add_lit_by(&self, from: &Circle, circle: &Circle, is_lit: &mut [u16; LANES]) {
+        let shape = Shape::of(circle.radius);
+        let (right, down) = (from.x - circle.x, from.y - circle.y);
+        let Some(limit) = shape.limit else {
+            for (lane, is_lit) in is_lit.iter_mut().enumerate() {
+                let (x, y) = (i32::from(right) + i32::from(self.x[lane]), i32::from(down) + i32::from(self.y[lane]));
+                *is_lit |= if shape.disc.contains((x, y)) { u16::MAX } else { 0 };
+            }
+            return;
+        };
+        for (lane, is_lit) in is_lit.iter_mut().enumerate() {
+            let distance = circle_distance(right + i16::from(self.x[lane]), down + i16::from(self.y[lane]));
+            *is_lit |= if distance < limit { u16::MAX } else { 0 };
+        }
+    }
+}
+
+/// A measure of a pixel's distance from a circle's centre by which pixels of small circles can be told from others.
+#[inline]
+pub(super) fn circle_distance(x: i16, y: i16) -> u16 {
+    // Circles are symmetric: the column -1 is as far from the centre as the column 0. Limited so that squares fit into 16 bits.
+    let odd = |distance: i16| (2 * (distance ^ (distance >> 15)).min(126) + 3) as u16;
+    let (x, y) = (odd(x), odd(y));
+    (x * x).saturating_add(y * y)
+}
