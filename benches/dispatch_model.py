@@ -18,7 +18,7 @@ from dataclasses import dataclass
 WORK = {
     "MysteryPath-Grid-v0": (1_670, 15),
     "Endless-MortarMayhem-v0": (2_280, 55),
-    "SearingSpotlights-v0": (6_570, 113),
+    "SearingSpotlights-v0": (6_190, 113),
 }
 
 
@@ -44,7 +44,7 @@ class Costs:
     unpark: float = 10.0
     #: Dividing a range into two.
     split: float = 20.0
-    #: Making a share that has not been divided yet.
+    #: Making a share.
     share: float = 5.0
     #: Instructions of one core.
     instructions_per_ns: float = 8.0
@@ -140,7 +140,7 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
     left = [envs * (share + 1) // threads - envs * share // threads for share in range(threads)]
     pieces = [min(max(share // 8, 8), 16) for share in left]
     groups = -(-threads // SHARES_IN_GROUP)
-    begin = threads * costs.share + groups * (costs.split + costs.lock)
+    begin = groups * (costs.split + costs.lock)
     begin += 2 * costs.lock + costs.line + 3 * costs.unpark
     # A worker writes that it has joined into a line that the caller has read, and wakes three others.
     joins = 2 * costs.line + 3 * costs.unpark
@@ -165,7 +165,7 @@ def shares(costs: Costs, env: float, envs: int, threads: int) -> Step:
         if group not in divided:
             shares_of_group = min(SHARES_IN_GROUP, threads - group * SHARES_IN_GROUP)
             read = costs.line + 4 * costs.next_line if thread else 0.0
-            divided[group] = now + read + costs.lock + shares_of_group * (costs.split + costs.lock)
+            divided[group] = now + read + costs.lock + shares_of_group * (costs.split + costs.share)
         resources.waiting += max(divided[group] - now, 0.0)
         now = max(now, divided[group])
         moved = holder.get(share, 0) != thread

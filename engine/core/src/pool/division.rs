@@ -1,7 +1,7 @@
 //! The division of a batch among threads.
 
 use std::ops::RangeInclusive;
-use std::sync::PoisonError;
+use std::sync::{OnceLock, PoisonError};
 
 use smallvec::SmallVec;
 
@@ -91,36 +91,31 @@ const SHARES_IN_GROUP: usize = if cfg!(loom) { 2 } else { 8 };
 /// Groups that need no allocation. The threads of loom's models have small stacks.
 const GROUPS_ON_STACK: usize = if cfg!(loom) { 1 } else { 8 };
 
-/// Shares that need no allocation.
-const SHARES_ON_STACK: usize = SHARES_IN_GROUP * GROUPS_ON_STACK;
-
 /// The shares of all threads.
 struct Shares<'a, E: Environment> {
     groups: SmallVec<[Group<'a, E>; GROUPS_ON_STACK]>,
-    shares: SmallVec<[Share<'a, E>; SHARES_ON_STACK]>,
     is_empty: EmptyShares,
     num_envs: usize,
     /// Environments to take at a time.
     piece: usize,
 }
 
-/// Several shares that may not have been divided yet.
+/// Several shares.
 struct Group<'a, E: Environment> {
+    /// Empty until the group is divided, and only set under the lock of `undivided`. The last group may have fewer shares.
+    shares: OnceLock<[Share<'a, E>; SHARES_IN_GROUP]>,
     is_divided: AtomicBool,
     undivided: Mutex<Option<EnvRange<'a, E>>>,
 }
 
-/// What is left of the environments that one thread starts with; on cache lines of its own.
+/// What is left of the environments that one thread starts with, `None` if nothing is; on cache lines of its own.
 #[repr(align(128))]
-struct Share<'a, E: Environment> {
-    /// `None` if nothing is left, and until the group is divided.
-    rest: Mutex<Option<EnvRange<'a, E>>>,
-}
+struct Share<'a, E: Environment>(Mutex<Option<EnvRange<'a, E>>>);
 
 /// For each share, whether nothing is left of it. Read before a lock is taken, so that threads at the end of a step do not wait for
 /// each other. They lie side by side: a thread without work reads one cache line or two, instead of one of each share.
 #[repr(align(128))]
-struct EmptyShares(SmallVec<[AtomicBool; SHARES_ON_STACK]>);
+struct EmptyShares(SmallVec<[AtomicBool; SHARES_IN_GROUP * GROUPS_ON_STACK]>);
 
 impl<'a, E: Environment> Shares<'a, E> {
     /// Divides a range into `count` shares, each of at least one environment.
@@ -128,7 +123,6 @@ impl<'a, E: Environment> Shares<'a, E> {
         let num_envs = range.slots.len();
         let mut shares = Shares {
             groups: SmallVec::with_capacity(count.div_ceil(SHARES_IN_GROUP)),
-            shares: (0..count).map(|_| Share { rest: Mutex::new(None) }).collect(),
             is_empty: EmptyShares((0..count).map(|_| AtomicBool::new(false)).collect()),
             num_envs,
             piece: (num_envs / count / PIECES_OF_SHARE).clamp(*ENVS_IN_PIECE.start(), *ENVS_IN_PIECE.end()),
@@ -143,9 +137,14 @@ impl<'a, E: Environment> Shares<'a, E> {
         shares
     }
 
+    /// Number of shares.
+    fn count(&self) -> usize {
+        self.is_empty.0.len()
+    }
+
     /// Number of the first environment of a share, counted from the first of the range.
     fn start(&self, share: usize) -> usize {
-        self.num_envs * share / self.shares.len()
+        self.num_envs * share / self.count()
     }
 
     /// Takes the first or the last piece of a share.
@@ -154,8 +153,9 @@ impl<'a, E: Environment> Shares<'a, E> {
         if is_empty.load(Ordering::Relaxed) {
             return None;
         }
-        self.divide_group(number / SHARES_IN_GROUP);
-        let mut rest = lock(&self.shares[number].rest);
+        let group = &self.groups[number / SHARES_IN_GROUP];
+        self.divide(group, number / SHARES_IN_GROUP * SHARES_IN_GROUP);
+        let mut rest = lock(&group.shares.get()?[number % SHARES_IN_GROUP].0);
         let range = rest.take()?;
         let num_envs = range.slots.len();
         if num_envs <= self.piece {
@@ -172,26 +172,31 @@ impl<'a, E: Environment> Shares<'a, E> {
         Some(piece)
     }
 
-    /// Fills the shares of a group, unless that has been done. Other threads that need them wait for it.
-    fn divide_group(&self, number: usize) {
-        let group = &self.groups[number];
+    /// Makes the shares of a group, of which `first` is the first, unless that has been done. Other threads that need them wait for it.
+    fn divide(&self, group: &Group<'a, E>, first: usize) {
         if group.is_divided.load(Ordering::Acquire) {
             return;
         }
         let mut undivided = lock(&group.undivided);
-        let Some(mut range) = undivided.take() else { return };
-        let first = number * SHARES_IN_GROUP;
-        for (number, share) in (first..).zip(self.shares[first..].iter().take(SHARES_IN_GROUP)) {
-            let (envs, others) = range.split_at(self.start(number + 1) - self.start(number));
-            *lock(&share.rest) = Some(envs);
-            range = others;
+        let mut rest = undivided.take();
+        if rest.is_none() {
+            return;
         }
+        _ = group.shares.set(std::array::from_fn(|number| {
+            let share = first + number;
+            let envs = rest.take().filter(|_| share < self.count()).map(|range| {
+                let (envs, others) = range.split_at(self.start(share + 1) - self.start(share));
+                rest = Some(others);
+                envs
+            });
+            Share(Mutex::new(envs))
+        }));
         group.is_divided.store(true, Ordering::Release);
     }
 }
 
 impl<'a, E: Environment> Group<'a, E> {
     fn new(range: EnvRange<'a, E>) -> Self {
-        Group { is_divided: AtomicBool::new(false), undivided: Mutex::new(Some(range)) }
+        Group { shares: OnceLock::new(), is_divided: AtomicBool::new(false), undivided: Mutex::new(Some(range)) }
     }
 }

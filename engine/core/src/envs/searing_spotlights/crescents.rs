@@ -89,8 +89,16 @@ impl Crescents {
     ) {
         for (number, block) in self.blocks.iter().enumerate() {
             let first = number * LANES;
-            let mut is_lit = from_number(self.left.saturating_sub(first));
-            others.clone().for_each(|other| block.add_lit_by(from, &other, &mut is_lit));
+            let left = self.left.saturating_sub(first);
+            let mut is_lit = from_number(left);
+            for other in others.clone() {
+                // The circle itself lights what it enters. Most crescents have fewer pixels than half a block.
+                if left <= LANES / 2 {
+                    block.add_lit_by::<{ LANES / 2 }>(from, &other, &mut is_lit);
+                } else {
+                    block.add_lit_by::<LANES>(from, &other, &mut is_lit);
+                }
+            }
             let pixels = block.offsets(from);
             let count = LANES.min(self.len - first);
             for (pixel, is_lit) in pixels[..count].iter().zip(&is_lit[..count]) {
@@ -144,21 +152,18 @@ impl Block {
         offsets
     }
 
-    /// Sets the lanes of the pixels that a circle lights to [`u16::MAX`].
+    /// Sets those of the first `N` lanes whose pixels a circle lights to [`u16::MAX`].
     #[inline]
-    fn add_lit_by(&self, from: &Circle, circle: &Circle, is_lit: &mut [u16; LANES]) {
+    fn add_lit_by<const N: usize>(&self, from: &Circle, circle: &Circle, is_lit: &mut [u16; LANES]) {
         let shape = Shape::of(circle.radius);
         let (right, down) = (from.x - circle.x, from.y - circle.y);
-        let Some(limit) = shape.limit else {
-            for (lane, is_lit) in is_lit.iter_mut().enumerate() {
-                let (x, y) = (i32::from(right) + i32::from(self.x[lane]), i32::from(down) + i32::from(self.y[lane]));
-                *is_lit |= if shape.disc.contains((x, y)) { u16::MAX } else { 0 };
-            }
-            return;
-        };
-        for (lane, is_lit) in is_lit.iter_mut().enumerate() {
-            let distance = circle_distance(right + i16::from(self.x[lane]), down + i16::from(self.y[lane]));
-            *is_lit |= if distance < limit { u16::MAX } else { 0 };
+        let pixels = self.x.iter().zip(&self.y).map(|(x, y)| (right + i16::from(*x), down + i16::from(*y)));
+        let lanes = is_lit[..N].iter_mut().zip(pixels);
+        if let Some(limit) = shape.limit {
+            lanes.for_each(|(is_lit, (x, y))| *is_lit |= if circle_distance(x, y) < limit { u16::MAX } else { 0 });
+        } else {
+            let is_inside = |x: i16, y: i16| shape.disc.contains((x.into(), y.into()));
+            lanes.for_each(|(is_lit, (x, y))| *is_lit |= if is_inside(x, y) { u16::MAX } else { 0 });
         }
     }
 }
@@ -170,4 +175,80 @@ pub(super) fn circle_distance(x: i16, y: i16) -> u16 {
     let odd = |distance: i16| (2 * (distance ^ (distance >> 15)).min(126) + 3) as u16;
     let (x, y) = (odd(x), odd(y));
     (x * x).saturating_add(y * y)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::shape::{MAX_MOVED_RADIUS, REACH};
+    use super::*;
+
+    fn circle(x: i16, y: i16, radius: i16) -> Circle {
+        Circle { x, y, radius }
+    }
+
+    fn is_lit(circle: &Circle, (x, y): (i32, i32)) -> bool {
+        Shape::of(circle.radius).disc.contains((x - i32::from(circle.x), y - i32::from(circle.y)))
+    }
+
+    #[test]
+    fn crescents_are_what_a_move_leaves_and_enters() {
+        let shape = Shape::of(9);
+        assert_eq!(shape.crescents((0, 0)).len, 0);
+        let down = shape.crescents((0, 1));
+        assert_eq!((down.left, down.len), (18, 36), "a pixel in each column at either end");
+        assert_eq!(down.bounds_of_left(&circle(20, 30, 9)), Rect::new(11, 21, 18, 8));
+        assert_eq!(Shape::of(0).crescents((1, 0)).len, 0);
+        assert!(
+            Shape::of(MAX_MOVED_RADIUS).crescents((REACH, REACH)).blocks.len() > 1,
+            "more than one block is tested"
+        );
+    }
+
+    #[test]
+    fn moves_are_painted_as_two_frames_differ() {
+        let (dark, lit, unknown) = ([1; FRAME_BYTES], [2; FRAME_BYTES], [0; FRAME_BYTES]);
+        let centres = [(40, 40), (-3, 30), (SCREEN as i16 + 2, 61), (50, -1), (20, SCREEN as i16 - 2), (2, 5)];
+        for radius in [1, 7, MAX_MOVED_RADIUS] {
+            for (x, y) in centres {
+                // Of all sizes, one with the least radius that has no limit, overlapping, apart, and at the edge.
+                let others =
+                    [circle(x + 9, y - 4, 11), circle(x - 30, y, 25), circle(x, y + 200, 200), circle(x, y, 3)];
+                for (right, down) in [(1, 0), (0, -1), (-1, 2), (REACH, REACH), (-REACH, 0), (0, 0)] {
+                    let (from, to) = (circle(x, y, radius), circle(x + right, y + down, radius));
+                    for others in [&others[..0], &others[..1], &others] {
+                        let mut frame = unknown;
+                        let crescents = Shape::of(radius).crescents((right, down));
+                        crescents.paint(&from, others.iter().copied(), [&dark, &lit], &mut frame);
+                        let mut noted: Vec<_> = crescents.on_screen(&from).collect();
+                        noted.sort_unstable();
+                        let mut painted = Vec::new();
+                        for (pixel, found) in frame.as_chunks::<3>().0.iter().enumerate() {
+                            let pixel = (pixel / SCREEN, pixel % SCREEN);
+                            let (x, y) = (pixel.0 as i32, pixel.1 as i32);
+                            let is_changed = is_lit(&from, (x, y)) != is_lit(&to, (x, y)) && y >= BAR_HEIGHT as i32;
+                            let now = std::iter::once(&to).chain(others).any(|circle| is_lit(circle, (x, y)));
+                            let expected = if !is_changed { 0 } else { 1 + u8::from(now) };
+                            assert_eq!(*found, [expected; 3], "{from:?} to {to:?} at {pixel:?}");
+                            painted.extend(is_changed.then_some(pixel));
+                        }
+                        assert_eq!(noted, painted);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn all_moved_circles_have_a_limit() {
+        for radius in 1..=MAX_MOVED_RADIUS {
+            let shape = Shape::of(radius);
+            let limit = shape.limit.unwrap();
+            let distances = (-60..60).chain([-8000, -182, 150, 8000]);
+            for (x, y) in distances.clone().flat_map(|x| distances.clone().map(move |y| (x, y))) {
+                let expected = shape.disc.contains((x.into(), y.into()));
+                assert_eq!(circle_distance(x, y) < limit, expected, "radius {radius}: {x}, {y}");
+            }
+        }
+        assert_eq!(Shape::of(MAX_MOVED_RADIUS + 1).limit, None);
+    }
 }

@@ -102,4 +102,12 @@ fn limit(disc: &Disc) -> Option<u16> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn short_moves_of_small_circles_are_precomputed() {
+        assert!(Shape::is_precomputed(9, (REACH, -REACH)));
+        assert!(!Shape::is_precomputed(9, (REACH + 1, 0)));
+        assert!(!Shape::is_precomputed(9, (0, -REACH - 1)));
+        assert!(!Shape::is_precomputed(MAX_SPOT_RADIUS as i16, (1, 0)));
+    }
 }
