@@ -198,7 +198,11 @@ def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -
     assert planning.remaining_seconds(planned, 3) == pytest.approx(252 / 3)
     # No division makes the longest job shorter.
     assert planning.remaining_seconds(planned, 100) == pytest.approx(80)
-    assert "9 of 60 updates; training takes 4.2 minutes more" in running.left(planned, 1)
+    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 4.2 minutes, and its evaluation")
+    # One evaluation is measured: five others of the same duration.
+    (planned[1].folder / "evaluation.json").write_text('{"seconds": 12.0}')
+    assert planning.remaining_seconds(planned, 1) == pytest.approx(252 + 5 * 12)
+    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 5.2 minutes")
 
 
 def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
