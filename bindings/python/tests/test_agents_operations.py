@@ -83,7 +83,7 @@ def test_operations_are_within_the_budget(agent: str) -> None:
 
 
 @pytest.mark.slow
-def test_act_waits_only_for_the_actions() -> None:
+def test_act_waits_only_for_the_actions_and_copies_each_observation_once() -> None:
     """Counted on a stand-in for a CUDA device; in a subprocess, since a registered device cannot be removed."""
     program = f"""
 import sys
@@ -101,8 +101,11 @@ collect, learn = rollout.RolloutCollector.collect, ppo.learn
 def counting(name, function):
     def run(*args):
         other_device.waits.clear()
+        other_device.uploads.clear()
         result = function(*args)
         found[name] = dict(other_device.waits)
+        if name == "collect":
+            found["uploads"] = sorted(other_device.uploads.items())
         return result
     return run
 
@@ -119,5 +122,7 @@ for agent in ("gru", "trxl", "stack"):
         found = json.loads(line)
         # Each action is copied to the CPU, and nothing else waits.
         assert found["collect"] == {"copy_": STEPS * GROUPS}, line
+        # Each group's observation, also the last one, goes to the device once, and its rewards and ends of episodes together.
+        assert found["uploads"] == [[[2, 4], STEPS * GROUPS], [[4, 17], (STEPS + 1) * GROUPS]], line
         # The reset mask and the metrics; the Transformer-XL also needs the length of the longest episode.
         assert sum(found["learn"].values()) <= 2 + 1, line
