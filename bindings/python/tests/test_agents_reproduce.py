@@ -205,6 +205,16 @@ def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -
     assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 5.2 minutes")
 
 
+def test_the_status_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ReproduceArguments((str(own(tmp_path)),), status=True, out=tmp_path / "out", jobs=1)
+    execute(given)
+    assert capsys.readouterr().out.startswith("not started  MortarMayhem-Grid-v0 gru seed 1, update 0 of 6\n")
+    (job,) = planning.jobs(definitions.parse("mine", json.dumps(OWN)), tmp_path / "out", 1)
+    log_of(job, 6, 2.0)
+    execute(given)
+    assert "MortarMayhem-Grid-v0 gru seed 1, update 6 of 6, evaluation left\n" in capsys.readouterr().out
+
+
 def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
     experiment = definitions.parse("mine", json.dumps(OWN))
     (job,) = planning.jobs(experiment, tmp_path, 1)

@@ -52,7 +52,8 @@ def write(jobs: Sequence[Job], folder: Path, scale: float) -> Path:
         text += ["", f"This is {small}. Do not compare its numbers with the published ones."]
     if experiment.kind == "curves":
         protocol = experiment.evaluation
-        text += ["", f"Evaluation: {protocol.seeds} seeds from 200,000 on, {protocol.repetitions} episodes each."]
+        episodes = "one episode" if protocol.repetitions == 1 else f"{protocol.repetitions} episodes"
+        text += ["", f"Evaluation: {protocol.seeds} seeds from 200,000 on, {episodes} each."]
         text += [
             "Mean and standard deviation are over the runs; best is the highest mean over the runs at any checkpoint."
         ]
