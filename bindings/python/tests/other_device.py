@@ -53,6 +53,8 @@ class Device(TorchDispatchMode):
 WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "unique_dim"}
 #: Number of operations for which CUDA would wait: copies to the CPU, and those of `WAITING`.
 waits: Counter[str] = Counter()
+#: Number of copies from the CPU to the device by shape.
+uploads: Counter[tuple[int, ...]] = Counter()
 
 
 def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
@@ -69,6 +71,9 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if there and (to_cpu or name in WAITING):
         waits[name] += 1
     asked = kwargs.get("device")
+    into = isinstance(args[0], There) if name == "copy_" else name == "_to_copy" and asked is not None and not to_cpu
+    if here and into:
+        uploads[tuple(here[0].shape)] += 1
     if asked is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}
     own = REPLACED.get(name, operation)

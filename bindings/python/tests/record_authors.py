@@ -4,11 +4,13 @@
 
 Needs git, torch, numpy and einops. The authors' code is fetched to a temporary folder; only numbers are kept, in
 `authors.json.gz`: the weights by the authors' names, the inputs, the outputs while acting and while learning, and the gradients
-of `sum(output * factor)`. The positional encodings are those of the authors' main branch: absolute, learned and none.
+of `sum(output * factor)`. The main branch has absolute, learned and no positional encoding. Of the branch with the relative one
+only the attention is recorded: its blocks put the query itself into the memory, in the place of the newest token.
 """
 
 import argparse
 import gzip
+import importlib.util
 import json
 import subprocess
 import sys
@@ -19,7 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-COMMIT = "8dd62bdee66c2825d6fcea6fffefcdeb4f010609"
+#: The main branch, and the branch `test/relative_pe`.
+COMMIT, RELATIVE = "8dd62bdee66c2825d6fcea6fffefcdeb4f010609", "5419b0c80599179f5708e32ba3b0f66172817cf0"
 DATA = Path(__file__).parent / "authors.json.gz"
 INPUT, WIDTH, SEQUENCES, LENGTH = 5, 8, 3, 4
 #: Window and longest episode of the Transformer-XL, and the step in the episode of each row of the batch. At step 0 the authors'
@@ -27,17 +30,18 @@ INPUT, WIDTH, SEQUENCES, LENGTH = 5, 8, 3, 4
 WINDOW, LONGEST, STEPS = 5, 12, (1, 2, 4, 6, 9)
 
 
-def fetched(repository: str, folder: Path) -> Path:
-    """The folder with the authors' modules, at `COMMIT`."""
+def fetched(repository: str, folder: Path) -> None:
+    """Put the authors' modules into a folder: `neroRL` of `COMMIT`, and `relative/neroRL` of `RELATIVE`."""
     git = folder / "git"
     if Path(repository).exists():
         git = Path(repository)
     else:
         subprocess.run(["git", "clone", "--quiet", "--bare", "--filter=blob:none", repository, git], check=True)
-    command = ["git", f"--git-dir={git}", "archive", COMMIT, "neroRL/__init__.py", "neroRL/nn"]
-    archive = subprocess.run(command, check=True, capture_output=True).stdout
-    subprocess.run(["tar", "x", "-C", folder], input=archive, check=True)
-    return folder
+    for commit, into in ((COMMIT, folder), (RELATIVE, folder / "relative")):
+        into.mkdir(exist_ok=True)
+        command = ["git", f"--git-dir={git}", "archive", commit, "neroRL/__init__.py", "neroRL/nn"]
+        archive = subprocess.run(command, check=True, capture_output=True).stdout
+        subprocess.run(["tar", "x", "-C", into], input=archive, check=True)
 
 
 def randomised(module: nn.Module) -> nn.Module:
@@ -91,6 +95,22 @@ def transformer(module: type[nn.Module], encoding: str, gate_bias: float | None)
     )
 
 
+def relative(file: Path) -> dict[str, Any]:
+    """The attention with relative encoding of one query to the last tokens of a window; the newest one is at distance 1."""
+    spec = importlib.util.spec_from_file_location("relative", file)
+    assert spec is not None and spec.loader is not None
+    theirs = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(theirs)
+    heads, past = 2, WINDOW - 1
+    module = randomised(theirs.RelPartialLearnableMultiHeadAttn(WIDTH, heads))
+    module.r_w_bias, module.r_r_bias = (nn.Parameter(torch.randn(heads, WIDTH // heads)) for _ in range(2))
+    query, tokens = torch.randn(len(STEPS), 1, WIDTH), torch.randn(len(STEPS), past, WIDTH)
+    mask = torch.arange(past) >= past - torch.tensor(STEPS).unsqueeze(1)
+    encodings = theirs.SinusoidalPosition(WIDTH)(past + 1)[:past]
+    output, _ = module(tokens, tokens, query, mask, encodings, module.r_w_bias, module.r_r_bias)
+    return {"query": query, "tokens": tokens, "mask": mask} | gradients(module, output)
+
+
 def gradients(module: nn.Module, output: Tensor) -> dict[str, Any]:
     """The output, and the gradients of its sum weighted with a drawn factor."""
     factor = torch.randn_like(output)
@@ -120,7 +140,8 @@ def main() -> None:
     parser.add_argument("--repository", default="https://github.com/MarcoMeter/neroRL", help="URL or a git directory")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        sys.path.insert(0, str(fetched(args.repository, Path(folder))))
+        fetched(args.repository, Path(folder))
+        sys.path.insert(0, folder)
         from neroRL.nn.recurrent import GRU, LSTM
         from neroRL.nn.transformer import Transformer
 
@@ -134,8 +155,10 @@ def main() -> None:
             "trxl, none": transformer(Transformer, "", None),
             "gtrxl, bias 0": transformer(Transformer, "absolute", 0.0),
             "gtrxl, bias 2": transformer(Transformer, "absolute", 2.0),
+            "attention, relative": relative(Path(folder) / "relative/neroRL/nn/transformer.py"),
         }
-    data = json.dumps({"source": "MarcoMeter/neroRL", "commit": COMMIT, "cases": numbers(cases)})
+    commits = {"commit": COMMIT, "relative_commit": RELATIVE}
+    data = json.dumps({"source": "MarcoMeter/neroRL", **commits, "cases": numbers(cases)})
     DATA.write_bytes(gzip.compress(data.encode(), mtime=0))
 
 

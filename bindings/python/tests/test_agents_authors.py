@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from endless_gym.agents.memory import AnyMemory
 from endless_gym.agents.recurrent import RecurrentMemory, RecurrentMinibatch, RecurrentState
 from endless_gym.agents.settings import Recurrence, Transformer
-from endless_gym.agents.transformer import TransformerMemory
+from endless_gym.agents.transformer import MASKED, Attention, TransformerMemory
 
 RECORDED = json.loads(gzip.decompress((Path(__file__).parent / "authors.json.gz").read_bytes()))["cases"]
 CPU = torch.device("cpu")
@@ -72,7 +72,7 @@ def assert_gradients(memory: AnyMemory, output: Tensor, factor: Tensor, recorded
         assert_close(parameter.grad, expected[name])
 
 
-@pytest.mark.parametrize("name", [name for name in RECORDED if "trxl" not in name])
+@pytest.mark.parametrize("name", [name for name in RECORDED if "gru" in name or "lstm" in name])
 def test_recurrent_layers(name: str) -> None:
     recorded = RECORDED[name]
     x, hidden, factor = (tensors(recorded[key]) for key in ("x", "hidden", "factor"))
@@ -133,6 +133,49 @@ def test_transformer(name: str) -> None:
     assert_gradients(memory, output, factor[minibatch.indices], recorded)
 
 
+def test_relative_attention() -> None:
+    """The authors divide scores by the root of a head's size, and project distances with one matrix for all heads."""
+    recorded = RECORDED["attention, relative"]
+    query, tokens, mask, factor = (tensors(recorded[key]) for key in ("query", "tokens", "mask", "factor"))
+    weights, gradients = tensors(recorded["weights"]), tensors(recorded["gradients"])
+    heads, size = weights["r_w_bias"].shape
+    past, width = tokens.shape[1:]
+    given = Transformer(width=width, heads=heads, shared_heads=False, positional_encoding="relative")
+    attention, norm = Attention(given), nn.LayerNorm(width)
+    scale = heads**0.5
+    blocks = {name: torch.block_diag(*heads * [weights[f"{name}.weight"]]) for name in ("queries", "keys", "values")}
+    theirs = {
+        "content_bias": scale * weights["r_w_bias"].unsqueeze(1),
+        "distance_bias": scale * weights["r_r_bias"].unsqueeze(1),
+        "distances.weight": weights["r_net.weight"],
+        "fc_out.weight": weights["fc_out.weight"],
+        "fc_out.bias": torch.zeros(width),
+        "queries.weight": scale * blocks["queries"],
+        "keys.weight": blocks["keys"],
+        "values.weight": blocks["values"],
+    }
+    attention.load_state_dict(theirs, strict=True)
+    bias = torch.zeros(mask.shape).masked_fill(~mask, MASKED)[:, None, None]
+    first = torch.zeros(len(query), 1, 1, dtype=torch.bool)
+    output = attention(query, tokens, norm, bias, first, past - torch.arange(past).unsqueeze(0), None)
+    assert_close(output, tensors(recorded["output"]))
+    (output * factor).sum().backward()
+    found = {name: parameter.grad for name, parameter in attention.named_parameters()}
+
+    def of_shared_heads(gradient: Tensor) -> Tensor:
+        return torch.stack([gradient[each : each + size, each : each + size] for each in range(0, width, size)]).sum(0)
+
+    assert_close(found["content_bias"].squeeze(1) * scale, gradients["r_w_bias"])
+    assert_close(found["distance_bias"].squeeze(1) * scale, gradients["r_r_bias"])
+    assert_close(found["distances.weight"], gradients["r_net.weight"])
+    assert_close(found["fc_out.weight"], gradients["fc_out.weight"])
+    assert_close(of_shared_heads(found["queries.weight"]) * scale, gradients["queries.weight"])
+    assert_close(of_shared_heads(found["keys.weight"]), gradients["keys.weight"])
+    assert_close(of_shared_heads(found["values.weight"]), gradients["values.weight"])
+    assert all(gradient.any() for gradient in gradients.values())
+
+
 def test_all_kinds_are_recorded() -> None:
     encodings = ["trxl, absolute", "trxl, learned", "trxl, none"]
-    assert list(RECORDED) == ["gru", "gru, two layers, residual", "lstm", *encodings, "gtrxl, bias 0", "gtrxl, bias 2"]
+    recurrent, gated = ["gru", "gru, two layers, residual", "lstm"], ["gtrxl, bias 0", "gtrxl, bias 2"]
+    assert list(RECORDED) == [*recurrent, *encodings, *gated, "attention, relative"]

@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -162,10 +163,11 @@ def test_progress_callback_counts_every_episode(runs: Path) -> None:
 
 
 def test_results_round_trip_through_json(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "results.json"
+    file, start = tmp_path / "results.json", time.monotonic()
     protocol.execute(small(runs, json=str(file), episodes=True))
     table = capsys.readouterr().out
     written = json.loads(file.read_text())
+    assert 0 < written.pop("seconds") < time.monotonic() - start
     assert written["protocol"] == {
         "first_seed": 200_000,
         "seeds": 5,

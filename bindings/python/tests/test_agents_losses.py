@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from agents_helpers import BRANCHES, ends, make, observations, play, settings
+from operations import Operations
 
 from endless_gym.agents import losses
 from endless_gym.agents.agent import Agent, AgentOutput
@@ -29,9 +30,10 @@ def test_advantages_by_hand() -> None:
     torch.testing.assert_close(advantages.flatten(), torch.tensor([first, second, third]))
 
 
-def test_advantages_are_discounted_sums_of_td_errors() -> None:
+@pytest.mark.parametrize("steps", [1, 2, 7, 8, 12])
+def test_advantages_are_discounted_sums_of_td_errors(steps: int) -> None:
     """By definition: TD errors, discounted with gamma * lambda, up to the end of the episode or the segment."""
-    steps, envs = 12, 4
+    envs = 4
     rewards, values, last = torch.randn(steps, envs), torch.randn(steps, envs), torch.randn(envs)
     dones = ends(steps, envs)
     advantages = losses.generalised_advantages(rewards, values, dones, last, GAMMA, LAMBDA)
@@ -46,6 +48,14 @@ def test_advantages_are_discounted_sums_of_td_errors() -> None:
                 if dones[t, env]:
                     break
             assert float(advantages[start, env]) == pytest.approx(total, abs=1e-5)
+
+
+def test_advantages_of_long_segments_take_few_operations() -> None:
+    steps, envs = 512, 2
+    rewards, values, last = torch.randn(steps, envs), torch.randn(steps, envs), torch.randn(envs)
+    with Operations() as operations:
+        losses.generalised_advantages(rewards, values, ends(steps, envs), last, 0.995, 0.95)
+    assert operations.computed <= 40
 
 
 @pytest.mark.parametrize(

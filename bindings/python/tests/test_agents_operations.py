@@ -5,6 +5,7 @@ only make a view are not counted.
 """
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,14 +16,17 @@ import torch
 from agents_helpers import settings
 from operations import Operations
 
+from endless_gym.agents import encoders
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.ppo import learn, make_optimizer
+from endless_gym.agents.recurrence import PackedGRU
 from endless_gym.agents.rollout import RolloutCollector
-from endless_gym.agents.settings import Settings
+from endless_gym.agents.settings import PRESETS, Settings
 
 STEPS, GROUPS = 16, 2
+WORKSPACE = Path(__file__).parents[3]
 
 #: Operations of one step of one group, and of one minibatch, each with its share of what is done once for a segment or an
 #: update. The Transformer-XL has two blocks, and the actions two branches. A change that needs more must say why.
@@ -83,7 +87,7 @@ def test_operations_are_within_the_budget(agent: str) -> None:
 
 
 @pytest.mark.slow
-def test_act_waits_only_for_the_actions() -> None:
+def test_act_waits_only_for_the_actions_and_copies_each_observation_once() -> None:
     """Counted on a stand-in for a CUDA device; in a subprocess, since a registered device cannot be removed."""
     program = f"""
 import sys
@@ -101,8 +105,11 @@ collect, learn = rollout.RolloutCollector.collect, ppo.learn
 def counting(name, function):
     def run(*args):
         other_device.waits.clear()
+        other_device.uploads.clear()
         result = function(*args)
         found[name] = dict(other_device.waits)
+        if name == "collect":
+            found["uploads"] = sorted(other_device.uploads.items())
         return result
     return run
 
@@ -119,5 +126,38 @@ for agent in ("gru", "trxl", "stack"):
         found = json.loads(line)
         # Each action is copied to the CPU, and nothing else waits.
         assert found["collect"] == {"copy_": STEPS * GROUPS}, line
+        # Each group's observation, also the last one, goes to the device once, and its rewards and ends of episodes together.
+        assert found["uploads"] == [[[2, 4], STEPS * GROUPS], [[4, 17], (STEPS + 1) * GROUPS]], line
         # The reset mask and the metrics; the Transformer-XL also needs the length of the longest episode.
         assert sum(found["learn"].values()) <= 2 + 1, line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["gru", "trxl"])
+def test_counts_in_the_documentation(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table of the estimate for a GPU, which encodes all frames at once and whose recurrent layer is one operation."""
+    monkeypatch.setattr(encoders, "FRAMES_PER_CHUNK", 1 << 30)
+    paper = replace(PRESETS["paper"], env="Endless-MortarMayhem-v0", agent=agent)
+    # The number of environments does not change the operations.
+    given = replace(paper, environment=replace(paper.environment, num_envs=2, num_threads=1)).validated()
+    steps, ppo = given.ppo.steps, given.ppo
+    with Environments(given) as environments:
+        torch.manual_seed(1)
+        made = make_agent(given, environments.spec)
+        collector = RolloutCollector(made, environments, steps, torch.Generator().manual_seed(1))
+        collector._frames = None  # Equal frames are encoded once on the CPU only.
+        optimizer, states = make_optimizer(made, 1e-4), [memory.state for memory in collector.memories]
+        learn(made, optimizer, collector.collect(Clock())[0], states, 0, replace(ppo, epochs=1), torch.Generator())
+        with Operations() as rollout:
+            segment, _ = collector.collect(Clock())
+        with Operations() as update:
+            for name in ("forward", "backward"):
+                monkeypatch.setattr(PackedGRU, name, staticmethod(update.as_one(getattr(PackedGRU, name))))
+            learn(made, optimizer, segment, states, 1, ppo, torch.Generator().manual_seed(0))
+    text, column = (WORKSPACE / "docs/train/agents.md").read_text(), ["gru", "trxl"].index(agent)
+    for row, count in (
+        ("operations of a call of the network, 512 calls", rollout.computed / steps),
+        ("operations of a minibatch, 24 minibatches", update.computed / (ppo.epochs * ppo.minibatches)),
+    ):
+        (numbers,) = re.findall(rf"^\| {row} \| (\d+) \| (\d+) \|$", text, re.MULTILINE)
+        assert int(numbers[column]) == round(count), row

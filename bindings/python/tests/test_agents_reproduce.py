@@ -18,8 +18,7 @@ import torch
 
 from endless_gym.agents import checkpoint, reproduce
 from endless_gym.agents.curves import published
-from endless_gym.agents.experiments import definitions, planning, running
-from endless_gym.agents.experiments.report import ablation_numbers
+from endless_gym.agents.experiments import definitions, planning, report, running
 from endless_gym.agents.reproduce import ReproduceArguments, execute
 from endless_gym.agents.settings import to_dict
 from endless_gym.agents.train import parse
@@ -198,7 +197,21 @@ def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -
     assert planning.remaining_seconds(planned, 3) == pytest.approx(252 / 3)
     # No division makes the longest job shorter.
     assert planning.remaining_seconds(planned, 100) == pytest.approx(80)
-    assert "9 of 60 updates; training takes 4.2 minutes more" in running.left(planned, 1)
+    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 4.2 minutes, and its evaluation")
+    # One evaluation is measured: five others of the same duration.
+    (planned[1].folder / "evaluation.json").write_text('{"seconds": 12.0}')
+    assert planning.remaining_seconds(planned, 1) == pytest.approx(252 + 5 * 12)
+    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 5.2 minutes")
+
+
+def test_the_status_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ReproduceArguments((str(own(tmp_path)),), status=True, out=tmp_path / "out", jobs=1)
+    execute(given)
+    assert capsys.readouterr().out.startswith("not started  MortarMayhem-Grid-v0 gru seed 1, update 0 of 6\n")
+    (job,) = planning.jobs(definitions.parse("mine", json.dumps(OWN)), tmp_path / "out", 1)
+    log_of(job, 6, 2.0)
+    execute(given)
+    assert "MortarMayhem-Grid-v0 gru seed 1, update 6 of 6, evaluation left\n" in capsys.readouterr().out
 
 
 def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
@@ -232,12 +245,28 @@ def test_each_job_gets_a_gpu() -> None:
 def test_numbers_of_the_ablation_table() -> None:
     """The best update is that with the highest mean over the runs; updates before the first end of an episode do not count."""
     nan = float("nan")
-    found = ablation_numbers([[nan, 0.2, 0.8, 0.1], [nan, 0.4, 0.4, 0.3]], [[1, 2, 3, 99], [1, 2, 3, 99]])
+    found = report.ablation_numbers([[nan, 0.2, 0.8, 0.1], [nan, 0.4, 0.4, 0.3]], [[1, 2, 3, 99], [1, 2, 3, 99]])
     assert found["success_mean"] == pytest.approx(0.6)
     assert found["success_std"] == pytest.approx(0.2)
     assert found["duration"] == 0.75
     assert found["gradient_norm_mean"] == 2
     assert found["gradient_norm_std"] == pytest.approx(np.std([1, 2, 3]))
+
+
+def test_wall_time_draws_the_published_curves_over_both_times(tmp_path: Path) -> None:
+    values = {"mean": 4.0}
+    flags = {"agent": "gru", "ppo.updates": 3}
+    runs = [{"name": "gru", "env": "MysteryPath-v0", "flags": flags, "published": "gru", "values": values}]
+    experiment = definitions.parse("mine", json.dumps(OWN | {"kind": "wall-time", "runs": runs}))
+    (job,) = planning.jobs(experiment, tmp_path, 1)
+    log_of(job, 3, 2.0)
+    (row,), (figure,) = report._wall_time([job], tmp_path / "out")
+    # The paper's run has 25,000 updates, and a checkpoint every 500.
+    assert (row["mean"], row["mean (paper)"], row["hours"]) == (2.0, 4.0, pytest.approx(2 * 25_000 / 3600))
+    theirs, ours = json.loads(figure.with_suffix(".json").read_text())["curves"]
+    assert theirs["seconds"] == list(range(0, 25_001 * 4, 500 * 4))
+    assert ours["seconds"] == list(range(0, 25_001 * 2, 500 * 2))
+    assert theirs["scores"] == ours["scores"] == published("MysteryPath-v0", ["gru"])[0].scores.tolist()
 
 
 def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,25 @@ def estimates(curve: Curve, spread: Spread) -> list[tuple[float, ...]]:
     ]
 
 
-def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Path) -> Path:
+@dataclass(frozen=True)
+class Scale:
+    """The horizontal axis of a plot.
+
+    Attributes:
+        name: What `Curve.steps` counts, in the files.
+        label: Label of the axis.
+        unit: How many of them are one on the axis.
+    """
+
+    name: str
+    label: str
+    unit: float
+
+
+STEPS, HOURS = Scale("steps", "Steps (in millions)", 1e6), Scale("seconds", "Hours", 3600.0)
+
+
+def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Path, scale: Scale = STEPS) -> Path:
     """Plot curves, and write NAME.png, NAME.csv and NAME.json.
 
     Args:
@@ -81,6 +99,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
         curves: The curves.
         spread: What is shown of the runs.
         out: Output folder; created if it does not exist.
+        scale: The horizontal axis.
 
     Returns:
         Path of the PNG file.
@@ -94,7 +113,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     axes = figure.add_subplot()
     for number, curve in enumerate(curves):
         rows = estimates(curve, spread)
-        steps = [row[0] / 1e6 for row in rows]
+        steps = [row[0] / scale.unit for row in rows]
         style = "--" if curve.source == "published" else "-"
         title = f"{curve.label} (paper)" if curve.source == "published" else curve.label
         marker = "o" if len(steps) == 1 else ""
@@ -109,7 +128,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
             axes.fill_between(
                 steps, [row[2] for row in rows], [row[3] for row in rows], color=f"C{number}", alpha=0.2, lw=0
             )
-    axes.set(title=name, xlabel="Steps (in millions)", ylabel=axis)
+    axes.set(title=name, xlabel=scale.label, ylabel=axis)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend()
@@ -118,18 +137,18 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
     with (out / f"{name}.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         if spread == "runs":
-            writer.writerow(["source", "label", "run", "steps", "score"])
+            writer.writerow(["source", "label", "run", scale.name, "score"])
             for curve in curves:
                 for row in estimates(curve, spread):
                     writer.writerows(
                         [curve.source, curve.label, run, row[0], score] for run, score in enumerate(row[1:])
                     )
         else:
-            writer.writerow(["source", "label", "steps", "mean" if spread == "std" else "iqm", "low", "high"])
+            writer.writerow(["source", "label", scale.name, "mean" if spread == "std" else "iqm", "low", "high"])
             writer.writerows([curve.source, curve.label, *row] for curve in curves for row in estimates(curve, spread))
     data = [
         {"env": curve.env, "label": curve.label, "source": curve.source}
-        | {"steps": curve.steps.tolist(), "scores": curve.scores.tolist()}
+        | {scale.name: curve.steps.tolist(), "scores": curve.scores.tolist()}
         for curve in curves
     ]
     (out / f"{name}.json").write_text(json.dumps({"axis": axis, "curves": data}) + "\n")

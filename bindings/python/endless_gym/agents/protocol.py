@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -191,7 +192,7 @@ def execute(arguments: EvalArguments) -> None:
     """Evaluate the checkpoints, and write or print the results."""
     if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
         raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
-    messages = Console(stderr=True)
+    messages, start = Console(stderr=True), time.monotonic()
     experiments = evaluate_runs(arguments, messages)
     for experiment in experiments:
         if not experiment.common_steps():
@@ -200,6 +201,7 @@ def execute(arguments: EvalArguments) -> None:
                 "number of steps; evaluate them separately, or train with the same --checkpoint-interval and --keep-checkpoints"
             )
     written = to_json(experiments, protocol(arguments), arguments.episodes)
+    written["seconds"] = time.monotonic() - start
     if arguments.json == "-":
         print(json.dumps(written, indent=1))
         return

@@ -164,8 +164,11 @@ def execute(arguments: ReproduceArguments) -> None:
         return
     if arguments.status:
         for job in planned:
-            of = f", update {min(job.updates_done(), job.updates)} of {job.updates}" if job.updates else ""
-            console.print(f"{job.state():<11}  {job.title}{of}", soft_wrap=True)
+            state, trained = job.state(), min(job.updates_done(), job.updates)
+            of = f", update {trained} of {job.updates}" if job.updates else ""
+            if job.experiment.kind == "curves" and state != "done" and trained == job.updates:
+                of += ", evaluation left"
+            console.print(f"{state:<11}  {job.title}{of}", soft_wrap=True)
     side_by_side = "on Ray" if arguments.ray else f"{machine.jobs} at a time"
     console.print(f"{running.left(planned, machine.jobs)}, {side_by_side}", soft_wrap=True)
     if arguments.status:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -255,28 +255,54 @@ def seconds_per_update(job: Job) -> float | None:
     return statistics.median(times) if times else None
 
 
-def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None:
-    """Estimated time that the training of the jobs that are not done still takes; None before the first measured update.
+def evaluation_seconds(job: Job) -> float | None:
+    """Time of a job's evaluation; None if it has none, or before it is done."""
+    file = job.folder / EVALUATION
+    return json.loads(file.read_text()).get("seconds") if _complete(file) else None
 
-    A job without measurement takes as long per update as those of the same environment and agent, or else as the mean of all.
+
+def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -> Callable[[Job], float] | None:
+    """A measurement of each job; where there is none, the mean of the jobs of the same environment and agent, or else of all.
+
+    Args:
+        planned: The jobs.
+        measured: The measurement of a job; None without one.
+
+    Returns:
+        The measurement or its estimate; None if no job has a measurement.
+    """
+    known = [(job, value) for job in planned if (value := measured(job)) is not None]
+    if not known:
+        return None
+
+    def kind(job: Job) -> tuple[str, Value]:
+        return job.run.env, job.run.flags.get("agent", "gru")
+
+    def estimate(job: Job) -> float:
+        value = measured(job)
+        alike = [other for one, other in known if kind(one) == kind(job)] or [other for _, other in known]
+        return statistics.mean(alike) if value is None else value
+
+    return estimate
+
+
+def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None:
+    """Estimated time that the jobs that are not done still take; None before the first measured update.
+
+    Evaluations count once the first one is done.
 
     Args:
         planned: The jobs.
         side_by_side: Number of jobs that run at a time.
     """
-    alike: dict[tuple[str, Value], list[float]] = {}
-    for job in planned:
-        measured = seconds_per_update(job)
-        if measured is not None:
-            alike.setdefault((job.run.env, job.run.flags.get("agent", "gru")), []).append(measured)
-    if not alike:
+    training, evaluation = _estimate(planned, seconds_per_update), _estimate(planned, evaluation_seconds)
+    if training is None:
         return None
-    overall = statistics.mean(value for values in alike.values() for value in values)
-    left = []
-    for job in planned:
-        kind = alike.get((job.run.env, job.run.flags.get("agent", "gru")))
-        each = seconds_per_update(job) or (statistics.mean(kind) if kind else overall)
-        left.append(max(0, job.updates - job.updates_done()) * each)
+    left = [max(0, job.updates - job.updates_done()) * training(job) for job in planned]
+    if evaluation is not None:
+        for number, job in enumerate(planned):
+            if job.experiment.kind == "curves" and not _complete(job.folder / EVALUATION):
+                left[number] += evaluation(job)
     return max(sum(left) / side_by_side, max(left))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from endless_gym.agents.experiments import planning
 from endless_gym.agents.experiments.definitions import Run
 from endless_gym.agents.experiments.planning import Job
 from endless_gym.agents.logs import read_progress
-from endless_gym.agents.plot import draw
-from endless_gym.agents.settings import paper_run_length
+from endless_gym.agents.plot import HOURS, draw
+from endless_gym.agents.settings import PAPER_STEPS_PER_UPDATE, paper_run_length
 from endless_gym.agents.statistics import interquartile_mean
 
 #: A row of a table: text or numbers by column; columns that a row lacks stay empty.
@@ -52,7 +53,8 @@ def write(jobs: Sequence[Job], folder: Path, scale: float) -> Path:
         text += ["", f"This is {small}. Do not compare its numbers with the published ones."]
     if experiment.kind == "curves":
         protocol = experiment.evaluation
-        text += ["", f"Evaluation: {protocol.seeds} seeds from 200,000 on, {protocol.repetitions} episodes each."]
+        episodes = "one episode" if protocol.repetitions == 1 else f"{protocol.repetitions} episodes"
+        text += ["", f"Evaluation: {protocol.seeds} seeds from 200,000 on, {episodes} each."]
         text += [
             "Mean and standard deviation are over the runs; best is the highest mean over the runs at any checkpoint."
         ]
@@ -196,8 +198,8 @@ def _ablation(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]
 
 
 def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
-    del folder
     rows = []
+    panels: dict[str, list[Curve]] = {}
     for run, own in _by_run(jobs):
         updates = [planning.update_seconds(job) for job in own]
         # The first update compiles, and starts the environments.
@@ -207,7 +209,16 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
         numbers |= {"median": float(np.median(seconds)), "iqm": interquartile_mean(seconds)}
         numbers["hours"] = seconds.mean() * whole / 3600
         rows.append(_beside(run, {name: float(number) for name, number in numbers.items()}))
-    return rows, []
+        for curve in published(run.env, [run.published]):
+            # The published scores over the paper's time, and over ours.
+            times = {curve.label: run.values["mean"]} if "mean" in run.values else {}
+            times[f"{curve.label} in our time"] = float(seconds.mean())
+            for label, mean in times.items():
+                at = np.rint(curve.steps / PAPER_STEPS_PER_UPDATE * mean).astype(np.int64)
+                panels.setdefault(run.env, []).append(replace(curve, label=label, steps=at))
+    return rows, [
+        draw(f"{env}-wall-time", metrics.metric(env)[1], curves, "std", folder, HOURS) for env, curves in panels.items()
+    ]
 
 
 def _speed(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:

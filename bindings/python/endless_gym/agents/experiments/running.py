@@ -277,11 +277,12 @@ def left(planned: Sequence[Job], side_by_side: int) -> str:
     if total:
         text += f", {trained:,} of {total:,} updates"
         seconds = planning.remaining_seconds(planned, side_by_side)
-        if trained < total:
-            text += (
-                "; time unknown before the first update"
-                if seconds is None
-                else f"; training takes {duration(seconds)} more"
+        evaluated = [planning.evaluation_seconds(job) is not None for job in planned if job.experiment.kind == "curves"]
+        if trained < total and seconds is None:
+            text += "; time unknown before the first update"
+        elif seconds:
+            text += f"; the rest takes {duration(seconds)}" + (
+                ", and its evaluation" if evaluated and not any(evaluated) else ""
             )
     return text
 
