@@ -1,6 +1,6 @@
-"""The agents on a GPU: equality with the CPU, copies, CUDA graphs, and training throughput. Takes less than ten minutes.
+"""The agents on CUDA: equality with the CPU, copies, CUDA graphs, and training throughput. Takes less than ten minutes.
 
-    python gpu.py --json gpu.json --markdown gpu.md
+    python on_cuda.py --json on_cuda.json --markdown on_cuda.md
 
 * Equality: each agent computes a rollout's log-probabilities and values, and a minibatch's loss and gradients, on the CPU and on
   the device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
@@ -231,7 +231,7 @@ def main() -> int:
     device, started = torch.device(args.device), time.monotonic()
     cuda = device.type == "cuda"
     if cuda and not torch.cuda.is_available():
-        print("gpu.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr)
+        print("on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr)
         return 1
     versions = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}"
     name = torch.cuda.get_device_name(device) if cuda else f"the CPU ({platform.machine()}), as a test of the program"

@@ -1,4 +1,4 @@
-"""The program that measures the agents on a GPU: its parts that run on the CPU, and its message without a GPU."""
+"""The program that measures the agents on CUDA: its parts that run on the CPU, and its message without a GPU."""
 
 import json
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-PROGRAM = Path(__file__).parents[3] / "benches" / "agents" / "gpu.py"
+PROGRAM = Path(__file__).parents[3] / "benches" / "agents" / "on_cuda.py"
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -17,10 +17,10 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 def test_the_parts_that_need_no_gpu(tmp_path: Path) -> None:
-    files = ("--json", str(tmp_path / "gpu.json"), "--markdown", str(tmp_path / "gpu.md"))
+    files = ("--json", str(tmp_path / "cuda.json"), "--markdown", str(tmp_path / "cuda.md"))
     done = run("--device", "cpu", "--updates", "1", *files)
     assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "gpu.json").read_text())
+    report = json.loads((tmp_path / "cuda.json").read_text())
     # On the CPU both sides are the same.
     assert [row["agent"] for row in report["equality"]] == ["none", "stack", "position", "gru", "lstm", "trxl", "gtrxl"]
     assert all(row["largest_difference"] == 0.0 for row in report["equality"])
@@ -33,7 +33,7 @@ def test_the_parts_that_need_no_gpu(tmp_path: Path) -> None:
         assert row["shares_of_time"].keys() == {"stepping", "inference", "learning"}
         assert sum(row["shares_of_time"].values()) <= 1.0
     assert report["left_out"] == []
-    text = (tmp_path / "gpu.md").read_text()
+    text = (tmp_path / "cuda.md").read_text()
     assert text.startswith("# The agents on the CPU") and "| gru | 4 " in text
     assert text in done.stdout
 
@@ -42,4 +42,4 @@ def test_the_parts_that_need_no_gpu(tmp_path: Path) -> None:
 def test_without_cuda_it_says_so_and_fails() -> None:
     done = run()
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "gpu.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one\n"
+    assert done.stderr == "on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one\n"
