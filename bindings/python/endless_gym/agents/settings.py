@@ -195,6 +195,8 @@ class Settings:
     """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
     compile: bool = False
     """compile the network with `torch.compile`; the first updates then take minutes longer"""
+    cuda_graphs: bool = True
+    """on CUDA, repeat the operations of a rollout's steps as CUDA graphs: fewer launches. Without `--compile` only"""
     bf16: bool = False
     """bfloat16 autocast for the network; weights and losses stay float32"""
     run: str = ""
