@@ -100,19 +100,19 @@ class RecordedGraphs:
     """Stands in for `endless_gym.agents.graphs.CudaGraphs`.
 
     Attributes:
-        captures: Number of graphs.
+        captures: Number of operations in each graph, without those that only make a view.
         replays: Number of replays.
     """
 
     def __init__(self) -> None:
-        self.captures = self.replays = 0
+        self.captures: list[int] = []
+        self.replays = 0
 
     def warm_up(self, function: Callable[[], None]) -> None:
         for _ in range(2):
             function()
 
     def capture(self, function: Callable[[], None]) -> Callable[[], None]:
-        self.captures += 1
         numpy = torch.Tensor.numpy
         torch.Tensor.numpy = refuse
         recording = Recording()
@@ -123,6 +123,7 @@ class RecordedGraphs:
             torch.Tensor.numpy = numpy
         recording.finish()
         calls = recording.calls
+        self.captures.append(len(calls))
         del recording
 
         @torch.no_grad()

@@ -19,7 +19,8 @@ from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
 from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector, Segment
-from endless_gym.agents.settings import Settings
+from endless_gym.agents.settings import PRESETS, Settings
+from endless_gym.agents.train import parse
 from endless_gym.agents.transformer import TransformerMemory
 
 STEPS, GROUPS, SEGMENTS = 16, 2, 3
@@ -137,8 +138,29 @@ def test_rollouts_are_those_without_graphs_bit_by_bit(make: Callable[..., Run], 
     """Three segments with updates in between, in which weights change, episodes end and the ring is filled several times."""
     recorded = compared(make, small(kind))
     # Two graphs for each group, captured once, and the steps that are compared with those without graphs.
-    assert recorded.captures == 2 * GROUPS
+    assert len(recorded.captures) == 2 * GROUPS
     assert recorded.replays == 2 * GROUPS * (SEGMENTS * STEPS + graphs.COMPARED_STEPS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("agent", "operations"), [("gru", [34, 5]), ("trxl", [60, 19])])
+def test_the_networks_of_the_paper(make: Callable[..., Run], agent: str, operations: list[int]) -> None:
+    """With fewer environments, and a segment that is longer than the window of 256 steps."""
+    paper = replace(PRESETS["paper"], env="Endless-MortarMayhem-v0", agent=agent)
+    paper = replace(
+        paper,
+        environment=replace(paper.environment, num_envs=2, num_threads=1),
+        ppo=replace(paper.ppo, steps=280),
+    )
+    recorded = RecordedGraphs()
+    runs = make(paper), make(paper, recorded)
+    for _ in range(2):
+        (_, expected), (_, found) = (run.collect() for run in runs)
+        assert len(expected) == len(found) and all(map(equal, expected, found))
+        for run in runs:
+            for parameter in run.agent.parameters():
+                parameter.data *= 0.9
+    assert recorded.captures == operations
 
 
 def one_slot(self: fixed.FixedTransformer, step: torch.Tensor) -> torch.Tensor:
@@ -209,7 +231,7 @@ class Faulty(RecordedGraphs):
 
     def capture(self, function: Callable[[], None]) -> Callable[[], None]:
         replay = super().capture(function)
-        if self.captures != self.number:
+        if len(self.captures) != self.number:
             return replay
         if self.fault == "refused":
             raise torch.cuda.OutOfMemoryError("there is no memory for the graph")
@@ -256,6 +278,23 @@ def test_a_resumed_run_continues_as_without_graphs(make: Callable[..., Run]) -> 
             assert len(found) == len(expected) and all(map(equal, expected, found)), kind
 
 
+@pytest.mark.parametrize("kind", ["gru", "stack", "trxl"])
+def test_acting_without_graphs_can_follow(make: Callable[..., Run], kind: str) -> None:
+    """`Agent.act` with the memories of a rollout, and another rollout."""
+    given = small(kind)
+    runs = make(given), make(given, RecordedGraphs())
+    for update in range(2):
+        (_, expected), (_, found) = (run.segment(update) for run in runs)
+        assert all(map(equal, expected, found))
+        for group in range(GROUPS):
+            for _ in range(3):
+                one, other = (
+                    run.agent.act(run.collector.current[group].observation, run.collector.memories[group], greedy=True)
+                    for run in runs
+                )
+                assert all(map(equal, tree_leaves(vars(one)), tree_leaves(vars(other))))
+
+
 def test_parameters_that_move_are_captured_again(make: Callable[..., Run]) -> None:
     given, recorded = small("gru"), RecordedGraphs()
     eager, graphed = make(given), make(given, recorded)
@@ -264,14 +303,14 @@ def test_parameters_that_move_are_captured_again(make: Callable[..., Run]) -> No
         assert all(map(equal, expected, found))
         for parameter in graphed.agent.parameters():
             parameter.data = parameter.data.clone()
-    assert recorded.captures == 2 * 2 * GROUPS
+    assert len(recorded.captures) == 2 * 2 * GROUPS
 
 
 def test_graphs_are_used_on_cuda_only() -> None:
     given, cuda = small("gru"), torch.device("cuda")
     assert isinstance(graphs.graphs_for(given, cuda), graphs.CudaGraphs)
     assert graphs.graphs_for(given, torch.device("cpu")) is None
-    assert graphs.graphs_for(replace(given, cuda_graphs=False), cuda) is None
+    assert graphs.graphs_for(parse(["--no-cuda-graphs"]), cuda) is None
     assert graphs.graphs_for(replace(given, compile=True), cuda) is None
 
 
