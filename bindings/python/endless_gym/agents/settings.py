@@ -196,7 +196,8 @@ class Settings:
     compile: bool = False
     """compile the network with `torch.compile`; the first updates then take minutes longer"""
     cuda_graphs: bool = True
-    """on CUDA, repeat the operations of a rollout's steps as CUDA graphs: fewer launches. Without `--compile` only"""
+    """on CUDA, replay the steps of a rollout as CUDA graphs. If they cannot be captured, or the first steps with them and without
+    differ, a warning says so, and the run goes on without. Not with `--compile`"""
     bf16: bool = False
     """bfloat16 autocast for the network; weights and losses stay float32"""
     run: str = ""
