@@ -190,6 +190,11 @@ def hidden_is_replaced(self: fixed.FixedRecurrent, update: torch.Tensor, step: t
     self.state.hidden = update
 
 
+def update_is_freed(self: graphs.GraphedGroup, before: dict[str, Any]) -> None:
+    self._decision = replace(self._decision, memory_update=None)
+    compare(self, before)
+
+
 def nothing(*args: Any) -> None:
     pass
 
@@ -198,13 +203,15 @@ def not_a_copy(self: fixed.FixedRecurrent) -> None:
     self.memory.store(self.state, copy=False)
 
 
-capture, decide, load = graphs.GraphedGroup.capture, graphs.GraphedGroup._decide, graphs.GraphedGroup._load
+capture, compare = graphs.GraphedGroup.capture, graphs.GraphedGroup._compare
+decide, load = graphs.GraphedGroup._decide, graphs.GraphedGroup._load
 
 #: Mistakes: an agent, a class, one of its methods, and what is in the place of the method.
 MISTAKES = {
     "the slot is a number of the host": ("trxl", fixed.FixedTransformer, "_slot", one_slot),
     "the step is a number of the host": ("none", graphs.GraphedGroup, "_decide", one_step),
     "the ends of episodes are a copy": ("gru", graphs.GraphedGroup, "capture", copied_outcome),
+    "what one graph hands to the other is freed": ("gru", graphs.GraphedGroup, "_compare", update_is_freed),
     "the weights are replaced": ("gru", graphs.GraphedGroup, "_load", weights_of_the_agent),
     "the weights are not made again": ("none", acting.ActingWeights, "copy_", nothing),
     "the blocks are not made again": ("trxl", transformer.ActingBlock, "copy_", nothing),
