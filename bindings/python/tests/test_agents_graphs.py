@@ -366,5 +366,13 @@ def test_cuda_graphs_are_captured_after_a_warm_up_on_another_stream(monkeypatch:
         "main waits for side",
     ]
     calls.clear()
+
+    def failing() -> None:
+        raise RuntimeError("in the warm-up")
+
+    with pytest.raises(RuntimeError, match="in the warm-up"):
+        made.warm_up(failing)
+    assert calls[-1] == "main waits for side"
+    calls.clear()
     made.capture(lambda: calls.append("run"))()
     assert calls == ["enter cuda:0", "enter capture", "run", "leave capture", "leave cuda:0", "replay"]

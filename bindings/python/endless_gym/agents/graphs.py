@@ -59,13 +59,15 @@ class CudaGraphs(Graphs):
     def warm_up(self, function: Callable[[], None]) -> None:
         stream = torch.cuda.Stream(self._device)
         stream.wait_stream(torch.cuda.current_stream(self._device))
-        with torch.cuda.stream(stream):
-            for _ in range(WARM_UPS):
-                function()
-            # A capture that fails leaves more behind than an operation that is refused.
-            with refused_waits():
-                function()
-        torch.cuda.current_stream(self._device).wait_stream(stream)
+        try:
+            with torch.cuda.stream(stream):
+                for _ in range(WARM_UPS):
+                    function()
+                # A capture that fails leaves more behind than an operation that is refused.
+                with refused_waits():
+                    function()
+        finally:
+            torch.cuda.current_stream(self._device).wait_stream(stream)
 
     def capture(self, function: Callable[[], None]) -> Callable[[], None]:
         graph = torch.cuda.CUDAGraph()
