@@ -8,18 +8,22 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from agents_helpers import settings
 from operations import Operations
+from recorded_graphs import RecordedGraphs
 
 from endless_gym.agents import encoders
 from endless_gym.agents.agent import make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.environments import Environments
+from endless_gym.agents.host import Outcome, Upload
 from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.recurrence import PackedGRU
 from endless_gym.agents.rollout import RolloutCollector
@@ -53,6 +57,13 @@ def small(name: str) -> Settings:
     )
 
 
+#: Launches of one step of one group with graphs: the upload of the observation, two graphs, the copy of the actions and the
+#: upload of the outcome. Hidden states are stored for each sequence, here every eighth step.
+LAUNCHES = {"none": 5, "stack": 5, "position": 5, "gru": 5 + 1 / 8, "lstm": 5 + 1 / 8, "trxl": 5, "gtrxl": 5}
+#: Launches for each segment of two groups: weights, noise, cache and bootstrap value are made without graphs.
+SEGMENT_LAUNCHES = {"none": 63, "stack": 69, "position": 73, "gru": 96, "lstm": 102, "trxl": 176, "gtrxl": 288}
+
+
 def counted(agent: str, device: str = "cpu") -> dict[str, float]:
     """Operations of the second segment and update; the first one makes what is made once."""
     given = small(agent)
@@ -84,6 +95,39 @@ def test_operations_are_within_the_budget(agent: str) -> None:
     assert counts["waiting"] == 0
     assert counts["act"] <= act
     assert counts["update"] <= update
+
+
+def launches(agent: str, steps: int, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Launches of the second segment with graphs; uploads are copies of NumPy on the CPU, and count as one each."""
+    given, recorded, uploads = small(agent), RecordedGraphs(), 0
+
+    def counting(function: Callable[..., None]) -> Callable[..., None]:
+        def call(*args: Any) -> None:
+            nonlocal uploads
+            uploads += 1
+            function(*args)
+
+        return call
+
+    with Environments(given) as environments, monkeypatch.context() as patch:
+        torch.manual_seed(1)
+        made = make_agent(given, environments.spec)
+        collector = RolloutCollector(made, environments, steps, torch.Generator().manual_seed(1), graphs=recorded)
+        collector.collect(Clock())
+        patch.setattr(Upload, "copy", counting(Upload.copy))
+        patch.setattr(Outcome, "copy_to", counting(Outcome.copy_to))
+        recorded.replays = 0
+        with Operations() as operations:
+            collector.collect(Clock())
+    return operations.computed + recorded.replays + uploads
+
+
+@pytest.mark.parametrize("agent", LAUNCHES)
+def test_launches_with_graphs_are_within_the_budget(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    short, long = (launches(agent, steps, monkeypatch) for steps in (STEPS, 2 * STEPS))
+    for_each_step = (long - short) / (STEPS * GROUPS)
+    assert for_each_step == LAUNCHES[agent]
+    assert short - for_each_step * STEPS * GROUPS <= SEGMENT_LAUNCHES[agent]
 
 
 @pytest.mark.slow

@@ -281,10 +281,7 @@ class Agent(nn.Module):
     @torch.no_grad()
     def embed(self, observed: Observation) -> Tensor:
         """Encode and embed what `observe` returned, for `decide`: float (n, width). The memory has no influence."""
-        weights = self.acting_weights()
-        with self._autocast():
-            encoded = self._encode(observed, weights)
-            return encoded if weights.embedding is None else linear_relu(encoded, weights.embedding)
+        return self._embed(observed, self.acting_weights())
 
     @torch.no_grad()
     def decide(
@@ -298,10 +295,32 @@ class Agent(nn.Module):
             noise: Gumbel noise, float32 (n, branches, choices), as `noise` returns it; None for the most likely choices.
             embedded: What `embed` returns for `observed`, if it is known.
         """
-        weights = self.acting_weights()
-        embedded = self.embed(observed) if embedded is None else embedded
-        with self._autocast():
-            hidden, memory_update = self.memory.step(embedded, memory.state, memory.reset_mask)
+
+        def step(x: Tensor) -> tuple[Tensor, Any]:
+            return self.memory.step(x, memory.state, memory.reset_mask)
+
+        return self.decide_with(self.acting_weights(), step, observed, noise, embedded)
+
+    @torch.no_grad()
+    def decide_with(
+        self,
+        weights: ActingWeights,
+        step: Callable[[Tensor], tuple[Tensor, Any]],
+        observed: Observation,
+        noise: Tensor | None,
+        embedded: Tensor | None = None,
+    ) -> Decision:
+        """As `decide`, with given weights and a given step of the memory.
+
+        Args:
+            weights: The weights for acting.
+            step: Computes the memory's output and update of embedded observations; see `Memory.step`.
+            observed: As for `decide`.
+            noise: As for `decide`.
+            embedded: As for `decide`.
+        """
+        with self.autocast():
+            hidden, memory_update = step(self._embed(observed, weights) if embedded is None else embedded)
             outputs = weights.heads(hidden)
         logits = weights.logits(outputs)
         # The Gumbel-max trick: the largest of the logits with independent Gumbel noise is a sample of the policy.
@@ -311,7 +330,7 @@ class Agent(nn.Module):
     @torch.no_grad()
     def remember(self, memory: AgentMemory, decision: Decision, transform_update: dict[str, Tensor]) -> None:
         """Update the memory after `decide`; the next observation continues the episodes until `AgentMemory.reset`."""
-        with self._autocast():
+        with self.autocast():
             self.memory.update_state(memory.state, decision.memory_update)
         self.transform.update_state(memory.transform_state, transform_update)
         memory.reset_mask = memory.no_reset
@@ -359,7 +378,7 @@ class Agent(nn.Module):
         """
         if torch.is_grad_enabled():
             self.refresh()
-        with self._autocast():
+        with self.autocast():
             embedded = self.memory.embed(self.encoder(observation))
             memory_output = self.memory(embedded if rows is None else embedded.index_select(0, rows), minibatch)
             hidden = self.body(memory_output)
@@ -414,6 +433,12 @@ class Agent(nn.Module):
         # Of the kinds of observations that are no dict, only one fits the agent.
         return {next(iter(self.observation_shapes)): observation} if len(self.observation_shapes) == 1 else {}
 
+    def _embed(self, observed: Observation, weights: ActingWeights) -> Tensor:
+        """As `embed`, with given weights."""
+        with self.autocast():
+            encoded = self._encode(observed, weights)
+            return encoded if weights.embedding is None else linear_relu(encoded, weights.embedding)
+
     def _encode(self, observed: Observation, weights: ActingWeights) -> Tensor:
         """As `encoder`, with the weights for acting."""
         if weights.vector is None:
@@ -424,7 +449,8 @@ class Agent(nn.Module):
         vector = linear_relu(joined, weights.vector)
         return vector if self.encoder.frames is None else torch.cat([self.encoder.frames(observed[FRAME]), vector], -1)
 
-    def _autocast(self) -> contextlib.AbstractContextManager[Any]:
+    def autocast(self) -> contextlib.AbstractContextManager[Any]:
+        """The context of the type that the network computes in."""
         if not self.settings.bf16:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, torch.bfloat16)

@@ -195,6 +195,9 @@ class Settings:
     """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
     compile: bool = False
     """compile the network with `torch.compile`; the first updates then take minutes longer"""
+    cuda_graphs: bool = True
+    """on CUDA, replay the steps of a rollout as CUDA graphs. If they cannot be captured, or the first steps with them and without
+    differ, a warning says so, and the run goes on without. Not with `--compile`"""
     bf16: bool = False
     """bfloat16 autocast for the network; weights and losses stay float32"""
     run: str = ""

@@ -32,7 +32,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endless_gym.agents.acting import linear_relu, transposed
+from endless_gym.agents.acting import linear_relu, refill, transposed
 from endless_gym.agents.encoders import orthogonal
 from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
 from endless_gym.agents.settings import Transformer
@@ -300,7 +300,10 @@ class Block(nn.Module):
 
 
 class ActingBlock:
-    """A block for one step of n environments, with few operations; see `acting`."""
+    """A block for one step of n environments, with few operations; see `acting`.
+
+    What is not transposed or converted are the parameters themselves.
+    """
 
     def __init__(self, block: Block, dtype: torch.dtype) -> None:
         """Prepare the weights of `block`, to compute in `dtype`."""
@@ -316,6 +319,10 @@ class ActingBlock:
         self.gate_attention, self.gate_fc = block.gate_attention, block.gate_fc
         self.content_bias = attention.content_bias.detach() if attention.relative else None
         self.distance_bias = attention.distance_bias.detach() if attention.relative else None
+
+    def copy_(self, other: ActingBlock) -> None:
+        """Copy the weights of the same block, made later, into the tensors of this one."""
+        refill((self.queries, *self.fc_out, *self.fc), (other.queries, *other.fc_out, *other.fc))
 
     def __call__(
         self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, encoded: Tensor | None
@@ -467,8 +474,13 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         else:
             self.register_buffer("table", None)
         self._dtype, self._generation = torch.float32, 0
-        self._acting: list[ActingBlock] = []
-        self._ages = ring_ages(settings.window, device)
+        #: The blocks for acting; see `refresh`.
+        self.acting_blocks: list[ActingBlock] = []
+        #: See `ring_ages`.
+        self.ages = ring_ages(settings.window, device)
+        #: Whether the attention while acting is as short as the episodes. On the CPU the largest position is known without
+        #: waiting for a device.
+        self.spans = device.type == "cpu"
         self._attended, self._masked = torch.zeros((), device=device), torch.full((), MASKED, device=device)
 
     @property
@@ -485,36 +497,59 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
 
     def refresh(self, dtype: torch.dtype) -> None:
         self._dtype, self._generation = dtype, self._generation + 1
-        self._acting = [ActingBlock(block, dtype) for block in self.blocks]
+        self.acting_blocks = [ActingBlock(block, dtype) for block in self.blocks]
 
     def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor) -> tuple[Tensor, TransformerUpdate]:
-        cache = self._cache(state)
+        cache = self.cache(state)
         position = state.next_position.masked_fill(reset_mask, 0)
-        # On the CPU the largest position is known without waiting for a device, and the attention is as short as the episodes.
-        past = self.past if self.device.type != "cpu" else min(self.past, max(1, int(position.numpy().max())))
-        start, length = cache.span(past)
-        offset = self.settings.window - cache.slot + start
-        attends = self._ages[offset : offset + length] <= position.unsqueeze(-1)
+        start, length = 0, cache.slots
+        if self.spans:
+            start, length = cache.span(min(self.past, max(1, int(position.numpy().max()))))
+        ages = slice(self.settings.window - cache.slot + start, self.settings.window - cache.slot + start + length)
+        distances = None if cache.distances is None else [encoded[:, ages] for encoded in cache.distances]
+        slots = cache.keys_and_values(start, length)
+        return self.step_with(self.acting_blocks, x, position, self.ages[ages], slots, distances)
+
+    def step_with(
+        self,
+        blocks: Sequence[ActingBlock],
+        x: Tensor,
+        position: Tensor,
+        ages: Tensor,
+        slots: tuple[Sequence[Tensor], Sequence[Tensor]],
+        distances: Sequence[Tensor] | None,
+    ) -> tuple[Tensor, TransformerUpdate]:
+        """As `step`, with given blocks and a given part of the KV cache.
+
+        Args:
+            blocks: The blocks for acting.
+            x: As for `step`.
+            position: Position of the current step in its episode, int64 (n,).
+            ages: Ages of the slots, int64 (tokens,).
+            slots: Keys and values of each block, float (n, heads, tokens, head size).
+            distances: Projected encodings of the ages for each block, float (heads, tokens, head size); None without relative
+                encoding.
+        """
+        attends = ages <= position.unsqueeze(-1)
         bias = torch.where(attends, self._attended, self._masked)[:, None, None].to(self._dtype)
         first = (position == 0).unsqueeze(-1)
-        keys, values = cache.keys_and_values(start, length)
+        keys, values = slots
         encoding = self._encoding(position) if self.settings.query_encoding else None
         inputs = []
-        for layer, block in enumerate(self._acting):
+        for layer, block in enumerate(blocks):
             inputs.append(x)
             x = x if encoding is None else x + encoding
-            distances = cache.distances[layer][:, offset : offset + length] if cache.distances else None
-            x = block(x, keys[layer], values[layer], bias, first, distances)
+            x = block(x, keys[layer], values[layer], bias, first, None if distances is None else distances[layer])
         return x, TransformerUpdate(inputs, position)
 
     def update_state(self, state: TransformerState, update: TransformerUpdate) -> None:
         if state.fill == state.inputs.shape[2]:
             state.compact(SPARE_COLUMNS)
-        cache, inputs = self._cache(state), torch.stack(update.inputs).float()
+        cache, inputs = self.cache(state), torch.stack(update.inputs).float()
         state.inputs.select(2, state.fill).copy_(inputs)
         state.position.select(1, state.fill).copy_(update.position)
         state.next_position = update.position + 1
-        cache.append(inputs if self.table is None else inputs + self._encoding(update.position))
+        cache.append(self.encoded(inputs, update.position))
         state.fill += 1
 
     def minibatches(
@@ -649,21 +684,22 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         if isinstance(self.table, nn.Parameter):
             return tokens
         # They have no gradient, so this is done once for a segment, not for each minibatch.
-        encoded = tokens if self.table is None else tokens + self._encoding(state.position[:, skipped:])
-        return normalised(encoded).to(self._dtype)
+        return normalised(self.encoded(tokens, state.position[:, skipped:])).to(self._dtype)
+
+    def encoded(self, tokens: Tensor, position: Tensor) -> Tensor:
+        """Tokens with the encodings of their positions int64 (...,) added, if there are any: float32 (layers, ..., width)."""
+        return tokens if self.table is None else tokens + self._encoding(position)
 
     def _encoding(self, position: Tensor) -> Tensor:
         """Encodings of positions int64 (...,), float32 (..., width). Positions beyond the table share its last row."""
         assert self.table is not None
         return functional.embedding(position.clamp(max=self.positions - 1), self.table)
 
-    def _cache(self, state: TransformerState) -> RingCache:
+    def cache(self, state: TransformerState) -> RingCache:
         """The keys and values of the state's tokens; computed with the current weights if there are none of these weights."""
         if state.cache is None or state.cache.generation != self._generation:
             window = slice(state.fill - self.past, state.fill)
-            tokens = state.inputs[:, :, window]
-            if self.table is not None:
-                tokens = tokens + self._encoding(state.position[:, window])
+            tokens = self.encoded(state.inputs[:, :, window], state.position[:, window])
             blocks = self.blocks
             attentions = [block.attention for block in blocks]
             projection = Projection(

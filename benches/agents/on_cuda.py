@@ -1,23 +1,27 @@
-"""The agents on a GPU: equality with the CPU, copies, CUDA graphs, and training throughput. Takes less than ten minutes.
+"""The agents on CUDA: equality with the CPU, copies, CUDA graphs, and training throughput. Takes less than ten minutes.
 
-    python gpu.py --json gpu.json --markdown gpu.md
+    python on_cuda.py --json on_cuda.json --markdown on_cuda.md
 
 * Equality: each agent computes a rollout's log-probabilities and values, and a minibatch's loss and gradients, on the CPU and on
   the device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
 * Copies: frames of a group from pageable and from page-locked memory to the device.
-* Graphs: the acting network of the GRU agent as a CUDA graph, beside the same operations without one.
+* Graphs: rollouts of the GRU and the Transformer-XL agent with the sizes of the preset `paper`, with CUDA graphs and without,
+  whose contents must be equal to the same tolerance. The first segment captures the graphs and has a time of its own.
 * Training: steps per second with a breakdown, and peak memory, with the networks, frames, environments and steps of the preset
   `paper`, and with more environments. The first update is excluded as warm-up.
 
 `--device cpu` runs the parts that need no GPU with small networks and few steps, to test this program; its numbers mean nothing.
-The exit status is 1 if there is no CUDA device, or a result on the device differs from the CPU's.
+The exit status is 1 if there is no CUDA device, if a result on the device differs from the CPU's, or if rollouts with graphs
+differ from those without, or go on without graphs.
 """
 
 import argparse
 import json
 import platform
+import statistics
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +32,7 @@ from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.environments import Environments
+from endless_gym.agents.graphs import Graphs
 from endless_gym.agents.ppo import learn, make_optimizer, minibatch_loss
 from endless_gym.agents.rollout import RolloutCollector, Segment
 from endless_gym.agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
@@ -117,39 +122,63 @@ def copies(device: torch.device) -> list[dict[str, Any]]:
     return rows
 
 
-@torch.no_grad()
-def graphs(device: torch.device) -> dict[str, Any]:
-    """Microseconds of the acting network of the paper's GRU agent for 16 environments, without and with a CUDA graph."""
-    agent = Agent(replace(PRESETS["paper"], env=ENV), {FRAME: (84, 84, 3)}, (3, 3), device=device)
-    memory, frames = agent.initial_memory(16), torch.zeros(16, 84, 84, 3, dtype=torch.uint8, device=device)
-    noise = agent.noise((16,), None)
+def rollouts(
+    settings: Settings, device: torch.device, graphs: Graphs | None, segments: int
+) -> list[tuple[dict[str, torch.Tensor], float, float]]:
+    """Some segments, after each of which the weights change.
 
-    def act() -> torch.Tensor:
-        return agent.decide({FRAME: frames}, memory, noise).outputs
+    Args:
+        settings: Settings of the run.
+        device: Device of the agent.
+        graphs: See `RolloutCollector`.
+        segments: Number of segments.
 
-    stream = torch.cuda.Stream(device)
-    stream.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(stream):
-        for _ in range(3):
-            act()
-    torch.cuda.current_stream(device).wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = act()
-    frames.random_(0, 256)
-    graph.replay()
-    difference = float((captured - act()).abs().max())
+    Returns:
+        For each segment its contents on the CPU, its seconds, and the seconds of `inference` in it.
+    """
+    settings = settings.validated()
+    torch.manual_seed(1)
+    rows = []
+    with Environments(settings) as environments:
+        agent = make_agent(settings, environments.spec, device)
+        generator, clock = torch.Generator(device).manual_seed(1), Clock()
+        collector = RolloutCollector(agent, environments, settings.ppo.steps, generator, graphs=graphs)
+        for _ in range(segments):
+            start = time.perf_counter()
+            segment, _ = collector.collect(clock)
+            contents = {
+                name: getattr(segment, name).cpu() for name in ("action", "log_prob", "value", "reward", "done")
+            }
+            rows.append((contents, time.perf_counter() - start, clock.take()["inference"]))
+            with torch.no_grad():
+                for parameter in agent.parameters():
+                    parameter.mul_(0.9)
+    return rows
 
-    def microseconds(call: Any) -> float:
-        call()
-        torch.cuda.synchronize(device)
-        start = time.perf_counter()
-        for _ in range(200):
-            call()
-        torch.cuda.synchronize(device)
-        return (time.perf_counter() - start) / 200 * 1e6
 
-    return {"without": microseconds(act), "with": microseconds(graph.replay), "largest_difference": difference}
+def compared_rollouts(
+    settings: Settings, device: torch.device, graphs: Graphs | None = None, segments: int = 4
+) -> dict[str, Any]:
+    """Rollouts with and without graphs: seconds of a segment after the first, and the largest difference of their contents."""
+    without = rollouts(replace(settings, cuda_graphs=False), device, None, segments)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with_graphs = rollouts(settings, device, graphs, segments)
+    refused = [str(warning.message) for warning in caught if issubclass(warning.category, RuntimeWarning)]
+    difference = max(
+        float((one[name].double() - other[name].double()).abs().max() / one[name].double().abs().max().clamp(min=1e-6))
+        for (one, *_), (other, *_) in zip(without, with_graphs, strict=True)
+        for name in one
+    )
+    row: dict[str, Any] = {"agent": settings.agent, "largest_difference": difference, "refused": refused}
+    row["equal"] = difference <= TOLERANCE and not refused
+    for name, rows in (("without", without), ("with", with_graphs)):
+        row[name] = {
+            "first_seconds": rows[0][1],
+            "seconds": statistics.median(seconds for _, seconds, _ in rows[1:]),
+            "inference_seconds": statistics.median(seconds for *_, seconds in rows[1:]),
+        }
+    return row
 
 
 def training(settings: Settings, device: torch.device, updates: int) -> dict[str, Any]:
@@ -197,11 +226,16 @@ def markdown(report: dict[str, Any]) -> str:
         for row in report["copies"]:
             kind = "page-locked" if row["page_locked"] else "pageable"
             lines.append(f"| {kind} | {row['gigabytes_per_second']:.1f} |")
-    if "graphs" in report:
-        row = report["graphs"]
-        lines += ["", "## Acting network of the GRU agent, 16 environments", ""]
-        lines += [f"{row['without']:.0f} µs without a CUDA graph, {row['with']:.0f} µs with one; largest difference "]
-        lines[-1] += f"{row['largest_difference']:.1e}."
+    lines += ["", "## Rollouts with CUDA graphs and without", ""]
+    lines += ["| agent | graphs | segment | of which inference | first segment | difference | equal |"]
+    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
+    for row in report["graphs"]:
+        equal = "yes" if row["equal"] else "**no**"
+        for name in ("without", "with"):
+            times = [f"{row[name][key]:.3f} s" for key in ("seconds", "inference_seconds", "first_seconds")]
+            ending = f"{row['largest_difference']:.1e} | {equal}" if name == "with" else " | "
+            lines.append(f"| {row['agent']} | {name} | {' | '.join(times)} | {ending} |")
+        lines += [f"\n{message}\n" for message in row["refused"]]
     lines += [
         "",
         "## Training",
@@ -231,7 +265,9 @@ def main() -> int:
     device, started = torch.device(args.device), time.monotonic()
     cuda = device.type == "cuda"
     if cuda and not torch.cuda.is_available():
-        print("gpu.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr)
+        print(
+            "on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr
+        )
         return 1
     versions = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}"
     name = torch.cuda.get_device_name(device) if cuda else f"the CPU ({platform.machine()}), as a test of the program"
@@ -239,14 +275,18 @@ def main() -> int:
     torch.backends.cudnn.allow_tf32 = False
     report["equality"] = equality(device)
     if cuda:
-        report["copies"], report["graphs"] = copies(device), graphs(device)
+        report["copies"] = copies(device)
         # As `endless-train`.
         torch.backends.cudnn.allow_tf32 = True
         torch.set_float32_matmul_precision("high")
+    paper = replace(PRESETS["paper"], env=ENV)
+    report["graphs"] = [
+        compared_rollouts(replace(paper, agent=agent) if cuda else networks(agent), device) for agent in ("gru", "trxl")
+    ]
     report["training"], report["left_out"] = [], []
     for num_envs, steps in BATCHES if cuda else ((4, 16),):
         for agent in ("gru", "trxl"):
-            settings = replace(PRESETS["paper"], env=ENV, agent=agent) if cuda else networks(agent)
+            settings = replace(paper, agent=agent) if cuda else networks(agent)
             settings = replace(
                 settings,
                 environment=replace(settings.environment, num_envs=num_envs),
@@ -265,7 +305,7 @@ def main() -> int:
         args.json.write_text(json.dumps(report, indent=1) + "\n")
     if args.markdown:
         args.markdown.write_text(text)
-    return 0 if all(row["equal"] for row in report["equality"]) else 1
+    return 0 if all(row["equal"] for row in report["equality"] + report["graphs"]) else 1
 
 
 if __name__ == "__main__":
