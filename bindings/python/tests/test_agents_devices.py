@@ -23,6 +23,7 @@ FLAGS = {
     "lstm": "--env MortarMayhemB-Grid-v0 --agent lstm --recurrence.layers 2",
     "none": "--env MortarMayhemB-Grid-v0 --agent none --ppo.advantage-normalisation minibatch",
     "gtrxl": "--env MortarMayhemB-Grid-v0 --agent gtrxl --transformer.positional-encoding relative",
+    "previous": "--env MortarMayhemB-v0 --agent trxl --transformer.query-previous",
     "learned": "--env MortarMayhemB-v0 --agent trxl --transformer.positional-encoding learned --transformer.query-encoding",
     "stack": "--env MortarMayhemB-Grid-v0 --agent stack --environment.observation rgb --model.stack 2",
     "position": "--env MortarMayhemB-Grid-v0 --agent position --ppo.advantage-normalisation batch",

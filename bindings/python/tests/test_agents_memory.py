@@ -27,6 +27,13 @@ KINDS = {
     "trxl, relative": ("trxl", transformer(positional_encoding="relative")),
     "trxl, no positions": ("trxl", transformer(positional_encoding="none")),
     "trxl, query encoding": ("trxl", transformer(query_encoding=True)),
+    "trxl, previous": ("trxl", transformer(query_previous=True)),
+    "trxl, single steps, previous": ("trxl", transformer(sequence_length=1, query_previous=True, query_encoding=True)),
+    "trxl, one block, relative, previous": (
+        "trxl",
+        transformer(layers=1, positional_encoding="relative", query_previous=True),
+    ),
+    "gtrxl, learned, previous": ("gtrxl", transformer(positional_encoding="learned", query_previous=True)),
     "trxl, short sequences": ("trxl", transformer(sequence_length=4)),
     "trxl, one sequence": ("trxl", transformer(sequence_length=64)),
     "trxl, single steps": ("trxl", transformer(sequence_length=1)),
@@ -219,6 +226,10 @@ def _plain_transformer(agent: Agent, observed: torch.Tensor, done: torch.Tensor)
             with torch.no_grad():
                 x = module.embedding(agent.encoder({"features": observed[step, env : env + 1]}))[0]
                 inputs, now = [], len(episode)
+                if module.fusion is not None:
+                    previous = episode[-1][-1] if episode else torch.zeros(module.width)
+                    linear = module.fusion[0]
+                    x = torch.relu(linear.weight @ torch.cat([x, previous]) + linear.bias)
                 window = range(max(0, now - module.settings.window + 1), now)
                 for layer, block in enumerate(module.blocks):
                     inputs.append(x)

@@ -15,9 +15,10 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
+from endless_gym.agents.acting import refill
 from endless_gym.agents.memory import AnyMemory, MemoryState
 from endless_gym.agents.recurrent import RecurrentMemory, RecurrentState
-from endless_gym.agents.transformer import TransformerMemory, TransformerState, TransformerUpdate
+from endless_gym.agents.transformer import TransformerMemory, TransformerState, TransformerUpdate, fused
 from endless_gym.agents.transformer_cache import RingCache
 
 MemoryT = TypeVar("MemoryT", bound=AnyMemory)
@@ -84,7 +85,7 @@ class FixedTransformer(FixedMemory[TransformerMemory, TransformerState]):
         self._inputs, self._position = torch.zeros_like(state.inputs), torch.zeros_like(state.position)
         self._next_position = torch.empty_like(state.next_position)
         self._cache: RingCache | None = None
-        self._blocks = memory.acting_blocks
+        self._blocks, self._fusion = memory.acting_blocks, memory.acting_fusion
         self._slots = torch.arange(memory.past + 1, device=memory.device)
 
     def load(self) -> None:
@@ -98,6 +99,8 @@ class FixedTransformer(FixedMemory[TransformerMemory, TransformerState]):
             state.next_position = self._next_position
         for block, newer in zip(self._blocks, self.memory.acting_blocks, strict=True):
             block.copy_(newer)
+        if self._fusion is not None and self.memory.acting_fusion is not None:
+            refill(self._fusion, self.memory.acting_fusion)
         cache = self.memory.cache(state)
         if self._cache is None:
             self._cache = cache
@@ -109,6 +112,10 @@ class FixedTransformer(FixedMemory[TransformerMemory, TransformerState]):
         memory, cache = self.memory, self._cache
         assert cache is not None
         position = self._next_position.masked_fill(reset_mask, 0)
+        if self._fusion is not None:
+            # The newest column; this step's is the next one.
+            previous = self._inputs[-1].index_select(1, step + (memory.past - 1)).squeeze(1)
+            x = fused(x, previous, reset_mask, self._fusion)
         chosen = self._slots + (cache.slots - self._slot(step))
         ages = memory.ages.index_select(0, chosen)
         distances = None

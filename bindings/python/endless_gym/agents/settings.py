@@ -98,6 +98,9 @@ class Transformer:
     environments, as in the paper"""
     query_encoding: bool = False
     """add the absolute or learned encoding to the queries as well"""
+    query_previous: bool = False
+    """make the first block's input from the embedding and the last block's input at the previous step, without
+    gradient, by a layer with ReLU"""
     shared_heads: bool = True
     """share the query, key and value projections among the heads of a block, as in the experiments of the paper"""
     gating: bool = False

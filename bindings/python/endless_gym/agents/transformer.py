@@ -19,6 +19,15 @@ Keys and values are not projected once for each window that contains a token:
 A query attends to the token of an earlier step if the distance in steps is at most `window - 1`, and at most the query's position
 in its episode. At the first step of an episode there is no token to attend to, and the attention output before the final
 projection is 0.
+
+With `Transformer.query_previous`, a layer with ReLU makes the first block's input, hence the first query, from the
+embedding and "the previous output of the TrXL block" (section 5.6.3 of the paper, which does not say more). In the
+authors' code (MarcoMeter/neroRL, branch `test/query_2`, commit 638502a) that is the last block's input, not its output,
+at the previous time step: as stored while acting, without gradient and without positional encoding, and 0 at the first
+step of an episode. That is the last block's newest token. It is known before learning begins, so the steps of a
+sequence need not be computed one after the other. The earlier branch `test/query` (b71311a) means the same token with
+its positional encoding, but selects that of the first environment of the batch for all, and, once the window is full,
+that of the current step. This is not followed.
 """
 
 from __future__ import annotations
@@ -32,7 +41,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endless_gym.agents.acting import linear_relu, refill, transposed
+from endless_gym.agents.acting import Affine, linear_relu, refill, transposed
 from endless_gym.agents.encoders import orthogonal
 from endless_gym.agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
 from endless_gym.agents.settings import Transformer
@@ -65,6 +74,19 @@ def sinusoids(positions: Tensor, width: int) -> Tensor:
 def normalised(tokens: Tensor) -> Tensor:
     """Tokens with mean 0 and variance 1: layer normalisation without gain and bias, float (..., width)."""
     return functional.layer_norm(tokens, tokens.shape[-1:])
+
+
+def fused(x: Tensor, previous: Tensor, first: Tensor, layer: Affine) -> Tensor:
+    """The first block's input in a step of acting with `Transformer.query_previous`, float (n, width).
+
+    Args:
+        x: Embedded observations, float (n, width).
+        previous: The last block's input at the previous step, float32 (n, width).
+        first: Whether the step is the first of an episode, bool (n,).
+        layer: The layer, for inputs of twice the width.
+    """
+    previous = previous.masked_fill(first.unsqueeze(-1), 0.0).to(x.dtype)
+    return linear_relu(torch.cat([x, previous], dim=-1), layer)
 
 
 @dataclass
@@ -431,6 +453,8 @@ class TransformerMinibatch(Minibatch):
         distance: Steps from each token to each query, int64 (C, P + C).
         groups: With C = 1, where the queries lie in groups of K. Then `tokens`, `position`, `bias` and `distance` have G groups
             in place of sequences, K queries in place of C, and the tokens that any query of the group may attend to.
+        previous: The last block's input at the step before each query, 0 if that is of another episode, float32
+            (sequences, C, width); None without `Transformer.query_previous`.
     """
 
     tokens: Tensor
@@ -439,6 +463,7 @@ class TransformerMinibatch(Minibatch):
     bias: Tensor
     distance: Tensor
     groups: Groups | None = None
+    previous: Tensor | None = None
 
 
 #: Makes a minibatch of the chosen sequences, sorted and on the CPU, and of `indices` and `everywhere` of `Minibatch`.
@@ -446,7 +471,11 @@ MakeMinibatch: TypeAlias = Callable[[Tensor, Tensor, Tensor], TransformerMinibat
 
 
 class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerMinibatch]):
-    """A fully connected layer, followed by attention blocks."""
+    """A fully connected layer, followed by attention blocks.
+
+    Attributes:
+        fusion: Layer of the embedding and the last block's previous input; None without `Transformer.query_previous`.
+    """
 
     #: Positional encoding by position in the episode, float32 (positions, width); None without an absolute or learned encoding.
     table: Tensor | None
@@ -464,6 +493,9 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         self.settings, self.positions, self.device = settings, positions, device
         self.width, self.past = settings.width, settings.window - 1
         self.embedding = nn.Sequential(orthogonal(nn.Linear(input_width, settings.width)), nn.ReLU())
+        self.fusion: nn.Sequential | None = None
+        if settings.query_previous:
+            self.fusion = nn.Sequential(orthogonal(nn.Linear(2 * settings.width, settings.width)), nn.ReLU())
         self.layers = nn.ModuleList(Block(settings) for _ in range(settings.layers))
         if settings.positional_encoding == "absolute":
             # As in the paper's implementation, the table is reversed: the first step of an episode has the largest angles.
@@ -476,6 +508,8 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         self._dtype, self._generation = torch.float32, 0
         #: The blocks for acting; see `refresh`.
         self.acting_blocks: list[ActingBlock] = []
+        #: The layer `fusion` for acting.
+        self.acting_fusion: Affine | None = None
         #: See `ring_ages`.
         self.ages = ring_ages(settings.window, device)
         #: Whether the attention while acting is as short as the episodes. On the CPU the largest position is known without
@@ -498,10 +532,13 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
     def refresh(self, dtype: torch.dtype) -> None:
         self._dtype, self._generation = dtype, self._generation + 1
         self.acting_blocks = [ActingBlock(block, dtype) for block in self.blocks]
+        self.acting_fusion = None if self.fusion is None else transposed(self.fusion[0], dtype)
 
     def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor) -> tuple[Tensor, TransformerUpdate]:
         cache = self.cache(state)
         position = state.next_position.masked_fill(reset_mask, 0)
+        if self.acting_fusion is not None:
+            x = fused(x, state.inputs[-1].select(1, state.fill - 1), reset_mask, self.acting_fusion)
         start, length = 0, cache.slots
         if self.spans:
             start, length = cache.span(min(self.past, max(1, int(position.numpy().max()))))
@@ -523,7 +560,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
 
         Args:
             blocks: The blocks for acting.
-            x: As for `step`.
+            x: The first block's input, float (n, width).
             position: Position of the current step in its episode, int64 (n,).
             ages: Ages of the slots, int64 (tokens,).
             slots: Keys and values of each block, float (n, heads, tokens, head size).
@@ -571,6 +608,12 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         tokens = torch.cat([self._tokens(state, skipped) for state in states], dim=1)
         position = torch.cat([state.position[:, skipped:] for state in states])
         parts = (self._groups if length == 1 else self._sequences)(tokens, position, past, steps, length)
+        previous = None
+        if self.fusion is not None:
+            queries = slice(past, past + sequences * length)
+            before = torch.cat([state.inputs[-1, :, self.past - 1 :][:, : sequences * length] for state in states])
+            previous = before.masked_fill((position[:, queries] == 0).unsqueeze(-1), 0.0)
+            previous = previous.unflatten(1, (sequences, length)).flatten(0, 1)
 
         def steps_of(envs: int) -> Tensor:
             """Index of each step of each sequence in the flattened segment, int64 (envs * sequences, length)."""
@@ -586,7 +629,10 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
                 everywhere = steps_everywhere[chosen.to(self.device)].flatten()
                 chosen = chosen[is_own(chosen // sequences, own)] - own.start * sequences
             indices = steps_here[chosen.to(self.device)].flatten()
-            return parts(chosen, indices, indices if everywhere is None else everywhere)
+            made = parts(chosen, indices, indices if everywhere is None else everywhere)
+            if previous is not None:
+                made.previous = previous[chosen.to(self.device)]
+            return made
 
         split = shuffled([length] * (envs * sequences), num_minibatches, epochs, generator)
         return LazyMinibatches(split, minibatch)
@@ -668,6 +714,9 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
     def forward(self, x: Tensor, minibatch: TransformerMinibatch) -> Tensor:
         queries = minibatch.query_position
         x = x.unflatten(0, queries.shape)
+        if self.fusion is not None:
+            assert minibatch.previous is not None
+            x = self.fusion(torch.cat([x, minibatch.previous.to(x.dtype)], dim=-1))
         learned = isinstance(self.table, nn.Parameter)
         encoding = self._encoding(minibatch.position) if learned else None
         query_encoding = self._encoding(queries) if self.settings.query_encoding else None
