@@ -5,7 +5,9 @@
 Needs git, torch, numpy and einops. The authors' code is fetched to a temporary folder; only numbers are kept, in
 `authors.json.gz`: the weights by the authors' names, the inputs, the outputs while acting and while learning, and the gradients
 of `sum(output * factor)`. The main branch has absolute, learned and no positional encoding. Of the branch with the relative one
-only the attention is recorded: its blocks put the query itself into the memory, in the place of the newest token.
+only the attention is recorded: its blocks put the query itself into the memory, in the place of the newest token. The
+branch with the previous output in the first query is recorded with gates: its blocks without them have a ReLU that
+those of the main branch do not have.
 """
 
 import argparse
@@ -16,13 +18,15 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-#: The main branch, and the branch `test/relative_pe`.
+#: The main branch, and the branches `test/relative_pe` and `test/query_2`.
 COMMIT, RELATIVE = "8dd62bdee66c2825d6fcea6fffefcdeb4f010609", "5419b0c80599179f5708e32ba3b0f66172817cf0"
+PREVIOUS = "638502a8c33110a6d3b22432c686dd54deabd79c"
 DATA = Path(__file__).parent / "authors.json.gz"
 INPUT, WIDTH, SEQUENCES, LENGTH = 5, 8, 3, 4
 #: Window and longest episode of the Transformer-XL, and the step in the episode of each row of the batch. At step 0 the authors'
@@ -31,13 +35,13 @@ WINDOW, LONGEST, STEPS = 5, 12, (1, 2, 4, 6, 9)
 
 
 def fetched(repository: str, folder: Path) -> None:
-    """Put the authors' modules into a folder: `neroRL` of `COMMIT`, and `relative/neroRL` of `RELATIVE`."""
+    """Put the authors' modules into a folder: `neroRL` of `COMMIT`, the others in `relative` and `previous`."""
     git = folder / "git"
     if Path(repository).exists():
         git = Path(repository)
     else:
         subprocess.run(["git", "clone", "--quiet", "--bare", "--filter=blob:none", repository, git], check=True)
-    for commit, into in ((COMMIT, folder), (RELATIVE, folder / "relative")):
+    for commit, into in ((COMMIT, folder), (RELATIVE, folder / "relative"), (PREVIOUS, folder / "previous")):
         into.mkdir(exist_ok=True)
         command = ["git", f"--git-dir={git}", "archive", commit, "neroRL/__init__.py", "neroRL/nn"]
         archive = subprocess.run(command, check=True, capture_output=True).stdout
@@ -69,12 +73,28 @@ def recurrent(kind: type[nn.Module], layers: int, residual: bool) -> dict[str, A
     } | gradients(module, output)
 
 
-def transformer(module: type[nn.Module], encoding: str, gate_bias: float | None) -> dict[str, Any]:
-    """One step of several environments with given memories; the authors' code is the same for acting and learning."""
+def loaded(file: Path) -> Any:
+    """The module in a file."""
+    spec = importlib.util.spec_from_file_location(file.parents[2].name, file)
+    assert spec is not None and spec.loader is not None
+    theirs = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(theirs)
+    return theirs
+
+
+def transformer(
+    module: type[nn.Module], encoding: str, gate_bias: float | None, previous: bool = False
+) -> dict[str, Any]:
+    """One step of several environments with given memories; the authors' code is the same for acting and learning.
+
+    With `previous`, the module is that of `PREVIOUS`, and gets the last block's input at the step before, as from its
+    sampler.
+    """
     config = {
         "num_blocks": 2,
         "embed_dim": WIDTH,
         "num_heads": 2,
+        "share_heads": True,  # of `PREVIOUS` only; the main branch has separate heads
         "max_episode_steps": LONGEST,
         "positional_encoding": encoding,
         "add_positional_encoding_to_query": False,
@@ -89,7 +109,9 @@ def transformer(module: type[nn.Module], encoding: str, gate_bias: float | None)
     starts = torch.tensor([max(0, step - WINDOW + 1) for step in STEPS]).unsqueeze(1)
     indices = starts + torch.arange(WINDOW)
     mask = torch.tril(torch.ones(WINDOW, WINDOW), diagonal=-1)[torch.tensor(STEPS).clamp(max=WINDOW - 1)]
-    output, inputs = made(x, memories, mask, indices)
+    newest = torch.tensor(STEPS).clamp(max=WINDOW - 1) - 1
+    given = (memories[torch.arange(len(STEPS)), newest, -1],) if previous else ()
+    output, inputs = made(x, memories, mask, indices, *given)
     return {"gate_bias": gate_bias, "x": x, "memories": memories, "steps": list(STEPS), "inputs": inputs} | gradients(
         made, output
     )
@@ -97,10 +119,7 @@ def transformer(module: type[nn.Module], encoding: str, gate_bias: float | None)
 
 def relative(file: Path) -> dict[str, Any]:
     """The attention with relative encoding of one query to the last tokens of a window; the newest one is at distance 1."""
-    spec = importlib.util.spec_from_file_location("relative", file)
-    assert spec is not None and spec.loader is not None
-    theirs = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(theirs)
+    theirs = loaded(file)
     heads, past = 2, WINDOW - 1
     module = randomised(theirs.RelPartialLearnableMultiHeadAttn(WIDTH, heads))
     module.r_w_bias, module.r_r_bias = (nn.Parameter(torch.randn(heads, WIDTH // heads)) for _ in range(2))
@@ -145,6 +164,12 @@ def main() -> None:
         from neroRL.nn.recurrent import GRU, LSTM
         from neroRL.nn.transformer import Transformer
 
+        # The branch imports a function that it does not call from a module that needs the authors' environments.
+        unused = ModuleType("neroRL.utils.utils")
+        vars(unused)["batched_index_select"] = None
+        sys.modules |= {"neroRL.utils": ModuleType("neroRL.utils"), "neroRL.utils.utils": unused}
+        previous = loaded(Path(folder) / "previous/neroRL/nn/transformer.py").Transformer
+
         torch.manual_seed(1)
         cases = {
             "gru": recurrent(GRU, 1, False),
@@ -156,8 +181,10 @@ def main() -> None:
             "gtrxl, bias 0": transformer(Transformer, "absolute", 0.0),
             "gtrxl, bias 2": transformer(Transformer, "absolute", 2.0),
             "attention, relative": relative(Path(folder) / "relative/neroRL/nn/transformer.py"),
+            # What is now the absolute encoding has the name `relative` in that branch.
+            "gtrxl, previous": transformer(previous, "relative", 0.0, previous=True),
         }
-    commits = {"commit": COMMIT, "relative_commit": RELATIVE}
+    commits = {"commit": COMMIT, "relative_commit": RELATIVE, "previous_commit": PREVIOUS}
     data = json.dumps({"source": "MarcoMeter/neroRL", **commits, "cases": numbers(cases)})
     DATA.write_bytes(gzip.compress(data.encode(), mtime=0))
 

@@ -32,6 +32,8 @@ def ours(theirs: dict[str, Tensor]) -> dict[str, Tensor]:
             found["table"] = tensor
         elif name.startswith("linear_embedding.") or name.startswith("linear_transform."):
             found["embedding.0." + name.split(".")[1]] = tensor
+        elif name.startswith("fusion."):
+            found["fusion.0." + name.split(".")[1]] = tensor
         elif name.startswith("recurrent_layer."):
             found["recurrent." + name.split(".")[1]] = tensor
         else:
@@ -106,8 +108,9 @@ def test_transformer(name: str) -> None:
         width=memories.shape[-1],
         heads=2,
         window=WINDOW,
-        shared_heads=False,
-        positional_encoding="absolute" if kind.startswith("bias") else kind,  # type: ignore[arg-type]
+        shared_heads=kind == "previous",
+        positional_encoding=kind if kind in ("learned", "none") else "absolute",  # type: ignore[arg-type]
+        query_previous=kind == "previous",
         gating=recorded["gate_bias"] is not None,
     )
     memory = TransformerMemory(x.shape[1], given, LONGEST, CPU)
@@ -178,4 +181,4 @@ def test_relative_attention() -> None:
 def test_all_kinds_are_recorded() -> None:
     encodings = ["trxl, absolute", "trxl, learned", "trxl, none"]
     recurrent, gated = ["gru", "gru, two layers, residual", "lstm"], ["gtrxl, bias 0", "gtrxl, bias 2"]
-    assert list(RECORDED) == [*recurrent, *encodings, *gated, "attention, relative"]
+    assert list(RECORDED) == [*recurrent, *encodings, *gated, "attention, relative", "gtrxl, previous"]
