@@ -126,6 +126,11 @@ def test_labels_match_the_published_results(flags: str, expected: str) -> None:
     assert any(expected.replace("_learned", "_lr_learned") in curves for curves in published["curves"].values())
 
 
+def test_label_without_published_results() -> None:
+    assert label(parse(["--agent", "trxl", "--transformer.query-previous"])) == "trxl_qprev"
+    assert label(parse(["--agent", "gru", "--transformer.query-previous"])) == "gru"
+
+
 def test_runs_and_checkpoints_are_found(runs: Path) -> None:
     assert [run.name for run, _ in find((runs,), False)] == ["a", "b", "c"]
     assert [file.name for _, files in find((runs / "a",), False) for file in files] == [

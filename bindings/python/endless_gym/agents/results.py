@@ -114,6 +114,7 @@ def label(settings: Settings) -> str:
     additions = {
         "_gt": settings.ppo.ground_truth_coefficient,
         "_qpos": trxl and settings.transformer.query_encoding,
+        "_qprev": trxl and settings.transformer.query_previous,
         "_learned": trxl and settings.transformer.positional_encoding == "learned",
         "_relative": trxl and settings.transformer.positional_encoding == "relative",
         "_rec": settings.ppo.reconstruction_coefficient,
