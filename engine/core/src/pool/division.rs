@@ -51,6 +51,17 @@ impl<'a, E: Environment> EnvRange<'a, E> {
         if count < 2 || self.slots.len() < ENVS_FOR_THREADS {
             return work(self);
         }
+        self.for_each_piece_on(threads, count, work)
+    }
+
+    /// As [`for_each_piece`](Self::for_each_piece) with `count` threads. The shares take kilobytes of the stack.
+    #[inline(never)]
+    fn for_each_piece_on(
+        self,
+        threads: &Threads,
+        count: usize,
+        work: impl Fn(EnvRange<'_, E>) -> Result<(), WrongFrame> + Sync,
+    ) -> Result<(), WrongFrame> {
         let shares = Shares::new(self, count);
         let outcome = Mutex::new(Ok(()));
         threads.run(count - 1, &|thread| {
