@@ -36,6 +36,7 @@ from endless_gym.agents.graphs import Graphs, relative_difference
 from endless_gym.agents.ppo import learn, make_optimizer, minibatch_loss
 from endless_gym.agents.rollout import RolloutCollector, Segment
 from endless_gym.agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
+from endless_gym.agents.train import choose_device
 
 AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
 TOLERANCE = 1e-3
@@ -267,6 +268,9 @@ def main() -> int:
             "on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr
         )
         return 1
+    if cuda:
+        device = choose_device(args.device)
+        torch.cuda.set_device(device)
     versions = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}"
     name = torch.cuda.get_device_name(device) if cuda else f"the CPU ({platform.machine()}), as a test of the program"
     report: dict[str, Any] = {"device": name, "versions": versions}
