@@ -32,10 +32,11 @@ from endless_gym.agents.agent import Agent, make_agent
 from endless_gym.agents.clock import Clock
 from endless_gym.agents.encoders import FRAME
 from endless_gym.agents.environments import Environments
-from endless_gym.agents.graphs import Graphs
+from endless_gym.agents.graphs import Graphs, relative_difference
 from endless_gym.agents.ppo import learn, make_optimizer, minibatch_loss
 from endless_gym.agents.rollout import RolloutCollector, Segment
 from endless_gym.agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
+from endless_gym.agents.train import choose_device
 
 AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
 TOLERANCE = 1e-3
@@ -98,9 +99,7 @@ def equality(device: torch.device) -> list[dict[str, Any]]:
         there = Agent(networks(name), shapes, (3, 3), device=device)
         there.load_state_dict(here.state_dict())
         one, two = (computed(agent, torch.Generator().manual_seed(2)) for agent in (here, there))
-        largest, where = max(
-            (float((one[key] - two[key]).abs().max() / one[key].abs().max().clamp(min=1e-6)), key) for key in one
-        )
+        largest, where = max((relative_difference(one[key], two[key]), key) for key in one)
         rows.append({"agent": name, "largest_difference": largest, "of": where, "equal": largest <= TOLERANCE})
     return rows
 
@@ -166,7 +165,7 @@ def compared_rollouts(
         with_graphs = rollouts(settings, device, graphs, segments)
     refused = [str(warning.message) for warning in caught if issubclass(warning.category, RuntimeWarning)]
     difference = max(
-        float((one[name].double() - other[name].double()).abs().max() / one[name].double().abs().max().clamp(min=1e-6))
+        relative_difference(one[name], other[name])
         for (one, *_), (other, *_) in zip(without, with_graphs, strict=True)
         for name in one
     )
@@ -269,6 +268,9 @@ def main() -> int:
             "on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr
         )
         return 1
+    if cuda:
+        device = choose_device(args.device)
+        torch.cuda.set_device(device)
     versions = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}"
     name = torch.cuda.get_device_name(device) if cuda else f"the CPU ({platform.machine()}), as a test of the program"
     report: dict[str, Any] = {"device": name, "versions": versions}

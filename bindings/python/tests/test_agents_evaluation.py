@@ -17,7 +17,7 @@ from endless_gym.agents import protocol
 from endless_gym.agents.evaluate import evaluate
 from endless_gym.agents.metrics import metric, path_length, task_progress
 from endless_gym.agents.protocol import EvalArguments, evaluate_runs, find
-from endless_gym.agents.results import Experiment, Run, label, read, to_json
+from endless_gym.agents.results import Experiment, Experiments, Run, label, read, to_json
 from endless_gym.agents.train import parse, train
 from endless_gym.env import Env
 from endless_gym.specs import spec
@@ -165,6 +165,19 @@ def test_progress_callback_counts_every_episode(runs: Path) -> None:
     evaluate(agent, range(200_000, 200_004), 2, num_threads=1, ended=counts.append)
     assert sum(counts) == 8
     assert min(counts) > 0
+
+
+def test_runs_of_an_experiment_differ_only_in_what_does_not_affect_learning() -> None:
+    given, experiments = settings("gru", env=GRID, seed=1), Experiments()
+    apart = {"seed": 2, "run": "b", "preset": "paper", "device": "cuda", "threads": 3, "bind_cores": True, "view": True}
+    apart |= {"compile": True, "cuda_graphs": False, "on_engine_failure": "fail", "time_limit": 1.0, "wandb": True}
+    for name, value in apart.items():
+        assert getattr(given, name) != value
+        assert experiments.of(replace(given, **{name: value})) is experiments.of(given), name
+    environment = replace(given.environment, engine="process", num_threads=7)
+    assert experiments.of(replace(given, environment=environment)) is experiments.of(given)
+    for other in (replace(given, bf16=True), replace(given, agent="lstm"), replace(given, env="MortarMayhem-v0")):
+        assert experiments.of(other) is not experiments.of(given)
 
 
 def test_results_round_trip_through_json(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,9 +1,10 @@
 """CUDA graphs of the steps of a rollout, on the CPU with graphs that behave as CUDA's."""
 
 import copy
+import math
 import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -109,8 +110,7 @@ def make() -> Iterator[Callable[..., Run]]:
 
     yield run
     for environments in opened:
-        with closing(environments):
-            pass
+        environments.close()
 
 
 def equal(one: Any, other: Any) -> bool:
@@ -318,6 +318,15 @@ def test_parameters_that_move_are_captured_again(make: Callable[..., Run]) -> No
         for parameter in graphed.agent.parameters():
             parameter.data = parameter.data.clone()
     assert len(recorded.captures) == 2 * 2 * GROUPS
+
+
+def test_differences_are_relative_and_no_number_differs() -> None:
+    values = torch.tensor([1.0, -4.0])
+    assert graphs.relative_difference(values, torch.tensor([1.0, -5.0])) == 0.25
+    assert graphs.relative_difference(values.long(), values.long()) == graphs.relative_difference(2, 2) == 0.0
+    nan, infinite = torch.tensor([1.0, math.nan]), torch.tensor([1.0, math.inf])
+    for one, other in ((values, nan), (nan, values), (nan, nan), (values, infinite), (values.long(), -values.long())):
+        assert graphs.relative_difference(one, other) == math.inf
 
 
 def test_graphs_are_used_on_cuda_only() -> None:

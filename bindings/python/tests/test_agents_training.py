@@ -28,7 +28,7 @@ from endless_gym.agents.evaluate import evaluate, mean
 from endless_gym.agents.ppo import learn, make_optimizer
 from endless_gym.agents.rollout import RolloutCollector
 from endless_gym.agents.settings import PRESETS, Settings
-from endless_gym.agents.train import check_resumable, main, parse, restore_generator, train
+from endless_gym.agents.train import check_resumable, choose_device, main, parse, restore_generator, train
 
 pytestmark = pytest.mark.slow
 
@@ -242,6 +242,25 @@ def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
     board = EventAccumulator(str(run))
     board.Reload()
     assert [event.step for event in board.Scalars("steps")] == [1, 2]
+
+
+def test_a_gpu_has_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """`torch.cuda.set_device`, which training calls, refuses a device without one."""
+
+    def set_device(device: torch.device) -> None:
+        assert device.index == 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", set_device)
+    for name in ("auto", "cuda", "cuda:0"):
+        assert choose_device(name) == torch.device("cuda", 0)
+        with pytest.raises(KeyboardInterrupt):
+            train(replace(small("gru", tmp_path / "run"), device=name))
+    assert choose_device("cuda:1") == torch.device("cuda", 1)
+    with pytest.raises(ValueError, match="the index must be 0 to 1"):
+        choose_device("cuda:2")
 
 
 def test_generator_state_of_another_device_is_replaced_by_a_seed() -> None:

@@ -5,7 +5,7 @@ outlive the step, and what differs between steps, the number of the step in its 
 
 `FixedMemory` computes what `Memory.step` and `Memory.update_state` compute, in this way. Its tensors are those of the memory's
 state, and what the state keeps on the host goes on as well: at the end of each step, the state is as `Memory.update_state` leaves
-it, and the one can follow the other.
+it. So a step of either kind can follow a step of the other.
 """
 
 from __future__ import annotations

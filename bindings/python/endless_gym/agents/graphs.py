@@ -29,8 +29,8 @@ from endless_gym.agents.encoders import FRAME, Observation
 from endless_gym.agents.fixed import fixed_memory
 from endless_gym.agents.settings import Settings
 
-#: Steps of the comparison with the operations without graphs. After the first step the ring of the Transformer-XL's cache is at
-#: its begin again.
+#: Steps of the comparison with the operations without graphs. After the first step the ring of the Transformer-XL's cache goes on
+#: at its first slot.
 COMPARED_STEPS = 3
 #: Largest difference that is taken for rounding, relative to the largest absolute value of a tensor. The graphs call the same
 #: kernels, so that no difference is expected.
@@ -279,8 +279,7 @@ class GraphedGroup:
             }
             for name, one, other in paired(expected, found):
                 difference = relative_difference(one, other)
-                # False for NaN, too.
-                if not difference <= TOLERANCE:
+                if difference > TOLERANCE:
                     raise ValueError(f"in step {step}, {name} differs by {difference:.1e}")
 
     def _addresses(self) -> list[int]:
@@ -297,9 +296,13 @@ def paired(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any
 
 
 def relative_difference(one: Any, other: Any) -> float:
-    """The largest difference of two tensors, relative to the largest value of the first; infinite for different integers."""
+    """The largest difference of two tensors, relative to the largest value of the first.
+
+    Infinite for different integers, and where one of them is NaN or infinite.
+    """
     if not torch.is_tensor(one):
         return 0.0 if one == other else math.inf
     if not one.is_floating_point():
         return 0.0 if torch.equal(one, other) else math.inf
-    return float((one - other).abs().max() / one.abs().max().clamp(min=1e-6))
+    difference = float((one - other).abs().max() / one.abs().max().clamp(min=1e-6))
+    return difference if math.isfinite(difference) else math.inf

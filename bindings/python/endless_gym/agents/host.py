@@ -34,7 +34,8 @@ class HostCopy:
         """Begin to copy `tensor`; on CUDA, later operations on the same stream do not delay the copy."""
         self._tensor.copy_(tensor, non_blocking=True)
         if self._done is not None:
-            self._done.record()
+            # Of the tensor's device, which need not be the current one.
+            self._done.record(torch.cuda.current_stream(tensor.device))
 
     def wait(self) -> None:
         """Wait until the copy is complete."""

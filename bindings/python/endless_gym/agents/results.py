@@ -21,13 +21,17 @@ _PER_RUN = (
     "resume",
     "device",
     "threads",
+    "bind_cores",
     "compile",
+    "cuda_graphs",
     "checkpoint_interval",
     "keep_checkpoints",
+    "on_engine_failure",
     "time_limit",
     "target_reward",
     "stop_when_learnt",
     "wandb",
+    "view",
 )
 
 

@@ -307,7 +307,7 @@ def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int
 def choose_device(name: str, ranks: Ranks | None = None) -> torch.device:
     """The device with the name `cpu`, `cuda` or `cuda:INDEX`, or for `auto` CUDA if available, else the CPU.
 
-    Each of several ranks on a machine has a GPU of its own.
+    A CUDA device has an index, which is 0 unless the name has another. Each of several ranks on a machine has a GPU of its own.
 
     Raises:
         ValueError: The name is invalid, or the device is not available.
@@ -323,9 +323,11 @@ def choose_device(name: str, ranks: Ranks | None = None) -> torch.device:
             if device.index is not None:
                 raise ValueError(f"--device must be auto, cpu or cuda with several ranks on a machine, got `{name}`")
             device = torch.device("cuda", ranks.local_rank)
+        # `torch.cuda.set_device` refuses a device without an index.
+        device = torch.device("cuda", device.index or 0)
         if not torch.cuda.is_available():
             raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; use cpu or auto")
-        if (device.index or 0) >= torch.cuda.device_count():
+        if device.index >= torch.cuda.device_count():
             raise ValueError(f"device `{name}`: the index must be 0 to {torch.cuda.device_count() - 1}")
     return device
 

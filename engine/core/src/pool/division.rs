@@ -115,6 +115,8 @@ struct Shares<'a, E: Environment> {
 struct Group<'a, E: Environment> {
     /// Empty until the group is divided, and only set under the lock of `undivided`. The last group may have fewer shares.
     shares: OnceLock<[Share<'a, E>; SHARES_IN_GROUP]>,
+    /// Whether `shares` is set. Together with `undivided` in place of [`OnceLock::get_or_init`], which loom does not know: one of
+    /// its threads would block all of them there.
     is_divided: AtomicBool,
     undivided: Mutex<Option<EnvRange<'a, E>>>,
 }

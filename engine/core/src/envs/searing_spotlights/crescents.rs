@@ -25,8 +25,8 @@ struct Block {
 /// The pixels that change when a circle moves.
 #[derive(Debug)]
 pub(super) struct Crescents {
-    /// Relative to the centre before the move: the pixels that the circle leaves, and then those that it enters. Around the circle, so
-    /// that an edge of the screen cuts off few runs of them.
+    /// Relative to the centre before the move: the pixels that the circle leaves, and then those that it enters. Each in the order of
+    /// their directions from the centre, so that those off the screen are few runs, and the branch on them is mostly predicted.
     blocks: SmallVec<[Block; 1]>,
     /// Number of pixels that the circle leaves.
     left: usize,
@@ -144,7 +144,8 @@ impl Block {
         let mut offsets = [0; LANES];
         for (lane, offset) in offsets.iter_mut().enumerate() {
             let (x, y) = (from.x + i16::from(self.x[lane]), from.y + i16::from(self.y[lane]));
-            // Columns to the left of the screen wrap around to offsets beyond those of any column to the right of it.
+            // Columns off the screen have offsets behind the last pixel; those to its left wrap around. That holds from -176 to 259,
+            // and a circle that is partly on the screen changes pixels from -50 to 133 only.
             *offset = (x as u16).wrapping_mul(3 * SCREEN as u16).wrapping_add((y as u16).wrapping_mul(3));
             let is_visible = (y as u16).wrapping_sub(BAR_HEIGHT as u16) < HEIGHT;
             *offset |= if is_visible { 0 } else { u16::MAX };
@@ -207,9 +208,12 @@ mod tests {
     #[test]
     fn moves_are_painted_as_two_frames_differ() {
         let (dark, lit, unknown) = ([1; FRAME_BYTES], [2; FRAME_BYTES], [0; FRAME_BYTES]);
+        // The last two are as far off the screen as a circle that is partly on it can be.
+        let (first, last) = (1 - MAX_MOVED_RADIUS, SCREEN as i16 + MAX_MOVED_RADIUS - 1);
         let centres = [(40, 40), (-3, 30), (SCREEN as i16 + 2, 61), (50, -1), (20, SCREEN as i16 - 2), (2, 5)];
+        let centres = centres.into_iter().chain([(first, BAR_HEIGHT as i16), (last, SCREEN as i16 - 1)]);
         for radius in [1, 7, MAX_MOVED_RADIUS] {
-            for (x, y) in centres {
+            for (x, y) in centres.clone() {
                 // Of all sizes, one with the least radius that has no limit, overlapping, apart, and at the edge.
                 let others =
                     [circle(x + 9, y - 4, 11), circle(x - 30, y, 25), circle(x, y + 200, 200), circle(x, y, 3)];
