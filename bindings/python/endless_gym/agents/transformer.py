@@ -325,7 +325,7 @@ class ActingBlock:
         refill((self.queries, *self.fc_out, *self.fc), (other.queries, *other.fc_out, *other.fc))
 
     def __call__(
-        self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, encoded: Tensor | None
+        self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor | None, encoded: Tensor | None
     ) -> Tensor:
         """The block's output, float (n, width).
 
@@ -334,7 +334,7 @@ class ActingBlock:
             keys: float (n, heads, tokens, head size).
             values: float (n, heads, tokens, head size).
             bias: Attention mask, float (n, 1, 1, tokens); 0 or `MASKED`.
-            first: Whether the query attends to no token, bool (n, 1).
+            first: Whether the query attends to no token, bool (n, 1); None if all attend to some.
             encoded: Projected encodings of the distances of the tokens, float (heads, tokens, head size); None without relative
                 encoding.
         """
@@ -345,7 +345,9 @@ class ActingBlock:
             bias = torch.add(bias, (queries + self.distance_bias) @ encoded.transpose(-2, -1), alpha=self.scale)
             queries = queries + self.content_bias
         summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
-        summed = summed.transpose(1, 2).reshape(x.shape).masked_fill_(first, 0.0)
+        summed = summed.transpose(1, 2).reshape(x.shape)
+        if first is not None:
+            summed = summed.masked_fill(first, 0.0)
         attended = torch.addmm(self.fc_out[0], summed, self.fc_out[1])
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
         added = linear_relu(functional.layer_norm(x, *self.norm_fc), self.fc)
@@ -499,22 +501,26 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         self._dtype, self._generation = dtype, self._generation + 1
         self.acting_blocks = [ActingBlock(block, dtype) for block in self.blocks]
 
-    def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor) -> tuple[Tensor, TransformerUpdate]:
+    def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor | None) -> tuple[Tensor, TransformerUpdate]:
         cache = self.cache(state)
-        position = state.next_position.masked_fill(reset_mask, 0)
+        position = state.next_position
+        if reset_mask is not None:
+            position = position.masked_fill(reset_mask, 0)
         start, length = 0, cache.slots
         if self.spans:
             start, length = cache.span(min(self.past, max(1, int(position.numpy().max()))))
         ages = slice(self.settings.window - cache.slot + start, self.settings.window - cache.slot + start + length)
         distances = None if cache.distances is None else [encoded[:, ages] for encoded in cache.distances]
         slots = cache.keys_and_values(start, length)
-        return self.step_with(self.acting_blocks, x, position, self.ages[ages], slots, distances)
+        starts = None if reset_mask is None else reset_mask.unsqueeze(-1)
+        return self.step_with(self.acting_blocks, x, position, starts, self.ages[ages], slots, distances)
 
     def step_with(
         self,
         blocks: Sequence[ActingBlock],
         x: Tensor,
         position: Tensor,
+        first: Tensor | None,
         ages: Tensor,
         slots: tuple[Sequence[Tensor], Sequence[Tensor]],
         distances: Sequence[Tensor] | None,
@@ -525,6 +531,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             blocks: The blocks for acting.
             x: As for `step`.
             position: Position of the current step in its episode, int64 (n,).
+            first: Whether the step is the first of its episode, bool (n, 1); None if none is.
             ages: Ages of the slots, int64 (tokens,).
             slots: Keys and values of each block, float (n, heads, tokens, head size).
             distances: Projected encodings of the ages for each block, float (heads, tokens, head size); None without relative
@@ -532,7 +539,6 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         """
         attends = ages <= position.unsqueeze(-1)
         bias = torch.where(attends, self._attended, self._masked)[:, None, None].to(self._dtype)
-        first = (position == 0).unsqueeze(-1)
         keys, values = slots
         encoding = self._encoding(position) if self.settings.query_encoding else None
         inputs = []
