@@ -87,8 +87,8 @@ class ActingWeights:
 
     def logits(self, outputs: Tensor) -> Tensor:
         """The logits, float32 (..., branches, choices), a view of what `heads` returned, float32 (..., outputs)."""
-        logits: Tensor = outputs[..., :-1].unflatten(-1, (self.branches, self.choices))
-        return logits
+        logits = outputs.narrow(-1, 0, self.branches * self.choices)
+        return logits.view(*outputs.shape[:-1], self.branches, self.choices)
 
     def log_prob(self, outputs: Tensor, actions: Tensor) -> Tensor:
         """Log-probabilities of actions int64 (..., branches), float32 (..., branches)."""

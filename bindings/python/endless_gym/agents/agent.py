@@ -297,7 +297,9 @@ class Agent(nn.Module):
         """
 
         def step(x: Tensor) -> tuple[Tensor, Any]:
-            return self.memory.step(x, memory.state, memory.reset_mask)
+            return self.memory.step(
+                x, memory.state, None if memory.reset_mask is memory.no_reset else memory.reset_mask
+            )
 
         return self.decide_with(self.acting_weights(), step, observed, noise, embedded)
 

@@ -122,7 +122,7 @@ class FixedTransformer(FixedMemory[TransformerMemory, TransformerState]):
         if cache.distances is not None:
             distances = [encoded.index_select(1, chosen) for encoded in cache.distances]
         slots = cache.keys_and_values(0, cache.slots)
-        return memory.step_with(self._blocks, x, position, ages, slots, distances)
+        return memory.step_with(self._blocks, x, position, reset_mask.unsqueeze(-1), ages, slots, distances)
 
     def update(self, update: TransformerUpdate, step: Tensor) -> None:
         assert self._cache is not None

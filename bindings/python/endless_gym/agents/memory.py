@@ -82,13 +82,13 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         """Prepare the weights for `step`, to compute in `dtype`; called first, and when the weights have changed."""
 
     @abstractmethod
-    def step(self, x: Tensor, state: StateT, reset_mask: Tensor) -> tuple[Tensor, UpdateT]:
+    def step(self, x: Tensor, state: StateT, reset_mask: Tensor | None) -> tuple[Tensor, UpdateT]:
         """Compute the output of one step without changing the state.
 
         Args:
             x: Encoded and embedded observations, float (n, input width).
             state: State of the same n environments.
-            reset_mask: Whether the observation is the first of an episode, bool (n,).
+            reset_mask: Whether the observation is the first of an episode, bool (n,); None if none is, as in most steps.
 
         Returns:
             The output, float (n, width), and the update for `update_state`.
@@ -213,7 +213,7 @@ class NoMemory(Memory[NoState, None, Minibatch]):
     def begin_segment(self, state: NoState, steps: int) -> None:
         del state, steps
 
-    def step(self, x: Tensor, state: NoState, reset_mask: Tensor) -> tuple[Tensor, None]:
+    def step(self, x: Tensor, state: NoState, reset_mask: Tensor | None) -> tuple[Tensor, None]:
         del state, reset_mask
         return x, None
 

@@ -113,8 +113,10 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         del dtype  # The recurrent layers compute in float32.
         self._cells = [[weight.detach() for weight in layer] for layer in self.recurrent.all_weights]
 
-    def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor) -> tuple[Tensor, Tensor]:
-        hidden = state.hidden.masked_fill(reset_mask.unsqueeze(-1), 0.0)
+    def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        hidden = state.hidden
+        if reset_mask is not None:
+            hidden = hidden.masked_fill(reset_mask.unsqueeze(-1), 0.0)
         x = x.float()
         y = x
         after: list[tuple[Tensor, ...]] = []
@@ -127,7 +129,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
                     after.append(torch.lstm_cell(y, parts, *cell))
                     y = after[-1][0]
         if len(after) == 1 and self.parts == 1:
-            next_hidden = y[None, None]
+            next_hidden = y.view(1, 1, *y.shape)
         else:
             next_hidden = torch.stack([torch.stack(part) for part in zip(*after, strict=True)])
         return y + x if self.settings.residual else y, next_hidden

@@ -330,7 +330,8 @@ class RolloutCollector:
         self._outcomes[group].copy_to(outcome, result.reward, result.done)
         # The graphs read the outcome itself.
         if self._graphs is None or step == self.steps - 1:
-            self.memories[group].reset_mask = outcome[1].bool()
+            memory = self.memories[group]
+            memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
         return result.episodes
 
     @torch.no_grad()

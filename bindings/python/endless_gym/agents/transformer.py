@@ -76,17 +76,18 @@ def normalised(tokens: Tensor) -> Tensor:
     return functional.layer_norm(tokens, tokens.shape[-1:])
 
 
-def fused(x: Tensor, previous: Tensor, first: Tensor, layer: Affine) -> Tensor:
+def fused(x: Tensor, previous: Tensor, first: Tensor | None, layer: Affine) -> Tensor:
     """The first block's input in a step of acting with `Transformer.query_previous`, float (n, width).
 
     Args:
         x: Embedded observations, float (n, width).
         previous: The last block's input at the previous step, float32 (n, width).
-        first: Whether the step is the first of an episode, bool (n,).
+        first: Whether the step is the first of an episode, bool (n,); None if none is.
         layer: The layer, for inputs of twice the width.
     """
-    previous = previous.masked_fill(first.unsqueeze(-1), 0.0).to(x.dtype)
-    return linear_relu(torch.cat([x, previous], dim=-1), layer)
+    if first is not None:
+        previous = previous.masked_fill(first.unsqueeze(-1), 0.0)
+    return linear_relu(torch.cat([x, previous.to(x.dtype)], dim=-1), layer)
 
 
 @dataclass
@@ -347,7 +348,7 @@ class ActingBlock:
         refill((self.queries, *self.fc_out, *self.fc), (other.queries, *other.fc_out, *other.fc))
 
     def __call__(
-        self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor, encoded: Tensor | None
+        self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor | None, encoded: Tensor | None
     ) -> Tensor:
         """The block's output, float (n, width).
 
@@ -356,7 +357,7 @@ class ActingBlock:
             keys: float (n, heads, tokens, head size).
             values: float (n, heads, tokens, head size).
             bias: Attention mask, float (n, 1, 1, tokens); 0 or `MASKED`.
-            first: Whether the query attends to no token, bool (n, 1).
+            first: Whether the query attends to no token, bool (n, 1); None if all attend to some.
             encoded: Projected encodings of the distances of the tokens, float (heads, tokens, head size); None without relative
                 encoding.
         """
@@ -367,7 +368,9 @@ class ActingBlock:
             bias = torch.add(bias, (queries + self.distance_bias) @ encoded.transpose(-2, -1), alpha=self.scale)
             queries = queries + self.content_bias
         summed = functional.scaled_dot_product_attention(queries, keys, values, bias, scale=self.scale)
-        summed = summed.transpose(1, 2).reshape(x.shape).masked_fill_(first, 0.0)
+        summed = summed.transpose(1, 2).reshape(x.shape)
+        if first is not None:
+            summed = summed.masked_fill(first, 0.0)
         attended = torch.addmm(self.fc_out[0], summed, self.fc_out[1])
         x = x + attended if self.gate_attention is None else self.gate_attention(x, attended)
         added = linear_relu(functional.layer_norm(x, *self.norm_fc), self.fc)
@@ -534,9 +537,11 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         self.acting_blocks = [ActingBlock(block, dtype) for block in self.blocks]
         self.acting_fusion = None if self.fusion is None else transposed(self.fusion[0], dtype)
 
-    def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor) -> tuple[Tensor, TransformerUpdate]:
+    def step(self, x: Tensor, state: TransformerState, reset_mask: Tensor | None) -> tuple[Tensor, TransformerUpdate]:
         cache = self.cache(state)
-        position = state.next_position.masked_fill(reset_mask, 0)
+        position = state.next_position
+        if reset_mask is not None:
+            position = position.masked_fill(reset_mask, 0)
         if self.acting_fusion is not None:
             x = fused(x, state.inputs[-1].select(1, state.fill - 1), reset_mask, self.acting_fusion)
         start, length = 0, cache.slots
@@ -545,13 +550,15 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         ages = slice(self.settings.window - cache.slot + start, self.settings.window - cache.slot + start + length)
         distances = None if cache.distances is None else [encoded[:, ages] for encoded in cache.distances]
         slots = cache.keys_and_values(start, length)
-        return self.step_with(self.acting_blocks, x, position, self.ages[ages], slots, distances)
+        starts = None if reset_mask is None else reset_mask.unsqueeze(-1)
+        return self.step_with(self.acting_blocks, x, position, starts, self.ages[ages], slots, distances)
 
     def step_with(
         self,
         blocks: Sequence[ActingBlock],
         x: Tensor,
         position: Tensor,
+        first: Tensor | None,
         ages: Tensor,
         slots: tuple[Sequence[Tensor], Sequence[Tensor]],
         distances: Sequence[Tensor] | None,
@@ -562,6 +569,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             blocks: The blocks for acting.
             x: The first block's input, float (n, width).
             position: Position of the current step in its episode, int64 (n,).
+            first: Whether the step is the first of its episode, bool (n, 1); None if none is.
             ages: Ages of the slots, int64 (tokens,).
             slots: Keys and values of each block, float (n, heads, tokens, head size).
             distances: Projected encodings of the ages for each block, float (heads, tokens, head size); None without relative
@@ -569,7 +577,6 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         """
         attends = ages <= position.unsqueeze(-1)
         bias = torch.where(attends, self._attended, self._masked)[:, None, None].to(self._dtype)
-        first = (position == 0).unsqueeze(-1)
         keys, values = slots
         encoding = self._encoding(position) if self.settings.query_encoding else None
         inputs = []
