@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn circles_reach_what_they_light() {
         for radius in 0..=MAX_SPOT_RADIUS {
-            let (circle, disc) = (Circle { x: 0, y: 0, radius: radius as i16 }, &Shape::of(radius as i16).disc);
+            let (circle, disc) = (Circle { x: 0, y: 0, radius: radius as i16 }, &Shape::of(radius as i16).extent.disc);
             for (x, y) in (-radius..radius).flat_map(|x| (-radius..radius).map(move |y| (x, y))) {
                 let pixel = Rect::new(x, y, 1, 1);
                 assert!(circle.reaches(&pixel) || !disc.contains((x, y)), "radius {radius}: {x}, {y}");

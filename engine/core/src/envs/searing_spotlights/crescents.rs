@@ -4,7 +4,7 @@ use smallvec::SmallVec;
 
 use super::circle::Circle;
 use super::config::BAR_HEIGHT;
-use super::shape::Shape;
+use super::extent::{Extent, distance};
 use crate::envs::screen::{FRAME_BYTES, Frame, SCREEN};
 use crate::raster::{Disc, Rect};
 
@@ -80,10 +80,10 @@ impl Crescents {
     ///
     /// Left pixels that are lit by none of `others` are copied from the frame `dark`, all others from `lit`.
     #[inline]
-    pub fn paint(
+    pub fn paint<'a>(
         &self,
         from: &Circle,
-        others: impl Iterator<Item = Circle> + Clone,
+        others: impl Iterator<Item = (Circle, &'a Extent)> + Clone,
         [dark, lit]: [&Frame; 2],
         frame: &mut Frame,
     ) {
@@ -91,12 +91,12 @@ impl Crescents {
             let first = number * LANES;
             let left = self.left.saturating_sub(first);
             let mut is_lit = from_number(left);
-            for other in others.clone() {
+            for (other, extent) in others.clone() {
                 // The circle itself lights what it enters. Most crescents have fewer pixels than half a block.
                 if left <= LANES / 2 {
-                    block.add_lit_by::<{ LANES / 2 }>(from, &other, &mut is_lit);
+                    block.add_lit_by::<{ LANES / 2 }>(from, &other, extent, &mut is_lit);
                 } else {
-                    block.add_lit_by::<LANES>(from, &other, &mut is_lit);
+                    block.add_lit_by::<LANES>(from, &other, extent, &mut is_lit);
                 }
             }
             let pixels = block.offsets(from);
@@ -155,32 +155,22 @@ impl Block {
 
     /// Sets those of the first `N` lanes whose pixels a circle lights to [`u16::MAX`].
     #[inline]
-    fn add_lit_by<const N: usize>(&self, from: &Circle, circle: &Circle, is_lit: &mut [u16; LANES]) {
-        let shape = Shape::of(circle.radius);
+    fn add_lit_by<const N: usize>(&self, from: &Circle, circle: &Circle, extent: &Extent, is_lit: &mut [u16; LANES]) {
         let (right, down) = (from.x - circle.x, from.y - circle.y);
         let pixels = self.x.iter().zip(&self.y).map(|(x, y)| (right + i16::from(*x), down + i16::from(*y)));
         let lanes = is_lit[..N].iter_mut().zip(pixels);
-        if let Some(limit) = shape.limit {
-            lanes.for_each(|(is_lit, (x, y))| *is_lit |= if circle_distance(x, y) < limit { u16::MAX } else { 0 });
+        if let Some(limit) = extent.limit {
+            lanes.for_each(|(is_lit, (x, y))| *is_lit |= if distance(x, y) < limit { u16::MAX } else { 0 });
         } else {
-            let is_inside = |x: i16, y: i16| shape.disc.contains((x.into(), y.into()));
+            let is_inside = |x: i16, y: i16| extent.disc.contains((x.into(), y.into()));
             lanes.for_each(|(is_lit, (x, y))| *is_lit |= if is_inside(x, y) { u16::MAX } else { 0 });
         }
     }
 }
 
-/// A measure of a pixel's distance from a circle's centre by which pixels of small circles can be told from others.
-#[inline]
-pub(super) fn circle_distance(x: i16, y: i16) -> u16 {
-    // Circles are symmetric: the column -1 is as far from the centre as the column 0. Limited so that squares fit into 16 bits.
-    let odd = |distance: i16| (2 * (distance ^ (distance >> 15)).min(126) + 3) as u16;
-    let (x, y) = (odd(x), odd(y));
-    (x * x).saturating_add(y * y)
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::shape::{MAX_MOVED_RADIUS, REACH};
+    use super::super::shape::{MAX_MOVED_RADIUS, REACH, Shape};
     use super::*;
 
     fn circle(x: i16, y: i16, radius: i16) -> Circle {
@@ -188,7 +178,7 @@ mod tests {
     }
 
     fn is_lit(circle: &Circle, (x, y): (i32, i32)) -> bool {
-        Shape::of(circle.radius).disc.contains((x - i32::from(circle.x), y - i32::from(circle.y)))
+        Shape::of(circle.radius).extent.disc.contains((x - i32::from(circle.x), y - i32::from(circle.y)))
     }
 
     #[test]
@@ -222,7 +212,8 @@ mod tests {
                     for others in [&others[..0], &others[..1], &others] {
                         let mut frame = unknown;
                         let crescents = Shape::of(radius).crescents((right, down));
-                        crescents.paint(&from, others.iter().copied(), [&dark, &lit], &mut frame);
+                        let lit_by = others.iter().map(|other| (*other, &Shape::of(other.radius).extent));
+                        crescents.paint(&from, lit_by, [&dark, &lit], &mut frame);
                         let mut noted: Vec<_> = crescents.on_screen(&from).collect();
                         noted.sort_unstable();
                         let mut painted = Vec::new();
@@ -240,19 +231,5 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn all_moved_circles_have_a_limit() {
-        for radius in 1..=MAX_MOVED_RADIUS {
-            let shape = Shape::of(radius);
-            let limit = shape.limit.unwrap();
-            let distances = (-60..60).chain([-8000, -182, 150, 8000]);
-            for (x, y) in distances.clone().flat_map(|x| distances.clone().map(move |y| (x, y))) {
-                let expected = shape.disc.contains((x.into(), y.into()));
-                assert_eq!(circle_distance(x, y) < limit, expected, "radius {radius}: {x}, {y}");
-            }
-        }
-        assert_eq!(Shape::of(MAX_MOVED_RADIUS + 1).limit, None);
     }
 }

@@ -159,7 +159,7 @@ impl Scene {
                         differ = true;
                         let circle = self.circles.get(circle);
                         let background = assets.lit.background(self.background);
-                        let disc = &Shape::of(circle.radius).disc;
+                        let disc = &Shape::of(circle.radius).extent.disc;
                         background.paint_disc(&mut canvas.clipped(bounds), disc, circle.centre());
                     }
                 });
@@ -177,7 +177,7 @@ impl Scene {
         self.for_each_object(assets, &assets.lit, Objects::ALL, |sprite, (x, y)| {
             for circle in self.circles.reaching(&sprite.bounds_at((x, y))) {
                 let circle = self.circles.get(circle);
-                sprite.blit_within(&mut canvas, x, y, &Shape::of(circle.radius).disc, circle.centre());
+                sprite.blit_within(&mut canvas, x, y, &Shape::of(circle.radius).extent.disc, circle.centre());
             }
         });
     }
@@ -236,9 +236,9 @@ impl Scene {
         let clip = Rect::new(columns.start as i32, rows.start as i32, columns.len() as i32, rows.len() as i32);
         for circle in self.circles.iter().filter(|circle| circle.reaches(&clip)) {
             let (shape, centre) = (Shape::of(circle.radius), circle.centre());
-            background.paint_disc(canvas, &shape.disc, centre);
+            background.paint_disc(canvas, &shape.extent.disc, centre);
             self.for_each_object(assets, &assets.lit, hidden, |sprite, (x, y)| {
-                sprite.blit_within(canvas, x, y, &shape.disc, centre);
+                sprite.blit_within(canvas, x, y, &shape.extent.disc, centre);
             });
             if self.outlined {
                 shape.draw_outline(canvas, centre, self.darkness);

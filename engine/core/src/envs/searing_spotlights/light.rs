@@ -134,7 +134,11 @@ impl<'a> LightChange<'a> {
         for (number, from, to) in self.moved() {
             let crescents = crescents(&from, &to);
             let others = self.scene.circles.reaching(&crescents.bounds_of_left(&from)).without(number);
-            crescents.paint(&from, others.map(|other| self.scene.circles.get(other)), [dark, lit], frame);
+            let others = others.map(|other| {
+                let other = self.scene.circles.get(other);
+                (other, &Shape::of(other.radius).extent)
+            });
+            crescents.paint(&from, others, [dark, lit], frame);
         }
         for replaced in &self.replaced {
             match replaced {
@@ -143,7 +147,7 @@ impl<'a> LightChange<'a> {
                     for_each_run(circle, |x, rows| copy_rows(x, rows, dark, frame));
                     for other in self.scene.circles.reaching(&circle.bounds()) {
                         let other = self.scene.circles.get(other);
-                        let disc = &Shape::of(other.radius).disc;
+                        let disc = &Shape::of(other.radius).extent.disc;
                         for_each_run(circle, |x, rows| copy_rows(x, disc.rows(other.centre(), x, &rows), lit, frame));
                     }
                 }
@@ -189,7 +193,7 @@ fn crescents(from: &Circle, to: &Circle) -> &'static Crescents {
 /// Calls `paint` with each column that a circle covers, and its rows there.
 #[inline]
 fn for_each_run(circle: &Circle, mut paint: impl FnMut(usize, Range<usize>)) {
-    let columns = Shape::of(circle.radius).disc.columns(circle.centre(), &COLUMNS, BAR_HEIGHT..SCREEN);
+    let columns = Shape::of(circle.radius).extent.disc.columns(circle.centre(), &COLUMNS, BAR_HEIGHT..SCREEN);
     columns.for_each(|DiscColumn { x, rows }| paint(x, rows));
 }
 

@@ -33,7 +33,7 @@ impl LightSpans {
     pub fn add(&mut self, circle: &Circle) {
         let shape = Shape::of(circle.radius);
         if circle.radius > MAX_MOVED_RADIUS {
-            for DiscColumn { x, rows } in shape.disc.columns(circle.centre(), &(0..SCREEN), 0..SCREEN) {
+            for DiscColumn { x, rows } in shape.extent.disc.columns(circle.centre(), &(0..SCREEN), 0..SCREEN) {
                 let (above, below) = (&mut self.above[BESIDE + x], &mut self.below[BESIDE + x]);
                 *above = (*above).min(BIAS as u8 + rows.start as u8);
                 *below = (*below).min(BIAS as u8 + (SCREEN - rows.end) as u8);
@@ -88,7 +88,7 @@ mod tests {
                 let (firsts, ends) = spans.on_screen();
                 let mut expected = [0..0; 0].to_vec();
                 expected.resize(SCREEN, 0..0);
-                let disc = &Shape::of(radius).disc;
+                let disc = &Shape::of(radius).extent.disc;
                 for DiscColumn { x, rows } in disc.columns((x.into(), y.into()), &(0..SCREEN), BAR_HEIGHT..SCREEN) {
                     expected[x] = rows;
                 }

@@ -33,6 +33,7 @@ mod config;
 mod crescents;
 mod drawing;
 pub mod expert;
+mod extent;
 mod features;
 mod light;
 mod light_spans;

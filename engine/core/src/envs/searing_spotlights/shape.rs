@@ -2,9 +2,10 @@
 
 use std::sync::OnceLock;
 
-use super::crescents::{Crescents, circle_distance};
+use super::crescents::Crescents;
+use super::extent::Extent;
 use super::parameters::MAX_SPOT_RADIUS;
-use crate::raster::{Canvas, Disc, blend_keyed, circle_outline};
+use crate::raster::{Canvas, blend_keyed, circle_outline};
 
 /// Longest move along each axis whose crescents are precomputed, in pixels.
 pub(super) const REACH: i16 = 3;
@@ -18,14 +19,11 @@ pub(super) const MAX_MOVED_RADIUS: i16 = 24;
 /// The shape of all circles of one radius.
 #[derive(Debug)]
 pub(super) struct Shape {
-    pub disc: Disc,
+    pub extent: Extent,
     /// How far the disc's column of that number begins below the top of a disc of [`MAX_MOVED_RADIUS`] about the same centre, and
     /// ends above its bottom; [`u8::MAX`] for a column without a pixel.
     pub margins: [u8; 2 * MAX_MOVED_RADIUS as usize],
     outline: Vec<(i32, i32)>,
-    /// What [`circle_distance`] is less than for the pixels of the disc alone; `None` for the larger discs, where there is no such
-    /// number.
-    pub limit: Option<u16>,
     /// By the move along both axes.
     crescents: Vec<Crescents>,
 }
@@ -44,13 +42,14 @@ impl Shape {
     }
 
     fn new(radius: i32) -> Self {
-        let disc = Disc::new(radius);
+        let extent = Extent::new(radius);
+        let disc = &extent.disc;
         let reach = -i32::from(REACH)..=i32::from(REACH);
         let moves = reach.clone().flat_map(|x| reach.clone().map(move |y| (x, y)));
         let crescents = if radius > MAX_MOVED_RADIUS.into() {
             Vec::new()
         } else {
-            moves.map(|to| Crescents::new(&disc, to)).collect()
+            moves.map(|to| Crescents::new(disc, to)).collect()
         };
         let mut margins = [u8::MAX; 2 * MAX_MOVED_RADIUS as usize];
         if !crescents.is_empty() {
@@ -58,7 +57,7 @@ impl Shape {
                 *margin = (i32::from(MAX_MOVED_RADIUS) - disc.half_height(x.into())) as u8;
             }
         }
-        Shape { limit: limit(&disc), disc, margins, outline: circle_outline(radius), crescents }
+        Shape { extent, margins, outline: circle_outline(radius), crescents }
     }
 
     /// Whether the crescent of a move is precomputed.
@@ -85,18 +84,6 @@ impl Shape {
             }
         }
     }
-}
-
-/// The least [`circle_distance`] of a pixel outside of a disc, if all pixels of the disc are nearer.
-fn limit(disc: &Disc) -> Option<u16> {
-    let radius = disc.radius() as i16;
-    if radius > MAX_MOVED_RADIUS {
-        return None;
-    }
-    let quarter = (0..=radius).flat_map(|x| (0..=radius).map(move |y| (x, y)));
-    let (inside, outside): (Vec<_>, Vec<_>) = quarter.partition(|(x, y)| disc.contains(((*x).into(), (*y).into())));
-    let limit = outside.iter().map(|(x, y)| circle_distance(*x, *y)).min()?;
-    inside.iter().all(|(x, y)| circle_distance(*x, *y) < limit).then_some(limit)
 }
 
 #[cfg(test)]
