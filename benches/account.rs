@@ -4,7 +4,7 @@
 //! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
 //!
 //! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--caches` simulates caches and the
-//! translation of addresses; `--memory` measures the memory.
+//! translation of addresses; `--memory` measures the memory; `--on-request` steps for `benches/compare_builds.py`.
 
 mod actions;
 
@@ -237,6 +237,22 @@ fn count<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant, 
     counted(&mut step, COUNTED_STEPS);
 }
 
+/// Reads a number of steps from each line of the standard input, takes them, and prints the processor time of an environment's step in
+/// nanoseconds.
+fn on_request(spec: &'static EnvSpec, num_envs: usize) {
+    let mut step = pool_step(spec, num_envs, false);
+    for line in std::io::stdin().lines() {
+        let steps: usize = line.unwrap().parse().unwrap();
+        // Its memory returns to the caches.
+        step();
+        let start = processor_time();
+        for _ in 0..steps {
+            step();
+        }
+        println!("{}", (processor_time() - start) / (steps * num_envs) as f64);
+    }
+}
+
 #[inline(never)]
 fn counted(step: &mut dyn FnMut(), steps: usize) {
     for _ in 0..steps {
@@ -455,6 +471,9 @@ fn main() {
     if let ["--touch", id, num_envs, steps] = arguments[..] {
         let mut step = pool_step(envs::spec(id).unwrap(), num_envs.parse().unwrap(), false);
         return counted(&mut step, steps.parse().unwrap());
+    }
+    if let ["--on-request", id, num_envs] = arguments[..] {
+        return on_request(envs::spec(id).unwrap(), num_envs.parse().unwrap());
     }
     if arguments == ["--memory"] {
         return memory_speed();
