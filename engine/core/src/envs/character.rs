@@ -2,6 +2,8 @@
 //!
 //! Source: the original's `character_controller.py`.
 
+use std::f64::consts::SQRT_2;
+
 use serde::{Deserialize, Serialize};
 
 /// Pixels by which a picture is wider than body and hands.
@@ -62,23 +64,16 @@ impl Character {
     }
 
     /// Turns in the direction of the action, and returns it as a unit vector; (0, 0) for no movement, which turns
-    /// nothing.
+    /// nothing. Without a branch, since random actions could not be predicted.
     fn turn(&mut self, action: &[i32]) -> [f64; 2] {
-        let towards = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
-        let (x, y): (f64, f64) = (towards(action[0]), towards(action[1]));
-        self.rotation = match (action[0], action[1]) {
-            (0, 1) => 0,
-            (1, 1) => 45,
-            (1, 0) => 90,
-            (1, 2) => 135,
-            (0, 2) => 180,
-            (2, 2) => 225,
-            (2, 0) => 270,
-            (2, 1) => 315,
-            _ => return [0.0, 0.0],
-        };
-        let length = (x * x + y * y).sqrt();
-        [x / length, y / length]
+        const TOWARDS: [f64; 3] = [0.0, -1.0, 1.0];
+        // By the branches of the action. The first is not used.
+        const ROTATIONS: [[i32; 3]; 3] = [[0, 0, 180], [90, 45, 135], [270, 315, 225]];
+        let (x, y) = (action[0] as usize, action[1] as usize);
+        let rotation = ROTATIONS[x][y];
+        self.rotation = if x + y == 0 { self.rotation } else { rotation };
+        let length = [1.0, SQRT_2][usize::from(x * y != 0)];
+        [TOWARDS[x] / length, TOWARDS[y] / length]
     }
 
     /// Moves by `speed` pixels, truncated to whole pixels on each axis, and returns the movement.
@@ -145,6 +140,30 @@ impl Character {
             225 => [diagonal, diagonal],
             270 => [1.0, 0.0],
             _ => [diagonal, -diagonal],
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_character_faces_the_way_that_it_moves() {
+        for (x, y) in (0..3).flat_map(|x| (0..3).map(move |y| (x, y))) {
+            let mut character = Character { rotation: 270, ..Character::default() };
+            let [right, down] = character.turn(&[x, y]);
+            let towards = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
+            let (expected_right, expected_down): (f64, f64) = (towards(x), towards(y));
+            if (x, y) == (0, 0) {
+                assert_eq!((right, down, character.rotation), (0.0, 0.0, 270));
+                continue;
+            }
+            let length = (expected_right * expected_right + expected_down * expected_down).sqrt();
+            assert_eq!((right, down), (expected_right / length, expected_down / length));
+            // Counterclockwise from up.
+            let degrees = (-expected_right).atan2(-expected_down).to_degrees().rem_euclid(360.0);
+            assert_eq!(f64::from(character.rotation), degrees.round(), "{x}, {y}");
         }
     }
 }
