@@ -34,7 +34,7 @@ impl<E: Environment> DrawnScene<E> {
     pub fn update(
         &mut self,
         assets: &Arc<E::Assets>,
-        scene: E::Scene,
+        mut scene: E::Scene,
         settings: DrawSettings,
         frame: &mut [u8],
     ) -> Result<(), WrongFrame> {
@@ -46,7 +46,7 @@ impl<E: Environment> DrawnScene<E> {
                 if settings.check {
                     compare::<E>(assets, Some(drawn), &scene, settings.format, frame)?;
                 }
-                *drawn = scene;
+                std::mem::swap(drawn, &mut scene);
             }
             drawn => {
                 draw_in_full::<E>(assets, &scene, settings.format, frame);

@@ -17,6 +17,28 @@ pub(super) struct Circle {
     pub radius: i16,
 }
 
+/// The edges of a rectangle, in pixels of the screen, limited to what circles are compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Edges {
+    pub left: i16,
+    pub top: i16,
+    pub right: i16,
+    pub bottom: i16,
+}
+
+impl From<&Rect> for Edges {
+    #[inline(always)]
+    fn from(rect: &Rect) -> Self {
+        let limited = |edge: i32| edge.clamp(i16::MIN.into(), i16::MAX.into()) as i16;
+        Edges {
+            left: limited(rect.x),
+            top: limited(rect.y),
+            right: limited(rect.x + rect.width),
+            bottom: limited(rect.y + rect.height),
+        }
+    }
+}
+
 impl Circle {
     /// Its centre in pixels.
     pub fn centre(&self) -> (i32, i32) {
@@ -24,14 +46,14 @@ impl Circle {
     }
 
     /// The smallest rectangle around it.
-    #[inline]
+    #[inline(always)]
     pub fn bounds(&self) -> Rect {
         let ((x, y), radius) = (self.centre(), i32::from(self.radius));
         Rect::new(x - radius, y - radius, 2 * radius, 2 * radius)
     }
 
     /// Whether a part of it may be visible: on the screen, and not only behind the bar at the top.
-    #[inline]
+    #[inline(always)]
     pub fn is_on_screen(&self) -> bool {
         let (low, high) = (-self.radius, SCREEN as i16 + self.radius);
         let is_within = |at: i16, low: i16| low < at && at < high;
@@ -40,7 +62,7 @@ impl Circle {
 
     /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius. Without a branch, since none
     /// could be predicted.
-    #[inline]
+    #[inline(always)]
     pub fn reaches(&self, rect: &Rect) -> bool {
         let radius = i32::from(self.radius);
         // The distance outside of the rectangle along one axis; one of `radius` is too far already.

@@ -3,9 +3,8 @@
 
 use smallvec::SmallVec;
 
-use super::circle::Circle;
+use super::circle::{Circle, Edges};
 use super::shape::{MAX_MOVED_RADIUS, REACH};
-use crate::raster::Rect;
 
 /// Circles of a block.
 const LANES: usize = 8;
@@ -21,7 +20,7 @@ struct Block {
 }
 
 impl Block {
-    #[inline]
+    #[inline(always)]
     fn set(&mut self, lane: usize, circle: &Circle) {
         let radius = i32::from(circle.radius);
         (self.x[lane], self.y[lane], self.radius[lane]) = (circle.x, circle.y, circle.radius);
@@ -29,8 +28,8 @@ impl Block {
     }
 
     /// A bit for each circle that may light a pixel from `left` and `top` to `right` and `bottom`.
-    #[inline]
-    fn reaching(&self, [left, top, right, bottom]: [i16; 4]) -> u16 {
+    #[inline(always)]
+    fn reaching(&self, Edges { left, top, right, bottom }: Edges) -> u16 {
         // The distance outside of the rectangle along one axis, at most 255, so that squares fit into 16 bits. That and the saturated
         // sum of squares change nothing for radii below 256. With 256, the largest, a circle just out of reach may be reported.
         let gap =
@@ -45,7 +44,7 @@ impl Block {
     }
 
     /// A bit for each circle that is not where `former` has it, and whether all have made no move but a precomputed one.
-    #[inline]
+    #[inline(always)]
     fn moved_since(&self, former: &Block) -> (u16, bool) {
         let is_near = |distance: i16| (distance.wrapping_add(REACH)) as u16 <= 2 * REACH as u16;
         let (mut bits, mut all_near) = ([0; LANES], true);
@@ -72,13 +71,13 @@ impl Circles {
     /// The most circles of which [`Numbers`] can be made.
     pub const MAX_NUMBERED: usize = u32::BITS as usize;
 
-    #[inline]
+    #[inline(always)]
     pub fn len(&self) -> usize {
         self.len
     }
 
     /// Adds a circle behind the last.
-    #[inline]
+    #[inline(always)]
     pub fn push(&mut self, circle: &Circle) {
         let (block, lane) = (self.len / LANES, self.len % LANES);
         if lane == 0 {
@@ -93,7 +92,7 @@ impl Circles {
     /// # Panics
     ///
     /// If there is none of that number.
-    #[inline]
+    #[inline(always)]
     pub fn get(&self, number: usize) -> Circle {
         let (block, lane) = (&self.blocks[number / LANES], number % LANES);
         Circle { x: block.x[lane], y: block.y[lane], radius: block.radius[lane] }
@@ -105,17 +104,16 @@ impl Circles {
 
     /// The circles that may light a pixel of a rectangle: those that [reach](Circle::reaches) it, and some of the largest radius
     /// that do not. Only for at most [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
-    #[inline]
-    pub fn reaching(&self, rect: &Rect) -> Numbers {
-        let edges = [rect.x, rect.y, rect.x + rect.width, rect.y + rect.height]
-            .map(|edge| edge.clamp(i16::MIN.into(), i16::MAX.into()) as i16);
+    #[inline(always)]
+    pub fn reaching(&self, rect: impl Into<Edges>) -> Numbers {
+        let edges = rect.into();
         let bits = |(number, block): (usize, &Block)| u32::from(block.reaching(edges)) << (number * LANES);
         Numbers(self.blocks.iter().enumerate().map(bits).fold(0, |all, bits| all | bits))
     }
 
     /// The circles that are not where `former` has them. `None` unless all have made no move but a precomputed one. Only for at most
     /// [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
-    #[inline]
+    #[inline(always)]
     pub fn moved_since(&self, former: &Circles) -> Option<Numbers> {
         if self.len != former.len {
             return None;
@@ -137,25 +135,25 @@ pub(super) struct Numbers(u32);
 impl Numbers {
     pub const NONE: Numbers = Numbers(0);
 
-    #[inline]
+    #[inline(always)]
     pub fn is_empty(self) -> bool {
         self.0 == 0
     }
 
     /// Those that are in both.
-    #[inline]
+    #[inline(always)]
     pub fn and(self, other: Numbers) -> Numbers {
         Numbers(self.0 & other.0)
     }
 
     /// Adds a number if `present`.
-    #[inline]
+    #[inline(always)]
     pub fn set(&mut self, number: usize, present: bool) {
         self.0 |= u32::from(present) << number;
     }
 
     /// All but one.
-    #[inline]
+    #[inline(always)]
     pub fn without(self, number: usize) -> Numbers {
         Numbers(self.0 & !(1 << number))
     }
@@ -164,7 +162,7 @@ impl Numbers {
 impl Iterator for Numbers {
     type Item = usize;
 
-    #[inline]
+    #[inline(always)]
     fn next(&mut self) -> Option<usize> {
         let number = self.0.trailing_zeros() as usize;
         // Without the lowest bit.
@@ -176,6 +174,7 @@ impl Iterator for Numbers {
 mod tests {
     use super::*;
     use crate::envs::searing_spotlights::shape::Shape;
+    use crate::raster::Rect;
 
     fn circles(circles: impl IntoIterator<Item = (i16, i16, i16)>) -> Circles {
         let mut lanes = Circles::default();

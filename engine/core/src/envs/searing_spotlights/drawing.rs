@@ -77,6 +77,7 @@ impl Scene {
     }
 
     /// Changes a painted frame from `shown` to this scene.
+    #[inline(always)]
     pub(super) fn repaint(&self, shown: &Scene, assets: &Assets, canvas: &mut Canvas<'_>) {
         let same_light = self.darkness == shown.darkness && self.blacked_out == shown.blacked_out;
         // In full darkness every background is black.
@@ -142,6 +143,7 @@ impl Scene {
 
     /// Repaints the objects after [`LightChange::paint`] has painted the background. Only for full darkness with all objects hidden in
     /// it: what is not lit of them is black already.
+    #[inline(always)]
     fn repaint_hidden_objects(
         &self,
         shown: &Scene,
@@ -199,7 +201,7 @@ impl Scene {
     }
 
     /// Calls `paint` with the picture and the top left corner of each selected object, from bottom to top.
-    #[inline]
+    #[inline(always)]
     fn for_each_object(
         &self,
         assets: &Assets,

@@ -11,6 +11,7 @@ use super::circle::Circle;
 use super::circles::{Circles, Numbers};
 use super::config::BAR_HEIGHT;
 use super::crescents::Crescents;
+use super::extent::Extent;
 use super::light_spans::LightSpans;
 use super::pictures::Assets;
 use super::scene::Scene;
@@ -54,7 +55,7 @@ pub(super) struct LightChange<'a> {
 impl<'a> LightChange<'a> {
     /// The differences between a frame that shows `shown` and one that shows `scene`, with at most [`Circles::MAX_NUMBERED`] circles
     /// each.
-    #[inline]
+    #[inline(always)]
     pub fn new(shown: &'a Scene, scene: &'a Scene) -> Self {
         // Without a circle that has appeared or disappeared, the numbers are the same.
         let former = std::array::from_fn(|number| number as u8);
@@ -91,21 +92,37 @@ impl<'a> LightChange<'a> {
     }
 
     /// The circles that have moved, before and after.
-    #[inline]
+    #[inline(always)]
     fn moved(&self) -> impl Iterator<Item = (usize, Circle, Circle)> {
         let former = |number: usize| self.shown.circles.get(self.former[number].into());
         self.moved.map(move |number| (number, former(number), self.scene.circles.get(number)))
     }
 
+    /// The circles that may light what the circle of that number leaves; `None` without any.
+    #[inline(always)]
+    fn others(
+        &self,
+        number: usize,
+        from: &Circle,
+        crescents: &Crescents,
+    ) -> Option<impl Iterator<Item = (Circle, &'static Extent)> + Clone> {
+        let numbers = self.scene.circles.reaching(crescents.bounds_of_left(from)).without(number);
+        let others = numbers.map(|other| {
+            let other = self.scene.circles.get(other);
+            (other, &Shape::of(other.radius).extent)
+        });
+        (!numbers.is_empty()).then_some(others)
+    }
+
     /// Rectangles around everything that changes.
-    #[inline]
+    #[inline(always)]
     pub fn bounds(&self) -> impl Iterator<Item = Rect> {
         let moved = self.moved().map(|(_, from, to)| from.bounds().union(&to.bounds()));
         self.replaced.iter().map(|replaced| replaced.circle().bounds()).chain(moved)
     }
 
     /// Whether anything within `rect` may change.
-    #[inline]
+    #[inline(always)]
     pub fn reaches(&self, rect: &Rect) -> bool {
         // A circle that reached the rectangle before its move is now at most that far away.
         let reach = i32::from(REACH);
@@ -115,6 +132,7 @@ impl<'a> LightChange<'a> {
     }
 
     /// Paints the changes of the background, without objects and outlines.
+    #[inline(always)]
     pub fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
         if self.moved.is_empty() && self.replaced.is_empty() {
             return;
@@ -133,12 +151,7 @@ impl<'a> LightChange<'a> {
         // What becomes dark is lit again within the circles of the scene, so that the order of the changes does not matter.
         for (number, from, to) in self.moved() {
             let crescents = crescents(&from, &to);
-            let others = self.scene.circles.reaching(&crescents.bounds_of_left(&from)).without(number);
-            let others = others.map(|other| {
-                let other = self.scene.circles.get(other);
-                (other, &Shape::of(other.radius).extent)
-            });
-            crescents.paint(&from, others, [dark, lit], frame);
+            crescents.paint(&from, self.others(number, &from, crescents), [dark, lit], frame);
         }
         for replaced in &self.replaced {
             match replaced {
@@ -171,34 +184,36 @@ impl LightChange<'_> {
         for replaced in &self.replaced {
             for_each_run(replaced.circle(), |x, rows| canvas.mark_dirty(x..x + 1, &rows));
         }
-        for (_, from, to) in self.moved() {
-            crescents(&from, &to).on_screen(&from).for_each(|(x, y)| canvas.mark_dirty(x..x + 1, &(y..y + 1)));
+        for (number, from, to) in self.moved() {
+            let crescents = crescents(&from, &to);
+            let painted = crescents.painted(&from, self.others(number, &from, crescents));
+            painted.for_each(|(x, y)| canvas.mark_dirty(x..x + 1, &(y..y + 1)));
         }
     }
 }
 
 /// Whether `to` may be the same circle as `from`, a few frames later.
-#[inline]
+#[inline(always)]
 fn is_moved(from: &Circle, to: &Circle) -> bool {
     let (x, y) = (to.x - from.x, to.y - from.y);
     (from.radius == to.radius) & (Shape::is_precomputed(from.radius, (x, y)) | (x | y == 0))
 }
 
 /// The pixels that change when a circle moves. The caller must have checked with [`is_moved`] that they are precomputed.
-#[inline]
+#[inline(always)]
 fn crescents(from: &Circle, to: &Circle) -> &'static Crescents {
     Shape::of(from.radius).crescents((to.x - from.x, to.y - from.y))
 }
 
 /// Calls `paint` with each column that a circle covers, and its rows there.
-#[inline]
+#[inline(always)]
 fn for_each_run(circle: &Circle, mut paint: impl FnMut(usize, Range<usize>)) {
     let columns = Shape::of(circle.radius).extent.disc.columns(circle.centre(), &COLUMNS, BAR_HEIGHT..SCREEN);
     columns.for_each(|DiscColumn { x, rows }| paint(x, rows));
 }
 
 /// Copies rows of a column; an empty or reversed range copies nothing.
-#[inline]
+#[inline(always)]
 fn copy_rows(x: usize, rows: Range<usize>, from: &Frame, to: &mut Frame) {
     if rows.start < rows.end {
         let bytes = (x * SCREEN + rows.start) * 3..(x * SCREEN + rows.end) * 3;

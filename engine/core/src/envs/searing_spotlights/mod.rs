@@ -49,6 +49,7 @@ mod state;
 #[cfg(test)]
 mod tests;
 mod top_bar;
+mod wide_vectors;
 
 use std::sync::Arc;
 
@@ -110,7 +111,7 @@ impl Environment for SearingSpotlights {
     }
 
     fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
-        scene.repaint(shown, assets, canvas);
+        wide_vectors::repaint(assets, shown, scene, canvas);
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {

@@ -42,7 +42,7 @@ pub(super) struct Bar {
 }
 
 impl Bar {
-    #[inline]
+    #[inline(always)]
     fn new(state: &State, config: &Config) -> Self {
         let parameters = &config.parameters;
         let shows_reward = parameters.show_last_positive_reward && !state.first_frame;
@@ -82,12 +82,12 @@ impl Scene {
     }
 
     /// Whether a circle may light a pixel of a rectangle. Only for at most [`Circles::MAX_NUMBERED`] circles.
-    #[inline]
+    #[inline(always)]
     pub(super) fn lights(&self, rect: &Rect) -> bool {
         !self.circles.reaching(rect).is_empty()
     }
 
-    #[inline]
+    #[inline(always)]
     fn without_circles(state: &State, config: &Config) -> Scene {
         Scene {
             background: state.background,

@@ -34,7 +34,7 @@ impl Shape {
     /// # Panics
     ///
     /// For any other radius.
-    #[inline]
+    #[inline(always)]
     pub fn of(radius: i16) -> &'static Shape {
         static SHAPES: [OnceLock<Shape>; MAX_SPOT_RADIUS as usize + 1] =
             [const { OnceLock::new() }; MAX_SPOT_RADIUS as usize + 1];
@@ -61,14 +61,14 @@ impl Shape {
     }
 
     /// Whether the crescent of a move is precomputed.
-    #[inline]
+    #[inline(always)]
     pub fn is_precomputed(radius: i16, (x, y): (i16, i16)) -> bool {
         let is_near = |distance: i16| (distance + REACH) as u16 <= 2 * REACH as u16;
         is_near(x) & is_near(y) & (radius <= MAX_MOVED_RADIUS)
     }
 
     /// The pixels that change when the circle moves. The caller must have checked [`is_precomputed`](Shape::is_precomputed).
-    #[inline]
+    #[inline(always)]
     pub fn crescents(&self, (x, y): (i16, i16)) -> &Crescents {
         &self.crescents[(x + REACH) as usize * MOVES + (y + REACH) as usize]
     }
