@@ -18,7 +18,7 @@ from dataclasses import dataclass
 WORK = {
     "MysteryPath-Grid-v0": (1_670, 15),
     "Endless-MortarMayhem-v0": (2_280, 55),
-    "SearingSpotlights-v0": (6_240, 113),
+    "SearingSpotlights-v0": (5_430, 111),
 }
 
 
