@@ -4,7 +4,7 @@
 use smallvec::SmallVec;
 
 use super::circle::{Circle, Edges};
-use super::shape::{MAX_MOVED_RADIUS, REACH};
+use super::crescents::{MAX_MOVED_RADIUS, REACH};
 
 /// Circles of a block.
 const LANES: usize = 8;

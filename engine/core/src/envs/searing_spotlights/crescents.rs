@@ -5,9 +5,14 @@ use smallvec::SmallVec;
 use super::circle::{Circle, Edges};
 use super::config::BAR_HEIGHT;
 use super::extent::{Extent, distance};
-use super::shape::{MAX_MOVED_RADIUS, REACH};
 use crate::envs::screen::{Frame, SCREEN};
 use crate::raster::{Disc, Rect};
+
+/// Longest move along each axis whose crescents are precomputed, in pixels.
+pub(super) const REACH: i16 = 3;
+
+/// Largest radius whose crescents are precomputed. Larger circles are repainted in full.
+pub(super) const MAX_MOVED_RADIUS: i16 = 24;
 
 /// Pixels of a block. Most moves change fewer.
 const LANES: usize = 64;

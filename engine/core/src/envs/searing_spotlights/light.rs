@@ -10,12 +10,12 @@ use smallvec::SmallVec;
 use super::circle::Circle;
 use super::circles::{Circles, Numbers};
 use super::config::BAR_HEIGHT;
-use super::crescents::Crescents;
+use super::crescents::{Crescents, REACH};
 use super::extent::Extent;
 use super::light_spans::LightSpans;
 use super::pictures::Assets;
 use super::scene::Scene;
-use super::shape::{REACH, Shape};
+use super::shape::Shape;
 use crate::envs::screen::{Frame, SCREEN};
 use crate::raster::{Canvas, DiscColumn, Rect, copy_run};
 

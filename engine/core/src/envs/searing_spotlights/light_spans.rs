@@ -2,7 +2,8 @@
 
 use super::circle::Circle;
 use super::config::BAR_HEIGHT;
-use super::shape::{MAX_MOVED_RADIUS, Shape};
+use super::crescents::MAX_MOVED_RADIUS;
+use super::shape::Shape;
 use crate::envs::screen::SCREEN;
 use crate::raster::DiscColumn;
 

@@ -2,19 +2,13 @@
 
 use std::sync::OnceLock;
 
-use super::crescents::Crescents;
+use super::crescents::{Crescents, MAX_MOVED_RADIUS, REACH};
 use super::extent::Extent;
 use super::parameters::MAX_SPOT_RADIUS;
 use crate::raster::{Canvas, blend_keyed, circle_outline};
 
-/// Longest move along each axis whose crescents are precomputed, in pixels.
-pub(super) const REACH: i16 = 3;
-
 /// Number of different moves along one axis.
 const MOVES: usize = 2 * REACH as usize + 1;
-
-/// Largest radius whose crescents are precomputed. Larger circles are repainted in full.
-pub(super) const MAX_MOVED_RADIUS: i16 = 24;
 
 /// The shape of all circles of one radius.
 #[derive(Debug)]
