@@ -20,10 +20,7 @@ class Build:
     def __init__(self, program: str, env: str, num_envs: int) -> None:
         self.steps = max(3, TURN // num_envs)
         self.process = subprocess.Popen(
-            [program, "--on-request", env, str(num_envs)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+            [program, "--on-request", env, str(num_envs)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
     def turn(self) -> float:
@@ -45,8 +42,8 @@ def compare(paths: list[str], env: str, num_envs: int, rounds: int) -> str:
         # Who begins alternates.
         for build in (0, 1) if number % 2 else (1, 0):
             times[build].append(builds[build].turn())
-    for program in builds:
-        program.stop()
+    for each in builds:
+        each.stop()
     old, new = map(statistics.median, times)
     first, median, third = statistics.quantiles([new / old for old, new in zip(*times, strict=True)], n=4)
     return f"{env:30} {num_envs:6} {old:8.0f} {new:8.0f} {median:8.3f} {first:8.3f} to {third:.3f}"
@@ -57,28 +54,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("old", help="program of the first build")
     parser.add_argument("new", help="program of the second build")
+    parser.add_argument("--env", nargs="+", default=["SearingSpotlights-v0"], help="ids (default: %(default)s)")
     parser.add_argument(
-        "--env",
-        nargs="+",
-        default=["SearingSpotlights-v0"],
-        help="ids (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--num-envs",
-        nargs="+",
-        type=int,
-        default=[64, 1024],
-        help="default: %(default)s",
+        "--num-envs", nargs="+", type=int, default=[64, 1024], help="numbers of environments (default: %(default)s)"
     )
     parser.add_argument("--rounds", type=int, default=60, help="turns of each (default: %(default)s)")
     arguments = parser.parse_args()
     print(f"{'nanoseconds a step':30} {'envs':>6} {'old':>8} {'new':>8} {'new/old':>8}   quartiles")
     for env in arguments.env:
         for num_envs in arguments.num_envs:
-            print(
-                compare([arguments.old, arguments.new], env, num_envs, arguments.rounds),
-                flush=True,
-            )
+            print(compare([arguments.old, arguments.new], env, num_envs, arguments.rounds), flush=True)
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ impl<E: Environment> DrawnScene<E> {
                 if settings.check {
                     compare::<E>(assets, Some(drawn), &scene, settings.format, frame)?;
                 }
+                // Faster than an assignment, for which a large scene is copied by a call of memcpy.
                 std::mem::swap(drawn, &mut scene);
             }
             drawn => {

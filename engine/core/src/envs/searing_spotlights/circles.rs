@@ -20,7 +20,7 @@ struct Block {
 }
 
 impl Block {
-    #[inline(always)]
+    #[inline]
     fn set(&mut self, lane: usize, circle: &Circle) {
         let radius = i32::from(circle.radius);
         (self.x[lane], self.y[lane], self.radius[lane]) = (circle.x, circle.y, circle.radius);
@@ -77,7 +77,7 @@ impl Circles {
     }
 
     /// Adds a circle behind the last.
-    #[inline(always)]
+    #[inline]
     pub fn push(&mut self, circle: &Circle) {
         let (block, lane) = (self.len / LANES, self.len % LANES);
         if lane == 0 {

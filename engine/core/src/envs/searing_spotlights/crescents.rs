@@ -23,8 +23,8 @@ const MAX_DISTANCE: i16 = MAX_MOVED_RADIUS + REACH;
 /// Numbers of columns or rows that may separate the pixels of a block.
 const CUTS: usize = 2 * MAX_DISTANCE as usize + 2;
 
-/// Up to [`LANES`] pixels side by side, relative to a circle's centre.
-#[derive(Clone, Debug)]
+/// Up to [`LANES`] pixels side by side, relative to a circle's centre, so that a set of them is the bits of one number.
+#[derive(Debug)]
 struct Block {
     /// Bytes in a frame from the centre's pixel.
     steps: [i16; LANES],
@@ -193,6 +193,7 @@ impl Block {
         for lane in lanes(pixels) {
             let start = (centre + isize::from(self.steps[lane % LANES])) as usize;
             let pixel = start..start + 3;
+            // Never off the frame; without a panic, which would be a call in the loop.
             let (Some(from), Some(to)) = (from[..].get(pixel.clone()), to.get_mut(pixel)) else { return };
             to.copy_from_slice(from);
         }

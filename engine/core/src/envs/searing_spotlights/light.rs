@@ -148,7 +148,7 @@ impl<'a> LightChange<'a> {
         let frame: &mut Frame = canvas.pixels_mut().try_into().expect("the canvas is a frame");
         let lit = assets.lit.background_frame(self.scene.background);
         let dark = assets.dark(self.scene.darkness).background_frame(self.scene.background);
-        // What becomes dark is lit again within the circles of the scene, so that the order of the changes does not matter.
+        // Nothing that a circle of the scene lights is dark in the end, so that the order of the changes does not matter.
         for (number, from, to) in self.moved() {
             let crescents = crescents(&from, &to);
             crescents.paint(&from, self.others(number, &from, crescents), [dark, lit], frame);

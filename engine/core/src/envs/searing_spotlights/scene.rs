@@ -42,7 +42,7 @@ pub(super) struct Bar {
 }
 
 impl Bar {
-    #[inline(always)]
+    #[inline]
     fn new(state: &State, config: &Config) -> Self {
         let parameters = &config.parameters;
         let shows_reward = parameters.show_last_positive_reward && !state.first_frame;
@@ -87,7 +87,7 @@ impl Scene {
         !self.circles.reaching(rect).is_empty()
     }
 
-    #[inline(always)]
+    #[inline]
     fn without_circles(state: &State, config: &Config) -> Scene {
         Scene {
             background: state.background,

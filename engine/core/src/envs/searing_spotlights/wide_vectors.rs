@@ -33,6 +33,7 @@ mod tests {
     use crate::envs::{Environment, FRAME_BYTES, Family, ResetParameters, SCREEN};
     use crate::random::Generator;
 
+    /// Without AVX2, both are the baseline.
     #[test]
     fn the_baseline_paints_the_same_pixels() {
         for spec in SPECS {
