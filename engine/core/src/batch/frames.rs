@@ -11,6 +11,7 @@ pub const MAX_STACK: usize = 64;
 /// Format of an observation's frames. The default is the original's: one frame, uint8 (84, 84, 3), indexed
 /// \[x\]\[y\]\[channel\].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct Frames {
     /// Order of the numbers within a frame.
     pub format: PixelFormat,

@@ -1,5 +1,6 @@
 //! Configuration of a pool, and reset requests.
 
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Map, Value as Json};
 
 use super::autoreset::Autoreset;
@@ -13,7 +14,10 @@ use crate::envs::{self, ResetParameters};
 pub type OptionMap = Map<String, Json>;
 
 /// Reset parameters of a pool's environments. Omitted parameters have the original's defaults.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// In JSON, an object is [`Shared`](Self::Shared), and a list of objects is [`Each`](Self::Each).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Json", untagged)]
 pub enum ResetOptions {
     /// The same for all environments.
     Shared(OptionMap),
@@ -27,42 +31,113 @@ impl Default for ResetOptions {
     }
 }
 
+impl TryFrom<Json> for ResetOptions {
+    type Error = String;
+
+    fn try_from(given: Json) -> Result<Self, String> {
+        let wrong = |given: &Json| format!("options must be an object, or a list of objects, got {given}");
+        match given {
+            Json::Object(shared) => Ok(ResetOptions::Shared(shared)),
+            Json::Array(each) => {
+                let object = |item| if let Json::Object(map) = item { Ok(map) } else { Err(wrong(&item)) };
+                each.into_iter().map(object).collect::<Result<_, _>>().map(ResetOptions::Each)
+            }
+            other => Err(wrong(&other)),
+        }
+    }
+}
+
 /// Configuration of a pool.
-#[derive(Clone, Debug)]
+///
+/// Its JSON has the names of the fields. Only `id` and `num_envs` are required, other fields have the defaults of
+/// [`new`](Self::new), and an unknown field is an error. `"frames": null` omits the frames.
+///
+/// ```
+/// use endless_gym_core::pool::{Autoreset, PoolConfig, Seeding};
+///
+/// let config: PoolConfig = serde_json::from_str(
+///     r#"{
+///         "id": "MortarMayhem-v0",
+///         "num_envs": 16,
+///         "options": {"command_count": [5]},
+///         "autoreset": "same_step",
+///         "seeding": {"range": {"start": 0, "end": 100000}}
+///     }"#,
+/// )?;
+/// assert_eq!(config.autoreset, Autoreset::SameStep);
+/// assert_eq!(config.seeding, Seeding::Range { start: 0, end: 100_000, step: 1, seed: None });
+/// assert_eq!(config.total_envs, 16);
+/// # Ok::<(), serde_json::Error>(())
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self", deny_unknown_fields)]
 pub struct PoolConfig {
     /// Environment id, such as `MortarMayhem-v0`.
     pub id: String,
     /// Number of environments in the pool, 1 to [`MAX_ENVS`].
     pub num_envs: usize,
     /// Reset parameters.
+    #[serde(default)]
     pub options: ResetOptions,
     /// When the next episode starts after one has ended.
+    #[serde(default)]
     pub autoreset: Autoreset,
     /// Whether same-step autoreset keeps the last observation of an episode, in the `final_*` sections. Without effect in other
     /// modes.
+    #[serde(default)]
     pub final_observation: bool,
     /// Source of the episodes' seeds.
+    #[serde(default)]
     pub seeding: Seeding,
     /// Whether an episode depends on its seed and its reset parameters alone. Otherwise, as in the original, some environments show
     /// what an earlier episode left (the character of Endless Mortar Mayhem, the lit circles and the background of Searing
     /// Spotlights), and with [`Seeding::Continue`] an episode continues the generator that the one before has drawn from. With this,
     /// every episode starts as in a new environment, and [`Seeding::Continue`] draws a seed for each later episode: from
     /// `SeedSequence(seed, spawn_key=(0,))`, where `seed` is the one that the environment was last given. Resets allocate memory.
+    #[serde(default)]
     pub independent_episodes: bool,
     /// Format of the frames; `None` omits them, and nothing is drawn.
+    #[serde(default = "default_frames")]
     pub frames: Option<Frames>,
     /// Whether the batch has the feature observation.
+    #[serde(default)]
     pub features: bool,
     /// Whether the batch says which parts of the frames have changed since the pool's batch before, for readers that keep a copy
     /// ([`ObservationCopy`](crate::batch::ObservationCopy)). Without effect without frames.
+    #[serde(default)]
     pub changes: bool,
     /// Whether every frame is drawn a second time, in full, and compared; a difference is [`PoolError::WrongFrame`]. For tests.
+    #[serde(default)]
     pub check_drawing: bool,
     /// Number of this pool's first environment among all environments, for [`seeding`](Self::seeding) and [`ResetRequest::Seed`]:
     /// an engine that serves several groups numbers the environments of all groups consecutively.
+    #[serde(default)]
     pub first_env: usize,
-    /// Number of environments in all pools together, for [`seeding`](Self::seeding): `first_env + num_envs` to 2^32 - 1.
+    /// Number of environments in all pools together, for [`seeding`](Self::seeding): `first_env + num_envs` to 2^32 - 1. In JSON, the
+    /// default is `first_env + num_envs`.
+    #[serde(default)]
     pub total_envs: usize,
+}
+
+fn default_frames() -> Option<Frames> {
+    Some(Frames::default())
+}
+
+// The derived functions, with the default that depends on other fields.
+impl<'de> Deserialize<'de> for PoolConfig {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut config = PoolConfig::deserialize(deserializer)?;
+        if config.total_envs == 0 {
+            config.total_envs = config.first_env.saturating_add(config.num_envs);
+        }
+        Ok(config)
+    }
+}
+
+impl Serialize for PoolConfig {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        PoolConfig::serialize(self, serializer)
+    }
 }
 
 impl PoolConfig {
@@ -75,9 +150,9 @@ impl PoolConfig {
             options: ResetOptions::default(),
             autoreset: Autoreset::default(),
             final_observation: false,
-            seeding: Seeding::Continue { seed: None },
+            seeding: Seeding::default(),
             independent_episodes: false,
-            frames: Some(Frames::default()),
+            frames: default_frames(),
             features: false,
             changes: false,
             check_drawing: false,
@@ -169,6 +244,66 @@ impl ResetRequest<'_> {
         match self {
             ResetRequest::All | ResetRequest::Seed(_) => true,
             ResetRequest::Each { reset, .. } => reset[env] != 0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::raster::PixelFormat;
+
+    /// The error of a configuration with the field `name` of that value.
+    fn error(name: &str, value: Json) -> String {
+        let mut given = json!({"id": "MortarMayhem-v0", "num_envs": 2});
+        given[name] = value;
+        serde_path_to_error::deserialize::<_, PoolConfig>(given).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn every_field_survives_json() {
+        let options = |text| serde_json::from_str::<OptionMap>(text).unwrap();
+        let new = PoolConfig::new("MysteryPath-v0", 2);
+        let all = PoolConfig {
+            options: ResetOptions::Each(vec![options(r#"{"agent_scale": 0.2}"#), options("{}")]),
+            autoreset: Autoreset::Disabled,
+            final_observation: true,
+            seeding: Seeding::Range { start: 1, end: 9, step: 2, seed: Some(u64::MAX) },
+            independent_episodes: true,
+            frames: Some(Frames { format: PixelFormat { grayscale: true, ..PixelFormat::default() }, stack: 4 }),
+            features: true,
+            check_drawing: true,
+            first_env: 3,
+            total_envs: 7,
+            ..new.clone()
+        };
+        let list = PoolConfig { seeding: Seeding::List(vec![3, 1]), frames: None, ..new.clone() };
+        let seeded = PoolConfig { seeding: Seeding::Continue { seed: Some(5) }, ..new.clone() };
+        for config in [new.clone(), all, list, seeded] {
+            let text = serde_json::to_string(&config).unwrap();
+            assert_eq!(serde_json::from_str::<PoolConfig>(&text).unwrap(), config, "{text}");
+        }
+        let short = json!({"id": "MysteryPath-v0", "num_envs": 2, "frames": {}, "seeding": {"continue": {}}});
+        assert_eq!(serde_json::from_value::<PoolConfig>(short).unwrap(), new);
+    }
+
+    #[test]
+    fn a_json_error_names_the_field_the_value_and_what_is_allowed() {
+        for (name, value, expected) in [
+            ("frame", json!(null), "unknown field `frame`, expected one of `id`, `num_envs`, `options`"),
+            ("num_envs", json!("many"), "num_envs: invalid type: string \"many\", expected usize"),
+            ("num_envs", json!(-1), "num_envs: invalid value: integer `-1`, expected usize"),
+            ("options", json!([{}, 5]), "options: options must be an object, or a list of objects, got 5"),
+            ("autoreset", json!("never"), "autoreset must be `next_step`, `same_step` or `disabled`, got `never`"),
+            ("seeding", json!({"next": {}}), "unknown variant `next`, expected one of `continue`, `range`, `list`"),
+            ("seeding", json!({"range": {"end": -3}}), "seeding.range.end: invalid value: integer `-3`, expected u64"),
+            ("frames", json!({"stack": 1.5}), "frames.stack: invalid type: floating point `1.5`, expected usize"),
+            ("frames", json!({"format": {"gray": true}}), "frames.format.gray: unknown field `gray`, expected one of"),
+        ] {
+            let found = error(name, value);
+            assert!(found.contains(expected), "{found}");
         }
     }
 }

@@ -11,7 +11,11 @@ pub(super) const MAX_TOTAL_ENVS: usize = u32::MAX as usize;
 
 /// The source of the episodes' seeds. Environments are numbered over all groups of an engine, so that results depend neither on
 /// the number of threads nor on the division into groups.
-#[derive(Clone, Debug, PartialEq, Eq)]
+///
+/// In JSON: `{"continue": {"seed": 1}}`, `{"range": {"start": 0, "end": 100000, "step": 1, "seed": 1}}` or `{"list": [3, 4]}`, where
+/// `seed` may be `null` or omitted, and `start` and `step` may be omitted.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Seeding {
     /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as the original's does
     /// when it is reset without a seed.
@@ -21,22 +25,37 @@ pub enum Seeding {
     /// start again with the environment's first item.
     Continue {
         /// The seed of environment 0; `None` seeds each environment from the operating system's entropy.
+        #[serde(default)]
         seed: Option<u64>,
     },
     /// Each episode draws its seed uniformly from `start`, `start + step`, ... below `end`. The paper trains on `0..100000`.
     Range {
-        /// The lowest seed.
+        /// The lowest seed; 0 by default.
+        #[serde(default)]
         start: u64,
         /// The end of the range, excluded: more than `start`, and at most 2^63 - 1.
         end: u64,
-        /// The difference between two seeds, 1 or more.
+        /// The difference between two seeds, 1 or more; 1 by default.
+        #[serde(default = "one")]
         step: u64,
         /// Seed of the draws: environment `i` draws with `SeedSequence(seed, spawn_key=(i,))`. `None` takes the operating system's
         /// entropy.
+        #[serde(default)]
         seed: Option<u64>,
     },
     /// Episode `e` of environment `i` of `n` has the seed at index `(e * n + i) % length` of the list, which must not be empty.
     List(Vec<u64>),
+}
+
+impl Default for Seeding {
+    /// Seeds from entropy.
+    fn default() -> Self {
+        Seeding::Continue { seed: None }
+    }
+}
+
+fn one() -> u64 {
+    1
 }
 
 impl Seeding {

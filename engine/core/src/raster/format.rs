@@ -15,6 +15,7 @@ use super::dirty_surface::DirtySurface;
 /// assert_eq!(format.shape(84, 84), [3, 84, 84]);
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct PixelFormat {
     /// One number for each pixel, without an index for the channel: its luma, as Gymnasium's `GrayscaleObservation` computes it.
     pub grayscale: bool,
