@@ -49,7 +49,6 @@ mod state;
 #[cfg(test)]
 mod tests;
 mod top_bar;
-mod wide_vectors;
 
 use std::sync::Arc;
 
@@ -111,7 +110,7 @@ impl Environment for SearingSpotlights {
     }
 
     fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
-        wide_vectors::repaint(assets, shown, scene, canvas);
+        scene.repaint(shown, assets, canvas);
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {

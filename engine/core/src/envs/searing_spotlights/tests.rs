@@ -9,7 +9,7 @@ use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLI
 use super::{Assets, MAX_SPOTLIGHTS, SPECS, SearingSpotlights, State, Variant};
 use crate::envs::{EnvSpec, Environment, FRAME_BYTES, Parameter, ParameterKind, ResetParameters, SCREEN};
 use crate::random::Generator;
-use crate::raster::Surface;
+use crate::raster::{Canvas, Surface};
 
 const FINITE: &EnvSpec = &SPECS[0];
 const ENDLESS: &EnvSpec = &SPECS[1];
@@ -222,5 +222,53 @@ fn a_width_beyond_32_bits_wraps() {
             assert!(steps < 50);
         }
         assert_eq!(environment.state.red_columns, red, "{width}");
+    }
+}
+
+/// Plays with as many spotlights as `initial_spawns`, and repaints each frame from one of the frames before it.
+fn repaint_episodes(spec: &'static EnvSpec, options: &Json, seed: u64) {
+    let (mut environment, mut random) = started(spec, options, seed);
+    let assets = Arc::clone(&environment.assets);
+    let mut shown = environment.scene();
+    let mut repainted = frame(&environment, 0);
+    for step in 0..120 {
+        // Some actions keep still, so that objects stay where they are while the light changes.
+        let action = [random.integers(0, 3) as i32, random.integers(0, 3) as i32 * (step / 8 % 2)];
+        if environment.step(&action, &mut random).terminated {
+            environment.reset(&assets, &mut random);
+        }
+        if step % 7 == 3 {
+            continue;
+        }
+        let scene = environment.scene();
+        scene.repaint(&shown, &assets, &mut Canvas::new(&mut repainted, SCREEN, SCREEN));
+        assert!(repainted == frame(&environment, 0), "{} {options}, step {step}: {shown:?} to {scene:?}", spec.id);
+        shown = scene;
+    }
+}
+
+#[test]
+fn repainted_frame_equals_frame_painted_in_full() {
+    let views = [
+        json!({}),
+        json!({"light_threshold": 200, "light_dim_off_duration": 3}),
+        json!({"black_background": true}),
+        json!({"agent_visible": true, "coins_visible": true, "agent_health": 3.0}),
+        json!({"light_dim_off_duration": 0, "agent_scale": 1.0, "coin_scale": 1.0}),
+    ];
+    let lights = [
+        json!({"spot_max_speed": 0.02}),
+        json!({"initial_spawns": 25, "spot_max_speed": 0.02, "spot_damage": 0.01}),
+        json!({"initial_spawns": 60, "spot_max_speed": 0.02, "spot_damage": 0.0}),
+        json!({"initial_spawns": 12, "spot_min_radius": 1.0, "spot_max_radius": 90.0, "spot_damage": 0.3}),
+        json!({"initial_spawns": 6, "spot_min_speed": 0.01, "spot_max_speed": 0.1, "num_spawns": 1000}),
+    ];
+    for spec in SPECS {
+        for (view, light) in views.iter().flat_map(|view| lights.iter().map(move |light| (view, light))) {
+            let mut options = view.as_object().unwrap().clone();
+            options.extend(light.as_object().unwrap().clone());
+            options.retain(|name, _| spec.parameters.iter().any(|parameter| parameter.name == name));
+            repaint_episodes(spec, &Json::from(options), 7);
+        }
     }
 }
