@@ -39,15 +39,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from endless_gym.agents.agent import Agent, make_agent
-from endless_gym.agents.clock import Clock
-from endless_gym.agents.environments import Environments
-from endless_gym.agents.logs import PROGRESS, read_progress
-from endless_gym.agents.ppo import learn, make_optimizer
-from endless_gym.agents.ranks import Ranks
-from endless_gym.agents.rollout import RolloutCollector, Segment
-from endless_gym.agents.settings import Settings
-from endless_gym.agents.train import parse
+from endless_gym_agents.agent import Agent, make_agent
+from endless_gym_agents.clock import Clock
+from endless_gym_agents.environments import Environments
+from endless_gym_agents.logs import PROGRESS, read_progress
+from endless_gym_agents.ppo import learn, make_optimizer
+from endless_gym_agents.ranks import Ranks
+from endless_gym_agents.rollout import RolloutCollector, Segment
+from endless_gym_agents.settings import Settings
+from endless_gym_agents.train import parse
 from rich.console import Console
 from rich.table import Table
 
@@ -234,7 +234,7 @@ def train_ranks(ranks: int, arguments: list[str], settings: Settings, cores: lis
         run += ["--environment.num-envs", str(ranks * settings.environment.num_envs)]
         run += ["--bind-cores"] if ranks * each <= len(cores) else []
         done = subprocess.run(
-            [*launch, "-m", "endless_gym.agents.train", "--", *arguments, *run],
+            [*launch, "-m", "endless_gym_agents.train", "--", *arguments, *run],
             env=os.environ | {"OMP_NUM_THREADS": str(each), "CUDA_VISIBLE_DEVICES": ""},
             capture_output=True,
             text=True,
@@ -261,7 +261,7 @@ def unconnected_runs(number: int, arguments: list[str], settings: Settings, core
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder, runs = Path(name), []
         for run in range(number):
-            program = [sys.executable, "-m", "endless_gym.agents.train", *arguments, "--run", str(folder / f"{run}")]
+            program = [sys.executable, "-m", "endless_gym_agents.train", *arguments, "--run", str(folder / f"{run}")]
             log = stack.enter_context((folder / f"{run}.log").open("w"))
             with bound(cores[run * each :][:each]):
                 process = subprocess.Popen(

@@ -29,7 +29,7 @@ PAGES = {
     "design/architecture.md": "ARCHITECTURE.md",
     "design/comparison.md": "benches/comparison.md",
     "reference/changes.md": "CHANGELOG.md",
-    "train/learning.md": "benches/agents/learning/README.md",
+    "train/learning.md": "agents/benches/learning/README.md",
 }
 
 #: What a page must not have: scripts, pictures and style sheets from other hosts.

@@ -10,4 +10,4 @@ head=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
 port=$((20000 + SLURM_JOB_ID % 10000))
 srun --cpus-per-task="$SLURM_CPUS_PER_TASK" torchrun --nnodes="$SLURM_NNODES" --nproc-per-node=4 --max-restarts=3 \
     --rdzv-backend=c10d --rdzv-endpoint="$head:$port" --rdzv-id="$SLURM_JOB_ID" \
-    -m endless_gym.agents.train -- --env Endless-MortarMayhem-v0 --agent trxl --environment.num-envs 256 --run runs/mortar
+    -m endless_gym_agents.train -- --env Endless-MortarMayhem-v0 --agent trxl --environment.num-envs 256 --run runs/mortar

@@ -180,7 +180,7 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def learning(folder: Path, results: Path) -> None:
-    """Learning curves of agents with and without memory, from a file of `benches/agents/learning.py`."""
+    """Learning curves of agents with and without memory, from a file of `agents/benches/learning.py`."""
     data = json.loads(results.read_text())
     colours = {"gru": "blue", "trxl": "green", "none": "red"}
 

@@ -1,7 +1,7 @@
 """Makes the pictures of the documentation in `docs/images`: `cargo xtask pictures` installs the package and runs this script.
 
 The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the results of
-`benches/agents/learning.py`; measure or train again first to change them. The same versions make the same bytes.
+`agents/benches/learning.py`; measure or train again first to change them. The same versions make the same bytes.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ def main() -> None:
     """Make all pictures."""
     (IMAGES / "environments").mkdir(parents=True, exist_ok=True)
     charts.comparison(IMAGES, ROOT / "benches/comparison.md")
-    charts.learning(IMAGES, ROOT / "benches/agents/learning/three-commands.json")
+    charts.learning(IMAGES, ROOT / "agents/benches/learning/three-commands.json")
     films.overview(IMAGES / "environments.webp")
     for scene in films.SCENES:
         films.environment(IMAGES / "environments" / f"{scene.id}.webp", scene)

@@ -86,7 +86,8 @@ fn train(environment: &Environment, wheel: &str) -> Result<(), String> {
         );
         return Ok(());
     }
-    run("install the extra `agents`", &mut environment.install(&[&format!("{wheel}[agents]")])?)?;
+    let agents = workspace().join("agents").display().to_string();
+    run("install the agents", &mut environment.install(&[wheel, &agents])?)?;
     let arguments = TRAIN.iter().flat_map(|line| line.split(' '));
     run("endless-train, ten updates", environment.program("endless-train").args(arguments))?;
     let checkpoint = environment.folder.join("run/checkpoints/last.pt");

@@ -29,7 +29,9 @@ pub fn libraries() -> Result<PathBuf, String> {
 pub fn ruff() -> Result<(), String> {
     let program = environment()?.join("bin/ruff");
     for arguments in [["format", "--check"].as_slice(), &["check"]] {
-        execute(Command::new(&program).current_dir(package()).args(arguments))?;
+        for package in packages() {
+            execute(Command::new(&program).current_dir(package).args(arguments))?;
+        }
         let others = [
             "--config",
             "bindings/python/pyproject.toml",
@@ -44,15 +46,29 @@ pub fn ruff() -> Result<(), String> {
     Ok(())
 }
 
-/// Checks the types of the package.
+/// Checks the types of the packages.
 pub fn mypy() -> Result<(), String> {
-    execute(Command::new(environment()?.join("bin/python")).args(["-m", "mypy"]).current_dir(package()))
+    let python = environment()?.join("bin/python");
+    packages().iter().try_for_each(|package| {
+        // The agents' imports of the other package are found by the path, since the two may be checked before they are installed.
+        let mut mypy = Command::new(&python);
+        execute(mypy.args(["-m", "mypy"]).env("MYPYPATH", self::package()).current_dir(package))
+    })
 }
 
-/// Runs the tests that a marker expression selects, with the package that [`install`] installed.
+/// Runs the tests of both packages that a marker expression selects, as [`install`] installed them.
 pub fn pytest(markers: &str) -> Result<(), String> {
+    packages().iter().try_for_each(|package| pytest_of(package, markers))
+}
+
+/// Runs the tests of the environments' package that need the original.
+pub fn pytest_original() -> Result<(), String> {
+    pytest_of(&package(), "original")
+}
+
+fn pytest_of(package: &Path, markers: &str) -> Result<(), String> {
     let mut pytest = Command::new(environment()?.join("bin/pytest"));
-    pytest.args(["-q", "--timeout", "300", "--durations", "30", "-m", markers]).current_dir(package());
+    pytest.args(["-q", "--timeout", "300", "--durations", "30", "-m", markers]).current_dir(package);
     pytest.env("ENDLESS_ORIGINAL_PYTHON", original::path()?);
     execute(pytest.env("ENDLESS_LIBRARIES_PYTHON", folder(LIBRARIES)?.join("bin/python")))
 }
@@ -77,7 +93,12 @@ fn package() -> PathBuf {
     workspace().join("bindings/python")
 }
 
-/// Builds the wheel in a profile of cargo and installs it into the virtual environment.
+/// The folders of the environments' package and of the agents'.
+fn packages() -> [PathBuf; 2] {
+    [package(), workspace().join("agents")]
+}
+
+/// Builds the wheel in a profile of cargo and installs it and the agents into the virtual environment.
 pub fn install(profile: &str) -> Result<(), String> {
     let folder = environment()?;
     let wheels = target()?.join("wheels");
@@ -87,7 +108,7 @@ pub fn install(profile: &str) -> Result<(), String> {
     maturin.arg("--manifest-path").arg(package().join("Cargo.toml")).arg("--out").arg(&wheels);
     execute(&mut maturin)?;
     let wheel = only_file(&wheels)?;
-    execute(uv_pip_install(&folder)?.args(["--reinstall", "--no-deps"]).arg(wheel))
+    execute(uv_pip_install(&folder)?.args(["--reinstall", "--no-deps"]).arg(wheel).arg(workspace().join("agents")))
 }
 
 fn only_file(folder: &Path) -> Result<PathBuf, String> {

@@ -179,7 +179,7 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "pytest with the original",
-        run: || python::pytest("original"),
+        run: python::pytest_original,
         after: &["wheel", "original environment"],
         needs: &[SharedMemory],
         ..STAGE

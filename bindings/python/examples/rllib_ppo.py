@@ -1,8 +1,8 @@
 """Train RLlib's PPO with a memory, on RLlib's new API stack, to remember one command of Mortar Mayhem.
 
-pip install './bindings/python[agents]' 'ray[rllib]'
+pip install ./bindings/python ./agents 'ray[rllib]'
 python rllib_ppo.py                   # feature observations: learns the command in a few minutes on one core
-python rllib_ppo.py --memory gru      # a module of its own, with the GRU of endless_gym.agents, in place of RLlib's LSTM
+python rllib_ppo.py --memory gru      # a module of its own, with the GRU of endless_gym_agents, in place of RLlib's LSTM
 python rllib_ppo.py --memory none     # the baseline without memory, which cannot
 python rllib_ppo.py --env-id Endless-MortarMayhem-v0 --options '{}' --observation rgb --total-timesteps 10000000
 
@@ -29,11 +29,11 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 
-from endless_gym.agents.encoders import FRAME, Encoder
-from endless_gym.agents.heads import PolicyHead, ValueHead
-from endless_gym.agents.recurrence import packed_layers
-from endless_gym.agents.recurrent import RecurrentMemory
-from endless_gym.agents.settings import Recurrence
+from endless_gym_agents.encoders import FRAME, Encoder
+from endless_gym_agents.heads import PolicyHead, ValueHead
+from endless_gym_agents.recurrence import packed_layers
+from endless_gym_agents.recurrent import RecurrentMemory
+from endless_gym_agents.settings import Recurrence
 
 
 class GRUModule(TorchRLModule, ValueFunctionAPI):
@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--env-id", default="MortarMayhem-Grid-v0", help="environment id")
     parser.add_argument("--options", default='{"command_count": [1]}', help="reset parameters as JSON")
     parser.add_argument("--observation", choices=["features", "rgb"], default="features", help="what the agent sees")
-    memories = "lstm: RLlib's; gru: a module with the GRU of endless_gym.agents; none: the baseline"
+    memories = "lstm: RLlib's; gru: a module with the GRU of endless_gym_agents; none: the baseline"
     parser.add_argument("--memory", choices=["lstm", "gru", "none"], default="lstm", help=memories)
     parser.add_argument("--max-seq-len", type=int, default=16, help="steps of truncated backpropagation through time")
     parser.add_argument("--num-env-runners", type=int, default=0, help="worker processes; 0 samples in this process")

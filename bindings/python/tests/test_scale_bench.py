@@ -18,9 +18,9 @@ import psutil
 import pytest
 from rich.console import Console
 
-from endless_gym.agents.logs import read_progress
-from endless_gym.agents.settings import PRESETS
-from endless_gym.agents.train import parse
+from endless_gym_agents.logs import read_progress
+from endless_gym_agents.settings import PRESETS
+from endless_gym_agents.train import parse
 
 BENCHES = Path(__file__).parents[3] / "benches"
 sys.path.insert(0, str(BENCHES))
@@ -224,7 +224,7 @@ def test_unconnected_runs_train_at_once_on_cores_of_their_own(monkeypatch: pytes
 
     def reading(run: Path) -> list[dict[str, Any]]:
         for child in psutil.Process().children():
-            if "endless_gym.agents.train" in child.cmdline():
+            if "endless_gym_agents.train" in child.cmdline():
                 seen[child.pid] = child.cpu_affinity()
         return read_progress(run)
 

@@ -113,7 +113,7 @@ def started(template: Path, folder: Path, **variables: str) -> list[list[str]]:
 
 
 def test_the_array_starts_a_run_for_each_seed(tmp_path: Path) -> None:
-    from endless_gym.agents.train import parse
+    from endless_gym_agents.train import parse
 
     template = FOLDER / "slurm-seeds.sh"
     first, last = map(int, options(template)["array"].split("-"))
@@ -135,7 +135,7 @@ def test_the_array_starts_a_run_for_each_seed(tmp_path: Path) -> None:
 def test_torchrun_starts_a_rank_for_each_gpu(tmp_path: Path) -> None:
     from torch.distributed.run import get_args_parser
 
-    from endless_gym.agents.train import parse
+    from endless_gym_agents.train import parse
 
     template = FOLDER / "slurm-torchrun.sh"
     given = options(template)
@@ -145,7 +145,7 @@ def test_torchrun_starts_a_rank_for_each_gpu(tmp_path: Path) -> None:
     launch = get_args_parser().parse_args(arguments)
     assert (launch.nnodes, launch.nproc_per_node, given["ntasks-per-node"]) == ("2", given["gpus-per-node"], "1")
     assert (launch.rdzv_backend, launch.rdzv_endpoint, launch.rdzv_id) == ("c10d", "node7:24567", "1234567")
-    assert (launch.module, launch.training_script) == (True, "endless_gym.agents.train")
+    assert (launch.module, launch.training_script) == (True, "endless_gym_agents.train")
     # Some versions of Python remove the first `--`.
     settings = parse([each for each in launch.training_script_args if each != "--"]).validated()
     ranks = int(given["nodes"]) * int(given["gpus-per-node"])
@@ -155,7 +155,7 @@ def test_torchrun_starts_a_rank_for_each_gpu(tmp_path: Path) -> None:
 
 
 def test_one_node_has_an_engine_of_its_own(tmp_path: Path) -> None:
-    from endless_gym.agents.train import parse
+    from endless_gym_agents.train import parse
 
     ((program, *arguments),) = started(FOLDER / "slurm-node.sh", tmp_path, JOB_ID="12", CPUS_PER_TASK="16")
     settings = parse(arguments).validated()

@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 
 import endless_gym
-import endless_gym.agents
 from endless_gym.configuration import MODES, AutoresetName
 from endless_gym.specs import OBSERVATIONS, ObservationName
 
@@ -71,10 +70,9 @@ def test_literals_are_the_names_that_are_accepted() -> None:
 def public_modules() -> Iterator[str]:
     """The package's modules, without programs and without the adapter that needs PufferLib's working directory."""
     yield "endless_gym"
-    for package in (endless_gym, endless_gym.agents):
-        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            if not module.name.rpartition(".")[2].startswith("_") and module.name != "endless_gym.pufferlib":
-                yield module.name
+    for module in pkgutil.iter_modules(endless_gym.__path__, "endless_gym."):
+        if not module.name.rpartition(".")[2].startswith("_") and module.name != "endless_gym.pufferlib":
+            yield module.name
 
 
 def public_functions(module_name: str) -> Iterator[tuple[str, object]]:

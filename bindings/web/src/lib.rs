@@ -67,7 +67,7 @@ pub extern "C" fn open() -> u32 {
     reply(request::open)
 }
 
-/// Reads the agent in the input, the file that `endless_gym.agents.export` writes. Returns as [`call`] does.
+/// Reads the agent in the input, the file that `endless_gym_agents.export` writes. Returns as [`call`] does.
 #[unsafe(no_mangle)]
 pub extern "C" fn load_agent() -> u32 {
     reply(request::load_agent)

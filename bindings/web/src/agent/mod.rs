@@ -1,4 +1,4 @@
-//! Trained agents: the file that `endless_gym.agents.export` writes, and the network that acts.
+//! Trained agents: the file that `endless_gym_agents.export` writes, and the network that acts.
 
 mod file;
 mod network;

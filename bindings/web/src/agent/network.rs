@@ -1,4 +1,4 @@
-//! The network of the agent `gru` with feature observations, as `endless_gym.agents` computes it: a layer for the features, a layer
+//! The network of the agent `gru` with feature observations, as `endless_gym_agents` computes it: a layer for the features, a layer
 //! for the embedding, a GRU cell, the body, and the policy head. All numbers are float32.
 
 use super::file::{AgentFileError, Tensors};

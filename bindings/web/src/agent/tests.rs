@@ -7,7 +7,7 @@ use super::*;
 
 const AGENT: &[u8] = include_bytes!("../../page/files/MortarMayhem-Grid-v0.agent.bin");
 
-/// Recorded by `python -m endless_gym.agents.export --vectors`.
+/// Recorded by `python -m endless_gym_agents.export --vectors`.
 #[derive(Deserialize)]
 struct Vectors {
     env: String,

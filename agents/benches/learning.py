@@ -1,0 +1,187 @@
+"""Trains agents with and without memory on small tasks, and evaluates them on seeds that training never uses.
+
+    python learning.py --task one-command --agents gru trxl none --seeds 1 2 3
+    python learning.py --plot
+
+Each run is one `endless-train` with the preset `quick` and the flags below. It stops at the target reward or the time limit
+of the task; an agent without memory gets as many updates as the slowest run with memory. The evaluation plays 50 seeds from
+200,000 on, three episodes each. The results of a task are stored in `learning/TASK.json`, with the commands and the learning
+curves; `--plot` plots all results and writes `learning/README.md`.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import shlex
+import tempfile
+import time
+from pathlib import Path
+
+from endless_gym_agents import checkpoint
+from endless_gym_agents.evaluate import evaluate, mean
+from endless_gym_agents.settings import Settings
+from endless_gym_agents.train import parse, train
+
+FOLDER = Path(__file__).parent / "learning"
+#: Flags, time limit in minutes, target reward, and the largest possible reward if it is known.
+TASKS = {
+    "one-command": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]'", 15, 0.097, 0.1),
+    "one-command-bf16": (
+        "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --bf16",
+        15,
+        0.097,
+        0.1,
+    ),
+    "one-command-pixels": (
+        "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --environment.observation rgb",
+        30,
+        0.097,
+        0.1,
+    ),
+    "two-commands": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[2]'", 30, 0.19, 0.2),
+    "three-commands": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[3]'", 30, 0.28, 0.3),
+    "mystery-path-grid-with-cues": (
+        "--env MysteryPath-Grid-v0 --environment.option show_origin=true show_goal=true reward_path_progress=0.1",
+        30,
+        1.6,
+        None,
+    ),
+    "endless-mystery-path": ("--env Endless-MysteryPath-v0", 30, 2.0, None),
+}
+
+
+def run(flags: list[str], folder: Path) -> dict:
+    """Train and evaluate an agent; returns the row for the results file."""
+    start = time.perf_counter()
+    settings: Settings = parse(flags)
+    done = checkpoint.load(train(dataclasses.replace(settings, run=str(folder))))
+    minutes = (time.perf_counter() - start) / 60
+    rows = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+    results = evaluate(done.agent, num_threads=1)
+    return {
+        "command": f"endless-train {shlex.join(flags)}",
+        "agent": settings.agent,
+        "seed": settings.seed,
+        "updates": done.update,
+        "steps": rows[-1]["steps"],
+        "minutes": round(minutes, 2),
+        "load_average": round(os.getloadavg()[0], 1),
+        "evaluation_reward": mean(results),
+        "evaluation": {name: mean(results, name) for name in results[0] if name != "seed"},
+        "curve": [[row["steps"], round(row["episode/reward"], 5)] for row in rows if "episode/reward" in row],
+    }
+
+
+def as_json(data: dict) -> str:
+    """JSON with one run per line."""
+    task, best = json.dumps(data["task"]), json.dumps(data["best_reward"])
+    runs = ",\n".join(json.dumps(run) for run in data["runs"])
+    return f'{{"task": {task}, "best_reward": {best}, "runs": [\n{runs}\n]}}\n'
+
+
+def plot() -> None:
+    """Plot the learning curves of each task beside its evaluations."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    colours = {"gru": "tab:green", "trxl": "tab:blue", "lstm": "tab:olive", "none": "tab:red", "stack": "tab:orange"}
+    for file in sorted(FOLDER.glob("*.json")):
+        data = json.loads(file.read_text())
+        figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), width_ratios=[3, 1], sharey=True)
+        agents = sorted({row["agent"] for row in data["runs"]})
+        for place, agent in enumerate(agents):
+            rows = [row for row in data["runs"] if row["agent"] == agent]
+            for number, row in enumerate(rows):
+                steps, rewards = zip(*row["curve"], strict=True)
+                label = agent if number == 0 else None
+                left.plot(
+                    [step / 1000 for step in steps], rewards, color=colours.get(agent, "grey"), lw=1.2, label=label
+                )
+            heights = [row["evaluation_reward"] for row in rows]
+            right.scatter([place] * len(rows), heights, color=colours.get(agent, "grey"), zorder=3)
+        left.set(xlabel="thousand steps", ylabel="mean reward of 100 episodes", title=f"{data['task']}: training")
+        right.set(
+            title="50 unseen seeds", xticks=range(len(agents)), xticklabels=agents, xlim=(-0.5, len(agents) - 0.5)
+        )
+        for axes in (left, right):
+            axes.grid(alpha=0.3)
+            if data["best_reward"]:
+                axes.axhline(data["best_reward"], color="black", lw=0.8, ls="--")
+        left.legend()
+        figure.tight_layout()
+        figure.savefig(file.with_suffix(".png"), dpi=110)
+        pyplot.close(figure)
+
+
+def report() -> None:
+    """Write `learning/README.md` with a table of all runs and the plots."""
+    lines = [
+        "# Learning with and without memory",
+        "",
+        "Agents with and without memory on small tasks, with feature observations unless the name contains `pixels`. Each run is",
+        "one command, on one or two cores of a shared machine. The reward is the mean over 50 seeds that training never uses,",
+        "three episodes each. An agent without memory was trained for as many updates as the slowest earlier run with memory.",
+        "Written by `learning.py --plot` from the JSON files in this folder, which contain the learning curves and the commands.",
+    ]
+    for task in TASKS:
+        file = FOLDER / f"{task}.json"
+        if not file.exists():
+            continue
+        data = json.loads(file.read_text())
+        best = f", {data['best_reward']} at most" if data["best_reward"] else ""
+        lines += ["", f"## {task}", "", f"    {data['runs'][0]['command']}", ""]
+        lines += [
+            f"| agent | seed | steps | minutes | evaluation reward{best} |",
+            "| --- | --- | --- | --- | --- |",
+        ]
+        for row in sorted(data["runs"], key=lambda row: (row["agent"] == "none", row["agent"], row["seed"])):
+            reward = f"{row['evaluation_reward']:.3f}"
+            lines.append(f"| {row['agent']} | {row['seed']} | {row['steps']:,} | {row['minutes']:.1f} | {reward} |")
+        lines += ["", f"![curves]({task}.png)"]
+    (FOLDER / "README.md").write_text("\n".join(lines) + "\n")
+
+
+def main() -> None:
+    """Train, evaluate and plot."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=TASKS, help="task to train and evaluate")
+    parser.add_argument("--agents", nargs="+", default=["gru", "none"], help="agents to train (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, default=[1, 2, 3], help="seeds of the runs (default: %(default)s)"
+    )
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads of PyTorch (default: %(default)s)")
+    parser.add_argument("--plot", action="store_true", help="plot all results and write learning/README.md")
+    args = parser.parse_args()
+    FOLDER.mkdir(exist_ok=True)
+    if args.task:
+        flags, minutes, target, best = TASKS[args.task]
+        file = FOLDER / f"{args.task}.json"
+        data = {"task": args.task, "best_reward": best, "runs": []}
+        data = json.loads(file.read_text()) if file.exists() else data
+        for agent in sorted(args.agents, key=lambda agent: agent == "none"):
+            for seed in args.seeds:
+                given = f"{flags} --agent {agent} --seed {seed} --preset quick"
+                given += f" --threads {args.threads} --environment.num-threads 1"
+                given += f" --time-limit {minutes} --target-reward {target}"
+                others = [row["updates"] for row in data["runs"] if row["agent"] != "none"]
+                if agent == "none" and others:
+                    given += f" --ppo.updates {max(others)}"
+                with tempfile.TemporaryDirectory() as folder:
+                    row = run(shlex.split(given), Path(folder) / "run")
+                kept = [old for old in data["runs"] if (old["agent"], old["seed"]) != (agent, seed)]
+                data["runs"] = [*kept, row]
+                file.write_text(as_json(data))
+                print(
+                    f"{args.task} {agent} {seed}: {row['evaluation_reward']:.4f} after {row['minutes']} minutes",
+                    flush=True,
+                )
+    if args.plot:
+        plot()
+        report()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,315 @@
+"""The agents on CUDA: equality with the CPU, copies, CUDA graphs, and training throughput. Takes less than ten minutes.
+
+    python on_cuda.py --json on_cuda.json --markdown on_cuda.md
+
+* Equality: each agent computes a rollout's log-probabilities and values, and a minibatch's loss and gradients, on the CPU and on
+  the device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
+* Copies: frames of a group from pageable and from page-locked memory to the device.
+* Graphs: rollouts of the GRU and the Transformer-XL agent with the sizes of the preset `paper`, with CUDA graphs and without,
+  whose contents must be equal to the same tolerance. The first segment captures the graphs and has a time of its own.
+* Training: steps per second with a breakdown, and peak memory, with the networks, frames, environments and steps of the preset
+  `paper`, and with more environments. The first update is excluded as warm-up.
+
+`--device cpu` runs the parts that need no GPU with small networks and few steps, to test this program; its numbers mean nothing.
+The exit status is 1 if there is no CUDA device, if a result on the device differs from the CPU's, or if rollouts with graphs
+differ from those without, or go on without graphs.
+"""
+
+import argparse
+import json
+import platform
+import statistics
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from endless_gym_agents import losses
+from endless_gym_agents.agent import Agent, make_agent
+from endless_gym_agents.clock import Clock
+from endless_gym_agents.encoders import FRAME
+from endless_gym_agents.environments import Environments
+from endless_gym_agents.graphs import Graphs, relative_difference
+from endless_gym_agents.ppo import learn, make_optimizer, minibatch_loss
+from endless_gym_agents.rollout import RolloutCollector, Segment
+from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
+from endless_gym_agents.train import choose_device
+
+AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
+TOLERANCE = 1e-3
+ENV = "Endless-MortarMayhem-v0"
+#: Environments and steps of the training measurements; the first is the paper's.
+BATCHES = ((32, 512), (128, 512), (512, 128))
+
+
+def networks(agent: str) -> Settings:
+    """Small networks for frames."""
+    return replace(
+        PRESETS["paper"],
+        env=ENV,
+        agent=agent,
+        environment=replace(PRESETS["paper"].environment, num_envs=4, groups=1),
+        recurrence=Recurrence(hidden_size=32, sequence_length=8),
+        transformer=Transformer(layers=2, width=32, heads=2, window=8, sequence_length=8, positions=64),
+        model=Model(vector_width=16, head_width=16),
+        ppo=PPO(updates=2, steps=16, epochs=1, minibatches=2),
+    )
+
+
+def computed(agent: Agent, draws: torch.Generator) -> dict[str, torch.Tensor]:
+    """What an agent computes of a drawn segment of 16 steps: outputs while acting, then loss and gradients; all on the CPU."""
+    steps, envs, device = 16, 4, agent.device
+    frames = torch.randint(0, 256, (steps, envs, 84, 84, 3), dtype=torch.uint8, generator=draws)
+    vectors = torch.randn(steps, envs, 16, generator=draws)
+    done = (torch.rand(steps, envs, generator=draws) < 0.1).to(device)
+    memory = agent.initial_memory(envs)
+    agent.memory.begin_segment(memory.state, steps)
+    rows = []
+    for step in range(steps):
+        first = memory.reset_mask
+        output = agent.act({FRAME: frames[step], "vector_observation": vectors[step]}, memory, greedy=True)
+        rows.append((first, output.action, output.log_prob, output.value, output.observation))
+        memory.reset(done[step])
+    first, action, log_prob, value = (torch.stack([row[i] for row in rows]) for i in range(4))
+    observation = {key: torch.stack([row[4][key] for row in rows]) for key in rows[0][4]}
+    reward = torch.randn(steps, envs, generator=draws).to(device)
+    last = torch.zeros(envs, device=device)
+    segment = Segment(observation, first, action, log_prob, value, reward, done, None, last)
+    advantages = losses.generalised_advantages(reward, value, done, last, 0.99, 0.95)
+    returns = (advantages + value).flatten()
+    (minibatch,) = agent.memory.minibatches([memory.state], first.cpu(), 1, torch.Generator().manual_seed(0))
+    loss, _ = minibatch_loss(agent, segment.flat(), minibatch, advantages.flatten(), returns, agent.settings.ppo, 0.01)
+    loss.backward()
+    gradients = {f"gradient of {name}": weight.grad for name, weight in agent.named_parameters()}
+    return {
+        name: tensor.detach().cpu()
+        for name, tensor in {"log_prob": log_prob, "value": value, "loss": loss, **gradients}.items()
+    }
+
+
+def equality(device: torch.device) -> list[dict[str, Any]]:
+    """The largest differences between the results of the CPU and of the device, relative to the largest value."""
+    shapes, rows = {FRAME: (84, 84, 3), "vector_observation": (16,)}, []
+    for name in AGENTS:
+        torch.manual_seed(1)
+        here = Agent(networks(name), shapes, (3, 3))
+        there = Agent(networks(name), shapes, (3, 3), device=device)
+        there.load_state_dict(here.state_dict())
+        one, two = (computed(agent, torch.Generator().manual_seed(2)) for agent in (here, there))
+        largest, where = max((relative_difference(one[key], two[key]), key) for key in one)
+        rows.append({"agent": name, "largest_difference": largest, "of": where, "equal": largest <= TOLERANCE})
+    return rows
+
+
+def copies(device: torch.device) -> list[dict[str, Any]]:
+    """Gigabytes per second of copies of the frames of 16 environments to the device."""
+    rows, target = [], torch.empty(16, 84, 84, 3, dtype=torch.uint8, device=device)
+    for locked in (False, True):
+        source = torch.zeros(target.shape, dtype=torch.uint8, pin_memory=locked)
+        for _ in range(10):
+            target.copy_(source, non_blocking=True)
+        torch.cuda.synchronize(device)
+        start, repeats = time.perf_counter(), 500
+        for _ in range(repeats):
+            target.copy_(source, non_blocking=True)
+        torch.cuda.synchronize(device)
+        seconds = time.perf_counter() - start
+        rows.append({"page_locked": locked, "gigabytes_per_second": repeats * target.numel() / seconds / 1e9})
+    return rows
+
+
+def rollouts(
+    settings: Settings, device: torch.device, graphs: Graphs | None, segments: int
+) -> list[tuple[dict[str, torch.Tensor], float, float]]:
+    """Some segments, after each of which the weights change.
+
+    Args:
+        settings: Settings of the run.
+        device: Device of the agent.
+        graphs: See `RolloutCollector`.
+        segments: Number of segments.
+
+    Returns:
+        For each segment its contents on the CPU, its seconds, and the seconds of `inference` in it.
+    """
+    settings = settings.validated()
+    torch.manual_seed(1)
+    rows = []
+    with Environments(settings) as environments:
+        agent = make_agent(settings, environments.spec, device)
+        generator, clock = torch.Generator(device).manual_seed(1), Clock()
+        collector = RolloutCollector(agent, environments, settings.ppo.steps, generator, graphs=graphs)
+        for _ in range(segments):
+            start = time.perf_counter()
+            segment, _ = collector.collect(clock)
+            contents = {
+                name: getattr(segment, name).cpu() for name in ("action", "log_prob", "value", "reward", "done")
+            }
+            rows.append((contents, time.perf_counter() - start, clock.take()["inference"]))
+            with torch.no_grad():
+                for parameter in agent.parameters():
+                    parameter.mul_(0.9)
+    return rows
+
+
+def compared_rollouts(
+    settings: Settings, device: torch.device, graphs: Graphs | None = None, segments: int = 4
+) -> dict[str, Any]:
+    """Rollouts with and without graphs: seconds of a segment after the first, and the largest difference of their contents."""
+    without = rollouts(replace(settings, cuda_graphs=False), device, None, segments)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with_graphs = rollouts(settings, device, graphs, segments)
+    refused = [str(warning.message) for warning in caught if issubclass(warning.category, RuntimeWarning)]
+    difference = max(
+        relative_difference(one[name], other[name])
+        for (one, *_), (other, *_) in zip(without, with_graphs, strict=True)
+        for name in one
+    )
+    row: dict[str, Any] = {"agent": settings.agent, "largest_difference": difference, "refused": refused}
+    row["equal"] = difference <= TOLERANCE and not refused
+    for name, rows in (("without", without), ("with", with_graphs)):
+        row[name] = {
+            "first_seconds": rows[0][1],
+            "seconds": statistics.median(seconds for _, seconds, _ in rows[1:]),
+            "inference_seconds": statistics.median(seconds for *_, seconds in rows[1:]),
+        }
+    return row
+
+
+def training(settings: Settings, device: torch.device, updates: int) -> dict[str, Any]:
+    """Steps per second of some updates after the first one, with their breakdown and the peak memory."""
+    settings = settings.validated()
+    ppo, cuda = settings.ppo, device.type == "cuda"
+    torch.manual_seed(1)
+    if cuda:
+        torch.cuda.reset_peak_memory_stats(device)
+    with Environments(settings) as environments:
+        agent = make_agent(settings, environments.spec, device)
+        optimizer = make_optimizer(agent, ppo.learning_rate)
+        collector = RolloutCollector(agent, environments, ppo.steps, torch.Generator(device).manual_seed(1))
+        clock, shuffle = Clock(), torch.Generator()
+        start = time.perf_counter()
+        for update in range(updates + 1):
+            if update == 1:
+                clock.take()
+                start = time.perf_counter()
+            segment, _ = collector.collect(clock)
+            with clock.measure("learning"):
+                states = [memory.state for memory in collector.memories]
+                learn(agent, optimizer, segment, states, update, ppo, shuffle)
+        seconds = time.perf_counter() - start
+    return {
+        "agent": settings.agent,
+        "num_envs": settings.environment.num_envs,
+        "steps": ppo.steps,
+        "steps_per_second": updates * settings.environment.num_envs * ppo.steps / seconds,
+        "shares_of_time": {name: spent / seconds for name, spent in clock.take().items()},
+        "peak_gigabytes": torch.cuda.max_memory_allocated(device) / 1e9 if cuda else None,
+    }
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """The report as Markdown."""
+    lines = [f"# The agents on {report['device']}", "", f"{report['versions']}.", "", "## Equality with the CPU", ""]
+    lines += [f"Largest difference, relative to the largest value; at most {TOLERANCE:g} is equal.", ""]
+    lines += ["| agent | difference | of | equal |", "| --- | --- | --- | --- |"]
+    for row in report["equality"]:
+        equal = "yes" if row["equal"] else "**no**"
+        lines.append(f"| {row['agent']} | {row['largest_difference']:.1e} | {row['of']} | {equal} |")
+    if "copies" in report:
+        lines += ["", "## Copies of the frames of 16 environments", "", "| memory | GB/s |", "| --- | --- |"]
+        for row in report["copies"]:
+            kind = "page-locked" if row["page_locked"] else "pageable"
+            lines.append(f"| {kind} | {row['gigabytes_per_second']:.1f} |")
+    lines += ["", "## Rollouts with CUDA graphs and without", ""]
+    lines += ["| agent | graphs | segment | of which inference | first segment | difference | equal |"]
+    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
+    for row in report["graphs"]:
+        equal = "yes" if row["equal"] else "**no**"
+        for name in ("without", "with"):
+            times = [f"{row[name][key]:.3f} s" for key in ("seconds", "inference_seconds", "first_seconds")]
+            ending = f"{row['largest_difference']:.1e} | {equal}" if name == "with" else " | "
+            lines.append(f"| {row['agent']} | {name} | {' | '.join(times)} | {ending} |")
+        lines += [f"\n{message}\n" for message in row["refused"]]
+    lines += [
+        "",
+        "## Training",
+        "",
+        "| agent | environments x steps | steps per second | share of time | peak memory |",
+    ]
+    lines += ["| --- | --- | --- | --- | --- |"]
+    for row in report["training"]:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in row["shares_of_time"].items())
+        memory = "" if row["peak_gigabytes"] is None else f"{row['peak_gigabytes']:.1f} GB"
+        batch = f"{row['num_envs']} x {row['steps']}"
+        lines.append(f"| {row['agent']} | {batch} | {row['steps_per_second']:,.0f} | {shares} | {memory} |")
+    for left_out in report["left_out"]:
+        lines += ["", f"Not measured, since the time was up: {left_out}."]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Run all parts, and print and write the report; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda", help="`cuda`, `cuda:INDEX` or `cpu` (default: %(default)s)")
+    parser.add_argument("--updates", type=int, default=2, help="timed updates of each training (default: %(default)s)")
+    parser.add_argument("--minutes", type=float, default=8.0, help="start no training after (default: %(default)s)")
+    parser.add_argument("--json", type=Path, help="write the report to this JSON file")
+    parser.add_argument("--markdown", type=Path, help="write the report to this Markdown file")
+    args = parser.parse_args()
+    device, started = torch.device(args.device), time.monotonic()
+    cuda = device.type == "cuda"
+    if cuda and not torch.cuda.is_available():
+        print(
+            "on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one", file=sys.stderr
+        )
+        return 1
+    if cuda:
+        device = choose_device(args.device)
+        torch.cuda.set_device(device)
+    versions = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}, Python {platform.python_version()}"
+    name = torch.cuda.get_device_name(device) if cuda else f"the CPU ({platform.machine()}), as a test of the program"
+    report: dict[str, Any] = {"device": name, "versions": versions}
+    torch.backends.cudnn.allow_tf32 = False
+    report["equality"] = equality(device)
+    if cuda:
+        report["copies"] = copies(device)
+        # As `endless-train`.
+        torch.backends.cudnn.allow_tf32 = True
+        torch.set_float32_matmul_precision("high")
+    paper = replace(PRESETS["paper"], env=ENV)
+    report["graphs"] = [
+        compared_rollouts(replace(paper, agent=agent) if cuda else networks(agent), device) for agent in ("gru", "trxl")
+    ]
+    report["training"], report["left_out"] = [], []
+    for num_envs, steps in BATCHES if cuda else ((4, 16),):
+        for agent in ("gru", "trxl"):
+            settings = replace(paper, agent=agent) if cuda else networks(agent)
+            settings = replace(
+                settings,
+                environment=replace(settings.environment, num_envs=num_envs),
+                ppo=replace(settings.ppo, steps=steps),
+            )
+            if (time.monotonic() - started) / 60 > args.minutes:
+                report["left_out"].append(f"{agent}, {num_envs} x {steps}")
+                continue
+            try:
+                report["training"].append(training(settings, device, args.updates))
+            except torch.cuda.OutOfMemoryError:
+                report["left_out"].append(f"{agent}, {num_envs} x {steps} (out of memory)")
+    text = markdown(report)
+    print(text)
+    if args.json:
+        args.json.write_text(json.dumps(report, indent=1) + "\n")
+    if args.markdown:
+        args.markdown.write_text(text)
+    return 0 if all(row["equal"] for row in report["equality"] + report["graphs"]) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

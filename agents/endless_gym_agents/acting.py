@@ -1,0 +1,137 @@
+"""The dense layers of the agent for acting, with weights in the form that needs the fewest operations.
+
+While acting, batches are small and the cost of a step is the number of operations. The layers here are single `addmm` calls on
+transposed copies of the agent's parameters; the policy and the value head are computed together. `Agent.refresh` says when
+`ActingWeights` are made again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from endless_gym_agents.heads import PolicyHead, ValueHead
+
+#: Bias (outputs,) and transposed weight (inputs, outputs) of a linear layer.
+Affine: TypeAlias = tuple[Tensor, Tensor]
+#: The logit of a choice that does not exist, in a branch with fewer choices than others. Finite, since infinity gives NaN.
+NO_CHOICE = -1e9
+
+_version = attrgetter("_version")
+
+
+def transposed(layer: nn.Module, dtype: torch.dtype) -> Affine:
+    """Bias and transposed weight of a layer; the weight is contiguous, which a product with few rows needs to be fast."""
+    assert isinstance(layer, nn.Linear)
+    return layer.bias.detach().to(dtype), layer.weight.detach().t().to(dtype).contiguous()
+
+
+def linear_relu(x: Tensor, layer: Affine) -> Tensor:
+    """A linear layer followed by a ReLU, float (n, outputs), for inputs float (n, inputs)."""
+    return torch.addmm(layer[0], x, layer[1]).relu_()
+
+
+def refill(tensors: Iterable[Tensor], newer: Iterable[Tensor]) -> None:
+    """Copy `newer` into `tensors`.
+
+    Both may be the same parameter: it has its new values already, and must not get a new version.
+    """
+    for mine, others in zip(tensors, newer, strict=True):
+        if mine.data_ptr() != others.data_ptr():
+            mine.copy_(others)
+
+
+def weights_version(parameters: Sequence[Tensor]) -> int:
+    """A number that rises with each change of the parameters in place, except by the kernels of fused optimizers."""
+    return sum(map(_version, parameters))
+
+
+@dataclass
+class ActingWeights:
+    """The layers after the memory, and the layer of vector observations.
+
+    Attributes:
+        version: `weights_version` of the parameters that they were made from.
+        vector: Layer of the vector observations; None without any.
+        embedding: Layer before the memory; None without one.
+        body: Layer after the memory.
+        hidden: Hidden layers of the policy and the value head side by side.
+        output: Output layers of both heads: the logits of all branches, each padded to the largest one, and the value.
+        branches: Number of branches.
+        choices: Choices of the largest branch.
+    """
+
+    version: int
+    vector: Affine | None
+    embedding: Affine | None
+    body: Affine
+    hidden: Affine
+    output: Affine
+    branches: int
+    choices: int
+
+    def copy_(self, other: ActingWeights) -> None:
+        """Copy the weights of the same layers, made later, into the tensors of these."""
+        for mine, others in zip(self._layers(), other._layers(), strict=True):
+            refill(mine, others)
+
+    def heads(self, x: Tensor) -> Tensor:
+        """Logits and value, float32 (n, branches * choices + 1), for outputs of the memory float (n, width)."""
+        x = linear_relu(linear_relu(x, self.body), self.hidden)
+        return torch.addmm(self.output[0], x, self.output[1]).float()
+
+    def logits(self, outputs: Tensor) -> Tensor:
+        """The logits, float32 (..., branches, choices), a view of what `heads` returned, float32 (..., outputs)."""
+        logits = outputs.narrow(-1, 0, self.branches * self.choices)
+        return logits.view(*outputs.shape[:-1], self.branches, self.choices)
+
+    def log_prob(self, outputs: Tensor, actions: Tensor) -> Tensor:
+        """Log-probabilities of actions int64 (..., branches), float32 (..., branches)."""
+        log_probs: Tensor = self.logits(outputs).log_softmax(-1)
+        return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
+
+    def _layers(self) -> list[Affine]:
+        layers = (self.vector, self.embedding, self.body, self.hidden, self.output)
+        return [layer for layer in layers if layer is not None]
+
+
+def acting_weights(
+    version: int,
+    dtype: torch.dtype,
+    vector: nn.Sequential | None,
+    embedding: nn.Sequential | None,
+    body: nn.Sequential,
+    policy: PolicyHead,
+    value: ValueHead,
+) -> ActingWeights:
+    """Make `ActingWeights` of the agent's layers; `dtype` is the type to compute in."""
+    (policy_bias, policy_weight), (value_bias, value_weight) = (
+        transposed(layer, dtype) for layer in (policy.hidden[0], value.layers[0])
+    )
+    branches = [transposed(layer, dtype) for layer in policy.branches]
+    choices, width = max(len(bias) for bias, _ in branches), policy_weight.shape[1]
+    outputs = len(branches) * choices + 1
+    bias = policy_bias.new_full((outputs,), NO_CHOICE)
+    weight = policy_weight.new_zeros(width + value_weight.shape[1], outputs)
+    for number, (branch_bias, branch_weight) in enumerate(branches):
+        columns = slice(number * choices, number * choices + len(branch_bias))
+        bias[columns] = branch_bias
+        weight[:width, columns] = branch_weight
+    last_bias, last_weight = transposed(value.layers[2], dtype)
+    bias[-1:] = last_bias
+    weight[width:, -1:] = last_weight
+    return ActingWeights(
+        version=version,
+        vector=None if vector is None else transposed(vector[0], dtype),
+        embedding=None if embedding is None else transposed(embedding[0], dtype),
+        body=transposed(body[0], dtype),
+        hidden=(torch.cat([policy_bias, value_bias]), torch.cat([policy_weight, value_weight], dim=1)),
+        output=(bias, weight),
+        branches=len(branches),
+        choices=choices,
+    )

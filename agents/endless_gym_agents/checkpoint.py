@@ -1,0 +1,125 @@
+"""Checkpoints: the state from which a run resumes, and the agent for evaluation.
+
+```python
+from endless_gym_agents import checkpoint
+
+loaded = checkpoint.load("runs/mine")    # the last checkpoint of a run, or a checkpoint file
+agent, steps = loaded.agent, loaded.steps
+```
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from endless_gym.specs import spec
+from endless_gym_agents.agent import Agent, make_agent
+from endless_gym_agents.settings import Settings, from_dict
+
+#: Version of a checkpoint's content. It changes when an older checkpoint can no longer be resumed or evaluated.
+CHECKPOINT_VERSION = 1
+
+#: Names inside the folder of a run: the settings, the folder of the checkpoints, and the last checkpoint in it.
+SETTINGS = "settings.json"
+FOLDER = "checkpoints"
+LAST = "last.pt"
+
+
+@dataclass
+class Checkpoint:
+    """A loaded checkpoint.
+
+    Attributes:
+        settings: Settings of the run.
+        agent: The agent with the weights of the checkpoint, in evaluation mode.
+        update: Number of updates so far.
+        steps: Number of environment steps so far.
+        state: The saved state; see `save`.
+    """
+
+    settings: Settings
+    agent: Agent
+    update: int
+    steps: int
+    state: dict[str, Any]
+
+
+def save(run: Path, state: dict[str, Any], keep: bool) -> Path:
+    """Write a checkpoint as the last one of a run, atomically.
+
+    Args:
+        run: Folder of the run.
+        state: `settings` (from `to_dict`), `update`, `steps`, `model`; and to resume, `optimizer`, `generators`, `player` (the
+            state of the rollout collector) and `episodes`.
+        keep: Also keep the checkpoint under the number of its update.
+
+    Returns:
+        Path of the last checkpoint.
+    """
+    folder = run / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    last, temporary = folder / LAST, folder / f"{LAST}.new"
+    torch.save({"version": CHECKPOINT_VERSION} | state, temporary)
+    if keep:
+        # A hard link: the same file under a second name.
+        numbered = folder / f"update-{state['update']:06d}.pt"
+        numbered.unlink(missing_ok=True)
+        os.link(temporary, numbered)
+    os.replace(temporary, last)
+    return last
+
+
+def files(run: str | Path) -> list[Path]:
+    """The numbered checkpoints of a run in order of their updates, or the last checkpoint if there are none."""
+    folder = Path(run) / FOLDER
+    return sorted(folder.glob("update-*.pt")) or [folder / LAST]
+
+
+def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
+    """Load a checkpoint.
+
+    Args:
+        path: A checkpoint file, or the folder of a run for its last checkpoint.
+        device: Device of the agent.
+
+    Raises:
+        FileNotFoundError: There is no such checkpoint.
+        ValueError: The checkpoint has another version.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / FOLDER / LAST
+    if not file.exists():
+        raise FileNotFoundError(
+            f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
+        )
+    # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
+    state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
+    version = state.get("version")
+    if version != CHECKPOINT_VERSION:
+        raise ValueError(
+            f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
+            "use the version of endless-gym that wrote it"
+        )
+    settings = from_dict(state["settings"])
+    agent = make_agent(settings, spec(settings.env), device)
+    agent.load_state_dict(state["model"])
+    agent.eval()
+    return Checkpoint(settings, agent, state["update"], state["steps"], state)
+
+
+def read_settings(run: str | Path) -> Settings:
+    """Read the settings of the run in folder `run`.
+
+    Raises:
+        FileNotFoundError: The folder contains no run.
+    """
+    if not (Path(run) / SETTINGS).exists():
+        raise FileNotFoundError(f"no run in {run}; expected a folder with {SETTINGS}, as endless-train writes it")
+    return from_dict(json.loads((Path(run) / SETTINGS).read_text()))

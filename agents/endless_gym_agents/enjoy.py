@@ -1,0 +1,143 @@
+"""`endless-enjoy`: record a video of a trained agent, with its observation beside the ground-truth view.
+
+```console
+endless-enjoy runs/mine                                        # one episode, as a GIF
+endless-enjoy runs/mine --seeds 200000 200001 --out play.mp4   # several, as MP4 (needs ffmpeg)
+```
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+
+from endless_gym.specs import ObservationName, spec
+from endless_gym.vector import EndlessVectorEnv, make_vec
+from endless_gym_agents import command, video
+from endless_gym_agents.agent import Agent, observation_shapes
+from endless_gym_agents.encoders import FRAME
+from endless_gym_agents.evaluate import EVALUATION_SEEDS
+from endless_gym_agents.train import choose_device
+
+
+@dataclass(frozen=True)
+class EnjoyArguments:
+    """Arguments of `endless-enjoy`."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """a checkpoint file, or the folder of a run for its last checkpoint"""
+    seeds: tuple[int, ...] = (EVALUATION_SEEDS.start,)
+    """seeds of the episodes, which are shown in order"""
+    out: Path = Path("episode.gif")
+    """output file, .gif (256 colours for each frame), .webp (without loss) or .mp4"""
+    action_seed: int = 0
+    """seed of the action sampling"""
+    greedy: bool = False
+    """take the most likely actions instead of sampling"""
+    max_steps: int = 1000
+    """stop recording an episode after this number of steps; 0 for no limit"""
+    fps: int = 0
+    """frames per second; 0 for the environment's frame rate"""
+    device: str = "cpu"
+    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
+
+
+@dataclass
+class EpisodeRecorder:
+    """Plays episodes and generates their video frames.
+
+    Attributes:
+        agent: The agent that plays.
+        action_seed: Seed of the action sampling.
+        greedy: Take the most likely actions instead of sampling.
+        max_steps: Largest number of steps of an episode; 0 for no limit.
+        rewards: Sum of rewards of each episode so far.
+        lengths: Number of steps of each episode so far.
+    """
+
+    agent: Agent
+    action_seed: int = 0
+    greedy: bool = False
+    max_steps: int = 0
+    rewards: list[float] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+
+    def frames(self, seeds: tuple[int, ...]) -> Iterator[video.Frame]:
+        """Generate a frame for the start and for each step of the episodes with these seeds; the last frame lasts one second."""
+        settings = self.agent.settings
+        generator = torch.Generator(self.agent.device).manual_seed(self.action_seed)
+        # The video shows rgb frames even if the agent observes features.
+        shown: ObservationName = "rgb" if settings.environment.observation == "rgb" else "rgb+features"
+        options = settings.options()
+        for seed in seeds:
+            # Like the original, an environment keeps some state between episodes; a new one gives the same video for a seed.
+            with make_vec(settings.env, 1, 1, options=options, autoreset="disabled", observation=shown) as envs:
+                yield from self._episode(envs, seed, generator)
+
+    def _episode(self, envs: EndlessVectorEnv, seed: int, generator: torch.Generator) -> Iterator[video.Frame]:
+        settings, memory = self.agent.settings, self.agent.initial_memory(1)
+        env_spec = spec(settings.env)
+        keys = observation_shapes(env_spec, settings.environment.observation)
+        observation, _ = envs.reset(seed=[seed])
+        reward, length, done = 0.0, 0, False
+        self.rewards.append(0.0)
+        self.lengths.append(0)
+        frame = self._frame(envs, observation, f"{settings.env}  seed {seed}  step 0")
+        yield frame
+        while not done and not (self.max_steps and length >= self.max_steps):
+            single = next(iter(keys))
+            observed = (
+                {key: observation[key] for key in keys} if isinstance(observation, dict) else {single: observation}
+            )
+            action = self.agent.act(observed, memory, generator, self.greedy).action.cpu().numpy()
+            observation, rewards, terminated, truncated, _ = envs.step(env_spec.batched_actions(action))
+            reward, length = reward + float(rewards[0]), length + 1
+            done = bool(terminated[0] or truncated[0])
+            self.rewards[-1], self.lengths[-1] = reward, length
+            text = f"{settings.env}  seed {seed}  step {length}  action {'-'.join(map(str, action[0]))}  reward {reward:.2f}"
+            frame = self._frame(envs, observation, text + ("  end" if done else ""))
+            yield frame
+        for _ in range(env_spec.render_fps):
+            yield frame
+
+    @staticmethod
+    def _frame(envs: EndlessVectorEnv, observation: Any, text: str) -> video.Frame:
+        frame = observation[FRAME] if isinstance(observation, dict) else observation
+        return video.compose(np.asarray(frame)[0], envs.ground_truth_view(0), text)
+
+
+def execute(arguments: EnjoyArguments) -> None:
+    """Record the video, and print the reward and length of each episode."""
+    if not arguments.seeds:
+        raise ValueError("--seeds must contain at least one seed, got none")
+    video.check(arguments.out)
+    agent = command.load_checkpoint(arguments.checkpoint, choose_device(arguments.device)).agent
+    recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
+    console = Console()
+    with Console(stderr=True).status(f"playing {agent.settings.env}"):
+        video.write(
+            arguments.out, recorder.frames(arguments.seeds), arguments.fps or spec(agent.settings.env).render_fps
+        )
+    for seed, reward, length in zip(arguments.seeds, recorder.rewards, recorder.lengths, strict=True):
+        console.print(f"seed {seed}: reward {reward:.2f} in {length} steps")
+    console.print(f"{arguments.out}", soft_wrap=True)
+
+
+def main() -> int:
+    """Entry point of the command `endless-enjoy`; returns the exit status."""
+    arguments = tyro.cli(
+        EnjoyArguments, prog="endless-enjoy", description=command.description(__doc__), args=sys.argv[1:]
+    )
+    return command.run("endless-enjoy", lambda: execute(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

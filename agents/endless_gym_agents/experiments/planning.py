@@ -1,0 +1,318 @@
+"""From an experiment to jobs: their flags at a scale, their folders, what is done of them, and how long the rest takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from endless_gym_agents import checkpoint
+from endless_gym_agents.experiments.definitions import Evaluation, Experiment, Run, Value, settings_of
+from endless_gym_agents.logs import PROGRESS, read_progress
+from endless_gym_agents.search_space import space
+
+#: The scale `tiny`: one update of most runs.
+TINY = 1 / 50_000
+#: Files of a job: the results of its evaluation, measurement or search.
+EVALUATION, SPEED, FINISHED = "evaluation.json", "speed.json", "finished.json"
+State = Literal["done", "interrupted", "not started"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of an experiment with one seed.
+
+    Attributes:
+        experiment: The experiment, at its scale.
+        run: The run, with the flags at that scale.
+        seed: Seed of the training.
+        folder: Folder of the run; the same for all experiments that contain it.
+    """
+
+    experiment: Experiment
+    run: Run
+    seed: int
+    folder: Path
+
+    @property
+    def title(self) -> str:
+        """Environment, name and seed."""
+        return f"{self.run.env} {self.run.name} seed {self.seed}"
+
+    @property
+    def updates(self) -> int:
+        """Updates of the training; 0 for jobs of other kinds."""
+        trains = self.experiment.kind in ("curves", "ablation", "wall-time")
+        return self.run.settings().ppo.updates if trains else 0
+
+    def updates_done(self) -> int:
+        """Updates in the log of the run."""
+        rows = read_progress(self.folder) if (self.folder / PROGRESS).exists() else []
+        return int(rows[-1]["update"]) if rows else 0
+
+    def trained(self) -> bool:
+        """Whether the last checkpoint is that of the last update."""
+        last = self.folder / checkpoint.FOLDER / checkpoint.LAST
+        if self.updates_done() < self.updates or not last.exists():
+            return False
+        return int(torch.load(last, map_location="cpu", weights_only=True, mmap=True)["update"]) >= self.updates
+
+    def state(self) -> State:
+        """Whether the job is done, and if not, whether it can be resumed."""
+        kind = self.experiment.kind
+        result = {"curves": EVALUATION, "simulation-speed": SPEED, "search": FINISHED}.get(kind, PROGRESS)
+        if _complete(self.folder / result) and (not self.updates or self.trained()):
+            return "done"
+        begun = (self.folder / checkpoint.FOLDER / checkpoint.LAST).exists() or (self.folder / "study.db").exists()
+        return "interrupted" if begun else "not started"
+
+
+def _complete(file: Path) -> bool:
+    """Whether a file exists and is complete; a process may have been killed while it wrote JSON."""
+    if not file.exists() or file.name == PROGRESS:
+        return file.exists()
+    try:
+        json.loads(file.read_text())
+    except json.JSONDecodeError:
+        return False
+    return True
+
+
+def read_scale(text: str) -> float:
+    """The scale that `--scale` names.
+
+    Raises:
+        ValueError: It is neither `tiny` nor a number in (0, 1].
+    """
+    try:
+        scale = TINY if text == "tiny" else float(text)
+    except ValueError:
+        scale = 0.0
+    if not 0 < scale <= 1:
+        raise ValueError(f"--scale must be greater than 0 and at most 1, or tiny; got `{text}`")
+    return scale
+
+
+def scaled(experiment: Experiment, scale: float) -> Experiment:
+    """A smaller version of an experiment; the same with scale 1.
+
+    Seeds, updates, the updates of the decay and between checkpoints, trials and episodes are multiplied by the scale;
+    environments, steps of a rollout, seeds of the evaluation and parameters of a search by its square root. Networks and tasks
+    stay.
+
+    Args:
+        experiment: The experiment.
+        scale: Greater than 0, at most 1.
+    """
+    if scale == 1:
+        return experiment
+
+    def times(number: int, factor: float, least: int = 1) -> int:
+        return min(number, max(least, round(number * factor)))
+
+    root = math.sqrt(scale)
+    runs = []
+    for run in experiment.runs:
+        settings = run.settings()
+        ppo, environment = settings.ppo, settings.environment
+        flags: dict[str, Value] = {
+            "ppo.updates": times(ppo.updates, scale),
+            "ppo.decay-updates": times(ppo.decay_updates, scale),
+            "ppo.steps": times(ppo.steps // 64, root) * 64,
+            "environment.num-envs": environment.groups * times(environment.num_envs // environment.groups, root),
+        }
+        runs.append(dataclasses.replace(run, flags={**run.flags, **flags}))
+    protocol, search = experiment.evaluation, experiment.search
+    searched = search.parameters or tuple(space(runs[0].settings()))
+    return dataclasses.replace(
+        experiment,
+        runs=tuple(runs),
+        seeds=times(experiment.seeds, scale),
+        episodes=times(experiment.episodes, scale),
+        evaluation=Evaluation(
+            times(protocol.interval, scale), times(protocol.seeds, root, 2), times(protocol.repetitions, root)
+        ),
+        search=dataclasses.replace(
+            search,
+            trials=times(search.trials, scale),
+            warm_up=times(search.warm_up, scale),
+            parameters=searched[: times(len(searched), root)],
+        ),
+    )
+
+
+def jobs(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] = ()) -> list[Job]:
+    """The jobs of an experiment at a scale, the first seed of all runs before the second.
+
+    Args:
+        experiment: The experiment at its full size.
+        out: Folder of all experiments.
+        scale: Scale of the experiment.
+        seeds: Seeds; empty for 1 to the number that the experiment names.
+
+    Raises:
+        ValueError: A seed is negative.
+    """
+    experiment = scaled(experiment, scale)
+    folder = folder_of(out, scale) / "runs"
+    chosen = tuple(seeds) or range(1, experiment.seeds + 1)
+    if min(chosen) < 0:
+        raise ValueError(f"--seeds must be 0 or more, got {min(chosen)}")
+    return [
+        Job(experiment, run, seed, folder / run.env / run.name / f"seed-{seed}")
+        for seed in chosen
+        for run in experiment.runs
+    ]
+
+
+def folder_of(out: Path, scale: float) -> Path:
+    """Folder of the runs and reports of a scale."""
+    return out if scale == 1 else out / f"scale-{scale:g}"
+
+
+def check_folders(planned: Sequence[Job]) -> None:
+    """Check that the runs in the folders are those of the jobs.
+
+    Raises:
+        ValueError: A folder has a run with other settings.
+    """
+    for job in planned:
+        if not job.updates or not (job.folder / checkpoint.SETTINGS).exists():
+            continue
+        found, wanted = checkpoint.read_settings(job.folder), job.run.settings()
+        own = ("env", "agent", "preset", "transformer", "recurrence", "model", "ppo")
+        for name in own:
+            if getattr(found, name) != getattr(wanted, name):
+                raise ValueError(
+                    f"{job.folder} has a run with another `{name}`: {getattr(found, name)}, and the experiment has "
+                    f"{getattr(wanted, name)}; use another --out, or remove the folder"
+                )
+
+
+def flags(values: Mapping[str, Value]) -> list[str]:
+    """Command-line arguments for flags and their values."""
+    arguments: list[str] = []
+    for name, value in values.items():
+        if isinstance(value, bool):
+            group, dot, entry = name.rpartition(".")
+            arguments.append(f"--{name}" if value else f"--{group}{dot}no-{entry}")
+        else:
+            arguments += [f"--{name}", *(map(str, value) if isinstance(value, list) else [str(value)])]
+    return arguments
+
+
+def commands(job: Job, device: str, engine_threads: int) -> list[list[str]]:
+    """What is left to run of a job: command lines, one after the other; the first word is a program of the package.
+
+    Args:
+        job: The job.
+        device: Device of the agent, as for `endless-train`.
+        engine_threads: Threads that step the environments.
+    """
+    experiment, run, folder = job.experiment, job.run, str(job.folder)
+    state = job.state()
+    if state == "done":
+        return []
+    if experiment.kind == "simulation-speed":
+        speed = ["endless-speed", "--env", run.env, "--episodes", str(experiment.episodes)]
+        return [[*speed, "--json", str(job.folder / SPEED)]]
+    here = ["--device", device, "--threads", "1", "--environment.num-threads", str(engine_threads)]
+    own = ["--env", run.env, *flags(run.flags), "--seed", str(job.seed)]
+    if experiment.kind == "search":
+        given = experiment.search
+        search = ["--folder", folder, "--trials", str(given.trials), "--warm-up", str(given.warm_up)]
+        search += ["--parameters", *given.parameters] if given.parameters else []
+        return [["endless-search", *search, *own, *here]]
+    wanted = [["endless-train", *own, "--run", folder, *here]]
+    if state == "interrupted":
+        wanted = [] if job.trained() else [["endless-train", "--resume", folder, *here]]
+    if experiment.kind == "curves":
+        protocol = experiment.evaluation
+        if wanted and state == "not started":
+            wanted[0] += ["--checkpoint-interval", str(protocol.interval), "--keep-checkpoints"]
+        test = ["--seeds", str(protocol.seeds), "--repetitions", str(protocol.repetitions)]
+        test += ["--device", device, "--threads", "1", "--engine-threads", str(engine_threads)]
+        wanted.append(["endless-eval", folder, *test, "--json", str(job.folder / EVALUATION)])
+    return wanted
+
+
+def update_seconds(job: Job) -> list[float]:
+    """Seconds of each update in the log of a job's run."""
+    rows = read_progress(job.folder) if (job.folder / PROGRESS).exists() else []
+    return [sum(value for name, value in row.items() if name.startswith("seconds/")) for row in rows]
+
+
+def seconds_per_update(job: Job) -> float | None:
+    """Median time of an update in the log of a job's run; None before its first update."""
+    times = update_seconds(job)
+    return statistics.median(times) if times else None
+
+
+def evaluation_seconds(job: Job) -> float | None:
+    """Time of a job's evaluation; None if it has none, or before it is done."""
+    file = job.folder / EVALUATION
+    return json.loads(file.read_text()).get("seconds") if _complete(file) else None
+
+
+def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -> Callable[[Job], float] | None:
+    """A measurement of each job; where there is none, the mean of the jobs of the same environment and agent, or else of all.
+
+    Args:
+        planned: The jobs.
+        measured: The measurement of a job; None without one.
+
+    Returns:
+        The measurement or its estimate; None if no job has a measurement.
+    """
+    known = [(job, value) for job in planned if (value := measured(job)) is not None]
+    if not known:
+        return None
+
+    def kind(job: Job) -> tuple[str, Value]:
+        return job.run.env, job.run.flags.get("agent", "gru")
+
+    def estimate(job: Job) -> float:
+        value = measured(job)
+        alike = [other for one, other in known if kind(one) == kind(job)] or [other for _, other in known]
+        return statistics.mean(alike) if value is None else value
+
+    return estimate
+
+
+def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None:
+    """Estimated time that the jobs that are not done still take; None before the first measured update.
+
+    Evaluations count once the first one is done.
+
+    Args:
+        planned: The jobs.
+        side_by_side: Number of jobs that run at a time.
+    """
+    training, evaluation = _estimate(planned, seconds_per_update), _estimate(planned, evaluation_seconds)
+    if training is None:
+        return None
+    left = [max(0, job.updates - job.updates_done()) * training(job) for job in planned]
+    if evaluation is not None:
+        for number, job in enumerate(planned):
+            if job.experiment.kind == "curves" and not _complete(job.folder / EVALUATION):
+                left[number] += evaluation(job)
+    return max(sum(left) / side_by_side, max(left))
+
+
+def as_json(experiment: Experiment, scale: float) -> dict[str, Any]:
+    """An experiment for `--list --json`: as its file, with the updates and steps of each run at the scale."""
+    small = scaled(experiment, scale)
+    values = json.loads(json.dumps(dataclasses.asdict(small)))
+    for row, run in zip(values["runs"], small.runs, strict=True):
+        settings = settings_of(run.env, run.flags).validated()
+        trains = small.kind != "simulation-speed"
+        row["updates"] = settings.ppo.updates if trains else 0
+        row["steps"] = row["updates"] * settings.environment.num_envs * settings.ppo.steps
+    return dict(values)

@@ -1,0 +1,295 @@
+"""Runs the commands of jobs side by side, each in a process of its own, and stops them so that they can be resumed."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import IO, Protocol
+
+import torch
+
+from endless_gym_agents import checkpoint
+from endless_gym_agents.experiments import planning
+from endless_gym_agents.experiments.planning import Job
+
+#: The measurement of an environment's speed.
+_SPEED = "endless-speed"
+#: Module of each program of the package.
+_MODULES = {
+    "endless-train": "endless_gym_agents.train",
+    "endless-eval": "endless_gym_agents.protocol",
+    "endless-search": "endless_gym_agents.search",
+    _SPEED: "endless_gym_agents.experiments.stepping",
+}
+#: Seconds between two looks at the processes, and between two estimates of the remaining time.
+_POLL, _REPORT = 0.1, 60.0
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What jobs run on.
+
+    Attributes:
+        jobs: Number of jobs that run at a time.
+        gpus: Visible GPUs, as in `CUDA_VISIBLE_DEVICES`; empty for the CPU.
+        device: Device of the agents, as for `endless-train`.
+        nice: Added to the niceness of the processes, 0 to 19.
+        job_cores: Cores of each job; 0 for its share of the cores of this machine.
+    """
+
+    jobs: int
+    gpus: tuple[str, ...] = ()
+    device: str = "auto"
+    nice: int = 19
+    job_cores: int = 0
+
+    @property
+    def engine_threads(self) -> int:
+        """Threads per job that step the environments."""
+        return self.job_cores or max(1, cores() // self.jobs)
+
+    def environment(self, slot: int) -> dict[str, str]:
+        """Environment variables that the job in a slot gets in addition."""
+        added = {"OMP_NUM_THREADS": "1"}
+        return added | {"CUDA_VISIBLE_DEVICES": self.gpus[slot % len(self.gpus)]} if self.gpus else added
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def machine(jobs: int, device: str, nice: int = 19) -> Machine:
+    """The machine with a number of jobs; 0 for one per GPU, or without GPUs one per core.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    if not 0 <= nice <= 19:
+        raise ValueError(f"--nice must be 0 to 19, got {nice}")
+    if jobs < 0:
+        raise ValueError(f"--jobs must be 0 or more, got {jobs}")
+    given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    count = torch.cuda.device_count() if device in ("auto", "cuda") else 0
+    gpus = tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))
+    return Machine(jobs or len(gpus) or cores(), gpus, device, nice)
+
+
+def shown(command: Sequence[str], machine: Machine, slot: int = 0) -> str:
+    """A command line for a shell, with its environment variables."""
+    variables = " ".join(f"{name}={value}" for name, value in machine.environment(slot).items())
+    if command[0] == _SPEED:  # It is no program of its own.
+        command = ["python", "-m", _MODULES[_SPEED], *command[1:]]
+    return f"{variables} nice -n {machine.nice} {shlex.join(command)}"
+
+
+class Process(Protocol):
+    """The process of a job, here or on another machine."""
+
+    def poll(self) -> int | None:
+        """The exit status; None before the process has ended."""
+
+    def send_signal(self, sig: int, /) -> None:
+        """Send a signal, unless the process has ended."""
+
+
+@dataclass
+class _Active:
+    """A job that is running in a slot."""
+
+    job: Job
+    slot: int
+    lock: IO[str]
+    commands: list[list[str]]
+    log: IO[str]
+    process: Process
+    begun: float = field(default_factory=time.monotonic)
+
+
+@dataclass
+class Outcome:
+    """What became of the jobs.
+
+    Attributes:
+        done: Jobs that have been completed.
+        failed: Jobs whose command failed, with its exit status.
+        elsewhere: Jobs that another process was running.
+        stopped: Whether the work was interrupted.
+    """
+
+    done: list[Job] = field(default_factory=list)
+    failed: list[tuple[Job, int]] = field(default_factory=list)
+    elsewhere: list[Job] = field(default_factory=list)
+    stopped: bool = False
+
+
+class Runner:
+    """Runs jobs; Ctrl-C (or SIGTERM) stops the running ones after their update, with checkpoints."""
+
+    def __init__(self, machine: Machine, say: Callable[[str], None], keep_checkpoints: bool = False) -> None:
+        """Make a runner.
+
+        Args:
+            machine: What the jobs run on.
+            say: Called with each line of progress.
+            keep_checkpoints: Keep all checkpoints of runs that have been evaluated, and not only the last.
+        """
+        self.machine, self.say, self.keep_checkpoints = machine, say, keep_checkpoints
+        self._active: list[_Active] = []
+        self._outcome = Outcome()
+
+    def run(self, planned: Sequence[Job]) -> Outcome:
+        """Run what is left of the jobs."""
+        waiting = [job for job in planned if job.state() != "done"]
+        before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        said = time.monotonic()
+        try:
+            while self._active or (waiting and not self._outcome.stopped):
+                taken = {active.slot for active in self._active}
+                for slot in sorted(set(range(self.machine.jobs)) - taken):
+                    while waiting and not self._outcome.stopped and not self._start(waiting.pop(0), slot):
+                        pass
+                time.sleep(_POLL)
+                for active in list(self._active):
+                    self._look(active)
+                if time.monotonic() - said > _REPORT:
+                    said = time.monotonic()
+                    self.say(left(planned, self.machine.jobs))
+        finally:
+            for active in self._active:
+                active.process.send_signal(signal.SIGKILL)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        return self._outcome
+
+    def _start(self, job: Job, slot: int) -> bool:
+        """Start the first command of a job; false if another process runs it."""
+        job.folder.parent.mkdir(parents=True, exist_ok=True)
+        # The lock belongs to the open file that the job's process inherits: it holds as long as one of both lives.
+        lock = Path(f"{job.folder}.lock").open("w")  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            self._outcome.elsewhere.append(job)
+            self.say(f"{job.title}: another process is running it")
+            return False
+        resumed = job.state() == "interrupted"
+        if not resumed and job.updates and (job.folder / checkpoint.SETTINGS).exists():
+            shutil.rmtree(job.folder)  # The run was killed before its first checkpoint.
+        job.folder.mkdir(exist_ok=True)
+        commands = planning.commands(job, self.machine.device, self.machine.engine_threads)
+        if not commands:  # Another process has completed it since.
+            lock.close()
+            return False
+        done = job.updates_done()
+        self.say(f"{job.title}: " + (f"resumed at update {done} of {job.updates}" if resumed else "started"))
+        log = Path(f"{job.folder}.log").open("a")  # noqa: SIM115
+        process = self._spawn(commands[0], slot, lock, log)
+        self._active.append(_Active(job, slot, lock, commands[1:], log, process))
+        return True
+
+    def _spawn(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> Process:
+        print(f"$ {shlex.join(command)}", file=log, flush=True)
+        return self._begin(command, slot, lock, log)
+
+    def _begin(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> Process:
+        """Start a command as a process."""
+        return popen(command, self.machine.nice, self.machine.environment(slot), log, (lock.fileno(),))
+
+    def _look(self, active: _Active) -> None:
+        """Go on with a job whose process has ended."""
+        status = active.process.poll()
+        if status is None:
+            return
+        if status == 0 and active.commands and not self._outcome.stopped:
+            active.process = self._spawn(active.commands.pop(0), active.slot, active.lock, active.log)
+            return
+        self._active.remove(active)
+        job, minutes = active.job, (time.monotonic() - active.begun) / 60
+        if status == 0 and job.experiment.kind == "search":
+            (job.folder / planning.FINISHED).write_text("{}\n")
+        if job.state() == "done":
+            if job.experiment.kind == "curves" and not self.keep_checkpoints:
+                for file in (job.folder / checkpoint.FOLDER).glob("update-*.pt"):
+                    file.unlink()
+            self._outcome.done.append(job)
+            self.say(f"{job.title}: done after {minutes:.1f} minutes")
+        elif self._outcome.stopped:
+            self.say(
+                f"{job.title}: stopped" + (f" at update {job.updates_done()} of {job.updates}" if job.updates else "")
+            )
+        else:
+            self._outcome.failed.append((job, status))
+            self.say(f"{job.title}: failed with status {status}; the log is {job.folder}.log")
+        active.log.close()
+        active.lock.close()
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        again = ", now without waiting for the end of an update" if self._outcome.stopped else ""
+        self._outcome.stopped = True
+        self.say(f"stopping {len(self._active)} jobs with checkpoints{again or '; press Ctrl-C again to stop at once'}")
+        for active in self._active:
+            active.process.send_signal(signal.SIGINT)
+
+
+def popen(
+    command: Sequence[str], nice: int, environment: Mapping[str, str], log: IO[str], inherited: Sequence[int] = ()
+) -> subprocess.Popen[bytes]:
+    """Start a command of the package as a process of this machine.
+
+    Args:
+        command: A program of the package and its arguments.
+        nice: Added to the niceness, 0 to 19.
+        environment: Environment variables in addition.
+        log: Where its output goes.
+        inherited: File descriptors that it inherits.
+    """
+    lowered = ["nice", "-n", str(nice)] if shutil.which("nice") else []
+    return subprocess.Popen(
+        [*lowered, sys.executable, "-m", _MODULES[command[0]], *command[1:]],
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, **environment},
+        pass_fds=inherited,
+        # The terminal's Ctrl-C reaches this process alone, which passes it on.
+        start_new_session=True,
+    )
+
+
+def left(planned: Sequence[Job], side_by_side: int) -> str:
+    """A line that says what is done and left, and how long the rest takes."""
+    states = [job.state() for job in planned]
+    trained, total = sum(min(job.updates_done(), job.updates) for job in planned), sum(job.updates for job in planned)
+    text = f"{states.count('done')} of {len(planned)} jobs done, {states.count('interrupted')} begun"
+    if total:
+        text += f", {trained:,} of {total:,} updates"
+        seconds = planning.remaining_seconds(planned, side_by_side)
+        evaluated = [planning.evaluation_seconds(job) is not None for job in planned if job.experiment.kind == "curves"]
+        if trained < total and seconds is None:
+            text += "; time unknown before the first update"
+        elif seconds:
+            text += f"; the rest takes {duration(seconds)}" + (
+                ", and its evaluation" if evaluated and not any(evaluated) else ""
+            )
+    return text
+
+
+def duration(seconds: float) -> str:
+    """A duration for a line of text, such as `2.5 hours`."""
+    for unit, size in (("days", 86_400.0), ("hours", 3_600.0), ("minutes", 60.0)):
+        if seconds >= size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} seconds"

@@ -1,0 +1,122 @@
+"""Runs the commands of jobs on Ray: each job is an actor that starts its process on a machine of the cluster, and signals it.
+
+What is done, the locks and the order of the jobs are those of `running`, in the process of the command. Experiments can therefore
+be continued with Ray or without.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from endless_gym_agents.experiments import running
+
+
+class RayRunner(running.Runner):
+    """Runs jobs on a connected Ray; Ctrl-C (or SIGTERM) stops the running ones after their update, with checkpoints."""
+
+    def __init__(
+        self, machine: running.Machine, say: Callable[[str], None], keep_checkpoints: bool = False, gpus: float = 0.0
+    ) -> None:
+        """Make a runner.
+
+        Args:
+            machine: What the jobs run on; `job_cores` are the CPU cores that Ray reserves for each.
+            say: Called with each line of progress.
+            keep_checkpoints: Keep all checkpoints of runs that have been evaluated, and not only the last.
+            gpus: GPUs that Ray reserves for each job.
+        """
+        super().__init__(machine, say, keep_checkpoints)
+        self._gpus = gpus
+
+    def _begin(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> running.Process:
+        del slot, lock
+        return _RayProcess(command, self.machine, self._gpus, Path(log.name))
+
+
+def jobs_that_fit(job_cpus: int, gpus: float) -> int:
+    """How many jobs of these CPU cores and GPUs the connected Ray can run at a time, at least 1."""
+    import ray
+
+    there = ray.cluster_resources()
+    fitting = there.get("CPU", 0.0) // job_cpus
+    if gpus:
+        fitting = min(fitting, there.get("GPU", 0.0) // gpus)
+    return max(1, int(fitting))
+
+
+class _RayProcess:
+    """A process that an actor starts as soon as Ray has the resources."""
+
+    def __init__(self, command: Sequence[str], machine: running.Machine, gpus: float, log: Path) -> None:
+        import ray
+
+        self._given = (list(command), machine.nice, machine.environment(0), str(log.resolve()))
+        # One call waits for the end of the process, another sends signals.
+        made = ray.remote(num_cpus=machine.job_cores, num_gpus=gpus, max_concurrency=2)(_Host)
+        self._host: Any = made.remote()
+        self._ready: Any = self._host.ready.remote()
+        self._end: Any = None
+        self._status: int | None = None
+
+    def poll(self) -> int | None:
+        import ray
+
+        if self._status is None and self._end is None and _is_there(self._ready):
+            try:
+                ray.get(self._ready)
+            except ray.exceptions.RayError:
+                self._status = -signal.SIGKILL
+            else:
+                self._end = self._host.run.remote(*self._given)
+        if self._status is None and self._end is not None and _is_there(self._end):
+            try:
+                self._status = int(ray.get(self._end))
+            except ray.exceptions.RayError:  # The machine, or the actor, is lost.
+                self._status = -signal.SIGKILL
+            ray.kill(self._host)  # gives its resources back
+        return self._status
+
+    def send_signal(self, sig: int, /) -> None:
+        import ray
+
+        if self._status is not None:
+            return
+        if self._end is None:  # It waits for resources.
+            ray.kill(self._host)
+            self._status = -sig
+        else:
+            self._host.send_signal.remote(int(sig))
+
+
+def _is_there(reference: Any) -> bool:
+    import ray
+
+    return bool(ray.wait([reference], timeout=0)[0])
+
+
+class _Host:
+    """The actor of a job: the parent of its process, which ends with it."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def ready(self) -> None:
+        """Return as soon as the actor runs."""
+
+    def run(self, command: Sequence[str], nice: int, environment: dict[str, str], log: str) -> int:
+        """Run a command to its end, and return its exit status."""
+        with open(log, "a") as output:
+            # Ray blocks it in its processes, and a child inherits that from the thread that starts it.
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            self._process = running.popen(command, nice, environment, output)
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            return self._process.wait()
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the command, unless it has ended."""
+        if self._process is not None:
+            self._process.send_signal(number)

@@ -1,0 +1,172 @@
+"""Logs of a run: one line per update on the terminal, `progress.jsonl`, TensorBoard and Weights & Biases."""
+
+from __future__ import annotations
+
+import json
+import math
+import secrets
+from collections import deque
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from endless_gym_agents.settings import Settings, to_dict
+
+#: Log file in the folder of a run, with one JSON object per update.
+PROGRESS = "progress.jsonl"
+#: Number of episodes that the means are computed over.
+RECENT = 100
+
+
+class Logger:
+    """Writes the metrics of each update."""
+
+    def __init__(self, run: Path, settings: Settings, update: int = 0) -> None:
+        """Open the logs of a run.
+
+        Args:
+            run: Folder of the run.
+            settings: Settings of the run.
+            update: Number of updates so far; entries of later updates are removed.
+        """
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.console = Console(highlight=False)
+        self._updates = settings.ppo.updates
+        progress = run / PROGRESS
+        if progress.exists():
+            kept = [row for row in read_progress(run) if row["update"] <= update]
+            progress.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
+        self._progress = progress.open("a")
+        self._board: Any = SummaryWriter(str(run), purge_step=update + 1)  # type: ignore[no-untyped-call]
+        rows = "\n".join(f"|{name}|{value}|" for name, value in _flat(to_dict(settings)))
+        self._board.add_text("settings", f"|setting|value|\n|-|-|\n{rows}", update)
+        self._wandb: Any = _weights_and_biases(run, settings, self.console) if settings.wandb else None
+
+    def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
+        """Log one update.
+
+        Args:
+            metrics: Metrics of the update by name, with `update`, `steps`, `steps_per_second`, `loss` and `entropy`.
+            seconds: Seconds by phase.
+        """
+        row = metrics | {f"seconds/{name}": value for name, value in seconds.items()}
+        self._progress.write(json.dumps({k: None if _is_nan(v) else v for k, v in row.items()}) + "\n")
+        self._progress.flush()
+        step = metrics["update"]
+        for name, value in row.items():
+            if name not in ("update", "steps"):
+                self._board.add_scalar(name if "/" in name else f"learning/{name}", value, step)
+        self._board.add_scalar("steps", metrics["steps"], step)
+        if self._wandb is not None:
+            self._wandb.log(row, step=step)
+        total = sum(seconds.values()) or 1.0
+        shares = " ".join(f"{name} {value / total:4.0%}" for name, value in seconds.items())
+        reward = metrics.get("episode/reward")
+        episodes = (
+            "no episode has ended yet"
+            if reward is None
+            else (f"reward {reward:.4f} length {metrics['episode/length']:.1f}")
+        )
+        self.console.print(
+            f"[bold]{step:>5}[/]/{self._updates} {metrics['steps']:>11,} steps {metrics['steps_per_second']:>8,.0f}/s  "
+            f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]",
+            soft_wrap=True,
+        )
+
+    def print(self, text: str) -> None:
+        """Print a line on the terminal."""
+        self.console.print(text, soft_wrap=True)
+
+    def close(self) -> None:
+        """Close all files."""
+        self._progress.close()
+        self._board.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+class SilentLogger(Logger):
+    """The logger of all ranks but the first: writes nothing."""
+
+    def __init__(self) -> None:
+        """Open nothing."""
+
+    def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
+        del metrics, seconds
+
+    def print(self, text: str) -> None:
+        del text
+
+    def close(self) -> None:
+        pass
+
+
+class Episodes:
+    """The final infos of the last 100 episodes.
+
+    Attributes:
+        recent: The infos, oldest first.
+    """
+
+    def __init__(self, infos: Iterable[dict[str, float]] = ()) -> None:
+        """Start with the infos of earlier episodes."""
+        self.recent: deque[dict[str, float]] = deque(infos, maxlen=RECENT)
+
+    def add(self, infos: Iterable[dict[str, float]]) -> None:
+        """Append the infos of more episodes."""
+        self.recent.extend(infos)
+
+    def is_full(self) -> bool:
+        """Whether 100 episodes have ended."""
+        return len(self.recent) == RECENT
+
+    def means(self) -> dict[str, float]:
+        """Mean of each entry under the key `episode/NAME`; empty if no episode has ended."""
+        if not self.recent:
+            return {}
+        return {f"episode/{key}": sum(info[key] for info in self.recent) / len(self.recent) for key in self.recent[0]}
+
+
+def read_progress(run: Path) -> list[dict[str, Any]]:
+    """The rows of `progress.jsonl`, one per update; an incomplete last line, from a killed process, is ignored."""
+    rows = []
+    for line in (run / PROGRESS).read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:
+    try:
+        import wandb
+    except ImportError:
+        console.print(
+            "--wandb needs Weights & Biases, which is not installed (pip install wandb); continuing without it"
+        )
+        return None
+    # A resumed run keeps its id.
+    kept = run / "wandb-id.txt"
+    if not kept.exists():
+        kept.write_text(secrets.token_hex(4))
+    given: dict[str, Any] = {"id": kept.read_text(), "name": run.name, "dir": str(run), "config": to_dict(settings)}
+    try:
+        return wandb.init(project="endless-gym", resume="allow", **given)
+    except wandb.Error as error:
+        raise ValueError(f"Weights & Biases: {error}; or log to local files with WANDB_MODE=offline") from None

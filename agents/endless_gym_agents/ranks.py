@@ -1,0 +1,218 @@
+"""The processes of a data-parallel run, which `torchrun` starts: each collects and learns from its share of the environments.
+
+N ranks compute what one process with all environments computes. Environments and action noise are numbered over all ranks; every
+rank divides the steps of all environments into the same minibatches and learns from its own part of each; gradients are summed,
+weighted by the number of steps.
+
+```console
+torchrun --nproc-per-node=2 -m endless_gym_agents.train -- --env MortarMayhem-Grid-v0 --preset quick
+```
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, distributed
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
+
+T = TypeVar("T")
+
+#: After this time without an answer from another rank, a rank gives up. A rank that has ended is noticed at once.
+TIMEOUT = timedelta(minutes=10)
+
+
+class RankLost(OSError):
+    """Another rank of the run has ended, or does not answer."""
+
+
+class Ranks:
+    """The ranks of this run. A process that `torchrun` did not start is the only rank.
+
+    Attributes:
+        rank: Number of this process, 0 to `size - 1`.
+        size: Number of processes.
+        local_rank: Number of this process among those of this machine.
+        local_size: Number of processes on this machine.
+        restarts: How often `torchrun` has started the run again.
+    """
+
+    def __init__(self) -> None:
+        """Read the environment variables that `torchrun` sets."""
+
+        def variable(name: str, default: int) -> int:
+            return int(os.environ.get(name, default))
+
+        # Both are needed to find the other processes, so that a stray `RANK` of a cluster's scheduler does not count.
+        started = "RANK" in os.environ and "MASTER_ADDR" in os.environ
+        self.rank, self.size = (variable("RANK", 0), variable("WORLD_SIZE", 1)) if started else (0, 1)
+        self.local_rank, self.local_size = (
+            (variable("LOCAL_RANK", 0), variable("LOCAL_WORLD_SIZE", 1)) if started else (0, 1)
+        )
+        self.restarts = variable("TORCHELASTIC_RESTART_COUNT", 0) if started else 0
+        self._cores = sorted(os.sched_getaffinity(0))
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process writes the logs and the checkpoints."""
+        return self.rank == 0
+
+    @contextmanager
+    def connected(self) -> Iterator[None]:
+        """Connects the ranks: by NCCL for tensors on a CUDA device, by gloo for others.
+
+        Raises:
+            RankLost: Another rank ended, or did not answer.
+        """
+        if self.size == 1:
+            yield
+            return
+        # Its functions have the process group of the time of the import as a default argument. If it were imported later (as
+        # torch._dynamo does, which optimizers import), it would keep the group and its threads until the interpreter ends.
+        import torch.distributed.nn.functional
+
+        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+        with self._watched("could not be reached"):
+            store, rank, size = next(rendezvous("env://", timeout=TIMEOUT))
+            # The store may be that of the run before a restart, with the addresses of processes that have ended.
+            store = PrefixStore(f"restart-{self.restarts}", store)
+            distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
+        with self._watched("has ended or does not answer"):
+            yield
+            # After an error, other ranks may not answer any more.
+            distributed.destroy_process_group()
+
+    @contextmanager
+    def _watched(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except distributed.DistError as error:
+            raise RankLost(self._lost(what, error)) from error
+        except RuntimeError as error:
+            # What gloo raises has no type of its own.
+            if "gloo" in str(error) or "onnection" in str(error):
+                raise RankLost(self._lost(what, error)) from error
+            raise
+
+    def _lost(self, what: str, error: Exception) -> str:
+        reason = str(error).splitlines()[0]
+        return f"rank {self.rank} of {self.size}: another rank {what} ({reason})"
+
+    @property
+    def threads(self) -> int | None:
+        """The threads for the environments of this rank, a share of the cores; `None` for the only rank: one per core."""
+        return None if self.local_size == 1 else max(1, len(self.cores))
+
+    @property
+    def cores(self) -> list[int]:
+        """The cores that are this rank's share of those that the process could use when it started."""
+        share = len(self._cores) // self.local_size
+        return self._cores[self.local_rank * share :][:share]
+
+    def bind(self) -> None:
+        """Bind this process, and the engine that it starts, to `cores`.
+
+        Raises:
+            ValueError: There are fewer cores than ranks on this machine.
+        """
+        if not self.cores:
+            given = f"{len(self._cores)} for {self.local_size} ranks"
+            raise ValueError(f"--bind-cores needs a core for each rank of a machine, got {given}; omit the flag")
+        os.sched_setaffinity(0, self.cores)
+
+    def check(self, num_envs: int, groups: int) -> None:
+        """Check that the environments can be divided.
+
+        Raises:
+            ValueError: They cannot.
+        """
+        if num_envs % (groups * self.size):
+            raise ValueError(
+                f"--environment.num-envs must be a multiple of {groups} groups times {self.size} ranks, got {num_envs}"
+            )
+
+    def share(self, total: int) -> range:
+        """The numbers that belong to this rank of `total` consecutive ones; `total` is a multiple of the number of ranks."""
+        size = total // self.size
+        return range(self.rank * size, (self.rank + 1) * size)
+
+    def columns(self, tensor: Tensor) -> Tensor:
+        """The columns of all ranks side by side, (T, N), from this rank's, (T, n)."""
+        if self.size == 1:
+            return tensor
+        # Not every backend knows booleans.
+        sent = tensor.byte() if tensor.dtype == torch.bool else tensor
+        sent = sent.contiguous()
+        parts = [torch.empty_like(sent) for _ in range(self.size)]
+        distributed.all_gather(parts, sent)
+        return torch.cat(parts, dim=1).to(tensor.dtype)
+
+    def add(self, tensors: Iterable[Tensor]) -> None:
+        """Replace tensors by their sums over all ranks, in one operation. All ranks then have the same bytes."""
+        if self.size == 1:
+            return
+        tensors = list(tensors)
+        joined = torch.cat([tensor.reshape(-1) for tensor in tensors])
+        distributed.all_reduce(joined)
+        for tensor, part in zip(tensors, joined.split([tensor.numel() for tensor in tensors]), strict=True):
+            tensor.copy_(part.view_as(tensor))
+
+    def copy_from_first(self, tensors: Iterable[Tensor]) -> None:
+        """Replace tensors by those of rank 0."""
+        if self.size > 1:
+            for tensor in tensors:
+                distributed.broadcast(tensor, 0)
+
+    def of_first(self, make: Callable[[], T]) -> T:
+        """What `make` returns at rank 0, where alone it is called. Its error there is an error everywhere.
+
+        Raises:
+            RankLost: There was an error at rank 0.
+        """
+        if self.size == 1:
+            return make()
+        answer: list[Any] = [None, None]
+        error: Exception | None = None
+        if self.is_first:
+            try:
+                answer[0] = make()
+            except Exception as raised:
+                answer[1], error = str(raised), raised
+        distributed.broadcast_object_list(answer, 0, device=torch.device("cpu"))
+        if error is not None:
+            raise error
+        if answer[1] is not None:
+            raise RankLost(f"rank {self.rank} of {self.size}: rank 0 stopped: {answer[1]}")
+        value: T = answer[0]
+        return value
+
+    def gathered(self, value: Any) -> list[Any] | None:
+        """The values of all ranks at rank 0, with tensors on the CPU; `None` elsewhere."""
+        if self.size == 1:
+            return [value]
+        values = [None] * self.size if self.is_first else None
+        distributed.gather_object(on_cpu(value), values, 0)
+        return values
+
+    def everywhere(self, value: Any) -> list[Any]:
+        """The values of all ranks, at every rank."""
+        if self.size == 1:
+            return [value]
+        values = [None] * self.size
+        distributed.all_gather_object(values, value)
+        return values
+
+
+def on_cpu(value: Any) -> Any:
+    """A value of dicts, lists and tensors, with the tensors on the CPU."""
+    if isinstance(value, Tensor):
+        return value.cpu()
+    if isinstance(value, dict):
+        return {key: on_cpu(part) for key, part in value.items()}
+    return [on_cpu(part) for part in value] if isinstance(value, list) else value

@@ -1,0 +1,224 @@
+"""Recurrent memory: GRU and LSTM, trained with truncated backpropagation through time.
+
+For learning, a segment is cut into sequences at the start of each episode and after every `sequence_length` steps. A sequence
+starts from the hidden state that was stored while acting (there is no burn-in), and gradients stop at its start. Sequences are
+packed (`PackedSequence`): no step is padded, and the number of sequential steps is the length of the longest sequence. On the CPU
+the layers of `recurrence` learn, and elsewhere those of PyTorch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.rnn import PackedSequence
+
+from endless_gym_agents.encoders import orthogonal
+from endless_gym_agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
+from endless_gym_agents.recurrence import packed_layers
+from endless_gym_agents.settings import Recurrence
+
+
+class RecurrentState(MemoryState):
+    """The hidden state, and the stored states that the sequences of the current segment start from.
+
+    Attributes:
+        hidden: float32 (parts, layers, n, hidden size). A GRU has one part, an LSTM two: hidden state and cell state.
+        stored: The hidden states before steps 0, L, 2L, ... of the segment, for sequences of length L; shaped as `hidden`.
+        time: Steps since the segment began.
+        steps: Length of the segment in steps; 0 if no segment is recorded.
+    """
+
+    def __init__(self, hidden: Tensor) -> None:
+        """Make a state with the given hidden state, outside a segment."""
+        self.hidden = hidden
+        self.stored: list[Tensor] = []
+        self.time = self.steps = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"hidden": self.hidden}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.hidden = state_dict["hidden"].to(self.hidden.device)
+
+
+@dataclass
+class RecurrentMinibatch(Minibatch):
+    """Packed sequences, in decreasing order of length.
+
+    Attributes:
+        batch_sizes: Number of sequences that have a step t, int64 (longest,), on the CPU; as in `PackedSequence`.
+        initial_hidden: States before the first steps of the sequences, float32 (parts, layers, sequences, hidden size).
+    """
+
+    batch_sizes: Tensor
+    initial_hidden: Tensor
+
+
+class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
+    """An optional fully connected layer, followed by GRU or LSTM layers.
+
+    The update that `step` returns is the next hidden state, float (parts, layers, n, hidden size).
+    """
+
+    def __init__(
+        self, kind: Literal["gru", "lstm"], input_width: int, settings: Recurrence, device: torch.device
+    ) -> None:
+        """Make the layers with orthogonal weights and zero biases.
+
+        Args:
+            kind: The kind of the recurrent layers.
+            input_width: Size of the encoded observations.
+            settings: Number and size of the layers, and the length of a sequence.
+            device: Device of the states.
+
+        Raises:
+            ValueError: A residual connection without embedding, with inputs that do not have the hidden size.
+        """
+        super().__init__()
+        self.settings = settings
+        self.width = settings.hidden_size
+        self.parts = 2 if kind == "lstm" else 1
+        self.device = device
+        if settings.residual and not settings.embedding and input_width != self.width:
+            raise ValueError(
+                f"--recurrence.residual needs inputs of the hidden size {self.width}, got an input width of {input_width}; "
+                "add --recurrence.embedding"
+            )
+        self.embedding = None
+        if settings.embedding:
+            self.embedding = nn.Sequential(orthogonal(nn.Linear(input_width, self.width)), nn.ReLU())
+        layers = nn.LSTM if kind == "lstm" else nn.GRU
+        self.recurrent = layers(self.width if settings.embedding else input_width, self.width, settings.layers)
+        for name, parameter in self.recurrent.named_parameters():
+            if "weight" in name:
+                nn.init.orthogonal_(parameter, 2**0.5)
+            else:
+                nn.init.zeros_(parameter)
+
+        self._cells: list[list[Tensor]] = []
+
+    def initial_state(self, num_envs: int) -> RecurrentState:
+        shape = (self.parts, self.settings.layers, num_envs, self.width)
+        return RecurrentState(torch.zeros(shape, device=self.device))
+
+    def begin_segment(self, state: RecurrentState, steps: int) -> None:
+        state.stored, state.time, state.steps = [], 0, steps
+
+    def refresh(self, dtype: torch.dtype) -> None:
+        del dtype  # The recurrent layers compute in float32.
+        self._cells = [[weight.detach() for weight in layer] for layer in self.recurrent.all_weights]
+
+    def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        hidden = state.hidden
+        if reset_mask is not None:
+            hidden = hidden.masked_fill(reset_mask.unsqueeze(-1), 0.0)
+        x = x.float()
+        y = x
+        after: list[tuple[Tensor, ...]] = []
+        with self._float32():
+            for cell, *parts in zip(self._cells, *(part.unbind() for part in hidden.unbind()), strict=True):
+                if self.parts == 1:
+                    y = torch.gru_cell(y, parts[0], *cell)
+                    after.append((y,))
+                else:
+                    after.append(torch.lstm_cell(y, parts, *cell))
+                    y = after[-1][0]
+        if len(after) == 1 and self.parts == 1:
+            next_hidden = y.view(1, 1, *y.shape)
+        else:
+            next_hidden = torch.stack([torch.stack(part) for part in zip(*after, strict=True)])
+        return y + x if self.settings.residual else y, next_hidden
+
+    def update_state(self, state: RecurrentState, update: Tensor) -> None:
+        # Hidden states are replaced and never written in place, so the stored ones stay valid without a copy.
+        self.store(state, copy=False)
+        state.hidden = update
+
+    def store(self, state: RecurrentState, copy: bool) -> None:
+        """Store the hidden state, or a copy of it, if a sequence starts from it, and count the step."""
+        if state.time < state.steps and state.time % self.settings.sequence_length == 0:
+            state.stored.append(state.hidden.clone() if copy else state.hidden)
+        state.time += 1
+
+    def minibatches(
+        self,
+        states: Sequence[RecurrentState],
+        reset_mask: Tensor,
+        num_minibatches: int,
+        generator: torch.Generator,
+        own: range | None = None,
+        epochs: int = 1,
+    ) -> Sequence[RecurrentMinibatch]:
+        length, (steps, envs) = self.settings.sequence_length, reset_mask.shape
+        own = range(envs) if own is None else own
+        stored = torch.stack(
+            [torch.cat([state.stored[cut] for state in states], dim=2) for cut in range(-(-steps // length))]
+        )  # (cuts, parts, layers, own environments, hidden size)
+        # A sequence starts every `length` steps and with each episode. Sequences are ordered by environment, then by step.
+        starts = reset_mask.t().clone()
+        starts[:, ::length] = True
+        env, time = starts.nonzero(as_tuple=True)
+        start = env * steps + time
+        lengths = torch.cat([start[1:], torch.tensor([envs * steps])]) - start
+
+        def minibatch(chosen: Tensor) -> RecurrentMinibatch:
+            everywhere = None
+            if len(own) < envs:
+                everywhere, _ = packed(time[chosen], env[chosen], lengths[chosen], envs)
+                everywhere, chosen = everywhere.to(self.device), chosen[is_own(env[chosen], own)]
+            chosen = chosen[lengths[chosen].argsort(descending=True, stable=True)]
+            e, t, sizes = env[chosen], time[chosen], lengths[chosen]
+            n = e - own.start if own.start else e
+            indices, batch_sizes = packed(t, n, sizes, len(own))
+            indices = indices.to(self.device)
+            hidden = stored[(t // length).to(stored.device), :, :, n.to(stored.device)]
+            starts_episode = reset_mask[t, e].to(stored.device)[:, None]
+            hidden = hidden.permute(1, 2, 0, 3).masked_fill(starts_episode, 0.0).contiguous()
+            everywhere = indices if everywhere is None else everywhere
+            return RecurrentMinibatch(indices, everywhere, batch_sizes, hidden)
+
+        return LazyMinibatches(shuffled(lengths.tolist(), num_minibatches, epochs, generator), minibatch)
+
+    def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
+        x = x.float()
+        with self._float32():
+            if x.device.type == "cpu":
+                sizes, weights = minibatch.batch_sizes.tolist(), self.recurrent.all_weights
+                y = packed_layers(x, weights, minibatch.initial_hidden, sizes)
+            else:
+                sequences = PackedSequence(x, minibatch.batch_sizes)
+                output, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
+                y = output.data
+        return y + x if self.settings.residual else y
+
+    def _float32(self) -> contextlib.AbstractContextManager[Any]:
+        """Disables autocast, which would run cuDNN's recurrent layers in float16 where bfloat16 is requested."""
+        if not torch.is_autocast_enabled(self.device.type):
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, enabled=False)
+
+    def _split(self, hidden: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        """Convert (parts, layers, n, hidden size) to what `nn.GRU` or `nn.LSTM` takes."""
+        return hidden[0] if self.parts == 1 else (hidden[0], hidden[1])
+
+
+def packed(time: Tensor, env: Tensor, lengths: Tensor, envs: int) -> tuple[Tensor, Tensor]:
+    """The steps of sequences in the order of a `PackedSequence`, if the sequences are in decreasing order of length.
+
+    Args:
+        time: First step of each sequence, int64 (sequences,).
+        env: Environment of each sequence, int64 (sequences,).
+        lengths: Steps of each sequence, int64 (sequences,).
+        envs: Number of environments in the segment.
+
+    Returns:
+        The index of each step in the flattened segment, int64, and the number of sequences that have a step t, int64 (longest,).
+    """
+    offset = torch.arange(int(lengths.max()) if len(lengths) else 0).unsqueeze(1)  # (longest, 1)
+    exists = offset < lengths
+    return ((time + offset) * envs + env)[exists], exists.sum(1)

@@ -1,0 +1,212 @@
+"""`endless-reproduce`: repeat the experiments of the paper, with figures and tables beside the published ones.
+
+Each run is an `endless-train` process with a folder of its own, which several experiments may share. Repeating the command skips
+what is done and resumes what was interrupted.
+
+```console
+endless-reproduce --list                       # the experiments
+endless-reproduce endless --scale 0.01         # a small version
+endless-reproduce endless --jobs 8             # the experiment, eight runs at a time
+endless-reproduce endless --ray auto           # on the machines of a Ray cluster
+```
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from endless_gym_agents import command, on_ray
+from endless_gym_agents.experiments import definitions, planning, running, running_ray
+from endless_gym_agents.experiments.definitions import Experiment
+from endless_gym_agents.experiments.planning import Job
+
+
+@dataclass(frozen=True)
+class ReproduceArguments:
+    """Arguments of `endless-reproduce`."""
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """experiments, as `--list` names them; `all` for all of them; or JSON files of your own"""
+    list: bool = False
+    """print the experiments, and run nothing"""
+    json: bool = False
+    """with `--list`: print JSON"""
+    dry_run: bool = False
+    """print the commands that are left to run, and run nothing"""
+    status: bool = False
+    """print what is done, what is left and how long it takes, and run nothing"""
+    report: bool = False
+    """write figures and tables of what is done, and run nothing"""
+    out: Path = Path("reproduction")
+    """folder of the runs, figures and tables"""
+    scale: str = "1"
+    """a smaller version: a number up to 1, or `tiny` for one update. It multiplies seeds, updates, trials and episodes;
+    its square root multiplies environments, steps of a rollout, seeds of the evaluation and the searched parameters"""
+    seeds: tuple[int, ...] = ()
+    """seeds of the runs; by default 1 to the number that the paper uses, 5 for most"""
+    jobs: int = 0
+    """runs side by side; 0 for one per GPU, or without GPUs one per core. With --ray for all machines; 0 for as many as the
+    resources permit"""
+    device: str = "auto"
+    """`cpu`, `cuda`, ...; `auto` for CUDA if available, else the CPU. Each run sees one GPU"""
+    nice: int = 19
+    """added to the niceness of the runs, 0 to 19; 19 leaves the cores to all other processes"""
+    keep_checkpoints: bool = False
+    """keep the checkpoints of evaluated runs, some gigabytes each, and not only the last one"""
+    ray: str = ""
+    """run on Ray. The flag alone starts Ray on this machine; with an address the runs are on that cluster, whose machines must
+    share the folder --out"""
+    job_cpus: int = 1
+    """with --ray: CPU cores of a run"""
+    job_gpus: float | None = None
+    """with --ray: GPUs of a run; by default 1 if the cluster has any and the device is not `cpu`"""
+
+
+def listed(experiments: list[Experiment], scale: float) -> Table:
+    """A table of experiments at a scale; `runs` is the number of runs and of their seeds."""
+    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for name in ("name", "paper", "runs", "updates", "title"):
+        right = name in ("runs", "updates")
+        table.add_column(name, justify="right" if right else "left", no_wrap=True)
+    for experiment in experiments:
+        values = planning.as_json(experiment, scale)
+        updates = sorted({row["updates"] for row in values["runs"]})
+        span = f"{updates[0]:,}" if len(updates) == 1 else f"{updates[0]:,}-{updates[-1]:,}"
+        count = f"{len(experiment.runs)} x {values['seeds']}"
+        table.add_row(experiment.name, experiment.section, count, span if updates[-1] else "", experiment.title)
+    return table
+
+
+def machine_of(arguments: ReproduceArguments) -> running.Machine:
+    """What the runs are started on; with `--ray` the number of jobs is that of this machine until Ray is connected.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    if not arguments.ray:
+        return running.machine(arguments.jobs, arguments.device, arguments.nice)
+    if arguments.job_cpus < 1:
+        raise ValueError(f"--job-cpus must be 1 or more, got {arguments.job_cpus}")
+    if arguments.job_gpus is not None and arguments.job_gpus < 0:
+        raise ValueError(f"--job-gpus must be 0 or more, got {arguments.job_gpus}")
+    here = running.machine(arguments.jobs, "cpu", arguments.nice)
+    # Ray gives each run its GPUs.
+    return replace(here, device=arguments.device, gpus=(), job_cores=arguments.job_cpus)
+
+
+def run(
+    planned: list[Job],
+    machine: running.Machine,
+    runner: Callable[[running.Machine, Callable[[str], None], bool], running.Runner],
+    say: Callable[[str], None],
+    keep_checkpoints: bool,
+) -> running.Outcome:
+    """Run what is left of the jobs.
+
+    Args:
+        planned: The jobs.
+        machine: What they run on.
+        runner: Makes a runner.
+        say: Called with each line of progress.
+        keep_checkpoints: As for `Runner`.
+    """
+    # Speeds are measured one at a time.
+    alone = [job for job in planned if job.experiment.kind == "simulation-speed"]
+    outcome = runner(machine, say, keep_checkpoints).run([job for job in planned if job not in alone])
+    if alone and not outcome.stopped:
+        speeds = runner(replace(machine, jobs=1), say, keep_checkpoints).run(alone)
+        outcome.failed += speeds.failed
+        outcome.stopped = speeds.stopped
+    return outcome
+
+
+def execute(arguments: ReproduceArguments) -> None:
+    """Do what the arguments say.
+
+    Raises:
+        ValueError: An argument is invalid, a folder has another run, or a run failed.
+        KeyboardInterrupt: The runs were stopped.
+    """
+    console, scale = Console(highlight=False), planning.read_scale(arguments.scale)
+    every = arguments.names == ("all",) or (arguments.list and not arguments.names)
+    experiments = [definitions.load(name) for name in (definitions.names() if every else arguments.names)]
+    if not experiments:
+        raise ValueError("no experiment given; `endless-reproduce --list` lists them")
+    if arguments.list:
+        if arguments.json:
+            print(json.dumps([planning.as_json(experiment, scale) for experiment in experiments], indent=1))
+        else:
+            # Names and numbers are whole also where the terminal, or a pipe, is narrow.
+            Console(highlight=False, width=max(console.width, 120)).print(listed(experiments, scale))
+        return
+    machine, out = machine_of(arguments), arguments.out
+    if arguments.ray:
+        on_ray.check_installed()
+        out = out.resolve()  # The other processes have other working directories.
+    parts = {one.name: planning.jobs(one, out, scale, arguments.seeds) for one in experiments}
+    # Runs that several experiments share are run once.
+    planned = list({job.folder: job for jobs in parts.values() for job in jobs}.values())
+    planning.check_folders(planned)
+    if arguments.dry_run:
+        for number, job in enumerate(job for job in planned if job.state() != "done"):
+            for line in planning.commands(job, machine.device, machine.engine_threads):
+                print(running.shown(line, machine, number))
+        return
+    if arguments.status:
+        for job in planned:
+            state, trained = job.state(), min(job.updates_done(), job.updates)
+            of = f", update {trained} of {job.updates}" if job.updates else ""
+            if job.experiment.kind == "curves" and state != "done" and trained == job.updates:
+                of += ", evaluation left"
+            console.print(f"{state:<11}  {job.title}{of}", soft_wrap=True)
+    side_by_side = "on Ray" if arguments.ray else f"{machine.jobs} at a time"
+    console.print(f"{running.left(planned, machine.jobs)}, {side_by_side}", soft_wrap=True)
+    if arguments.status:
+        return
+    outcome = running.Outcome()
+    if not arguments.report:
+        say = lambda line: console.print(line, soft_wrap=True)  # noqa: E731
+        if arguments.ray and any(job.state() != "done" for job in planned):
+            with on_ray.connected(arguments.ray):
+                gpus = on_ray.gpus(arguments.job_gpus, arguments.device)
+                machine = replace(machine, jobs=arguments.jobs or running_ray.jobs_that_fit(arguments.job_cpus, gpus))
+                outcome = run(
+                    planned, machine, partial(running_ray.RayRunner, gpus=gpus), say, arguments.keep_checkpoints
+                )
+        else:
+            outcome = run(planned, machine, running.Runner, say, arguments.keep_checkpoints)
+    if outcome.stopped:
+        console.print(f"{running.left(planned, machine.jobs)}; repeat the command to continue", soft_wrap=True)
+        raise KeyboardInterrupt
+    from endless_gym_agents.experiments import report
+
+    folder = planning.folder_of(out, scale)
+    for experiment in experiments:
+        written = report.write(parts[experiment.name], folder / experiment.name, scale)
+        console.print(f"{written}, with its figures and tables", soft_wrap=True)
+    if outcome.failed:
+        failed = "; ".join(f"{job.title} (log {job.folder}.log)" for job, _ in outcome.failed)
+        raise ValueError(f"{len(outcome.failed)} runs failed: {failed}; repeat the command to continue")
+
+
+def main() -> int:
+    """Entry point of the command `endless-reproduce`; returns the exit status."""
+    given = on_ray.with_address(sys.argv[1:])
+    arguments = tyro.cli(
+        ReproduceArguments, prog="endless-reproduce", description=command.description(__doc__), args=given
+    )
+    return command.run("endless-reproduce", lambda: execute(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

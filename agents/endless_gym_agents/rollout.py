@@ -1,0 +1,366 @@
+"""Collection of rollouts: segments of T steps in N environments.
+
+The environments are divided into groups. While the agent computes the actions of one group, the other groups are stepped. A
+segment continues the episodes of the previous one.
+
+Between an observation and the actions is only what the actions need: the observation is copied to its place in the segment, the
+network reads it there, and the copy of the actions is the only operation that waits for the device. The memory is updated while
+the environments step; log-probabilities and values are computed from the stored outputs at the end of the segment.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from endless_gym_agents.agent import Agent, AgentMemory
+from endless_gym_agents.clock import Clock
+from endless_gym_agents.encoders import FRAME, Observation
+from endless_gym_agents.environments import Environments, StepResult
+from endless_gym_agents.graphs import GraphedGroup, Graphs, graphs_for
+from endless_gym_agents.host import HostCopy, Outcome, Upload
+from endless_gym_agents.naive import Identity
+from endless_gym_agents.ranks import Ranks
+from endless_gym_agents.repeats import EmbeddedFrames
+
+
+@dataclass
+class Segment:
+    """T steps of N environments, on the agent's device.
+
+    Attributes:
+        observation: Transformed observations before each step, (T, N, ...) each; frames uint8, vectors float32.
+        reset_mask: Whether the observation is the first of an episode, bool (T, N).
+        action: int64 (T, N, branches).
+        log_prob: Log-probability of the choice in each branch, float32 (T, N, branches).
+        value: Value estimate of the observation, float32 (T, N).
+        reward: Reward of the step, float32 (T, N).
+        done: Whether the step ended its episode, bool (T, N).
+        ground_truth: Ground truth of the observation, float32 (T, N, entries); None if the agent does not estimate it.
+        last_value: Bootstrap value: the value estimate of the observation after the last step, float32 (N,).
+        first_occurrence: Index t * N + n of the first step with an equal observation, int64 (T, N); None if it is not known.
+    """
+
+    observation: Observation
+    reset_mask: Tensor
+    action: Tensor
+    log_prob: Tensor
+    value: Tensor
+    reward: Tensor
+    done: Tensor
+    ground_truth: Tensor | None
+    last_value: Tensor
+    first_occurrence: Tensor | None = None
+
+    def flat(self) -> Segment:
+        """The segment with steps and environments in one dimension, (T * N, ...); step t of environment n has index t * N + n."""
+
+        def flatten(tensor: Tensor) -> Tensor:
+            return tensor.flatten(0, 1)
+
+        return Segment(
+            observation={key: flatten(part) for key, part in self.observation.items()},
+            reset_mask=flatten(self.reset_mask),
+            action=flatten(self.action),
+            log_prob=flatten(self.log_prob),
+            value=flatten(self.value),
+            reward=flatten(self.reward),
+            done=flatten(self.done),
+            ground_truth=None if self.ground_truth is None else flatten(self.ground_truth),
+            last_value=self.last_value,
+            first_occurrence=None if self.first_occurrence is None else flatten(self.first_occurrence),
+        )
+
+    def distinct(self, indices: Tensor) -> tuple[Observation, Tensor | None]:
+        """The observations of steps of a flattened segment; equal ones once, if it is known which are equal.
+
+        Args:
+            indices: Indices of M steps, int64 (M,).
+
+        Returns:
+            The observations, (rows, ...) each, and the row of each step, int64 (M,); `None` if each step has a row of its own.
+        """
+        rows = None
+        if self.first_occurrence is not None:
+            indices, rows = self.first_occurrence.index_select(0, indices).unique(return_inverse=True)
+        return {key: part.index_select(0, indices) for key, part in self.observation.items()}, rows
+
+
+@dataclass
+class Columns:
+    """The part of a segment that belongs to one group of n environments: for each step a view of the tensors.
+
+    Attributes:
+        observation: Transformed observations by key.
+        action: int64 (n, branches).
+        outputs: Logits and value, float32 (n, outputs).
+        outcome: Rewards and ends of episodes, float32 (2, n); before each step, and after the last.
+        ground_truth: float32 (n, entries); empty if the agent does not estimate it.
+    """
+
+    observation: list[Observation]
+    action: Sequence[Tensor]
+    outputs: Sequence[Tensor]
+    outcome: Sequence[Tensor]
+    ground_truth: Sequence[Tensor]
+
+
+class RolloutCollector:
+    """Collects consecutive segments with an agent, in preallocated tensors.
+
+    Attributes:
+        memories: The agent's memory of each group of environments.
+        current: The latest result of each group.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        environments: Environments,
+        steps: int,
+        generator: torch.Generator,
+        ranks: Ranks | None = None,
+        graphs: Graphs | None = None,
+    ) -> None:
+        """Reset the environments and allocate the segment.
+
+        Args:
+            agent: The agent that acts.
+            environments: The environments.
+            steps: Steps of a segment.
+            generator: Generator that samples the actions, on the agent's device; in the same state at every rank.
+            ranks: The ranks of the run; `None` for this process alone.
+            graphs: Captures the steps; `None` for what the settings and the device determine.
+        """
+        self.agent, self.environments, self.steps, self.generator = agent, environments, steps, generator
+        groups, per_group, device = environments.groups, environments.per_group, agent.device
+        self._envs_everywhere = groups * per_group * (ranks or Ranks()).size
+        self._own = (ranks or Ranks()).share(self._envs_everywhere)
+        self.memories: list[AgentMemory] = [agent.initial_memory(per_group) for _ in range(groups)]
+        self.current: list[StepResult] = [environments.reset(group) for group in range(groups)]
+        shape, branches = (steps, groups * per_group), len(agent.branches)
+        self._observation = {
+            key: torch.zeros((*shape, *part), dtype=torch.uint8 if key == FRAME else torch.float32, device=device)
+            for key, part in agent.transform.shapes.items()
+        }
+        self._action = torch.zeros((*shape, branches), dtype=torch.long, device=device)
+        self._outputs = torch.zeros((*shape, branches * max(agent.branches) + 1), device=device)
+        # Before each step, and after the last.
+        self._outcome = torch.zeros((steps + 1, 2, shape[1]), device=device)
+        self._last_value = torch.zeros(shape[1], device=device)
+        self._ground_truth: Tensor | None = None
+        if agent.ground_truth is not None:
+            self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
+        self._graphs = graphs or graphs_for(agent.settings, device)
+        self._graphed: list[GraphedGroup] = []
+        are_frames = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
+        self._frames: EmbeddedFrames | None = None
+        # `torch.compile` would compile the encoder again for each number of frames.
+        if are_frames and device.type == "cpu" and not agent.settings.compile and self._graphs is None:
+            self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
+        self._parts = [self._columns(self._slice(group)) for group in range(groups)]
+        self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]
+        self._outcomes = [Outcome(per_group, device) for _ in range(groups)]
+        self._uploads = [Upload(device) for _ in range(groups)]
+
+    def collect(self, clock: Clock) -> tuple[Segment, list[dict[str, float]]]:
+        """Collect one segment.
+
+        Args:
+            clock: Measures the phases `stepping` and `inference`.
+
+        Returns:
+            The segment, whose tensors the next call overwrites, and the final infos of the episodes that ended.
+        """
+        episodes: list[dict[str, float]] = []
+        self.agent.refresh()
+        if self._frames is not None:
+            self._frames.clear()
+        # Drawn for the environments of all ranks, so that actions do not depend on how these are divided.
+        noise = self.agent.noise((self.steps, self._envs_everywhere), self.generator)
+        noise = noise[:, self._own.start : self._own.stop]
+        for group, memory in enumerate(self.memories):
+            self.agent.memory.begin_segment(memory.state, self.steps)
+            self._outcome[0, 1, self._slice(group)] = memory.reset_mask
+        if self._graphs is not None:
+            self._try_graphs(lambda: self._begin_graphs(noise))
+        noises = [noise[:, self._slice(group)].unbind() for group in range(self.environments.groups)]
+        for step in range(self.steps):
+            for group in range(self.environments.groups):
+                if step:
+                    with clock.measure("stepping"):
+                        episodes += self._receive(group, step - 1)
+                if self._graphs is not None and not self._graphed[group].captured:
+                    with clock.measure("inference"):
+                        self._upload(group)
+                        self._try_graphs(partial(self._graphed[group].capture, self._graphs))
+                if self._graphs is None:
+                    self._act(group, step, noises[group][step], clock)
+                else:
+                    self._act_by_graphs(group, step, clock)
+        for group, memory in enumerate(self.memories):
+            with clock.measure("stepping"):
+                episodes += self._receive(group, self.steps - 1)
+            with clock.measure("inference"):
+                value = self.agent.bootstrap_value(self.current[group].observation, memory)
+                self._last_value[self._slice(group)] = value
+        return self._segment(), episodes
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memories and snapshots of the environments, for a checkpoint between two segments."""
+        return {
+            "memories": [memory.state_dict() for memory in self.memories],
+            "environments": self.environments.snapshots(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load what `state_dict` returned, for the same settings."""
+        self.current = self.environments.restore(state_dict["environments"])
+        for memory, memory_state in zip(self.memories, state_dict["memories"], strict=True):
+            memory.load_state_dict(memory_state)
+
+    def start_episodes(self, environments: list[list[list[bytes]]]) -> None:
+        """Start episodes after those of another number of ranks.
+
+        Args:
+            environments: The snapshots of each rank, by group.
+        """
+        # In the order of the environments' numbers.
+        snapshots = [snapshot for rank in environments for group in rank for snapshot in group]
+        own = snapshots[self._own.start : self._own.stop]
+        groups, per_group = self.environments.groups, self.environments.per_group
+        self.environments.restore([own[group * per_group :][:per_group] for group in range(groups)])
+        self.current = [self.environments.reset(group) for group in range(groups)]
+
+    def _act(self, group: int, step: int, noise: Tensor, clock: Clock) -> None:
+        memory, current, part, agent = self.memories[group], self.current[group], self._parts[group], self.agent
+        with clock.measure("inference"):
+            slots, update = part.observation[step], dict[str, Tensor]()
+            if isinstance(agent.transform, Identity):
+                # Straight into the segment, where the network reads it.
+                for key, value in agent.as_mapping(current.observation).items():
+                    self._uploads[group].copy(key, value, slots[key])
+                observed = slots
+            else:
+                observed, update = agent.observe(agent.to_tensors(current.observation), memory)
+            decision = agent.decide(observed, memory, noise, self._embedded(group, step))
+            actions = self._actions[group]
+            actions.start(decision.action)
+            actions.wait()
+        with clock.measure("stepping"):
+            self.environments.send(actions.array, group)
+        with clock.measure("inference"):
+            # From here on the environments step.
+            agent.remember(memory, decision, update)
+            if observed is not slots:
+                for key, value in observed.items():
+                    slots[key].copy_(value)
+            part.action[step].copy_(decision.action)
+            part.outputs[step].copy_(decision.outputs)
+            self._upload_ground_truth(group, step)
+
+    def _act_by_graphs(self, group: int, step: int, clock: Clock) -> None:
+        """As `_act`, with the graphs, which have the noise of all steps."""
+        graphed, actions = self._graphed[group], self._actions[group]
+        with clock.measure("inference"):
+            self._upload(group)
+            actions.start(graphed.decide())
+            actions.wait()
+        with clock.measure("stepping"):
+            self.environments.send(actions.array, group)
+        with clock.measure("inference"):
+            graphed.remember()
+            self._upload_ground_truth(group, step)
+
+    def _upload(self, group: int) -> None:
+        """Begin to copy the group's observation to where the graphs read it."""
+        observation = self.agent.as_mapping(self.current[group].observation)
+        for key, target in self._graphed[group].observation.items():
+            self._uploads[group].copy(key, observation[key], target)
+
+    def _upload_ground_truth(self, group: int, step: int) -> None:
+        ground_truth, targets = self.current[group].ground_truth, self._parts[group].ground_truth
+        if targets and ground_truth is not None:
+            self._uploads[group].copy("ground truth", ground_truth, targets[step])
+
+    def _begin_graphs(self, noise: Tensor) -> None:
+        """Begin a segment with the noise of its steps, float32 (T, N, branches, choices)."""
+        if not all(graphed.is_valid() for graphed in self._graphed):
+            self._graphed = []
+        for group, memory in enumerate(self.memories):
+            columns = self._slice(group)
+            if len(self._graphed) == group:
+                segment = {key: part[:, columns] for key, part in self._observation.items()}
+                tensors = [self._action[:, columns], self._outputs[:, columns], self._outcome[:, :, columns]]
+                self._graphed.append(GraphedGroup(self.agent, memory, segment, *tensors))
+            self._graphed[group].begin_segment(noise[:, columns])
+
+    def _try_graphs(self, prepare: Callable[[], None]) -> None:
+        """Prepare graphs, or go on without any. The memories are as before, or can be used without graphs as well."""
+        try:
+            prepare()
+        except Exception as error:
+            self._graphs, self._graphed = None, []
+            warnings.warn(
+                f"CUDA graphs are not used, training goes on without them ({type(error).__name__}: {error}); "
+                "--no-cuda-graphs turns them off",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+
+    def _embedded(self, group: int, step: int) -> Tensor | None:
+        """What `Agent.embed` returns for an observation in the segment; None if equal observations are not encoded once."""
+        if self._frames is None:
+            return None
+        columns = self._slice(group)
+        start = step * self._action.shape[1]
+        frames = range(start + columns.start, start + columns.stop)
+        return self._frames.embed(frames, lambda new: self.agent.embed({FRAME: new}))
+
+    def _receive(self, group: int, step: int) -> list[dict[str, float]]:
+        result = self.environments.receive(group)
+        self.current[group] = result
+        outcome = self._parts[group].outcome[step + 1]
+        self._outcomes[group].copy_to(outcome, result.reward, result.done)
+        # The graphs read the outcome itself.
+        if self._graphs is None or step == self.steps - 1:
+            memory = self.memories[group]
+            memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
+        return result.episodes
+
+    @torch.no_grad()
+    def _segment(self) -> Segment:
+        """The collected segment, with what is computed from the outputs of all its steps."""
+        ends = self._outcome[:, 1].bool()
+        return Segment(
+            observation=self._observation,
+            reset_mask=ends[:-1],
+            action=self._action,
+            log_prob=self.agent.acting_weights().log_prob(self._outputs, self._action),
+            value=self._outputs[..., -1].contiguous(),
+            reward=self._outcome[1:, 0].contiguous(),
+            done=ends[1:],
+            ground_truth=self._ground_truth,
+            last_value=self._last_value,
+            first_occurrence=None if self._frames is None else self._frames.first.view(self._action.shape[:2]),
+        )
+
+    def _slice(self, group: int) -> slice:
+        return slice(group * self.environments.per_group, (group + 1) * self.environments.per_group)
+
+    def _columns(self, columns: slice) -> Columns:
+        """The views of a group; made once, since making a view costs as much as a small operation."""
+        parts = {key: part[:, columns].unbind() for key, part in self._observation.items()}
+        return Columns(
+            observation=[{key: part[step] for key, part in parts.items()} for step in range(self.steps)],
+            action=self._action[:, columns].unbind(),
+            outputs=self._outputs[:, columns].unbind(),
+            outcome=self._outcome[:, :, columns].unbind(),
+            ground_truth=() if self._ground_truth is None else self._ground_truth[:, columns].unbind(),
+        )

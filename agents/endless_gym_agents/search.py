@@ -1,0 +1,127 @@
+"""`endless-search`: the hyperparameter search of the paper.
+
+The first stage tries every choice of the paper's table as a single change of the initial settings. The second stage tries
+combinations proposed by a Tree-structured Parzen Estimator (TPE). After a warm-up, trials outside the best quarter of the
+earlier trials are pruned. The objective is the mean reward of the last 100 training episodes.
+
+The search can be interrupted and restarted at any time: the trials are stored in `study.db` of the search's folder, and an
+interrupted trial resumes from its checkpoint. Several processes of a machine may work on one folder; `--workers` starts them.
+`--ray` runs the trials on Ray Tune, on this machine or on a cluster.
+
+```console
+endless-search --env MortarMayhem-v0 --agent trxl --ppo.updates 5000 --trials 50
+endless-search --env MortarMayhem-v0 --agent trxl --ppo.updates 5000 --workers 4
+endless-search --env MortarMayhem-v0 --agent trxl --ppo.updates 5000 --ray auto
+```
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import tyro
+from rich.console import Console
+
+from endless_gym_agents import command, on_ray, search_ray, search_workers
+from endless_gym_agents.search_study import SearchArguments, Trial, Trials, resumable
+from endless_gym_agents.settings import PRESETS, Settings
+from endless_gym_agents.train import train
+
+
+def run_trial(trial: Trial, settings: Settings) -> None:
+    """Train with the settings of a trial, in this process.
+
+    Args:
+        trial: The trial.
+        settings: Its settings, possibly with other numbers of threads.
+
+    Raises:
+        KeyboardInterrupt: The run was interrupted; its checkpoint is that of its last update.
+    """
+    parent = multiprocessing.parent_process()
+    done = 0
+
+    def watch(update: int, means: Mapping[str, Any]) -> bool:
+        nonlocal done
+        done = update
+        # The worker of a search that was killed stops as if it had been interrupted.
+        return trial.observe(update, means.get("episode/reward")) or not (parent is None or parent.is_alive())
+
+    try:
+        settings, rows = resumable(settings)
+        for row in rows:
+            watch(row["update"], row)
+        if not trial.pruned:
+            train(settings, watch)
+        if done < settings.ppo.updates and not trial.pruned:
+            raise KeyboardInterrupt
+    except torch.cuda.OutOfMemoryError:
+        trial.fail("ran out of GPU memory")
+    except BaseException:
+        trial.interrupt()
+        raise
+    else:
+        trial.complete()
+
+
+def run_trials(trials: Trials, given: search_workers.Share | None = None) -> None:
+    """Run trials in this process, one after the other, until none is left to begin.
+
+    Args:
+        trials: The trials.
+        given: What this process may use of the machine; None for all of it.
+    """
+    while (trial := trials.begin()) is not None:
+        if given is None:
+            run_trial(trial, trial.settings)
+        else:
+            with search_workers.output_of(trial.settings):
+                run_trial(trial, given.limited(trial.settings))
+
+
+def execute(arguments: SearchArguments) -> None:
+    """Run the search, and report the best settings so far, also if it is interrupted."""
+    arguments = arguments.validated()
+    if arguments.ray:
+        # Tune imports pyarrow, which Ray alone does not install.
+        on_ray.check_installed("pyarrow")
+    trials = Trials(arguments, Console(highlight=False))
+    done, left = trials.remaining()
+    trials.say(f"{done} trials done, {left} remaining, in {trials.folder}; Ctrl-C stops the search")
+    try:
+        if not left:
+            return
+        if arguments.ray:
+            search_ray.run_on_ray(trials, train)
+        elif arguments.workers > 1:
+            search_workers.run_workers(trials, run_trials)
+        else:
+            run_trials(trials)
+    finally:
+        trials.report()
+
+
+def parse(arguments: list[str]) -> SearchArguments:
+    """Parse command-line arguments; the preset determines the defaults of the training flags."""
+    chosen = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    chosen.add_argument("--preset", default="paper")
+    preset = chosen.parse_known_args(arguments)[0].preset
+    default = SearchArguments(settings=PRESETS.get(preset, PRESETS["paper"]))
+    text = command.description(__doc__)
+    given = on_ray.with_address(arguments)
+    return tyro.cli(SearchArguments, prog="endless-search", description=text, args=given, default=default)
+
+
+def main() -> int:
+    """Entry point of the command `endless-search`; returns the exit status."""
+    arguments = parse(sys.argv[1:])
+    return command.run("endless-search", lambda: execute(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

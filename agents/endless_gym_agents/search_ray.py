@@ -1,0 +1,195 @@
+"""A hyperparameter search whose trials run on Ray Tune, on this machine or on a cluster.
+
+Tune starts the trials, and starts them again after failures. The study decides which trials there are and which are pruned, in
+the process of the search, as it does without Ray. The same search can therefore be continued with Ray or without.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from endless_gym_agents import on_ray
+from endless_gym_agents.search_study import Trial, Trials, resumable
+from endless_gym_agents.search_workers import Share, output_of
+from endless_gym_agents.settings import from_dict, to_dict
+
+#: Trains a run, as `endless_gym_agents.train.train`.
+Trainer = Callable[..., Path]
+
+#: Name of the folder with Tune's own files, in the folder of the search.
+TUNE = "tune"
+
+
+def run_on_ray(trials: Trials, trainer: Trainer) -> None:
+    """Run trials on Ray Tune until none is left to begin.
+
+    Args:
+        trials: The trials; `arguments.ray` is `local` or the address of a cluster.
+        trainer: Trains a run.
+
+    Raises:
+        KeyboardInterrupt: The search was interrupted. The trials resume from their last checkpoints.
+        ValueError: There is no such cluster, or a trial failed too often.
+    """
+    arguments = trials.arguments
+    # The runs log for themselves. Tune would take Ctrl-C for the end of the search.
+    quiet = {"TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1", "TUNE_DISABLE_SIGINT_HANDLER": "1", "RAY_AIR_NEW_OUTPUT": "0"}
+    for name, value in quiet.items():
+        os.environ.setdefault(name, value)
+    study = _Study(trials)
+    try:
+        # Ray would kill the engine together with its trainer. Nobody would remove their shared memory then, which the engine
+        # does when its trainer has ended, before it ends itself.
+        with on_ray.connected(arguments.ray, spare_children=True):
+            _tune(study, trainer, on_ray.gpus(arguments.trial_gpus, arguments.settings.device))
+    finally:
+        # Only now, since another process may begin the trials from here on.
+        study.interrupt()
+    if study.failed:
+        numbers = ", ".join(map(str, study.failed))
+        raise ValueError(
+            f"trials {numbers} failed more than {arguments.max_failures} times; see the logs in {trials.folder}, and repeat the "
+            "command to resume them"
+        )
+
+
+def _tune(study: _Study, trainer: Trainer, gpus: float) -> None:
+    """Run the trials of the study with Tune."""
+    from ray import tune
+    from ray.tune.schedulers import FIFOScheduler, TrialScheduler
+    from ray.tune.search import Searcher
+
+    class Proposals(Searcher):  # type: ignore[misc]
+        """Gives Tune the trials of the study, and tells the study how they end."""
+
+        def suggest(self, trial_id: str) -> Any:
+            return study.begin(trial_id) or Searcher.FINISHED
+
+        def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
+            study.end(trial_id, error)
+
+        def save(self, checkpoint_path: str) -> None:
+            """Nothing: the study is stored."""
+
+        def restore(self, checkpoint_path: str) -> None:
+            """Nothing: the study is stored."""
+
+    class Pruning(FIFOScheduler):  # type: ignore[misc]
+        """Stops the trials that the study prunes."""
+
+        def on_trial_result(self, tune_controller: Any, trial: Any, result: dict[str, Any]) -> str:
+            is_pruned = study.observe(trial.trial_id, result)
+            decision: str = TrialScheduler.STOP if is_pruned else TrialScheduler.CONTINUE
+            return decision
+
+    arguments = study.trials.arguments
+    tuner = tune.Tuner(
+        tune.with_resources(
+            _trainable(trainer, arguments.period, arguments.trial_cpus), {"cpu": arguments.trial_cpus, "gpu": gpus}
+        ),
+        tune_config=tune.TuneConfig(
+            search_alg=Proposals(),
+            scheduler=Pruning(),
+            num_samples=-1,
+            max_concurrent_trials=arguments.workers or None,
+        ),
+        run_config=tune.RunConfig(
+            name=time.strftime("%Y%m%d-%H%M%S"),
+            storage_path=str((study.trials.folder / TUNE).resolve()),
+            failure_config=tune.FailureConfig(max_failures=arguments.max_failures),
+            verbose=0,
+        ),
+    )
+    tuner.fit()
+
+
+def _trainable(trainer: Trainer, period: int, cpus: int) -> Callable[[dict[str, Any]], None]:
+    """The function that a process of Ray calls to train a trial, and calls again in another process after a failure."""
+
+    def run(config: dict[str, Any]) -> None:
+        from ray import tune
+
+        given = from_dict(config["settings"])
+        last, reward, done = given.ppo.updates, None, 0
+
+        def watch(update: int, means: Mapping[str, Any]) -> bool:
+            nonlocal reward, done
+            done, reward = update, means.get("episode/reward", reward)
+            # Each report waits until the search has read the one before.
+            if update % period == 0 and reward is not None and update < last:
+                tune.report({"update": update, "reward": reward})
+            return False
+
+        with output_of(given):
+            settings, rows = resumable(given)
+            for row in rows:
+                watch(row["update"], row)
+            exhausted = False
+            try:
+                if done < last:
+                    trainer(Share(cpus).limited(settings), watch)
+            except torch.cuda.OutOfMemoryError:
+                exhausted = True
+        tune.report({"update": done, "reward": reward, "end": "exhausted" if exhausted else "done"})
+
+    return run
+
+
+class _Study:
+    """The trials that Tune runs, by Tune's ids.
+
+    Attributes:
+        trials: The trials of the search.
+        failed: Numbers of the trials that failed more often than they are resumed.
+    """
+
+    def __init__(self, trials: Trials) -> None:
+        self.trials = trials
+        self.failed: list[int] = []
+        self._active: dict[str, Trial] = {}
+        self._ended: dict[str, str] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tune pickles what it is given, to restore a search from its own files. This one is restored from the study.
+        return {}
+
+    def begin(self, tune_id: str) -> dict[str, Any] | None:
+        """The configuration of the next trial; None if none is left to begin."""
+        trial = self.trials.begin()
+        if trial is None:
+            return None
+        self._active[tune_id] = trial
+        settings = to_dict(trial.settings)
+        # The other processes have other working directories.
+        return {"settings": settings | {"run": str(Path(trial.settings.run).resolve())}}
+
+    def observe(self, tune_id: str, result: Mapping[str, Any]) -> bool:
+        """Note a result; returns whether the trial is to be pruned."""
+        if "end" in result:
+            self._ended[tune_id] = result["end"]
+        return self._active[tune_id].observe(result["update"], result["reward"])
+
+    def end(self, tune_id: str, is_error: bool) -> None:
+        """Tell the study how a trial ended."""
+        trial, ended = self._active.pop(tune_id), self._ended.pop(tune_id, "")
+        if is_error:
+            self.failed.append(trial.number)
+            trial.postpone(f"failed; its log is {trial.settings.run}.log")
+        elif ended == "exhausted":
+            trial.fail("ran out of GPU memory")
+        elif trial.pruned or ended:
+            trial.complete()
+        else:
+            trial.interrupt()
+
+    def interrupt(self) -> None:
+        """The trials that are still active were interrupted."""
+        for trial in self._active.values():
+            trial.interrupt()
+        self._active.clear()

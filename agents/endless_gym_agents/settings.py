@@ -1,0 +1,438 @@
+"""The settings of a training run, and their presets.
+
+Every field is a command-line flag of `endless-train`. `--preset` selects the defaults, which the other flags override. Names
+follow the hyperparameter table of the paper where it has one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from endless_gym.specs import DEFAULT_ENV_ID, spec
+from endless_gym_agents.metrics import is_finite
+
+AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
+PresetName = Literal["paper", "old", "throughput", "throughput-512", "quick"]
+
+#: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
+TRAINING_SEEDS = range(100_000)
+
+
+#: Environment steps of one update in the paper: 32 environments, 512 steps each.
+PAPER_STEPS_PER_UPDATE = 32 * 512
+
+
+def paper_run_length(env: str, agent: str) -> int:
+    """Updates of the paper's runs, as its published curves have them; for what it does not train, those of the closest.
+
+    Args:
+        env: Canonical environment id.
+        agent: Name of the agent.
+    """
+    if env.startswith("Endless"):
+        return 50_000
+    if "Grid" in env:
+        return 10_000
+    if env.startswith("MortarMayhem"):
+        return 30_000
+    if env.startswith("SearingSpotlights") and agent not in ("gru", "trxl"):
+        return 16_000 if agent == "lstm" else 20_000
+    return 25_000
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Training environments."""
+
+    option: tuple[str, ...] = ()
+    """reset parameters, each as NAME=VALUE with a JSON value, such as `command_count=[2]`"""
+    observation: Literal["rgb", "features"] = "rgb"
+    """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
+    num_envs: int = 32
+    """number of environments, in all groups and at all ranks of a data-parallel run; the number of workers in the paper"""
+    groups: int = 1
+    """groups of environments. With two, an engine process steps one group while the agent computes the actions of the other; that
+    pays only where a step takes about as long as the actions"""
+    engine: Literal["thread", "process"] = "thread"
+    """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
+    num_threads: int = 0
+    """threads that step the environments; 0 for one per core"""
+
+
+@dataclass(frozen=True)
+class Recurrence:
+    """Memory of the agents gru and lstm."""
+
+    hidden_size: int = 512
+    """size of the hidden state"""
+    layers: int = 1
+    """number of stacked recurrent layers"""
+    residual: bool = False
+    """residual connection around the recurrent layers"""
+    embedding: bool = True
+    """fully connected layer before the recurrent layers"""
+    sequence_length: int = 512
+    """length of truncated BPTT in steps; longer segments are cut into sequences that start from stored hidden states"""
+
+
+@dataclass(frozen=True)
+class Transformer:
+    """Memory of the agents trxl (Transformer-XL) and gtrxl (GTrXL)."""
+
+    layers: int = 3
+    """number of blocks"""
+    width: int = 384
+    """embedding dimension of the blocks"""
+    heads: int = 4
+    """attention heads per block"""
+    window: int = 0
+    """length of the sliding attention window: the current step and the past steps that it can attend to; 0 for the length of the
+    longest episode, or 256 in endless environments, as in the paper"""
+    positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
+    """positional encoding of the cached steps"""
+    positions: int = 0
+    """rows of the table of the absolute or learned encoding; 0 for the length of the longest episode, or 2048 in endless
+    environments, as in the paper"""
+    query_encoding: bool = False
+    """add the absolute or learned encoding to the queries as well"""
+    query_previous: bool = False
+    """make the first block's input from the embedding and the last block's input at the previous step, without
+    gradient, by a layer with ReLU"""
+    shared_heads: bool = True
+    """share the query, key and value projections among the heads of a block, as in the experiments of the paper"""
+    gating: bool = False
+    """GRU-type gates of GTrXL in place of the residual connections; set by the agent `gtrxl`"""
+    gate_bias: float = 0.0
+    """initial bias of the gates; the larger, the closer a block is to the identity at the start. The paper uses 0 and 2"""
+    initialisation: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
+    """weight initialisation of the blocks"""
+    sequence_length: int = 1
+    """number of consecutive steps that are shuffled together into minibatches. 1, as in the paper: single steps. With longer
+    sequences learning is faster and needs less memory, but the gradients of long episodes have more noise"""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Layers before and after the memory."""
+
+    vector_width: int = 128
+    """units of the encoder of vector observations (features, vector observation, position)"""
+    body_width: int = 0
+    """units of the layer after the memory; 0 for the memory's output size, or `recurrence.hidden-size` without a memory"""
+    head_width: int = 512
+    """units of the hidden layers of the policy and value heads"""
+    value_gain: float = 1.0
+    """gain of the initial weights of the value head's output layer; a small gain speeds up the first updates if rewards are
+    small"""
+    stack: int = 4
+    """number of stacked grey frames of the agent `stack`; the paper uses 4 and 16"""
+
+
+@dataclass(frozen=True)
+class PPO:
+    """Proximal policy optimisation and loss coefficients."""
+
+    updates: int = 0
+    """number of updates of the run; one update uses `num_envs * steps` environment steps. 0 for as many environment steps as in
+    the paper: 50,000 of its updates in endless environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and
+    SearingSpotlights, 10,000 in the grids"""
+    decay_updates: int = 10_000
+    """updates over which learning rate and entropy coefficient decay linearly to their final values"""
+    steps: int = 512
+    """rollout length: steps of each environment per update; the worker steps of the paper"""
+    epochs: int = 3
+    """epochs per update"""
+    minibatches: int = 8
+    """minibatches per epoch"""
+    gamma: float = 0.995
+    """discount factor"""
+    gae_lambda: float = 0.95
+    """lambda of generalised advantage estimation"""
+    clip_range: float = 0.1
+    """clip range epsilon of the policy loss and of the value loss"""
+    advantage_normalisation: Literal["none", "batch", "minibatch"] = "none"
+    """normalise advantages over the whole batch, over each minibatch, or not at all"""
+    value_coefficient: float = 0.5
+    """coefficient of the value loss"""
+    learning_rate: float = 2.75e-4
+    """initial learning rate of AdamW"""
+    final_learning_rate: float = 1.0e-5
+    """learning rate after its decay"""
+    entropy_coefficient: float = 1.0e-4
+    """initial coefficient of the entropy bonus"""
+    final_entropy_coefficient: float = 1.0e-6
+    """coefficient of the entropy bonus after its decay"""
+    reconstruction_coefficient: float = 0.0
+    """coefficient of the observation reconstruction loss; 0 for no reconstruction head. The paper uses 0.1"""
+    ground_truth_coefficient: float = 0.0
+    """coefficient of the ground-truth estimation loss; 0 for no such head. The authors' configurations use 1. Only for
+    environments with `ground_truth` in `info`"""
+    max_gradient_norm: float = 0.25
+    """gradient clipping: largest global norm of the gradients"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Train an agent with PPO on one of the Memory Gym environments."""
+
+    env: str = DEFAULT_ENV_ID
+    """environment id; `endless list` lists them"""
+    agent: AgentName = "gru"
+    """gru, lstm, trxl (Transformer-XL) or gtrxl (gated Transformer-XL); or a baseline without memory: none, stack (stacked grey
+    frames) or position (encoded step number as an observation)"""
+    preset: PresetName = "paper"
+    """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
+    throughput: many environments and short rollouts, with gradients through 32 steps where the paper's go through 512;
+    throughput-512: many environments with the paper's 512 steps;
+    quick: small networks and feature observations, minutes on two CPU cores, and a stop when the task is learnt"""
+    seed: int = 1
+    """seed of the initial weights, the episode seeds and all sampling"""
+    device: str = "auto"
+    """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
+    threads: int = 0
+    """CPU threads of PyTorch; 0 for PyTorch's default"""
+    bind_cores: bool = False
+    """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
+    compile: bool = False
+    """compile the network with `torch.compile`; the first updates then take minutes longer"""
+    cuda_graphs: bool = True
+    """on CUDA, replay the steps of a rollout as CUDA graphs. If they cannot be captured, or the first steps with them and without
+    differ, a warning says so, and the run goes on without. Not with `--compile`"""
+    bf16: bool = False
+    """bfloat16 autocast for the network; weights and losses stay float32"""
+    run: str = ""
+    """folder of the run; empty for runs/ENV/AGENT-SEED-TIME"""
+    resume: str = ""
+    """resume the run in this folder from its last checkpoint; its settings are the defaults of the other flags"""
+    checkpoint_interval: int = 100
+    """updates between two checkpoints; the last update always writes a checkpoint"""
+    keep_checkpoints: bool = False
+    """keep all checkpoints, for evaluation, instead of the last one only"""
+    on_engine_failure: Literal["restart", "save", "fail"] = "restart"
+    """what to do when the engine process ends or does not answer. restart: start another one, which continues exactly; after
+    three restarts without a completed update, as `save`. save: complete the update in this process, write a checkpoint and stop.
+    fail: stop at once"""
+    time_limit: float = 0.0
+    """minutes after which training stops with a checkpoint; 0 for no limit"""
+    target_reward: float | None = None
+    """stop when the mean reward of the last 100 episodes reaches this value"""
+    stop_when_learnt: bool = False
+    """stop when the last 100 episodes show that the task is learnt: with 90 % of the best possible reward in Mortar Mayhem, with
+    success in 90 % of the episodes in the other finite environments. A target reward replaces it. The default of `quick`"""
+    wandb: bool = False
+    """also log to Weights & Biases, if it is installed"""
+    view: bool = False
+    """show the environments in a browser, and print the address of the page; needs `--environment.engine process`"""
+    environment: Environment = field(default_factory=Environment)
+    recurrence: Recurrence = field(default_factory=Recurrence)
+    transformer: Transformer = field(default_factory=Transformer)
+    model: Model = field(default_factory=Model)
+    ppo: PPO = field(default_factory=PPO)
+
+    def options(self) -> dict[str, Any]:
+        """The reset parameters by name.
+
+        Raises:
+            ValueError: A parameter is not NAME=VALUE, or its value is not JSON.
+        """
+        options = {}
+        for given in self.environment.option:
+            name, equals, text = given.partition("=")
+            try:
+                options[name] = json.loads(text.lower() if text in ("True", "False") else text)
+            except json.JSONDecodeError:
+                equals = ""
+            if not equals:
+                raise ValueError(
+                    f"--environment.option must be NAME=VALUE with a JSON value, such as 'command_count=[2]', got `{given}`"
+                )
+        return options
+
+    def validated(self) -> Settings:
+        """These settings, validated, with the canonical environment id.
+
+        Raises:
+            ValueError: A value is out of range, or a combination is not supported.
+        """
+        env_spec = spec(self.env)
+        env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
+        environment, ppo, transformer = self.environment, self.ppo, self.transformer
+        positive = {
+            "environment.num-envs": environment.num_envs,
+            "environment.groups": environment.groups,
+            "ppo.decay-updates": ppo.decay_updates,
+            "ppo.steps": ppo.steps,
+            "ppo.epochs": ppo.epochs,
+            "ppo.minibatches": ppo.minibatches,
+            "recurrence.layers": self.recurrence.layers,
+            "recurrence.hidden-size": self.recurrence.hidden_size,
+            "recurrence.sequence-length": self.recurrence.sequence_length,
+            "transformer.layers": transformer.layers,
+            "transformer.heads": transformer.heads,
+            "transformer.width": transformer.width,
+            "transformer.sequence-length": transformer.sequence_length,
+            "model.stack": self.model.stack,
+            "model.vector-width": self.model.vector_width,
+            "model.head-width": self.model.head_width,
+            "checkpoint-interval": self.checkpoint_interval,
+        }
+        for name, number in positive.items():
+            if number < 1:
+                raise ValueError(f"--{name} must be 1 or more, got {number}")
+        for name, number in {
+            "threads": self.threads,
+            "ppo.updates": ppo.updates,
+            "environment.num-threads": environment.num_threads,
+            "model.body-width": self.model.body_width,
+            "transformer.positions": transformer.positions,
+            "transformer.window": transformer.window,
+        }.items():
+            if number < 0:
+                raise ValueError(f"--{name} must be 0 or more, got {number}")
+        if environment.num_envs % environment.groups:
+            raise ValueError(
+                f"--environment.num-envs must be a multiple of --environment.groups, got {environment.num_envs} environments and "
+                f"{environment.groups} groups"
+            )
+        if self.view and environment.engine != "process":
+            raise ValueError(
+                "--view needs environments in an engine process, got --environment.engine "
+                f"{environment.engine}; add --environment.engine process"
+            )
+        if transformer.window == 1:
+            raise ValueError(
+                "--transformer.window must be 0 (automatic) or 2 or more, got 1: no past step to attend to"
+            )
+        if transformer.width % (2 * transformer.heads):
+            raise ValueError(
+                f"--transformer.width must be a multiple of twice --transformer.heads, got width {transformer.width} and "
+                f"{transformer.heads} heads"
+            )
+        if self.agent in ("trxl", "gtrxl") and ppo.steps % min(transformer.sequence_length, ppo.steps):
+            raise ValueError(
+                f"--ppo.steps must be a multiple of --transformer.sequence-length, got {ppo.steps} steps and sequences of "
+                f"{transformer.sequence_length}"
+            )
+        if self.environment.observation == "features" and self.ppo.reconstruction_coefficient:
+            raise ValueError(
+                "--ppo.reconstruction-coefficient needs frames, got --environment.observation features; "
+                "use rgb or the coefficient 0"
+            )
+        if transformer.query_encoding and transformer.positional_encoding not in ("absolute", "learned"):
+            raise ValueError(
+                "--transformer.query-encoding needs --transformer.positional-encoding absolute or learned, got "
+                f"{transformer.positional_encoding}"
+            )
+        settings = dataclasses.replace(self, env=env_spec.id)
+        return _replace(settings, ppo={"updates": ppo.updates or settings.paper_updates()})
+
+    def paper_updates(self) -> int:
+        """Updates with as many environment steps as the paper's run of this agent in this environment."""
+        steps = paper_run_length(self.env, self.agent) * PAPER_STEPS_PER_UPDATE
+        return -(-steps // (self.environment.num_envs * self.ppo.steps))
+
+    def positions(self) -> int:
+        """Rows of the table of positional encodings, with the default resolved."""
+        return self.transformer.positions or self._longest_episode() or 2048
+
+    def window(self) -> int:
+        """Length of the attention window, with the default resolved."""
+        return self.transformer.window or max(2, self._longest_episode() or 256)
+
+    def _longest_episode(self) -> int:
+        """Longest possible episode in steps; 0 in endless environments and without step limit."""
+        return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
+
+
+def _replace(settings: Settings, **groups: dict[str, Any]) -> Settings:
+    """Replace fields in groups of settings."""
+    changed = {name: dataclasses.replace(getattr(settings, name), **fields) for name, fields in groups.items()}
+    return dataclasses.replace(settings, **changed)
+
+
+def _presets() -> dict[str, Settings]:
+    paper = Settings()
+    old = _replace(
+        dataclasses.replace(paper, preset="old"),
+        ppo={
+            "gamma": 0.99,
+            "advantage_normalisation": "minibatch",
+            "clip_range": 0.2,
+            "value_coefficient": 0.25,
+            "learning_rate": 3.0e-4,
+            "final_learning_rate": 1.0e-4,
+            "final_entropy_coefficient": 1.0e-5,
+            "max_gradient_norm": 0.5,
+        },
+        recurrence={"embedding": False},
+    )
+    # The same number of environment steps per update as `paper`; sequences start from stored states. Gradients go back 32 steps
+    # at most, where the paper's go back 512.
+    throughput = _replace(
+        dataclasses.replace(paper, preset="throughput"),
+        environment={"num_envs": 512},
+        ppo={"steps": 32},
+        recurrence={"sequence_length": 32},
+        transformer={"sequence_length": 32},
+    )
+    # Four times the environments of `paper`, minibatches of the same size, and gradients through as many steps.
+    throughput_512 = _replace(
+        dataclasses.replace(paper, preset="throughput-512"),
+        environment={"num_envs": 128},
+        ppo={"minibatches": 32, "decay_updates": 2_500},
+        transformer={"sequence_length": 64},
+    )
+    quick = _replace(
+        dataclasses.replace(paper, preset="quick", checkpoint_interval=50, stop_when_learnt=True),
+        environment={"observation": "features", "num_envs": 64},
+        ppo={
+            "updates": 2000,
+            "decay_updates": 2000,
+            "steps": 64,
+            "minibatches": 4,
+            "gamma": 0.99,
+            "advantage_normalisation": "minibatch",
+            "learning_rate": 1.0e-3,
+            "final_learning_rate": 1.0e-4,
+            "entropy_coefficient": 1.0e-2,
+            "final_entropy_coefficient": 1.0e-3,
+            "max_gradient_norm": 0.5,
+        },
+        recurrence={"hidden_size": 128, "sequence_length": 64},
+        transformer={"layers": 2, "width": 64, "window": 64, "sequence_length": 32},
+        model={"vector_width": 64, "head_width": 64, "value_gain": 0.05},
+    )
+    return {"paper": paper, "old": old, "throughput": throughput, "throughput-512": throughput_512, "quick": quick}
+
+
+#: Default settings by preset name.
+PRESETS = _presets()
+
+
+def to_dict(settings: Settings) -> dict[str, Any]:
+    """The settings as nested dicts of JSON-serialisable values."""
+    return dataclasses.asdict(settings)
+
+
+def from_dict(values: dict[str, Any]) -> Settings:
+    """Convert what `to_dict` returned back to settings.
+
+    Raises:
+        TypeError: An unknown field.
+        KeyError: A group is missing.
+    """
+    values = dict(values)
+    groups = {
+        "environment": Environment,
+        "recurrence": Recurrence,
+        "transformer": Transformer,
+        "model": Model,
+        "ppo": PPO,
+    }
+    for name, kind in groups.items():
+        values[name] = kind(**values[name])
+    values["environment"] = dataclasses.replace(values["environment"], option=tuple(values["environment"].option))
+    return Settings(**values)

@@ -1,0 +1,358 @@
+"""`endless-train`: train an agent, in one process or, started by `torchrun`, in several.
+
+```console
+endless-train --env Endless-MortarMayhem-v0 --agent gru
+endless-train --env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --agent trxl --preset quick
+torchrun --nproc-per-node=4 -m endless_gym_agents.train -- --env MortarMayhem-v0    # see `endless_gym_agents.ranks`
+```
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+
+from endless_gym import EngineLost
+from endless_gym.episodes import EpisodeOptions
+from endless_gym_agents import checkpoint, command
+from endless_gym_agents.agent import make_agent
+from endless_gym_agents.clock import Clock
+from endless_gym_agents.environments import Environments
+from endless_gym_agents.learnt import learnt
+from endless_gym_agents.logs import Episodes, Logger, SilentLogger
+from endless_gym_agents.ppo import learn, make_optimizer
+from endless_gym_agents.ranks import Ranks
+from endless_gym_agents.rollout import RolloutCollector
+from endless_gym_agents.settings import PRESETS, Settings, to_dict
+
+
+def train(
+    settings: Settings,
+    watch: Callable[[int, dict[str, float]], bool] | None = None,
+    episode_options: EpisodeOptions | None = None,
+) -> Path:
+    """Train an agent: a new run, or from the last checkpoint of a run.
+
+    Each of the processes that `torchrun` starts calls it with the same settings. A run that `torchrun` starts again goes on from
+    its last checkpoint.
+
+    Args:
+        settings: Settings of the run.
+        watch: Called after each update with its number and the means of the last 100 episodes; the run stops if it returns true.
+        episode_options: Chooses the options of each episode, as for `make_vec`: a curriculum. Only with environments in this
+            process. A checkpoint does not contain its state.
+
+    Returns:
+        The folder of the run, with `settings.json`, `progress.jsonl`, the TensorBoard files and `checkpoints`.
+
+    Raises:
+        RankLost: Another process of the run has ended.
+        ValueError: The settings are invalid, or do not fit the run to resume.
+        FileExistsError: The folder already contains a run.
+        FileNotFoundError: There is no run to resume.
+        EngineLost: The engine process failed, and was not replaced; see `Settings.on_engine_failure`.
+    """
+    settings, ranks = settings.validated(), Ranks()
+    ranks.check(settings.environment.num_envs, settings.environment.groups)
+    device = choose_device(settings.device, ranks)
+    if settings.bind_cores:
+        ranks.bind()
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+        torch.set_float32_matmul_precision("high")  # TF32
+    with ranks.connected():
+        return train_rank(settings, ranks, device, watch, episode_options)
+
+
+def train_rank(
+    settings: Settings,
+    ranks: Ranks,
+    device: torch.device,
+    watch: Callable[[int, dict[str, float]], bool] | None,
+    episode_options: EpisodeOptions | None,
+) -> Path:
+    """The part of `train` that the processes of a run do together."""
+    resumed: dict[str, Any] | None = None
+    folder, has_begun = (
+        (settings.resume, True) if settings.resume else ranks.of_first(lambda: make_folder(settings, ranks))
+    )
+    run = Path(folder)
+    if has_begun:
+        resumed = command.load_checkpoint(run, "cpu").state
+        check_resumable(settings, checkpoint.read_settings(run))
+        settings = dataclasses.replace(settings, resume="", run=str(run))
+
+    torch.manual_seed(settings.seed)
+    generators = {
+        "actions": torch.Generator(device).manual_seed(settings.seed),
+        "minibatches": torch.Generator().manual_seed(settings.seed),
+    }
+
+    ppo, started, stop = settings.ppo, time.monotonic(), Interrupt(ranks)
+    with Environments(settings, episode_options, ranks) as environments, stop:
+        agent = make_agent(settings, environments.spec, device)
+        if settings.compile:
+            agent.compile_parts()
+        optimizer = make_optimizer(agent, ppo.learning_rate)
+        collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)
+        episodes, update, steps = Episodes(), 0, 0
+        if resumed is not None:
+            update, steps = resumed["update"], resumed["steps"]
+            agent.load_state_dict(resumed["model"])
+            optimizer.load_state_dict(resumed["optimizer"])
+            for name, generator in generators.items():
+                restore_generator(generator, resumed["generators"][name], settings.seed + update)
+            episodes.add(resumed["episodes"])
+            players = resumed["player"].get("ranks", [resumed["player"]])
+            if len(players) == ranks.size:
+                collector.load_state_dict(players[ranks.rank])
+            else:
+                collector.start_episodes([player["environments"] for player in players])
+        ranks.copy_from_first(agent.state_dict().values())
+
+        def save() -> None:
+            players = ranks.gathered(collector.state_dict())
+            if players is None:
+                return
+            state: dict[str, Any] = {
+                "settings": to_dict(settings),
+                "update": update,
+                "steps": steps,
+                "model": agent.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "generators": {name: generator.get_state() for name, generator in generators.items()},
+                "player": players[0] if ranks.size == 1 else {"ranks": players},
+                "episodes": list(episodes.recent),
+            }
+            checkpoint.save(run, state, settings.keep_checkpoints)
+
+        logger = Logger(run, settings, update) if ranks.is_first else SilentLogger()
+        # Written only after everything above has succeeded; the changed settings of a resumed run are its settings from now on.
+        if ranks.is_first:
+            (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
+        if resumed is None:
+            save()
+        where = f"{device}" if ranks.size == 1 else f"{ranks.size} ranks"
+        logger.print(
+            f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {where}, in {run}; Ctrl-C stops the run"
+        )
+
+        success: str | None = None
+        clock, stops = Clock(), False
+        while update < ppo.updates and not stops:
+            start = time.perf_counter()
+            environments.mark(logger.print)
+            segment, ended = collector.collect(clock)
+            with clock.measure("learning"):
+                states = [memory.state for memory in collector.memories]
+                learning = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"], ranks)
+            new_steps = settings.environment.num_envs * ppo.steps
+            update, steps = update + 1, steps + new_steps
+            for infos in ranks.everywhere(ended):
+                episodes.add(infos)
+            means = episodes.means()
+            rate = new_steps / (time.perf_counter() - start)
+            logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | learning, clock.take())
+
+            minutes = (time.monotonic() - started) / 60
+            if settings.time_limit and minutes >= settings.time_limit:
+                stop.requested = True
+            reward, target = means.get("episode/reward"), settings.target_reward
+            if reward is not None and target is not None and episodes.is_full() and reward >= target:
+                stop.requested = True
+            if settings.stop_when_learnt and target is None and episodes.is_full():
+                success = learnt(environments.spec, settings.options(), means)
+                stop.requested = stop.requested or success is not None
+            if environments.failure is not None:
+                stop.requested = True
+            if watch is not None and watch(update, means):
+                stop.requested = True
+            # All ranks stop after the same update.
+            stops = any(ranks.everywhere(stop.requested))
+            if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stops:
+                save()
+        if success is not None:
+            logger.print(f"the task is learnt: {success}; train longer with --no-stop-when-learnt")
+        logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
+        logger.close()
+        failures = [failure for failure in ranks.everywhere(environments.failure) if failure is not None]
+        if failures:
+            raise EngineLost(
+                f"{failures[0]}; the checkpoint is of update {update}; continue with: endless-train --resume {run}"
+            )
+    return run
+
+
+def make_folder(settings: Settings, ranks: Ranks) -> tuple[str, bool]:
+    """Make the folder of a new run.
+
+    Returns:
+        The folder, and whether it contains a checkpoint of this run, from before `torchrun` started it again.
+
+    Raises:
+        FileExistsError: The folder contains another run.
+        ValueError: The run was started again, and its folder has no fixed name.
+    """
+    if ranks.restarts and not settings.run:
+        raise ValueError("a run that torchrun starts again needs --run, to find its checkpoint; got no folder")
+    run = Path(settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    has_begun = bool(ranks.restarts) and (run / checkpoint.FOLDER / checkpoint.LAST).exists()
+    if (run / checkpoint.SETTINGS).exists() and not ranks.restarts:
+        raise FileExistsError(
+            f"{run} already contains a run; continue it with --resume {run}, or choose another folder"
+        )
+    run.mkdir(parents=True, exist_ok=True)
+    return str(run), has_begun
+
+
+class Interrupt:
+    """Context manager that turns the first SIGINT into a request to stop; the second one raises `KeyboardInterrupt`.
+
+    For a rank of several, SIGTERM is such a request, too. `torchrun` passes signals on that the terminal has already sent, so
+    that signals within two seconds count as one.
+
+    Attributes:
+        requested: Whether the run should stop after the current update.
+    """
+
+    def __init__(self, ranks: Ranks) -> None:
+        """Make the handler; it is installed on entry."""
+        self.requested = False
+        self._ranks = ranks
+        self._before: dict[int, Any] = {}
+        self._first = 0.0
+
+    def __enter__(self) -> Interrupt:
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM) if self._ranks.size > 1 else (signal.SIGINT,):
+                self._before[number] = signal.signal(number, self._on_signal)
+        except ValueError:  # Only the main thread can install handlers, and only it is interrupted.
+            pass
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._before.items():
+            # `torchrun` ends all ranks by SIGTERM when one has ended: this one closes its environments first.
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGTERM else handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if self._first:
+            if self._ranks.size > 1 and time.monotonic() < self._first + 2.0:
+                return
+            raise KeyboardInterrupt
+        self.requested, self._first = True, time.monotonic()
+        if self._ranks.is_first:
+            print(
+                "\nstopping after this update, with a checkpoint; press Ctrl-C again to stop immediately",
+                file=sys.stderr,
+            )
+
+
+def check_resumable(settings: Settings, before: Settings) -> None:
+    """Check that a run can be resumed with other settings: network, environments and seed must not change.
+
+    Args:
+        settings: The new settings.
+        before: The settings of the run.
+
+    Raises:
+        ValueError: A setting that must not change differs.
+    """
+    # The engine and its threads may change, and so may all of PPO except whether the auxiliary heads exist.
+    had = before.environment
+    environment = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
+    settings = dataclasses.replace(settings, environment=environment)
+    for name in ("env", "agent", "preset", "seed", "environment", "model", "recurrence", "transformer"):
+        given, had = getattr(settings, name), getattr(before, name)
+        if given != had:
+            raise ValueError(
+                f"a resumed run must keep its {name}: expected {had}, got {given}; omit the flag, or start a new run"
+            )
+    for name in ("reconstruction", "ground_truth"):
+        given, had = (getattr(each.ppo, f"{name}_coefficient") for each in (settings, before))
+        if bool(given) != bool(had):
+            raise ValueError(
+                f"a resumed run must keep its heads: --ppo.{name.replace('_', '-')}-coefficient must stay "
+                f"{'positive' if had else '0'} (it was {had:g}), got {given:g}; omit the flag, or start a new run"
+            )
+
+
+def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int) -> None:
+    """Restore the state of a generator; seed it instead if the state, uint8 (bytes,), is of another type of device.
+
+    Args:
+        generator: The generator.
+        state: State from a checkpoint.
+        seed: Seed for a state that does not fit.
+    """
+    if state.shape == generator.get_state().shape:
+        generator.set_state(state)
+    else:
+        generator.manual_seed(seed)
+
+
+def choose_device(name: str, ranks: Ranks | None = None) -> torch.device:
+    """The device with the name `cpu`, `cuda` or `cuda:INDEX`, or for `auto` CUDA if available, else the CPU.
+
+    A CUDA device has an index, which is 0 unless the name has another. Each of several ranks on a machine has a GPU of its own.
+
+    Raises:
+        ValueError: The name is invalid, or the device is not available.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"--device must be auto, cpu, cuda or cuda:INDEX, got `{name}`") from None
+    if device.type == "cuda":
+        if ranks is not None and ranks.local_size > 1:
+            if device.index is not None:
+                raise ValueError(f"--device must be auto, cpu or cuda with several ranks on a machine, got `{name}`")
+            device = torch.device("cuda", ranks.local_rank)
+        # `torch.cuda.set_device` refuses a device without an index.
+        device = torch.device("cuda", device.index or 0)
+        if not torch.cuda.is_available():
+            raise ValueError(f"device `{name}`: PyTorch finds no CUDA device; use cpu or auto")
+        if device.index >= torch.cuda.device_count():
+            raise ValueError(f"device `{name}`: the index must be 0 to {torch.cuda.device_count() - 1}")
+    return device
+
+
+def parse(arguments: list[str]) -> Settings:
+    """Parse command-line arguments; the defaults are those of `--preset`, or the settings of the run to `--resume`."""
+    import tyro
+
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default="paper")
+    first.add_argument("--resume", default="")
+    chosen = first.parse_known_args(arguments)[0]
+    if chosen.resume:
+        defaults = dataclasses.replace(checkpoint.read_settings(chosen.resume), time_limit=0.0, view=False)
+    else:
+        # tyro reports an unknown preset.
+        defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
+    description = "Train one of the paper's agents with PPO: endless-train --env Endless-MortarMayhem-v0 --agent gru"
+    return tyro.cli(Settings, prog="endless-train", description=description, args=arguments, default=defaults)
+
+
+def main() -> int:
+    """Entry point of the command `endless-train`; returns the exit status."""
+    return command.run("endless-train", lambda: train(parse(sys.argv[1:])))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

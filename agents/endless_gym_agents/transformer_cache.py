@@ -1,0 +1,128 @@
+"""The KV cache of the Transformer-XL for acting: keys and values of the last steps, in a ring of fixed size.
+
+All environments step together, so the step of a slot is known on the host: no operation waits for the device, and all shapes are
+constant. The ring has as many slots as the window; the slot of the current step holds the step that has just left the window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from endless_gym_agents.acting import refill
+
+
+def ring_ages(slots: int, device: torch.device) -> Tensor:
+    """Ages of the slots of a ring in steps, for every current slot: int64 (2 * slots,).
+
+    With the current slot s, the age of slot j is entry `slots - s + j`. The current slot has no step yet, and the largest age.
+    """
+    ages = torch.arange(2 * slots, device=device).neg() % slots
+    return ages.masked_fill(ages == 0, torch.iinfo(torch.int64).max)
+
+
+class Projection:
+    """Projects the tokens of all blocks to keys and values at once."""
+
+    def __init__(
+        self, norms: Sequence[nn.LayerNorm], keys: Sequence[nn.Linear], values: Sequence[nn.Linear], heads: int
+    ) -> None:
+        """Stack the weights of the blocks; they do not follow later changes.
+
+        Args:
+            norms: The layer normalisation of the tokens of each block.
+            keys: The key projection of each block, of a whole token or of each head's slice of it.
+            values: As `keys`.
+            heads: Number of heads.
+        """
+        self.heads, self.size, self.rows = heads, norms[0].normalized_shape[0] // heads, keys[0].in_features
+        self.scale = torch.stack([norm.weight.detach() for norm in norms]).unsqueeze(1)
+        self.shift = torch.stack([norm.bias.detach() for norm in norms]).unsqueeze(1)
+        matrices = []
+        for pair in zip(keys, values, strict=True):
+            parts = [layer.weight.detach().view(-1, self.size, self.rows) for layer in pair]
+            # For each head its key, then its value; with shared heads there is one matrix for all.
+            matrices.append(torch.cat(parts, dim=1).flatten(0, 1).t())
+        self.matrices = torch.stack(matrices)  # (layers, rows, outputs)
+
+    def copy_(self, other: Projection) -> None:
+        """Copy the weights of `other`, of the same blocks."""
+        refill((self.scale, self.shift, self.matrices), (other.scale, other.shift, other.matrices))
+
+    def __call__(self, tokens: Tensor) -> Tensor:
+        """Keys and values float (layers, m, heads, 2 * head size), of tokens with positions added, float32 (layers, m, width)."""
+        normal = functional.layer_norm(tokens, tokens.shape[-1:])
+        normal = torch.addcmul(self.shift, normal, self.scale).view(len(self.matrices), -1, self.rows)
+        return torch.bmm(normal, self.matrices).view(*tokens.shape[:2], self.heads, 2 * self.size)
+
+
+class RingCache:
+    """Keys and values of n environments.
+
+    Attributes:
+        slot: Slot of the current step.
+        generation: Which weights the keys and values were computed with; see `TransformerMemory.refresh`.
+        distances: Projected encodings of the ages of `ring_ages` for each block, float (heads, 2 * slots, head size); None
+            without relative encoding.
+    """
+
+    def __init__(
+        self,
+        projection: Projection,
+        tokens: Tensor,
+        generation: int,
+        dtype: torch.dtype,
+        distances: list[Tensor] | None,
+    ) -> None:
+        """Make the cache of the window before the current step.
+
+        Args:
+            projection: Projects the tokens.
+            tokens: The last tokens with positions added, one less than the ring has slots, float32 (layers, n, slots - 1, width).
+            generation: See the attribute.
+            dtype: Type of the keys and values.
+            distances: See the attribute.
+        """
+        layers, envs, past, _ = tokens.shape
+        self.projection, self.generation, self.distances = projection, generation, distances
+        self.size, self.slots, self.slot = projection.size, past + 1, past
+        shape = (layers, envs, projection.heads, self.slots, 2 * self.size)
+        self._ring = torch.zeros(shape, dtype=dtype, device=tokens.device)
+        projected = projection(tokens.flatten(1, 2)).unflatten(1, (envs, past))
+        self._ring[:, :, :, :past] = projected.transpose(2, 3)
+        self._columns = self._ring.unbind(3)
+        self._all = self._split(self._ring)
+
+    def span(self, past: int) -> tuple[int, int]:
+        """First slot and number of slots of a part of the ring that contains the last `past` steps."""
+        return (self.slot - past, past) if past <= self.slot else (0, self.slots)
+
+    def keys_and_values(self, start: int, length: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Keys and values of each block, float (n, heads, length, head size), of the slots from `start` on."""
+        return self._all if length == self.slots else self._split(self._ring.narrow(3, start, length))
+
+    def append(self, tokens: Tensor) -> None:
+        """Write the tokens of the current step, float32 (layers, n, width), with positions added, and go to the next slot."""
+        self._columns[self.slot].copy_(self.projection(tokens))
+        self.advance()
+
+    def append_at(self, slot: Tensor, tokens: Tensor) -> None:
+        """As `append`, with the slot of the current step on the device, int64 (1,). `slot` of this object stays."""
+        projected = self.projection(tokens).to(self._ring.dtype)
+        self._ring.index_copy_(3, slot, projected.unsqueeze(3))
+
+    def advance(self) -> None:
+        """Go to the next slot."""
+        self.slot = (self.slot + 1) % self.slots
+
+    def copy_(self, other: RingCache) -> None:
+        """Copy a cache of the same shape, and its weights, into the tensors of this one."""
+        self.slot, self.generation = other.slot, other.generation
+        refill((self._ring, *(self.distances or [])), (other._ring, *(other.distances or [])))
+        self.projection.copy_(other.projection)
+
+    def _split(self, slots: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        return slots.narrow(4, 0, self.size).unbind(), slots.narrow(4, self.size, self.size).unbind()

@@ -1,0 +1,68 @@
+"""Small agents and their rollouts, for the tests of the agents."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from endless_gym_agents.agent import Agent, AgentMemory
+from endless_gym_agents.settings import PRESETS, Model, Recurrence, Settings, Transformer
+
+FEATURES = {"features": (6,)}
+BRANCHES = (3, 2)
+
+
+def settings(agent: str, **changes: Any) -> Settings:
+    """Settings of a small network; `changes` replace fields."""
+    small = {
+        "recurrence": Recurrence(hidden_size=16, sequence_length=8),
+        "transformer": Transformer(layers=2, width=16, heads=2, window=6, sequence_length=8, positions=64),
+        "model": Model(vector_width=12, head_width=10),
+    }
+    return replace(PRESETS["quick"], agent=agent, **(small | changes))
+
+
+def transformer(**changes: Any) -> dict[str, Transformer]:
+    return {"transformer": replace(settings("trxl").transformer, **changes)}
+
+
+def make(agent: str, shapes: dict[str, tuple[int, ...]] = FEATURES, **changes: Any) -> Agent:
+    torch.manual_seed(3)
+    made = Agent(settings(agent, **changes), shapes, BRANCHES)
+    # As after some training: the biases and the output layer of the policy are no longer near zero.
+    for parameter in made.parameters():
+        parameter.data += 0.2 * torch.randn_like(parameter)
+    return made
+
+
+def observations(steps: int, envs: int) -> torch.Tensor:
+    return torch.randn(steps, envs, 6, generator=torch.Generator().manual_seed(5))
+
+
+def ends(steps: int, envs: int) -> torch.Tensor:
+    """Ends of episodes, bool (steps, envs): none in environment 0, different ones in the others."""
+    done = torch.rand(steps, envs, generator=torch.Generator().manual_seed(6)) < 0.15
+    done[:, 0] = False
+    return done
+
+
+def play(
+    agent: Agent, memory: AgentMemory, observed: torch.Tensor, done: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Act on given observations (T, N, 6) as one segment.
+
+    Returns:
+        Reset mask (T, N), actions (T, N, 2), log-probabilities (T, N, 2), and values (T, N).
+    """
+    agent.memory.begin_segment(memory.state, observed.shape[0])
+    rows = []
+    generator = torch.Generator().manual_seed(7)
+    for observation, end in zip(observed, done, strict=True):
+        reset_mask = memory.reset_mask
+        output = agent.act({"features": observation}, memory, generator)
+        rows.append((reset_mask, output.action, output.log_prob, output.value))
+        memory.reset(end)
+    # A rollout ends with a bootstrap value, which must not change the memory.
+    agent.bootstrap_value({"features": observed[-1]}, memory)
+    reset_mask, action, log_prob, value = (torch.stack(column) for column in zip(*rows, strict=True))
+    return reset_mask, action, log_prob, value

@@ -1,0 +1,61 @@
+"""Fixtures of the agents' tests."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from endless_gym import _native
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "libraries_python" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.libraries)
+
+
+@pytest.fixture(scope="session")
+def libraries_python() -> str:
+    """A Python that has Ray and what this one has."""
+    python = os.environ.get("ENDLESS_LIBRARIES_PYTHON")
+    if not python:
+        pytest.fail("ENDLESS_LIBRARIES_PYTHON names no Python with Ray; run `cargo xtask test`")
+    return python
+
+
+@pytest.fixture
+def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A folder for Ray's logs and sockets, whose paths must be short; Ray writes and sends nothing elsewhere."""
+    with tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        monkeypatch.setenv("RAY_TMPDIR", folder)
+        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # otherwise Ray writes a token to the home directory
+        monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        monkeypatch.delenv("RAY_ADDRESS", raising=False)  # otherwise Ray joins that cluster
+        yield folder
+
+
+@pytest.fixture(autouse=True, scope="session")
+def own_namespace() -> Iterator[None]:
+    """A namespace root of this test run, so that concurrent runs do not see each other's engines and segments."""
+    # A short path, since it is part of the path of Unix sockets.
+    root = tempfile.mkdtemp(prefix="endless-", dir="/tmp")
+    os.environ["ENDLESS_GYM_ROOT"] = root
+    # Processes that the tests start import the installed packages, not the sources in their working directory.
+    os.environ["PYTHONSAFEPATH"] = "1"
+    yield
+    left = _segments()
+    shutil.rmtree(root, ignore_errors=True)
+    assert not left, f"left in /dev/shm: {sorted(left)}"
+
+
+@pytest.fixture(scope="session")
+def segments(own_namespace: None) -> Callable[[], set[str]]:
+    """The shared memory segments of this test run."""
+    return _segments
+
+
+def _segments() -> set[str]:
+    prefix = _native.segment_prefix()
+    return {name for name in os.listdir("/dev/shm") if name.startswith(prefix)}

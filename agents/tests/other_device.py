@@ -1,0 +1,212 @@
+"""A stand-in for a CUDA device on machines without one.
+
+A tensor of this device wraps a CPU tensor. As on CUDA, an operation on tensors of both devices is an error, and so is access to
+the data without a copy. Run as a program, this trains on the device and on the CPU, and prints the results of both as JSON:
+
+    python other_device.py FOLDER FLAGS_AS_JSON ...
+"""
+
+import contextlib
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils import backend_registration
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+NAME = "elsewhere"
+
+
+class There(torch.Tensor):
+    """A tensor of the device; `here` is the wrapped CPU tensor."""
+
+    @staticmethod
+    def __new__(cls, here: torch.Tensor) -> "There":
+        shape, strides, offset = here.size(), here.stride(), here.storage_offset()
+        made = torch.Tensor._make_wrapper_subclass(
+            cls, shape, strides=strides, storage_offset=offset, dtype=here.dtype, device=torch.device(NAME, 0)
+        )
+        made.here = here
+        return made
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @classmethod
+    def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return computed(operation, args, kwargs or {})
+
+
+class Device(TorchDispatchMode):
+    """Dispatches factory functions with `device="elsewhere"`, such as `torch.zeros`."""
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return computed(operation, args, kwargs or {})
+
+
+#: Operations whose result, or its shape, is needed on the host. On CUDA the host waits for them.
+WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "unique_dim"}
+#: Number of operations for which CUDA would wait: copies to the CPU, and those of `WAITING`.
+waits: Counter[str] = Counter()
+#: Number of copies from the CPU to the device by shape.
+uploads: Counter[tuple[int, ...]] = Counter()
+
+
+def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    name = operation.overloadpacket.__name__
+    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+    there = [tensor for tensor in tensors if isinstance(tensor, There)]
+    # Zero-dimensional tensors may be on any device, and copies cross devices.
+    here = [tensor for tensor in tensors if not isinstance(tensor, There) and tensor.dim()]
+    if there and here and name not in ("_to_copy", "copy_"):
+        shapes = [[tuple(tensor.shape) for tensor in some] for some in (there, here)]
+        raise RuntimeError(f"{name}: tensors on two devices, of shapes {shapes[0]} and {shapes[1]}")
+    to_cpu = name == "copy_" and bool(here) and here[0] is args[0]
+    to_cpu |= name == "_to_copy" and torch.device(kwargs.get("device") or NAME).type == "cpu"
+    if there and (to_cpu or name in WAITING):
+        waits[name] += 1
+    asked = kwargs.get("device")
+    into = isinstance(args[0], There) if name == "copy_" else name == "_to_copy" and asked is not None and not to_cpu
+    if here and into:
+        uploads[tuple(here[0].shape)] += 1
+    if asked is not None:
+        kwargs = kwargs | {"device": torch.device("cpu")}
+    own = REPLACED.get(name, operation)
+    args_here, kwargs_here = tree_map_only(There, lambda tensor: tensor.here, (args, kwargs))
+    out = own(*args_here, **kwargs_here)
+    is_there = torch.device(asked).type == NAME if asked is not None else bool(there)
+    if name == "copy_":
+        is_there = isinstance(args[0], There)
+    if not is_there or name == "_local_scalar_dense":
+        return out
+    out = tree_map_only(torch.Tensor, There, out)
+    return out if name in REPLACED else return_and_correct_aliasing(operation, args, kwargs, out)
+
+
+def lstm_cell(x: Any, h: Any, cell: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
+    """The fused LSTM cell, which PyTorch calls on devices other than the CPU."""
+    gates = x + h if bias_x is None else x + h + bias_x + bias_h
+    into, forget, new, out = gates.chunk(4, 1)
+    into, forget, new, out = into.sigmoid(), forget.sigmoid(), new.tanh(), out.sigmoid()
+    after = forget * cell + into * new
+    return out * after.tanh(), after, torch.cat([into, forget, new, out], 1)
+
+
+def lstm_cell_backward(grad_h: Any, grad_c: Any, before: Any, after: Any, kept: Any, has_bias: bool) -> Any:
+    into, forget, new, out = kept.chunk(4, 1)
+    to_h = torch.zeros_like(before) if grad_h is None else grad_h
+    to_c = to_h * out * (1 - after.tanh() ** 2) + (0 if grad_c is None else grad_c)
+    gates = torch.cat(
+        [
+            to_c * new * into * (1 - into),
+            to_c * before * forget * (1 - forget),
+            to_c * into * (1 - new * new),
+            to_h * after.tanh() * out * (1 - out),
+        ],
+        1,
+    )
+    return gates, to_c * forget, gates.sum(0) if has_bias else None
+
+
+def gru_cell(x: Any, h: Any, hidden: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
+    """The fused GRU cell."""
+    x, h = (x, h) if bias_x is None else (x + bias_x, h + bias_h)
+    (reset_x, update_x, new_x), (reset_h, update_h, new_h) = x.chunk(3, 1), h.chunk(3, 1)
+    reset, update = (reset_x + reset_h).sigmoid(), (update_x + update_h).sigmoid()
+    new = (new_x + reset * new_h).tanh()
+    return new + update * (hidden - new), torch.cat([reset, update, new, hidden, new_h], 1)
+
+
+def gru_cell_backward(grad: Any, kept: Any, has_bias: bool) -> Any:
+    reset, update, new, hidden, new_h = kept.chunk(5, 1)
+    to_new = grad * (1 - update) * (1 - new * new)
+    to_update = grad * (hidden - new) * update * (1 - update)
+    to_reset = to_new * new_h * reset * (1 - reset)
+    to_x = torch.cat([to_reset, to_update, to_new], 1)
+    to_h = torch.cat([to_reset, to_update, to_new * reset], 1)
+    return to_x, to_h, grad * update, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
+
+
+#: Operations that PyTorch calls on devices other than the CPU only.
+REPLACED = {
+    "_thnn_fused_gru_cell": gru_cell,
+    "_thnn_fused_gru_cell_backward": gru_cell_backward,
+    "_thnn_fused_lstm_cell": lstm_cell,
+    "_thnn_fused_lstm_cell_backward_impl": lstm_cell_backward,
+    # Use the unfused attention.
+    "_fused_sdp_choice": lambda *args, **kwargs: 0,
+}
+
+
+class Module(backend_registration._DummyBackendModule):
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.bfloat16]
+
+
+class Generator(torch.Generator):
+    """A CPU generator for every device, so that random numbers are equal on all devices."""
+
+    def __new__(cls, device: Any = "cpu") -> torch.Generator:
+        return super().__new__(cls, "cpu")
+
+
+def register() -> None:
+    """Register the device with PyTorch; must be called before the first backward pass, and cannot be undone."""
+    backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=Module())
+
+
+@contextlib.contextmanager
+def device() -> Iterator[None]:
+    """Context in which the device can be used."""
+    generator, save, to = torch.Generator, torch.save, torch.nn.Module.to
+    torch.Generator = Generator
+
+    def moved(module: torch.nn.Module, *args: Any, **kwargs: Any) -> torch.nn.Module:
+        """Replace the parameters, whose class changes with the device."""
+        torch.__future__.set_swap_module_params_on_conversion(True)
+        to(module, *args, **kwargs)
+        torch.__future__.set_swap_module_params_on_conversion(False)
+        return module
+
+    torch.nn.Module.to = moved
+    # Files contain CPU tensors; for CUDA tensors, `map_location` has this effect.
+    torch.save = lambda state, file: save(tree_map_only(There, lambda tensor: tensor.here.clone(), state), file)
+    try:
+        with Device():
+            yield
+    finally:
+        torch.Generator, torch.save, torch.nn.Module.to = generator, save, to
+
+
+def main() -> None:
+    from endless_gym_agents import checkpoint
+    from endless_gym_agents.evaluate import evaluate
+    from endless_gym_agents.train import parse, train
+
+    register()
+    folder = Path(sys.argv[1])
+    results = []
+    for number, flags in enumerate(map(json.loads, sys.argv[2:])):
+        both = {}
+        for name in ("cpu", NAME):
+            settings = replace(parse(flags), device=name, run=str(folder / f"{number}-{name}"))
+            with device() if name == NAME else contextlib.nullcontext():
+                run = train(settings)
+                # Resume from the checkpoint.
+                settings = replace(
+                    settings, resume=str(run), ppo=replace(settings.ppo, updates=settings.ppo.updates + 1)
+                )
+                rows = [json.loads(line) for line in (train(settings) / "progress.jsonl").read_text().splitlines()]
+                episodes = evaluate(checkpoint.load(run, name).agent, range(2), 1, num_threads=1)
+            both[name] = {"rows": rows, "episodes": episodes}
+        results.append(both)
+    print(json.dumps(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""The evaluation protocol: metrics from known infos, and results of checkpoints."""
+
+import io
+import json
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from agents_helpers import settings
+from rich.console import Console
+
+import endless_gym_agents
+from endless_gym.env import Env
+from endless_gym.specs import spec
+from endless_gym_agents import protocol
+from endless_gym_agents.evaluate import evaluate
+from endless_gym_agents.metrics import metric, path_length, task_progress
+from endless_gym_agents.protocol import EvalArguments, evaluate_runs, find
+from endless_gym_agents.results import Experiment, Experiments, Run, label, read, to_json
+from endless_gym_agents.train import parse, train
+
+GRID = "MortarMayhem-Grid-v0"
+
+#: Path lengths of the evaluation seeds, from the best rewards of the published episodes of the paper.
+PATHS = [8, 9, 9, 12, 9, 10, 8, 7, 12, 9, 10, 10, 10, 10, 11, 9, 9, 8, 9, 10, 8, 9, 8, 9, 8]
+PATHS += [12, 7, 9, 11, 7, 11, 12, 9, 9, 8, 10, 11, 7, 10, 9, 6, 6, 10, 7, 9, 10, 11, 11, 7, 11]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of one experiment and one of another, with two checkpoints each."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, agent, seed in (("a", "gru", 1), ("b", "gru", 2), ("c", "none", 1)):
+        given = settings(agent, env=GRID, seed=seed, run=str(folder / name), checkpoint_interval=1, threads=1)
+        environment = replace(given.environment, num_envs=4, option=("command_count=[2]",))
+        ppo = replace(given.ppo, steps=8, minibatches=1, updates=2)
+        train(replace(given, environment=environment, ppo=ppo, keep_checkpoints=True))
+    return folder
+
+
+def small(*paths: Path, **changes: object) -> EvalArguments:
+    return replace(EvalArguments(paths), seeds=5, threads=1, engine_threads=1, **changes)
+
+
+@pytest.mark.parametrize(
+    ("env", "options", "final", "path", "expected"),
+    [
+        ("MortarMayhem-v0", {}, {"reward": 0.3, "commands_completed": 0.3, "success": 0}, 0, 0.3),
+        # The last command failed, but the infos count it.
+        ("MortarMayhem-v0", {}, {"reward": 0.9, "commands_completed": 1.0, "success": 1}, 0, 0.9),
+        ("MortarMayhem-v0", {}, {"reward": 1.0, "commands_completed": 1.0, "success": 1}, 0, 1.0),
+        (GRID, {"command_count": [1]}, {"reward": 0.0, "commands_completed": 1.0, "success": 1}, 0, 0.0),
+        (GRID, {"command_count": [2, 4]}, {"reward": 0.3, "commands_completed": 1.0, "success": 1}, 0, 0.75),
+        # This reward does not show whether the last command failed.
+        (GRID, {"reward_episode_success": 1}, {"reward": 1.9, "commands_completed": 1.0, "success": 1}, 0, 1.0),
+        ("MysteryPath-v0", {}, {"reward": 0.4, "success": 0}, 8, 0.5),
+        ("MysteryPath-v0", {}, {"reward": 1.7, "success": 1}, 8, 1.0),
+        ("MysteryPath-Grid-v0", {}, {"reward": 1.0, "success": 1}, 8, 1.0),
+        ("MysteryPath-Grid-v0", {}, {"reward": 0.0, "success": 0}, 8, 0.0),
+        ("SearingSpotlights-v0", {}, {"coins_collected": 1, "success": 0}, 0, 0.5),
+        ("SearingSpotlights-v0", {}, {"coins_collected": 1, "success": 1}, 0, 1.0),
+        ("SearingSpotlights-v0", {"num_coins": [4]}, {"coins_collected": 1, "success": 0}, 0, 0.125),
+        ("Endless-MysteryPath-v0", {}, {"reward": 0.4, "tiles_visited": 4}, 0, None),
+    ],
+)
+def test_task_progress(
+    env: str, options: dict[str, object], final: dict[str, float], path: int, expected: float | None
+) -> None:
+    progress = task_progress(spec(env), options, final, path)
+    assert progress == (expected if expected is None else pytest.approx(expected))
+
+
+def test_metrics_of_the_paper() -> None:
+    assert metric("Endless-MortarMayhem-v0") == ("commands_completed", "Commands")
+    assert metric("Endless-MysteryPath-v0") == ("tiles_visited", "Tiles")
+    assert metric("Endless-SearingSpotlights-v0") == ("coins_collected", "Coins")
+    assert metric("MysteryPath-v0")[0] == "task_progress"
+
+
+def test_path_lengths_match_the_published_episodes() -> None:
+    env = Env("MysteryPath-v0", render_mode="debug_rgb_array")
+    lengths = []
+    for seed in range(200_000, 200_050):
+        env.reset(seed=seed)
+        lengths.append(path_length(env.render()))
+    assert lengths == PATHS
+
+
+def test_task_progress_uses_the_path_length_of_each_seed() -> None:
+    """An untrained agent reaches one or two tiles; each is a fraction of the path of its seed."""
+    agent = settings(
+        "none", env="MysteryPath-v0", environment=replace(settings("none").environment, option=("max_steps=60",))
+    )
+    from endless_gym_agents.agent import make_agent
+
+    results = evaluate(make_agent(agent, spec("MysteryPath-v0")), range(200_000, 200_010), 2, num_threads=1)
+    for result in results:
+        path = PATHS[int(result["seed"]) - 200_000]
+        assert result["task_progress"] == pytest.approx(round(result["reward"] / 0.1) / path)
+    assert any(result["task_progress"] > 0 for result in results)
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("--agent gru", "gru"),
+        ("--agent gru --recurrence.hidden-size 384", "gru_384"),
+        ("--agent gru --ppo.reconstruction-coefficient 0.1", "gru_rec"),
+        ("--agent lstm", "lstm"),
+        ("--agent none", "ppo"),
+        ("--agent stack --model.stack 16", "16stack"),
+        ("--agent position", "pos_enc"),
+        ("--agent gtrxl --transformer.gate-bias 2 --ppo.reconstruction-coefficient 0.1", "gtrxl_b2_rec"),
+        ("--agent gtrxl", "gtrxl_b0"),
+        ("--agent trxl --transformer.query-encoding", "trxl_qpos"),
+        ("--agent trxl --ppo.ground-truth-coefficient 0.1", "trxl_gt"),
+        ("--agent trxl --transformer.positional-encoding learned", "trxl_learned"),
+    ],
+)
+def test_labels_match_the_published_results(flags: str, expected: str) -> None:
+    assert label(parse(flags.split())) == expected
+    published = json.loads((Path(endless_gym_agents.__file__).parent / "published.json").read_text())
+    assert any(expected.replace("_learned", "_lr_learned") in curves for curves in published["curves"].values())
+
+
+def test_label_without_published_results() -> None:
+    assert label(parse(["--agent", "trxl", "--transformer.query-previous"])) == "trxl_qprev"
+    assert label(parse(["--agent", "gru", "--transformer.query-previous"])) == "gru"
+
+
+def test_runs_and_checkpoints_are_found(runs: Path) -> None:
+    assert [run.name for run, _ in find((runs,), False)] == ["a", "b", "c"]
+    assert [file.name for _, files in find((runs / "a",), False) for file in files] == [
+        "update-000000.pt",
+        "update-000001.pt",
+        "update-000002.pt",
+    ]
+    assert find((runs / "a" / "checkpoints",), True) == [(runs / "a", [runs / "a" / "checkpoints" / "last.pt"])]
+    file = runs / "b" / "checkpoints" / "update-000001.pt"
+    assert find((file,), False) == [(runs / "b", [file])]
+
+
+def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path) -> None:
+    quiet = Console(quiet=True)
+    once = evaluate_runs(small(runs), quiet)
+    assert [(one.label, len(one.runs), one.common_steps()) for one in once] == [
+        ("gru_16", 2, [0, 32, 64]),
+        ("ppo", 1, [0, 32, 64]),
+    ]
+    for run in once[0].runs:
+        for episodes in run.episodes:
+            assert Counter(episode["seed"] for episode in episodes) == dict.fromkeys(range(200_000, 200_005), 3)
+    again = evaluate_runs(small(runs), quiet)
+    assert to_json(again, {}, True) == to_json(once, {}, True)
+    other = evaluate_runs(small(runs, action_seed=1), quiet)
+    assert to_json(other, {}, True) != to_json(once, {}, True)
+
+
+def test_progress_callback_counts_every_episode(runs: Path) -> None:
+    counts: list[int] = []
+    agent = protocol.command.load_checkpoint(runs / "a", "cpu").agent
+    evaluate(agent, range(200_000, 200_004), 2, num_threads=1, ended=counts.append)
+    assert sum(counts) == 8
+    assert min(counts) > 0
+
+
+def test_runs_of_an_experiment_differ_only_in_what_does_not_affect_learning() -> None:
+    given, experiments = settings("gru", env=GRID, seed=1), Experiments()
+    apart = {"seed": 2, "run": "b", "preset": "paper", "device": "cuda", "threads": 3, "bind_cores": True, "view": True}
+    apart |= {"compile": True, "cuda_graphs": False, "on_engine_failure": "fail", "time_limit": 1.0, "wandb": True}
+    for name, value in apart.items():
+        assert getattr(given, name) != value
+        assert experiments.of(replace(given, **{name: value})) is experiments.of(given), name
+    environment = replace(given.environment, engine="process", num_threads=7)
+    assert experiments.of(replace(given, environment=environment)) is experiments.of(given)
+    for other in (replace(given, bf16=True), replace(given, agent="lstm"), replace(given, env="MortarMayhem-v0")):
+        assert experiments.of(other) is not experiments.of(given)
+
+
+def test_results_round_trip_through_json(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, start = tmp_path / "results.json", time.monotonic()
+    protocol.execute(small(runs, json=str(file), episodes=True))
+    table = capsys.readouterr().out
+    written = json.loads(file.read_text())
+    assert 0 < written.pop("seconds") < time.monotonic() - start
+    assert written["protocol"] == {
+        "first_seed": 200_000,
+        "seeds": 5,
+        "repetitions": 3,
+        "action_seed": 0,
+        "greedy": False,
+    }
+    gru, none = written["experiments"]
+    means = []
+    for run in gru["runs"]:
+        scores = [episode["reward"] / 0.2 for episode in run["episodes"][-1]]
+        means.append(sum(scores) / 15)
+        assert run["metrics"]["task_progress"][-1] == pytest.approx(means[-1])
+    last = gru["summary"][-1]
+    assert (last["steps"], last["over"], last["mean"]) == (64, "2 runs", pytest.approx(sum(means) / 2))
+    assert last["std"] == pytest.approx(abs(means[0] - means[1]) / 2)
+    assert f"{last['mean']:.4f}" in table
+    assert none["summary"][-1]["over"] == "15 episodes"
+    assert to_json(read(file), written["protocol"], True) == written
+
+
+def test_the_table_says_which_metric_to_trust() -> None:
+    """An agent that executes no command, which the original reports as a success."""
+    episodes = [{"reward": 0.0, "success": 1.0, "commands_completed": 1.0, "task_progress": 0.39, "seed": 1.0}] * 3
+
+    def printed(env: str) -> str:
+        run = Run("run", 1)
+        run.add(64, episodes)
+        console = Console(width=100, record=True, file=io.StringIO())
+        console.print(protocol.table(Experiment(env, "gru", {}, [run])))
+        return " ".join(console.export_text().split())
+
+    table = printed(GRID)
+    assert "64 success * 1.0000" in table and "64 commands_completed * 1.0000" in table
+    assert "64 task_progress 0.3900" in table
+    assert "Trust task_progress. * as the original reports it: a last command that failed counts as executed" in table
+    for env in ("MysteryPath-v0", "SearingSpotlights-v0"):
+        assert "*" not in printed(env) and "Trust" not in printed(env)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "no path given; expected checkpoint files"),
+        ("nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
+        (".", "no checkpoint in .; expected the folder of a run"),
+        ("text.pt", "text.pt is not a checkpoint of this version of endless-train"),
+        ("text.pt --seeds 0", "--seeds and --repetitions must be 1 or more, got 0 and 3"),
+        ("text.pt --json none/results.json", "cannot write none/results.json: no folder none"),
+        ("text.pt --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.pt").write_text("not a checkpoint\n")
+    monkeypatch.setattr(sys, "argv", ["endless-eval", *arguments.split()])
+    assert protocol.main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith("endless-eval: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_ctrl_c_stops_cleanly(runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*arguments: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(protocol, "evaluate", interrupted)
+    monkeypatch.setattr(sys, "argv", ["endless-eval", str(runs)])
+    assert protocol.main() == 130
+    assert capsys.readouterr().err == "endless-eval: stopped\n"

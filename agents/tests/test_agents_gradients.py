@@ -1,0 +1,106 @@
+"""Every weight learns. AdamW decays a weight also without a gradient, so that it changes does not show that it learns."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from agents_helpers import BRANCHES, ends, make, observations, play, settings
+from test_agents_memory import KINDS
+
+from endless_gym_agents import losses
+from endless_gym_agents.agent import Agent, AgentMemory
+from endless_gym_agents.encoders import FRAME
+from endless_gym_agents.ppo import minibatch_loss
+from endless_gym_agents.rollout import Segment
+
+STEPS, ENVS = 12, 3
+
+
+def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> list[str]:
+    """Names of the weights that no gradient of the total loss reaches; of the others some entry has a gradient."""
+    given = agent.settings.ppo
+    advantages = losses.generalised_advantages(
+        segment.reward, segment.value, segment.done, segment.last_value, given.gamma, given.gae_lambda
+    )
+    (minibatch,) = agent.memory.minibatches([memory.state], segment.reset_mask, 1, torch.Generator().manual_seed(0))
+    returns = (advantages + segment.value).flatten()
+    loss, _ = minibatch_loss(agent, segment.flat(), minibatch, advantages.flatten(), returns, given, 0.01)
+    loss.backward()
+    return [name for name, weight in agent.named_parameters() if weight.grad is None or not weight.grad.any()]
+
+
+def segment_of(agent: Agent, observation: dict[str, torch.Tensor], played: tuple[torch.Tensor, ...]) -> Segment:
+    reset_mask, action, log_prob, value = played
+    draws = torch.Generator().manual_seed(2)
+    return Segment(
+        observation=observation,
+        reset_mask=reset_mask,
+        action=action,
+        log_prob=log_prob,
+        value=value + 0.05 * torch.randn(value.shape, generator=draws),
+        reward=torch.randn(STEPS, ENVS, generator=draws),
+        done=ends(STEPS, ENVS),
+        ground_truth=torch.randn(STEPS, ENVS, 2, generator=draws) if agent.ground_truth else None,
+        last_value=torch.randn(ENVS, generator=draws),
+    )
+
+
+# The observation of the agents `stack` and `position` is transformed in `act`, before the network.
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in ("stack", "position")])
+def test_every_weight_gets_a_gradient(name: str) -> None:
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
+    # The second segment: the hidden states of recurrent layers are no longer zero.
+    play(agent, memory, observed, ends(STEPS, ENVS))
+    segment = segment_of(agent, {"features": observed}, play(agent, memory, observed, ends(STEPS, ENVS)))
+    assert without_gradient(agent, segment, memory) == []
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
+    """Sequences of one step are computed in another way than longer ones."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
+    play(agent, memory, observed, ends(STEPS, ENVS))
+    reset_mask, *_ = play(agent, memory, observed, ends(STEPS, ENVS))
+    factor, gradients = torch.randn(STEPS * ENVS), []
+    for length in (1, 4, STEPS):
+        agent.memory.settings = replace(agent.memory.settings, sequence_length=length)
+        (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+        agent.zero_grad()
+        value = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch).value
+        (value * factor[minibatch.indices]).sum().backward()
+        gradients.append({key: weight.grad for key, weight in agent.named_parameters() if weight.grad is not None})
+    for other in gradients[1:]:
+        torch.testing.assert_close(other, gradients[0], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["gru", "trxl"])
+def test_every_weight_of_an_agent_with_all_heads_gets_a_gradient(kind: str) -> None:
+    given = settings(kind)
+    ppo = replace(given.ppo, reconstruction_coefficient=0.1, ground_truth_coefficient=1.0)
+    given = replace(given, ppo=ppo, environment=replace(given.environment, observation="rgb"))
+    torch.manual_seed(3)
+    agent = Agent(given, {FRAME: (84, 84, 3), "vector_observation": (5,)}, BRANCHES, ground_truth=2)
+    memory, draws = agent.initial_memory(ENVS), torch.Generator().manual_seed(4)
+    frames = torch.randint(0, 256, (STEPS, ENVS, 84, 84, 3), dtype=torch.uint8, generator=draws)
+    observation = {FRAME: frames, "vector_observation": torch.randn(STEPS, ENVS, 5, generator=draws)}
+    agent.memory.begin_segment(memory.state, STEPS)
+    rows = []
+    for step, done in enumerate(ends(STEPS, ENVS)):
+        reset_mask = memory.reset_mask
+        output = agent.act({key: part[step] for key, part in observation.items()}, memory, draws)
+        rows.append((reset_mask, output.action, output.log_prob, output.value))
+        memory.reset(done)
+    played = tuple(torch.stack(column) for column in zip(*rows, strict=True))
+    assert without_gradient(agent, segment_of(agent, observation, played), memory) == []
+
+
+def test_a_weight_without_gradient_is_found() -> None:
+    agent = make("trxl")
+    agent.memory.blocks[0].fc.weight.requires_grad_(False)
+    memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
+    segment = segment_of(agent, {"features": observed}, play(agent, memory, observed, ends(STEPS, ENVS)))
+    assert without_gradient(agent, segment, memory) == ["memory.layers.0.fc.weight"]

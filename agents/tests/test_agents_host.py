@@ -1,0 +1,21 @@
+"""Copies between the host and a device."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from endless_gym_agents.host import HostCopy
+
+
+def test_the_copy_is_waited_for_on_the_stream_of_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An event that is recorded without a stream is one of the current device, which need not be the tensor's."""
+    calls = []
+    done = SimpleNamespace(record=calls.append, synchronize=lambda: calls.append("wait"))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: f"stream of {device}")
+    copy = HostCopy((2,), torch.long, torch.device("cpu"))
+    monkeypatch.setattr(copy, "_done", done)
+    copy.start(torch.tensor([3, 4]))
+    copy.wait()
+    assert calls == ["stream of cpu", "wait"]
+    assert copy.array.tolist() == [3, 4]

@@ -1,0 +1,60 @@
+"""When a task counts as learnt, and the runs that stop then."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from agents_helpers import settings
+
+from endless_gym import spec
+from endless_gym_agents.learnt import learnt
+from endless_gym_agents.settings import PRESETS
+from endless_gym_agents.train import train
+
+GRID = "MortarMayhem-Grid-v0"
+
+
+@pytest.mark.parametrize(
+    ("id", "options", "means", "is_learnt"),
+    [
+        (GRID, {"command_count": [1]}, {"reward": 0.089, "success": 1.0}, False),
+        (GRID, {"command_count": [1]}, {"reward": 0.091, "success": 1.0}, True),
+        (GRID, {"command_count": [1, 3]}, {"reward": 0.19, "success": 1.0}, True),
+        (GRID, {"command_count": [1, 3]}, {"reward": 0.17, "success": 1.0}, False),
+        (GRID, {"reward_episode_success": 1.0}, {"reward": 1.7, "success": 1.0}, False),
+        (GRID, {"reward_episode_success": 1.0}, {"reward": 1.85, "success": 1.0}, True),
+        (GRID, {"reward_command_success": 0.0}, {"reward": 0.0, "success": 1.0}, False),
+        ("MysteryPath-v0", {}, {"reward": 9.0, "success": 0.89}, False),
+        ("MysteryPath-v0", {}, {"reward": 0.1, "success": 0.91}, True),
+        ("SearingSpotlights-v0", {}, {"reward": 0.1, "success": 0.91}, True),
+        ("Endless-MortarMayhem-v0", {}, {"reward": 100.0}, False),
+        (GRID, {}, {}, False),
+    ],
+)
+def test_learnt(id: str, options: dict[str, object], means: dict[str, float], is_learnt: bool) -> None:
+    given = {f"episode/{name}": value for name, value in means.items()}
+    assert (learnt(spec(id), options, given) is not None) is is_learnt
+
+
+def test_only_the_preset_quick_stops_by_default() -> None:
+    assert [name for name, preset in PRESETS.items() if preset.stop_when_learnt] == ["quick"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "stops"), [({}, True), ({"stop_when_learnt": False}, False), ({"target_reward": 9.0}, False)]
+)
+def test_a_run_stops_and_says_so(
+    changes: dict[str, object], stops: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = settings("none", env=GRID, run=str(tmp_path / "run"), threads=1, **changes)
+    # Failures are rewarded like successes, so that every agent reaches the reward.
+    options = ("command_count=[1]", "reward_command_failure=0.1")
+    environment = replace(given.environment, num_envs=8, option=options)
+    run = train(replace(given, environment=environment, ppo=replace(given.ppo, steps=32, minibatches=1, updates=25)))
+    updates = len((run / "progress.jsonl").read_text().splitlines())
+    output = " ".join(capsys.readouterr().out.split())
+    assert ("the task is learnt: the last episodes have a mean reward of 0.1" in output) is stops
+    assert (updates < 25) is stops
+    assert json.loads((run / "settings.json").read_text())["stop_when_learnt"] is given.stop_when_learnt

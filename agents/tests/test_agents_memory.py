@@ -1,0 +1,406 @@
+"""The memories: their outputs against plain references, and that no information leaks from the future or other episodes."""
+
+import math
+
+import pytest
+import torch
+from agents_helpers import BRANCHES, ends, make, observations, play, settings, transformer
+
+from endless_gym_agents.agent import Agent
+from endless_gym_agents.memory import balanced_split
+from endless_gym_agents.settings import PRESETS, Recurrence
+from endless_gym_agents.transformer import Block, Gate, TransformerMemory
+
+STEPS, ENVS = 24, 3
+
+KINDS = {
+    "none": ("none", {}),
+    "position": ("position", {}),
+    "stack": ("stack", {}),
+    "gru": ("gru", {}),
+    "gru, two layers, residual": ("gru", {"recurrence": Recurrence(16, layers=2, residual=True, sequence_length=5)}),
+    "lstm": ("lstm", {}),
+    "lstm without embedding": ("lstm", {"recurrence": Recurrence(16, embedding=False, sequence_length=24)}),
+    "trxl": ("trxl", {}),
+    "trxl, full heads": ("trxl", transformer(shared_heads=False)),
+    "trxl, learned": ("trxl", transformer(positional_encoding="learned", query_encoding=True)),
+    "trxl, relative": ("trxl", transformer(positional_encoding="relative")),
+    "trxl, no positions": ("trxl", transformer(positional_encoding="none")),
+    "trxl, query encoding": ("trxl", transformer(query_encoding=True)),
+    "trxl, previous": ("trxl", transformer(query_previous=True)),
+    "trxl, single steps, previous": ("trxl", transformer(sequence_length=1, query_previous=True, query_encoding=True)),
+    "trxl, one block, relative, previous": (
+        "trxl",
+        transformer(layers=1, positional_encoding="relative", query_previous=True),
+    ),
+    "gtrxl, learned, previous": ("gtrxl", transformer(positional_encoding="learned", query_previous=True)),
+    "trxl, short sequences": ("trxl", transformer(sequence_length=4)),
+    "trxl, one sequence": ("trxl", transformer(sequence_length=64)),
+    "trxl, single steps": ("trxl", transformer(sequence_length=1)),
+    "trxl, single steps, short window": ("trxl", transformer(sequence_length=1, window=6)),
+    "trxl, single steps, separate heads": ("trxl", transformer(sequence_length=1, shared_heads=False)),
+    "trxl, single steps, relative": ("trxl", transformer(sequence_length=1, positional_encoding="relative")),
+    "trxl, single steps, learned": ("trxl", transformer(sequence_length=1, positional_encoding="learned")),
+    "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
+}
+WITH_STATE = [name for name in KINDS if name not in ("none", "position")]
+
+
+@pytest.fixture(autouse=True)
+def short_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of single steps from several parts of a segment; with the short window, the last part is longer than the segment."""
+    monkeypatch.setattr("endless_gym_agents.transformer.SHORTEST_PART", 5)
+
+
+@pytest.fixture(params=KINDS)
+def agent(request: pytest.FixtureRequest) -> Agent:
+    kind, changes = KINDS[request.param]
+    return make(kind, **changes)
+
+
+@pytest.mark.parametrize("minibatches", [1, 3])
+def test_forward_equals_act(agent: Agent, minibatches: int) -> None:
+    """Equal log-probabilities and values for each step of the second of two segments; each step is in one minibatch."""
+    memory, done = agent.initial_memory(ENVS), ends(2 * STEPS, ENVS)
+    observed = observations(2 * STEPS, ENVS)
+    play(agent, memory, observed[:STEPS], done[:STEPS])
+    observations_seen = []
+    agent.transform.apply, apply = _recording(agent.transform.apply, observations_seen), agent.transform.apply
+    reset_mask, action, log_prob, value = play(agent, memory, observed[STEPS:], done[STEPS:])
+    agent.transform.apply = apply
+    seen = {key: torch.stack([step[key] for step in observations_seen]).flatten(0, 1) for key in observations_seen[0]}
+    batches = agent.memory.minibatches([memory.state], reset_mask, minibatches, torch.Generator().manual_seed(0))
+    indices = torch.cat([minibatch.indices for minibatch in batches])
+    assert sorted(indices.tolist()) == list(range(STEPS * ENVS))
+    assert len(batches) == minibatches
+    for minibatch in batches:
+        output = agent({key: part[minibatch.indices] for key, part in seen.items()}, minibatch)
+        assert_close(output.value, value.flatten()[minibatch.indices])
+        assert_close(
+            output.log_prob(action.flatten(0, 1)[minibatch.indices]), log_prob.flatten(0, 1)[minibatch.indices]
+        )
+
+
+def test_epochs_follow_one_another(agent: Agent) -> None:
+    """The minibatches of two epochs are those of two divisions with the same generator."""
+    memory = agent.initial_memory(ENVS)
+    reset_mask, *_ = play(agent, memory, observations(STEPS, ENVS), ends(STEPS, ENVS))
+
+    def divided(generator: torch.Generator, epochs: int) -> list[list[int]]:
+        batches = agent.memory.minibatches([memory.state], reset_mask, 2, generator, epochs=epochs)
+        return [minibatch.indices.tolist() for minibatch in batches]
+
+    generator = torch.Generator().manual_seed(0)
+    apart = [divided(generator, 1), divided(generator, 1)]
+    assert divided(torch.Generator().manual_seed(0), 2) == apart[0] + apart[1]
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
+def test_minibatches_without_a_step_of_the_rank(name: str) -> None:
+    """A rank with one of three environments: its steps are in some of the minibatches, and the others can be made, too."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, done = agent.initial_memory(1), ends(STEPS, 1)
+    reset_mask, *_ = play(agent, memory, observations(STEPS, 1), done)
+    everywhere = reset_mask.expand(STEPS, ENVS)
+    many = STEPS * ENVS
+    batches = agent.memory.minibatches(
+        [memory.state], everywhere, many, torch.Generator().manual_seed(0), own=range(1, 2)
+    )
+    indices = [minibatch.indices for minibatch in batches]
+    assert not all(len(part) for part in indices)
+    assert sorted(torch.cat(indices).tolist()) == list(range(STEPS))
+
+
+def test_groups_are_concatenated_along_the_environments() -> None:
+    for kind in ("gru", "lstm", "trxl"):
+        agent, observed, done = make(kind), observations(STEPS, 4), ends(STEPS, 4)
+        memories = [agent.initial_memory(2) for _ in range(2)]
+        parts = [play(agent, memories[g], observed[:, 2 * g : 2 * g + 2], done[:, 2 * g : 2 * g + 2]) for g in range(2)]
+        reset_mask, value = (torch.cat([part[i] for part in parts], dim=1) for i in (0, 3))
+        states = [memory.state for memory in memories]
+        for minibatch in agent.memory.minibatches(states, reset_mask, 2, torch.Generator().manual_seed(0)):
+            output = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch)
+            assert_close(output.value, value.flatten()[minibatch.indices])
+
+
+@pytest.mark.parametrize("name", WITH_STATE)
+def test_act_does_not_leak(name: str) -> None:
+    """An observation influences only the later steps of its own episode in its own environment."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    done = torch.zeros(STEPS, ENVS, dtype=torch.bool)
+    done[9, 1] = True  # the changed step belongs to the episode of steps 0 to 9
+    observed = observations(STEPS, ENVS)
+    changed = observed.clone()
+    changed[6, 1] += 1.0
+    _, _, _, before = play(agent, agent.initial_memory(ENVS), observed, done)
+    _, _, _, after = play(agent, agent.initial_memory(ENVS), changed, done)
+    differs = before != after
+    allowed = torch.zeros_like(differs)
+    allowed[6:10, 1] = True
+    assert not differs[~allowed].any()
+    # All later steps of the episode are influenced, also with the stack of four observations.
+    assert differs[6:10, 1].all()
+
+
+# Frame stacks are made in `act`; `forward` takes the stacked observations.
+@pytest.mark.parametrize("name", [name for name in WITH_STATE if KINDS[name][0] != "stack"])
+def test_forward_does_not_leak(name: str) -> None:
+    """The gradient of one step's value with respect to all observations is nonzero only up to that step, within its episode."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
+    done[9, 1] = True
+    observed = observations(STEPS, ENVS)
+    reset_mask, *_ = play(agent, memory, observed, done)
+    (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+    flat = observed.flatten(0, 1)[minibatch.indices].requires_grad_()
+    value = agent({"features": flat}, minibatch).value
+    (gradient,) = torch.autograd.grad(value[(minibatch.indices == 15 * ENVS + 1).nonzero().item()], flat)
+    reached = {(int(step) // ENVS, int(step) % ENVS) for step in minibatch.indices[gradient.abs().sum(-1) > 0]}
+    assert (15, 1) in reached
+    assert reached <= {(t, 1) for t in range(10, 16)}
+    if kind in ("trxl", "gtrxl"):
+        # Cached tokens have no gradient.
+        assert reached == {(15, 1)}
+    else:
+        # Truncated BPTT: back to the start of the episode or of the sequence.
+        length = changes.get("recurrence", settings(kind).recurrence).sequence_length
+        assert reached == {(t, 1) for t in range(max(10, 15 - 15 % length), 16)}
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+def test_band_mask_of_cached_tokens(name: str) -> None:
+    """A cached token influences exactly the next `window - 1` steps of its own episode."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    window = agent.memory.settings.window
+    memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
+    done[13, 1] = True
+    observed = observations(STEPS, ENVS)
+    reset_mask, *_ = play(agent, memory, observed, done)
+
+    def values() -> torch.Tensor:
+        (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+        value = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch).value
+        return torch.zeros(STEPS * ENVS).index_copy(0, minibatch.indices, value.detach()).view(STEPS, ENVS)
+
+    for step, last in ((6, 6 + window - 1), (11, 13)):
+        before = values()
+        token = memory.state.inputs[:, 1, window - 1 + step]
+        kept = token.clone()
+        token += torch.randn(token.shape)
+        differs = values() != before
+        token.copy_(kept)
+        expected = torch.zeros_like(differs)
+        expected[step + 1 : last + 1, 1] = True
+        assert torch.equal(differs, expected)
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+@pytest.mark.parametrize("recording", [True, False])
+def test_kv_cache_equals_a_loop_over_windows(name: str, recording: bool) -> None:
+    """Transformer-XL against a plain loop that projects the window of each step and environment separately."""
+    kind, changes = KINDS[name]
+    agent = make(kind, **changes)
+    memory, steps = agent.initial_memory(ENVS), 5 * STEPS
+    observed, done = observations(steps, ENVS), ends(steps, ENVS)
+    outputs = []
+    for step in range(steps):
+        # Without segments, the state is compacted whenever it is full.
+        if recording and step % STEPS == 0:
+            agent.memory.begin_segment(memory.state, STEPS)
+        outputs.append(agent.act({"features": observed[step]}, memory).value)
+        memory.reset(done[step])
+    expected = _plain_transformer(agent, observed, done)
+    assert_close(torch.stack(outputs), expected)
+
+
+def _plain_transformer(agent: Agent, observed: torch.Tensor, done: torch.Tensor) -> torch.Tensor:
+    module: TransformerMemory = agent.memory
+    values = torch.zeros(observed.shape[:2])
+    for env in range(observed.shape[1]):
+        episode: list[list[torch.Tensor]] = []  # the inputs of all blocks for each step of the episode
+        for step in range(observed.shape[0]):
+            with torch.no_grad():
+                x = module.embedding(agent.encoder({"features": observed[step, env : env + 1]}))[0]
+                inputs, now = [], len(episode)
+                if module.fusion is not None:
+                    previous = episode[-1][-1] if episode else torch.zeros(module.width)
+                    linear = module.fusion[0]
+                    x = torch.relu(linear.weight @ torch.cat([x, previous]) + linear.bias)
+                window = range(max(0, now - module.settings.window + 1), now)
+                for layer, block in enumerate(module.blocks):
+                    inputs.append(x)
+                    if module.settings.query_encoding:
+                        x = x + _encoding(module, now)
+                    tokens = [episode[t][layer] + _encoding(module, t) for t in window]
+                    x = _plain_block(block, x, tokens, [now - t for t in window])
+                episode.append(inputs)
+                values[step, env] = agent.value(agent.body(x.unsqueeze(0)))[0]
+            if done[step, env]:
+                episode = []
+    return values
+
+
+def _encoding(module: TransformerMemory, position: int) -> torch.Tensor:
+    kind, width = module.settings.positional_encoding, module.width
+    if kind == "learned":
+        return module.table[min(position, module.positions - 1)]
+    if kind != "absolute":
+        return torch.zeros(width)
+    return _sinusoid(module.positions - 1 - min(position, module.positions - 1), width)
+
+
+def _sinusoid(angle: float, width: int) -> torch.Tensor:
+    scaled = [angle / 10_000 ** (2 * i / width) for i in range(width // 2)]
+    return torch.tensor([math.sin(a) for a in scaled] + [math.cos(a) for a in scaled])
+
+
+def _plain_block(block: Block, x: torch.Tensor, tokens: list[torch.Tensor], ages: list[int]) -> torch.Tensor:
+    attention = block.attention
+    heads, size, width = attention.heads, attention.size, x.shape[-1]
+
+    def projected(layer: torch.nn.Linear, vector: torch.Tensor, head: int) -> torch.Tensor:
+        part = slice(head * size, (head + 1) * size)
+        return layer.weight @ vector[part] if layer.in_features == size else (layer.weight @ vector)[part]
+
+    normal = [block.norm_tokens(token) for token in tokens]
+    query = block.norm_query(x)
+    summed = torch.zeros(width)
+    for head in range(heads if tokens else 0):
+        q = projected(attention.queries, query, head)
+        scores = []
+        for token, age in zip(normal, ages, strict=True):
+            k = projected(attention.keys, token, head)
+            if attention.relative:
+                r = projected(attention.distances, _sinusoid(age, width), head)
+                scores.append((q + attention.content_bias[head, 0]) @ k + (q + attention.distance_bias[head, 0]) @ r)
+            else:
+                scores.append(q @ k)
+        weights = torch.softmax(torch.stack(scores) / math.sqrt(width), dim=0)
+        mixed = sum(w * projected(attention.values, token, head) for w, token in zip(weights, normal, strict=True))
+        summed[head * size : (head + 1) * size] = mixed
+    attended = attention.fc_out(summed)
+    x = x + attended if block.gate_attention is None else _plain_gate(block.gate_attention, x, attended)
+    added = torch.relu(block.fc(block.norm_fc(x)))
+    return x + added if block.gate_fc is None else _plain_gate(block.gate_fc, x, added)
+
+
+def _plain_gate(gate: Gate, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    width = x.shape[-1]
+    w_r, w_z, w_g = gate.from_y.weight.split(width)
+    u_r, u_z = gate.from_x.weight.split(width)
+    r, z = torch.sigmoid(w_r @ y + u_r @ x), torch.sigmoid(w_z @ y + u_z @ x - gate.bias)
+    return (1 - z) * x + z * torch.tanh(w_g @ y + gate.from_reset.weight @ (r * x))
+
+
+def test_gru_cell_from_its_equations() -> None:
+    """One step of the GRU agent, computed from the equations of the GRU."""
+    agent = make("gru")
+    x = agent.memory.embedding(agent.encoder({"features": observations(1, 1)[0]}))[0]
+    parts = agent.memory.recurrent
+    hidden = torch.randn(16)
+    memory = agent.initial_memory(1)
+    memory.state.hidden[0, 0, 0] = hidden
+    memory.reset_mask[:] = False
+    i_r, i_z, i_n = (parts.weight_ih_l0 @ x + parts.bias_ih_l0).split(16)
+    h_r, h_z, h_n = (parts.weight_hh_l0 @ hidden + parts.bias_hh_l0).split(16)
+    r, z = torch.sigmoid(i_r + h_r), torch.sigmoid(i_z + h_z)
+    expected = (1 - z) * torch.tanh(i_n + r * h_n) + z * hidden
+    agent.act({"features": observations(1, 1)[0]}, memory)
+    assert_close(memory.state.hidden[0, 0, 0], expected.detach())
+
+
+def test_bootstrap_value_does_not_change_the_memory() -> None:
+    for kind in ("none", "position", "stack", "gru", "lstm", "trxl"):
+        agent, observed = make(kind), observations(4, ENVS)
+        memory = agent.initial_memory(ENVS)
+        for step in range(3):
+            agent.act({"features": observed[step]}, memory)
+        once = agent.bootstrap_value({"features": observed[3]}, memory)
+        assert torch.equal(agent.bootstrap_value({"features": observed[3]}, memory), once)
+        assert_close(agent.act({"features": observed[3]}, memory).value, once)
+
+
+def test_state_dict_of_the_memory() -> None:
+    for kind, changes in KINDS.values():
+        agent, observed, done = make(kind, **changes), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
+        memory, other = agent.initial_memory(ENVS), agent.initial_memory(ENVS)
+        play(agent, memory, observed[:STEPS], done[:STEPS])
+        other.load_state_dict(memory.state_dict())
+        one, two = (play(agent, m, observed[STEPS:], done[STEPS:])[3] for m in (memory, other))
+        assert torch.equal(one, two)
+
+
+def test_kv_cache_is_recomputed_when_a_segment_begins() -> None:
+    """After an update of the weights, the outputs are those of the new weights."""
+    agent, observed, done = make("trxl"), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
+    memory = agent.initial_memory(ENVS)
+    play(agent, memory, observed[:STEPS], done[:STEPS])
+    for block in agent.memory.blocks:
+        block.attention.keys.weight.data.mul_(-1)
+    reset_mask, _, _, value = play(agent, memory, observed[STEPS:], done[STEPS:])
+    (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
+    output = agent({"features": observed[STEPS:].flatten(0, 1)[minibatch.indices]}, minibatch)
+    assert_close(output.value, value.flatten()[minibatch.indices])
+
+
+def test_compiled_agent_has_the_same_outputs() -> None:
+    agent, observed, done = make("trxl"), observations(STEPS, ENVS), ends(STEPS, ENVS)
+    _, action, _, value = play(agent, agent.initial_memory(ENVS), observed, done)
+    parameters = agent.state_dict().keys()
+    agent.compile_parts()
+    _, again, _, compiled = play(agent, agent.initial_memory(ENVS), observed, done)
+    assert torch.equal(action, again)
+    assert_close(compiled, value)
+    assert agent.state_dict().keys() == parameters
+
+
+def test_balanced_split() -> None:
+    sizes = [1, 30, 5, 5, 9, 2, 2, 2, 8, 8, 8, 20]
+    parts = balanced_split(sizes, 4, torch.Generator().manual_seed(1))
+    assert sorted(torch.cat(parts).tolist()) == list(range(len(sizes)))
+    assert all(10 <= sum(sizes[i] for i in part) <= 40 for part in parts)
+    assert len(balanced_split([1], 4, torch.Generator())) == 1
+
+
+def test_stack_of_grey_frames() -> None:
+    agent = Agent(PRESETS["paper"].__class__(agent="stack"), {"visual_observation": (84, 84, 3)}, BRANCHES)
+    memory = agent.initial_memory(2)
+    colours = torch.tensor([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [10, 20, 30]], dtype=torch.uint8)
+    stacks = []
+    for colour in colours:
+        frames = colour.expand(2, 84, 84, 3)
+        stacks.append(agent.act({"visual_observation": frames}, memory).observation["visual_observation"])
+        memory.reset(torch.tensor([False, len(stacks) == 3]))
+    assert stacks[0].shape == (2, 84, 84, 4)
+    assert stacks[0][0, 5, 7].tolist() == [76] * 4  # 0.299 * 255
+    assert stacks[2][0, 5, 7].tolist() == [76, 76, 150, 29]
+    assert stacks[4][0, 0, 0].tolist() == [150, 29, 255, 18]
+    assert stacks[4][1, 0, 0].tolist() == [255, 255, 255, 18]  # its episode starts with the fourth frame
+
+
+def test_position_encoding_alternates_sine_and_cosine() -> None:
+    agent, observed = make("position"), observations(3, 2)
+    memory = agent.initial_memory(2)
+    for step in range(3):
+        seen = agent.act({"features": observed[step]}, memory).observation["position"]
+        memory.reset(torch.tensor([False, step == 0]))
+    expected = [f(2 / 10_000 ** (2 * i / 16)) for i in range(8) for f in (math.sin, math.cos)]
+    assert_close(seen[0], torch.tensor(expected))
+    assert_close(seen[1, :2], torch.tensor([math.sin(1), math.cos(1)]))
+
+
+def assert_close(one: torch.Tensor, two: torch.Tensor) -> None:
+    torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
+
+
+def _recording(apply, seen):
+    def recorded(observation, state, reset_mask):
+        result = apply(observation, state, reset_mask)
+        seen.append(result[0])
+        return result
+
+    return recorded

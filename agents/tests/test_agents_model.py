@@ -1,0 +1,422 @@
+"""The network: number of parameters, heads, settings and presets."""
+
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+from agents_helpers import BRANCHES, make, settings, transformer
+
+from endless_gym import make_vec, spec
+from endless_gym_agents import curves
+from endless_gym_agents.agent import Agent, make_agent
+from endless_gym_agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
+from endless_gym_agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
+from endless_gym_agents.memory import Minibatch
+from endless_gym_agents.settings import PRESETS, Recurrence, Settings, Transformer, from_dict, to_dict
+from endless_gym_agents.transformer import Block, Gate, TransformerMemory
+
+PAPER = PRESETS["paper"]
+
+
+@pytest.mark.parametrize(
+    ("agent", "changes", "count"),
+    [
+        ("gru", {}, 4_049_575),
+        ("gru", {"recurrence": Recurrence(hidden_size=384)}, 2_713_255),
+        ("trxl", {}, 2_803_111),
+        # Full heads: three matrices of 384 x 384 for three of 96 x 96, in three blocks.
+        ("trxl", {"transformer": Transformer(shared_heads=False)}, 2_803_111 + 9 * (384**2 - 96**2)),
+        ("trxl", {"transformer": Transformer(positional_encoding="learned")}, 2_803_111 + 2048 * 384),
+        # One more matrix of a head's size and two biases in each block.
+        ("trxl", {"transformer": Transformer(positional_encoding="relative")}, 2_803_111 + 3 * (96**2 + 2 * 384)),
+        # Two gates of six matrices and a bias in each block.
+        ("gtrxl", {}, 2_803_111 + 3 * 2 * (6 * 384**2 + 384)),
+        # An LSTM has four where a GRU has three.
+        ("lstm", {}, 4_049_575 + 2 * 512 * 512 + 2 * 512),
+        # As the GRU agent, without embedding and GRU: the body takes the 3136 outputs of the convolutions.
+        ("none", {}, 4_049_575 - 1_606_144 - 1_575_936 + (3136 - 512) * 512),
+    ],
+)
+def test_numbers_of_parameters(agent: str, changes: dict, count: int) -> None:
+    made = Agent(replace(PAPER, agent=agent, **changes), {"visual_observation": (84, 84, 3)}, (3, 3))
+    assert made.num_parameters == count
+
+
+def test_preset_paper_equals_the_table_of_the_paper() -> None:
+    """Hyperparameters of the column `Final`."""
+    ppo, recurrence, trxl = PAPER.ppo, PAPER.recurrence, PAPER.transformer
+    assert PAPER.environment.num_envs == 32
+    assert ppo.steps == 512
+    assert ppo.steps * PAPER.environment.num_envs == 16_384
+    assert (ppo.gamma, ppo.gae_lambda, ppo.epochs, ppo.minibatches) == (0.995, 0.95, 3, 8)
+    assert ppo.advantage_normalisation == "none"
+    assert (ppo.clip_range, ppo.value_coefficient) == (0.1, 0.5)
+    assert (ppo.learning_rate, ppo.final_learning_rate) == (2.75e-4, 1.0e-5)
+    assert (ppo.entropy_coefficient, ppo.final_entropy_coefficient) == (1.0e-4, 1.0e-6)
+    assert ppo.max_gradient_norm == 0.25
+    assert ppo.decay_updates * 16_384 == 163_840_000
+    assert asdict(recurrence) == {
+        "hidden_size": 512,
+        "layers": 1,
+        "residual": False,
+        "embedding": True,
+        "sequence_length": 512,
+    }
+    assert (trxl.layers, trxl.width, trxl.heads) == (3, 384, 4)
+    assert (trxl.initialisation, trxl.positional_encoding) == ("xavier", "absolute")
+    # The authors shuffle single steps.
+    assert trxl.sequence_length == 1
+
+
+@pytest.mark.parametrize(
+    ("env", "option", "window", "positions"),
+    [
+        ("Endless-MortarMayhem-v0", (), 256, 2048),
+        ("Endless-MysteryPath-v0", (), 256, 2048),
+        ("Endless-SearingSpotlights-v0", (), 256, 2048),
+        # A window of 256, or of the longest episode; 274 steps and the one that ends it.
+        ("MortarMayhem-v0", (), 275, 275),
+        ("MortarMayhem-v0", ("command_count=[2, 1]",), 51, 51),
+        ("MysteryPath-v0", (), 512, 512),
+        ("MysteryPath-Grid-v0", (), 128, 128),
+        ("SearingSpotlights-v0", ("max_steps=100",), 100, 100),
+        ("SearingSpotlights-v0", ("max_steps=-1",), 256, 2048),
+        ("Endless-MysteryPath-v0", ("max_steps=5000",), 256, 2048),
+    ],
+)
+def test_window_and_positions_follow_the_longest_episode(
+    env: str, option: tuple[str, ...], window: int, positions: int
+) -> None:
+    given = replace(PAPER, env=env, agent="trxl", environment=replace(PAPER.environment, option=option)).validated()
+    assert (given.window(), given.positions()) == (window, positions)
+    memory = make_agent(given, spec(env)).memory
+    assert isinstance(memory, TransformerMemory)
+    assert (memory.past, memory.positions) == (window - 1, positions)
+    fixed = replace(given, transformer=replace(given.transformer, window=9, positions=11))
+    assert (fixed.window(), fixed.positions()) == (9, 11)
+
+
+def test_run_lengths_are_those_of_the_published_curves() -> None:
+    """A published curve has a point every 500 updates, the first one before training."""
+    agents = {"16stack": "stack", "4stack": "stack", "ppo": "none", "pos_enc": "position"}
+    for env, runs in curves._published()["curves"].items():
+        for run, scores in runs.items():
+            run = run.removesuffix("_cues")
+            agent = agents.get(run, run.split("_")[0])
+            given = replace(PAPER, env=env, agent=agent).validated()
+            assert given.ppo.updates == 500 * (len(scores[0]) - 1), (env, run)
+            assert given.ppo.decay_updates == 10_000
+    fewer = replace(PAPER, environment=replace(PAPER.environment, num_envs=8)).validated()
+    assert fewer.ppo.updates == 4 * PAPER.validated().ppo.updates
+    assert replace(PAPER, ppo=replace(PAPER.ppo, updates=7)).validated().ppo.updates == 7
+
+
+def test_preset_throughput_512_keeps_the_steps_of_the_paper() -> None:
+    given = PRESETS["throughput-512"].validated()
+    assert (given.environment.num_envs, given.ppo.steps, given.recurrence.sequence_length) == (128, 512, 512)
+    batch, paper = 128 * 512, 32 * 512
+    assert batch / given.ppo.minibatches == paper / PAPER.ppo.minibatches
+    assert batch * given.ppo.updates == paper * PAPER.validated().ppo.updates
+    assert batch * given.ppo.decay_updates == paper * PAPER.ppo.decay_updates
+    assert replace(given.transformer, sequence_length=1) == PAPER.transformer
+
+
+def test_preset_throughput_has_more_environments_and_equal_steps_per_update() -> None:
+    given = PRESETS["throughput"]
+    assert (given.environment.num_envs, given.ppo.steps) == (512, 32)
+    assert given.environment.num_envs * given.ppo.steps == PAPER.environment.num_envs * PAPER.ppo.steps
+    assert given.recurrence.sequence_length == given.transformer.sequence_length == given.ppo.steps
+    assert replace(given.ppo, steps=PAPER.ppo.steps) == PAPER.ppo
+
+
+def test_preset_old_differs_only_in_its_column() -> None:
+    old = PRESETS["old"]
+    assert (old.ppo.gamma, old.ppo.clip_range, old.ppo.value_coefficient) == (0.99, 0.2, 0.25)
+    assert (old.ppo.learning_rate, old.ppo.final_learning_rate) == (3.0e-4, 1.0e-4)
+    assert (old.ppo.final_entropy_coefficient, old.ppo.max_gradient_norm) == (1.0e-5, 0.5)
+    assert old.ppo.advantage_normalisation == "minibatch"
+    assert not old.recurrence.embedding
+    names = (
+        "gamma advantage_normalisation clip_range value_coefficient learning_rate final_learning_rate "
+        "final_entropy_coefficient max_gradient_norm"
+    )
+    same = {name: getattr(PAPER.ppo, name) for name in names.split()}
+    assert replace(old.ppo, **same) == PAPER.ppo
+    assert replace(old, preset="paper", ppo=PAPER.ppo, recurrence=PAPER.recurrence) == PAPER
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_settings_round_trip_through_dicts(name: str) -> None:
+    given = replace(PRESETS[name], environment=replace(PAPER.environment, option=("command_count=[2]",)))
+    assert from_dict(to_dict(given)) == given
+    assert from_dict(to_dict(given.validated())) == given.validated()
+
+
+def test_settings_of_earlier_versions_have_the_defaults_of_later_ones() -> None:
+    values = to_dict(PAPER)
+    del values["transformer"]["query_previous"]
+    assert from_dict(values) == PAPER
+    assert not any("fusion" in name for name in make("trxl").state_dict())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": replace(PAPER.environment, num_envs=31, groups=2)}, "got 31 environments and 2 groups"),
+        ({"environment": replace(PAPER.environment, option=("a",))}, "must be NAME=VALUE .* got `a`"),
+        ({"environment": replace(PAPER.environment, option=("a=x",))}, "must be NAME=VALUE .* got `a=x`"),
+        (
+            {"agent": "trxl", "ppo": replace(PAPER.ppo, steps=100), "transformer": Transformer(sequence_length=64)},
+            "got 100 steps and sequences of 64",
+        ),
+        ({"transformer": Transformer(window=1)}, "window must be 0 .* or 2 or more, got 1"),
+        (
+            {"transformer": Transformer(width=100, heads=3)},
+            "multiple of twice --transformer.heads, got width 100 and 3 heads",
+        ),
+        ({"transformer": Transformer(query_encoding=True, positional_encoding="relative")}, "got relative"),
+        ({"ppo": replace(PAPER.ppo, epochs=0)}, "--ppo.epochs must be 1 or more, got 0"),
+        ({"ppo": replace(PAPER.ppo, decay_updates=0)}, "--ppo.decay-updates must be 1 or more, got 0"),
+        ({"transformer": Transformer(width=0)}, "--transformer.width must be 1 or more, got 0"),
+        ({"threads": -1}, "--threads must be 0 or more, got -1"),
+        ({"env": "Nothing-v0"}, r"id must be one of .*, got 'Nothing-v0'"),
+        (
+            {"env": "MortarMayhem-v0", "environment": replace(PAPER.environment, option=("command_count=3",))},
+            r"options must have a number for .max_steps., .*got \{'command_count': 3\}",
+        ),
+    ],
+)
+def test_invalid_settings_are_rejected(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(PAPER, **changes).validated()
+
+
+def test_options_are_json() -> None:
+    given = replace(PAPER, environment=replace(PAPER.environment, option=("a=[1, 2]", "b=true", "c=False", "d=0.5")))
+    assert given.options() == {"a": [1, 2], "b": True, "c": False, "d": 0.5}
+
+
+def test_heads_without_their_targets_are_rejected() -> None:
+    with pytest.raises(ValueError, match=r"needs a ground truth, and .* has none"):
+        make("gru", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
+    with pytest.raises(ValueError, match="needs frames, and the observation has only features"):
+        make("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
+
+
+@pytest.mark.parametrize(
+    ("observation", "given", "message"),
+    [
+        (
+            "features",
+            "rgb",
+            r"`features` float32 \(n, 17\), since the agent was trained on features; got `.*` uint8 \(2, 84, 84, 3\)",
+        ),
+        (
+            "rgb",
+            "features",
+            r"`visual_observation` uint8 \(n, 84, 84, 3\), since the agent was trained on frames; got `.*` float32",
+        ),
+    ],
+)
+def test_an_observation_of_another_kind_is_an_error(observation: str, given: str, message: str) -> None:
+    small = settings("gru", env="MortarMayhem-Grid-v0")
+    agent = make_agent(replace(small, environment=replace(small.environment, observation=observation)), spec(small.env))
+    with make_vec(small.env, 2, observation=given) as envs, make_vec(small.env, 2, observation="rgb+features") as both:
+        frames, _ = envs.reset(seed=1)
+        for call in (agent.act, agent.bootstrap_value):
+            with pytest.raises(ValueError, match=message):
+                call(frames, agent.initial_memory(2))
+            with pytest.raises(ValueError, match="make the environments with observation="):
+                call({given: frames}, agent.initial_memory(2))
+        # Entries that the agent does not use are left out.
+        agent.act(both.reset(seed=1)[0], agent.initial_memory(2))
+
+
+def test_an_agent_of_two_observations_needs_both() -> None:
+    small = settings("gru", env="MortarMayhemB-Grid-v0")
+    agent = make_agent(replace(small, environment=replace(small.environment, observation="rgb")), spec(small.env))
+    with make_vec(small.env, 2) as envs:
+        observation, _ = envs.reset(seed=1)
+        agent.act(observation, agent.initial_memory(2))
+        with pytest.raises(ValueError, match=r"`vector_observation` float32 .*got one array"):
+            agent.act(observation["visual_observation"], agent.initial_memory(2))
+        with pytest.raises(ValueError, match=r"got `visual_observation` uint8 \(2, 84, 84, 3\)"):
+            agent.act({"visual_observation": observation["visual_observation"]}, agent.initial_memory(2))
+
+
+def test_atari_encoder_scales_and_permutes_frames() -> None:
+    """Against the same convolutions of frames that are converted and transposed by hand."""
+    encoder, frames = AtariEncoder(3), torch.randint(0, 256, (FRAMES_PER_CHUNK + 2, 84, 84, 3), dtype=torch.uint8)
+    x = torch.zeros(len(frames), 3, 84, 84)
+    for channel in range(3):
+        x[:, channel] = frames[:, :, :, channel].float() / 255
+    for layer in encoder.convolutions:
+        x = layer(x)
+    assert x.shape == (FRAMES_PER_CHUNK + 2, 3136)
+    torch.testing.assert_close(encoder(frames), x, rtol=1e-4, atol=1e-5)
+
+
+def test_initial_policy_is_nearly_uniform_and_sampling_follows_it() -> None:
+    agent = make("none")
+    memory, rows = agent.initial_memory(20_000), torch.randn(1, 6).expand(20_000, 6)
+    output = agent.act({"features": rows}, memory, torch.Generator().manual_seed(0))
+    for branch, choices in enumerate(BRANCHES):
+        for choice in range(choices):
+            drawn = output.action[:, branch] == choice
+            expected = float(output.log_prob[drawn][0, branch].exp())
+            # Five standard deviations.
+            assert abs(float(drawn.float().mean()) - expected) < 5 * math.sqrt(expected * (1 - expected) / 20_000)
+    greedy = agent.act({"features": rows}, agent.initial_memory(20_000), greedy=True)
+    assert (greedy.log_prob >= output.log_prob).all()
+    fresh = PolicyHead(64, 64, (3, 3))(torch.randn(100, 64))
+    assert all((logits.softmax(-1) - 1 / 3).abs().max() < 0.15 for logits in fresh)
+
+
+def test_reconstruction_head_takes_the_output_of_the_memory() -> None:
+    """The gradient of the head reaches the memory, not the body; the frame has the shape of the observation."""
+    given = settings("gru", ppo=replace(PAPER.ppo, reconstruction_coefficient=0.1))
+    given = replace(given, environment=replace(given.environment, observation="rgb"))
+    agent = Agent(given, {"visual_observation": (84, 84, 3)}, BRANCHES)
+    memory, frames = agent.initial_memory(2), torch.randint(0, 256, (2, 84, 84, 3), dtype=torch.uint8)
+    agent.memory.begin_segment(memory.state, 1)
+    agent.act({"visual_observation": frames}, memory)
+    (minibatch,) = agent.memory.minibatches([memory.state], torch.ones(1, 2, dtype=torch.bool), 1, torch.Generator())
+    output = agent({"visual_observation": frames[minibatch.indices]}, minibatch)
+    assert output.frame.shape == (2, 3, 84, 84)
+    output.frame.sum().backward()
+    assert agent.memory.recurrent.weight_ih_l0.grad.abs().sum() > 0
+    assert agent.body[0].weight.grad is None
+
+
+def test_heads_are_two_layer_perceptrons() -> None:
+    """Against a computation with Python floats."""
+
+    def row(layer: torch.nn.Linear, x: list[float]) -> list[float]:
+        weights, biases = layer.weight.tolist(), layer.bias.tolist()
+        return [sum(w * v for w, v in zip(ws, x, strict=True)) + b for ws, b in zip(weights, biases, strict=True)]
+
+    torch.manual_seed(2)
+    x = torch.randn(3, 5)
+    policy, value, truth = PolicyHead(5, 4, BRANCHES), ValueHead(5, 4, 0.5), GroundTruthHead(5, 4, 2)
+    for head in (policy, value, truth):
+        for parameter in head.parameters():
+            parameter.data.normal_()
+    outputs = [torch.cat(policy(x), 1), value(x).unsqueeze(1), truth(x)]
+    layers = [(policy.hidden[0], [*policy.branches])] + [(head.layers[0], [head.layers[2]]) for head in (value, truth)]
+    for output, (hidden, last) in zip(outputs, layers, strict=True):
+        for given, found in zip(x.tolist(), output.tolist(), strict=True):
+            middle = [max(0.0, v) for v in row(hidden, given)]
+            assert found == pytest.approx([v for layer in last for v in row(layer, middle)], rel=1e-4, abs=1e-5)
+
+
+def test_reconstruction_head_is_a_stack_of_transposed_convolutions() -> None:
+    """Against a loop over cells that adds the kernels, in numpy with float64."""
+    torch.manual_seed(2)
+    head = ReconstructionHead(5, 3)
+    for parameter in head.parameters():
+        parameter.data.normal_(std=0.1)
+    given = torch.randn(2, 5)
+    linear, *convolutions = (layer for layer in head.layers if hasattr(layer, "weight"))
+    for x, found in zip(given, head(given).detach().numpy(), strict=True):
+        weight, bias = linear.weight.detach().numpy().astype(float), linear.bias.detach().numpy()
+        frame = np.maximum(weight @ x.numpy() + bias, 0.0).reshape(64, 7, 7)
+        for layer in convolutions:
+            kernel, stride = layer.weight.detach().numpy().astype(float), layer.stride[0]
+            size = (frame.shape[1] - 1) * stride + kernel.shape[2]
+            out = np.zeros((kernel.shape[1], size, size)) + layer.bias.detach().numpy()[:, None, None]
+            for i, j in np.ndindex(frame.shape[1:]):
+                cell = np.tensordot(frame[:, i, j], kernel, 1)
+                out[:, i * stride : i * stride + kernel.shape[2], j * stride : j * stride + kernel.shape[3]] += cell
+            frame = out if layer is convolutions[-1] else np.maximum(out, 0.0)
+        np.testing.assert_allclose(found, frame, rtol=1e-3, atol=1e-3)
+
+
+def test_reconstruction_head_mirrors_the_shapes_of_the_encoder() -> None:
+    """The shapes of the layers are those of the Atari encoder in reverse order."""
+    x, shapes = torch.randn(1, 32), []
+    for layer in ReconstructionHead(32, 4).layers:
+        x = layer(x)
+        shapes.append(tuple(x.shape[1:]))
+    assert shapes[2] == (64, 7, 7)
+    assert [shapes[i] for i in (3, 5, 7)] == [(64, 9, 9), (32, 20, 20), (4, 84, 84)]
+
+
+def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
+    given = settings("trxl", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
+    agent = Agent(given, {"features": (6,)}, BRANCHES, ground_truth=2)
+    layers = agent.ground_truth.layers
+    assert (layers[0].in_features, layers[2].out_features) == (16, 2)
+    minibatch = Minibatch(torch.arange(3), torch.arange(3))
+    assert make("none")({"features": torch.randn(3, 6)}, minibatch).ground_truth is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "bound"),
+    [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))],
+)
+def test_uniform_initialisations(kind: str, bound: float) -> None:
+    """The weights of a block are within the bound and close to it; T-Fixup scales the output projection."""
+    block = Block(Transformer(layers=3, width=64, heads=4, shared_heads=False, initialisation=kind))
+    for name, weight in block.named_parameters():
+        if weight.dim() < 2:
+            continue
+        factor = 0.67 * 3**-0.25 if kind == "tfixup" and "fc_out" in name else 1.0
+        assert 0.98 * bound * factor < float(weight.abs().max()) <= bound * factor, name
+
+
+def test_orthogonal_initialisation() -> None:
+    block = Block(Transformer(width=64, heads=4, shared_heads=False, initialisation="orthogonal"))
+    for weight in (block.fc.weight, block.attention.queries.weight):
+        torch.testing.assert_close(weight @ weight.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
+
+
+def test_initialisation_of_gates_and_relative_biases() -> None:
+    """The matrices of the gates have the initialisation of the block, each on its own; the biases of the encoding are 0."""
+    changes = {"shared_heads": False, "gating": True, "positional_encoding": "relative"}
+    block = Block(Transformer(width=64, heads=4, initialisation="orthogonal", gate_bias=2.0, **changes))
+    for gate in (block.gate_attention, block.gate_fc):
+        for matrix in (*gate.from_y.weight.chunk(3), *gate.from_x.weight.chunk(2), gate.from_reset.weight):
+            torch.testing.assert_close(matrix @ matrix.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
+        assert torch.equal(gate.bias, torch.full((64,), 2.0))
+    assert not block.attention.content_bias.any() and not block.attention.distance_bias.any()
+
+
+@pytest.mark.parametrize("bias", [0.0, 2.0])
+def test_gate_with_zero_weights(bias: float) -> None:
+    """With zero weights the candidate is 0 and x is scaled by 1 - sigmoid(-bias), which is closer to 1 for a bias of 2."""
+    gate, x = Gate(8, bias), torch.randn(5, 8)
+    for layer in (gate.from_x, gate.from_y, gate.from_reset):
+        layer.weight.data.zero_()
+    torch.testing.assert_close(gate(x, torch.randn(5, 8)), x * (1 - 1 / (1 + math.exp(bias))))
+
+
+def test_table_of_the_absolute_encoding() -> None:
+    """Row p is the encoding of `positions - 1 - p`: the sines of all frequencies, then the cosines."""
+    agent = make("trxl", **transformer(positions=10))
+    table = agent.memory.table
+    assert table.shape == (10, 16)
+    torch.testing.assert_close(table[9], torch.tensor([0.0] * 8 + [1.0] * 8))
+    assert float(table[6, 1]) == pytest.approx(math.sin(3 / 10_000 ** (2 / 16)), abs=1e-6)
+    assert float(table[6, 9]) == pytest.approx(math.cos(3 / 10_000 ** (2 / 16)), abs=1e-6)
+
+
+def test_every_setting_is_documented() -> None:
+    """tyro takes the help text of a field from the docstring below it."""
+    import contextlib
+    import io
+
+    from endless_gym_agents.train import parse
+
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), pytest.raises(SystemExit):
+        parse(["--help"])
+    text = " ".join(printed.getvalue().replace("│", " ").split())
+    for flag in ("--env", "--agent", "--ppo.learning-rate", "--transformer.window", "--recurrence.sequence-length"):
+        assert flag in text
+    assert "(default: 0.000275)" in text
+    assert parse(["--preset", "old"]) == PRESETS["old"]
+    changed = parse(["--preset", "old", "--agent", "lstm", "--ppo.gamma", "0.9"])
+    assert changed == replace(PRESETS["old"], agent="lstm", ppo=replace(PRESETS["old"].ppo, gamma=0.9))
+    assert isinstance(changed, Settings)

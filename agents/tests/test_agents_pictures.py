@@ -1,0 +1,263 @@
+"""Videos of episodes and plots of learning curves."""
+
+import csv
+import json
+import stat
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from agents_helpers import settings
+from PIL import Image
+
+from endless_gym.env import Env
+from endless_gym.specs import spec
+from endless_gym_agents import enjoy, plot, video
+from endless_gym_agents.agent import make_agent
+from endless_gym_agents.curves import aggregate, evaluated, published, scale
+from endless_gym_agents.plot import PlotArguments, draw_all
+from endless_gym_agents.results import Experiment, Run, to_json
+from endless_gym_agents.train import train
+
+GRID = "MortarMayhem-Grid-v0"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    given = settings("gru", env=GRID, run=str(folder), threads=1)
+    environment = replace(given.environment, num_envs=4, option=("command_count=[1]",))
+    return train(replace(given, environment=environment, ppo=replace(given.ppo, steps=16, minibatches=1, updates=2)))
+
+
+def rgb(image: Image.Image) -> np.ndarray:
+    return np.asarray(image.convert("RGB"))
+
+
+def test_frame_shows_the_observation_beside_the_view() -> None:
+    frame = np.zeros((84, 84, 3), np.uint8)
+    frame[10, 20] = (255, 0, 0)  # x 10, y 20
+    view = np.random.default_rng(0).integers(256, size=(336, 336, 3), dtype=np.uint8)
+    picture = video.compose(frame, view, "one line")
+    assert picture.shape == (video.HEIGHT, video.WIDTH, 3)
+    assert (picture[80:84, 40:44] == (255, 0, 0)).all()
+    assert (picture[:336, :336] == (255, 0, 0)).all(-1).sum() == 16
+    assert (picture[:336, 344:] == view).all()
+    assert (picture[336:] == video._TEXT_COLOUR).all(-1).any()
+
+
+def test_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "video.gif"
+    enjoy.execute(enjoy.EnjoyArguments(run, seeds=(200_000, 200_003), out=out))
+    lengths = [int(line.split(" in ")[1].split()[0]) for line in capsys.readouterr().out.splitlines()[:2]]
+    assert min(lengths) > 0
+    with Image.open(out) as image:
+        assert image.size == (video.WIDTH, video.HEIGHT)
+        # One frame for the start and for each step; the repeated last frame of an episode is merged.
+        assert image.n_frames == sum(lengths) + 2
+        for place, seed in ((0, 200_000), (lengths[0] + 1, 200_003)):
+            env = Env(GRID, render_mode="debug_rgb_array", options={"command_count": [1]})
+            observation, _ = env.reset(seed=seed)
+            image.seek(place)
+            shown = rgb(image)
+            assert (shown[:336:4, :336:4] == observation.swapaxes(0, 1)).all()
+            assert (shown[:336, 344:] == env.render()).all()
+        assert image.info["duration"] == pytest.approx(1000 / spec(GRID).render_fps, rel=0.1)
+    assert [file.name for file in tmp_path.iterdir()] == ["video.gif"]
+
+
+def test_webp_shows_every_pixel(tmp_path: Path) -> None:
+    agent = make_agent(settings("none", env=GRID), spec(GRID))
+    frames = list(enjoy.EpisodeRecorder(agent, 0, max_steps=12).frames((5,)))
+    # Noise, too: every colour, and no two pixels alike.
+    frames.append(np.random.default_rng(0).integers(256, size=frames[0].shape, dtype=np.uint8))
+    distinct = [frame for at, frame in enumerate(frames) if at == 0 or not np.array_equal(frame, frames[at - 1])]
+    video.write(tmp_path / "video.webp", frames, 25)
+    with Image.open(tmp_path / "video.webp") as image:
+        # A repeated frame is merged with the one before.
+        assert image.n_frames in (len(distinct), len(frames))
+        expected = distinct if image.n_frames == len(distinct) else frames
+        duration = 0
+        for place, frame in enumerate(expected):
+            image.seek(place)
+            assert np.array_equal(rgb(image), frame), place
+            duration += image.info["duration"]
+    assert duration == 40 * len(frames)
+
+
+def test_video_is_reproducible() -> None:
+    agent = make_agent(settings("none", env=GRID), spec(GRID))
+    one, two, other = (
+        np.stack(list(enjoy.EpisodeRecorder(agent, action_seed, max_steps=12).frames((5,))))
+        for action_seed in (0, 0, 1)
+    )
+    assert np.array_equal(one, two)
+    assert one.shape != other.shape or not np.array_equal(one, other)
+
+
+def test_mp4_is_piped_to_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stub in place of ffmpeg stores its input and its arguments."""
+    program = tmp_path / "bin" / "ffmpeg"
+    program.parent.mkdir()
+    program.write_text('#!/bin/sh\necho "$@" > "$(dirname "$0")/called"\nfor last; do :; done\nexec cat > "$last"\n')
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
+    pictures = [np.full((video.HEIGHT, video.WIDTH, 3), value, np.uint8) for value in (1, 2, 3)]
+    video.write(tmp_path / "video.mp4", pictures, 25)
+    assert (tmp_path / "video.mp4").read_bytes() == np.stack(pictures).tobytes()
+    assert f"-s {video.WIDTH}x{video.HEIGHT} -r 25 -i -" in (program.parent / "called").read_text()
+
+    program.write_text("#!/bin/sh\ncat > /dev/null\necho no such encoder >&2\nexit 1\n")
+    with pytest.raises(OSError, match="no such encoder"):
+        video.write(tmp_path / "other.mp4", pictures, 25)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["bin", "video.mp4"]
+
+
+def test_interrupted_video_leaves_no_file(tmp_path: Path) -> None:
+    def pictures() -> object:
+        yield np.zeros((video.HEIGHT, video.WIDTH, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.write(tmp_path / "video.gif", pictures(), 25)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("nowhere", "no checkpoint nowhere"),
+        ("nowhere --out video.avi", "--out must end in .gif, .webp or .mp4, got `video.avi`"),
+        ("nowhere --out none/video.gif", "cannot write none/video.gif: no folder none"),
+        ("nowhere --out video.mp4", "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg"),
+        ("nowhere --seeds", "--seeds must contain at least one seed, got none"),
+    ],
+)
+def test_errors_of_enjoy_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr(sys, "argv", ["endless-enjoy", *arguments.split()])
+    assert enjoy.main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"endless-enjoy: {message}")
+    assert error.count("\n") == 1
+
+
+def experiment(env: str, name: str, label: str, scores: list[list[float]]) -> Experiment:
+    """With checkpoints at 10, 20, ... steps."""
+    steps = [10 * (place + 1) for place in range(len(scores[0]))]
+    rows = enumerate(scores)
+    runs = [Run(f"run-{seed}", seed, steps, {name: row}, [[{name: each}] for each in row]) for seed, row in rows]
+    return Experiment(env, label, {}, runs)
+
+
+def results(file: Path, *experiments: Experiment) -> Path:
+    file.write_text(json.dumps(to_json(experiments, {}, True)))
+    return file
+
+
+def test_plots_contain_the_given_curves(tmp_path: Path) -> None:
+    scores = [[0.0, 0.2, 0.5], [0.2, 0.4, 0.7]]
+    file = results(tmp_path / "results.json", experiment("MysteryPath-v0", "task_progress", "gru", scores))
+    (picture,) = draw_all(PlotArguments((file,), tmp_path / "plots", published=("trxl",)))
+    with Image.open(picture) as image:
+        assert image.size == (1350, 750)
+        colours = {colour for _, colour in image.convert("RGB").getcolors(1 << 20)}
+        assert {(0x1F, 0x77, 0xB4), (0xFF, 0x7F, 0x0E)} <= colours  # both curves
+    rows = list(csv.DictReader(picture.with_suffix(".csv").open()))
+    ours = [row for row in rows if row["source"] == "evaluated"]
+    assert [int(row["steps"]) for row in ours] == [10, 20, 30]
+    assert [float(row["mean"]) for row in ours] == pytest.approx([0.1, 0.3, 0.6])
+    assert [float(row["low"]) for row in ours] == pytest.approx([0.0, 0.2, 0.5])
+    assert [float(row["high"]) for row in ours] == pytest.approx([0.2, 0.4, 0.7])
+    mine, theirs = json.loads(picture.with_suffix(".json").read_text())["curves"]
+    assert (mine["label"], mine["scores"]) == ("gru", scores)
+    (trxl,) = published("MysteryPath-v0", ["trxl"])
+    assert (theirs["source"], theirs["scores"]) == ("published", trxl.scores.tolist())
+    assert sum(row["source"] == "published" for row in rows) == trxl.scores.shape[1] == 51
+
+
+def test_spreads_runs_and_iqm(tmp_path: Path) -> None:
+    scores = [[0.0], [0.1], [0.2], [0.3], [1.0]]
+    file = results(tmp_path / "results.json", experiment("MysteryPath-v0", "task_progress", "gru", scores))
+    (picture,) = draw_all(PlotArguments((file,), tmp_path, published=(), spread="runs"))
+    rows = list(csv.DictReader(picture.with_suffix(".csv").open()))
+    assert [[float(row["score"])] for row in rows] == scores
+    (picture,) = draw_all(PlotArguments((file,), tmp_path, published=(), spread="iqm"))
+    (row,) = csv.DictReader(picture.with_suffix(".csv").open())
+    assert float(row["iqm"]) == pytest.approx(0.2)
+    assert 0 <= float(row["low"]) < 0.2 < float(row["high"]) <= 1
+
+
+def test_aggregated_curves_match_the_text_of_the_paper() -> None:
+    """The paper states peaks of 0.98 (GRU) and 0.39 (Transformer-XL) in the endless tasks, and those below in the finite ones."""
+    peaks = {}
+    for family, envs in plot.FAMILIES.items():
+        curves = [curve for env in envs for curve in published(env, ("gru", "trxl", "gru_rec", "trxl_rec"))]
+        together = aggregate(family, curves)
+        assert all(curve.scores.shape[0] == 15 for curve in together)
+        peaks[family] = {curve.label: curve.mean()[0].max() for curve in together}
+    assert peaks["endless"] == {"gru": pytest.approx(0.98, abs=0.006), "trxl": pytest.approx(0.39, abs=0.006)}
+    expected = {"gru": 0.83, "trxl": 0.56, "gru_rec": 0.82, "trxl_rec": 0.99}
+    assert peaks["finite"] == {name: pytest.approx(value, abs=0.006) for name, value in expected.items()}
+
+
+def test_evaluations_are_normalised_like_the_paper(tmp_path: Path) -> None:
+    best = {env: scale(env) for env in plot.FAMILIES["endless"]}
+    # The paper: at best, the mean of the five GRU runs is 115 commands.
+    assert best["Endless-MortarMayhem-v0"] == pytest.approx(115.8, abs=0.1)
+    names = ("commands_completed", "tiles_visited", "coins_collected")
+    labels = ("gru", "gru", "gru_rec")  # as in the paper's plot
+    given = [
+        experiment(env, name, label, [[best[env] / 2, best[env]], [0.0, best[env] / 4]])
+        for env, name, label in zip(best, names, labels, strict=True)
+    ]
+    file = results(tmp_path / "results.json", *given)
+    (picture,) = draw_all(PlotArguments((file,), tmp_path, aggregate="endless", published=()))
+    (curve,) = json.loads(picture.with_suffix(".json").read_text())["curves"]
+    assert (curve["label"], curve["steps"]) == ("gru", [10, 20])
+    assert np.allclose(curve["scores"], 3 * [[0.5, 1.0], [0.0, 0.25]])
+
+
+def test_curve_has_the_common_steps_of_its_runs() -> None:
+    given = experiment("MysteryPath-v0", "task_progress", "gru", [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    given.runs[1].steps = [20, 30, 40]
+    curve = evaluated(given)
+    assert curve.steps.tolist() == [20, 30]
+    assert curve.scores.tolist() == [[0.2, 0.3], [0.4, 0.5]]
+
+
+def test_training_rewards(run: Path, tmp_path: Path) -> None:
+    (picture,) = draw_all(PlotArguments((run,), tmp_path))
+    (curve,) = json.loads(picture.with_suffix(".json").read_text())["curves"]
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    assert curve["steps"] == [row["steps"] for row in rows]
+    assert curve["scores"] == [[row["episode/reward"] for row in rows]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("nowhere.json", "no such file or folder: nowhere.json"),
+        ("text.json", "text.json is not a file of `endless-eval --json`"),
+        (".", "no progress.jsonl in .; expected the folder of a run"),
+        ("--env NoSuch-v0", "no curves of environment `NoSuch-v0`; the paper has curves of "),
+        ("one.json --aggregate finite", "gru: the finite plot needs evaluations in all of MortarMayhem-v0, "),
+    ],
+)
+def test_errors_of_plots_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.json").write_text("{}")
+    results(tmp_path / "one.json", experiment("MysteryPath-v0", "task_progress", "gru", [[0.5]]))
+    monkeypatch.setattr(sys, "argv", ["endless-plot", *arguments.split()])
+    assert plot.main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"endless-plot: {message}")
+    assert error.count("\n") == 1

@@ -1,0 +1,105 @@
+"""Probes of an agent's memory: synthetic memories with and without the answer, and a real agent's."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from agents_helpers import settings
+
+from endless_gym.specs import spec
+from endless_gym_agents import checkpoint, probe
+from endless_gym_agents.agent import make_agent
+from endless_gym_agents.probe import Recording, Score
+from endless_gym_agents.settings import to_dict
+
+ID = "Endless-MysteryPath-v0"
+
+
+def synthetic(linear: bool) -> dict[tuple[str, str, str], Score]:
+    """Scores where the memory contains the truth, linearly or as a product of signs, and the observation is noise."""
+    generator = torch.Generator().manual_seed(1)
+    episode = torch.arange(60).repeat_interleave(50)
+    memory = torch.randn(len(episode), 8, generator=generator)
+    bit = ((memory[:, 0] > 0) == (memory[:, 1] > 0)).float()
+    truth = torch.stack([memory[:, :3].sum(-1) if linear else bit, (memory[:, 4] > 0).float()], dim=-1)
+    noise = torch.randn(len(episode), 8, generator=generator)
+    scores = probe.probe(Recording(memory, noise, truth, episode), ["a", "b"])
+    assert len(scores) == 8
+    return {(score.column, score.source, score.probe): score for score in scores}
+
+
+def test_a_linear_memory_is_read_by_both_probes_and_noise_by_none() -> None:
+    scores = synthetic(linear=True)
+    assert scores["a", "memory", "linear"].explained > 0.99
+    assert scores["a", "memory", "mlp"].explained > 0.95
+    assert scores["a", "memory", "linear"].accuracy is None
+    sign = scores["b", "memory", "linear"]
+    assert sign.accuracy is not None
+    assert sign.majority is not None
+    assert sign.accuracy > 0.95 > 0.6 > sign.majority
+    for name in ("a", "b"):
+        for kind in ("linear", "mlp"):
+            assert scores[name, "observation", kind].explained < 0.05
+    guess = scores["b", "observation", "linear"].accuracy
+    assert guess is not None
+    assert 0.4 < guess < 0.6
+
+
+def test_only_the_nonlinear_probe_reads_a_nonlinear_memory() -> None:
+    scores = synthetic(linear=False)
+    assert scores["a", "memory", "linear"].explained < 0.05
+    assert scores["a", "memory", "mlp"].explained > 0.6
+
+
+@pytest.mark.parametrize("agent", ["gru", "trxl", "none"])
+def test_recording_has_what_the_heads_see(agent: str) -> None:
+    """The value head applied to the recorded memory gives the values of acting; recording does not change the agent."""
+    given = settings(agent)
+    torch.manual_seed(0)
+    made = make_agent(replace(given, env=ID), spec(ID))
+    made.eval()
+    before = {name: value.clone() for name, value in made.state_dict().items()}
+    values, act = [], made.act
+
+    def acting(*arguments, **named):
+        output = act(*arguments, **named)
+        values.append(output.value)
+        return output
+
+    made.act = acting
+    recorded = probe.record(made, range(200_000, 200_004), max_steps=10)
+    # Until the first episode ends, every step has all environments.
+    steps = len(values) if len(recorded.episode) == 4 * len(values) else int((recorded.episode.bincount()).min())
+    assert steps > 1
+    with torch.no_grad():
+        again = made.value(made.body(recorded.memory[: 4 * steps]))
+    torch.testing.assert_close(again, torch.cat(values[:steps]), rtol=1e-4, atol=1e-5)
+    assert recorded.truth.shape == (len(recorded.episode), 3)
+    assert set(recorded.truth.unique().tolist()) <= {0.0, 1.0}
+    assert all(torch.equal(before[name], value) for name, value in made.state_dict().items())
+
+
+def test_the_command_and_its_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for env in (ID, "MortarMayhem-Grid-v0"):
+        given = replace(settings("gru"), env=env)
+        made = make_agent(given, spec(env))
+        state = {"settings": to_dict(given), "update": 1, "steps": 64, "model": made.state_dict()}
+        checkpoint.save(tmp_path / env, state, keep=False)
+    command = ["endless-probe", str(tmp_path / ID), "--episodes", "5", "--max-steps", "20"]
+    monkeypatch.setattr(sys, "argv", [*command, "--json"])
+    assert probe.main() == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [score["column"] for score in found["scores"][:3]] == ["right", "up", "down"]
+    assert found["steps"] <= 100
+    for changed, message in (
+        (["--episodes", "1"], "--episodes must be 2 or more and --max-steps 1 or more, got 1 and 512"),
+        ([], "a probe needs a ground truth, and MortarMayhem-Grid-v0 has none"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["endless-probe", str(tmp_path / "MortarMayhem-Grid-v0"), *changed])
+        assert probe.main() == 1
+        assert message in capsys.readouterr().err

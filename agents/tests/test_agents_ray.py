@@ -1,0 +1,244 @@
+"""The hyperparameter search on Ray Tune."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import optuna
+import psutil
+import pytest
+from rich.console import Console
+
+from endless_gym_agents import checkpoint, search
+from endless_gym_agents.search_study import Trials
+from endless_gym_agents.settings import Settings
+from endless_gym_agents.train import train
+
+pytestmark = pytest.mark.slow
+
+SCRIPT = Path(__file__).parent / "ray_search.py"
+
+
+def test_search_on_ray(
+    tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
+) -> None:
+    """The worst trial is pruned, and the one whose process is killed resumes from its checkpoint.
+
+    The path of the interpreter has a space.
+    """
+    spaced = tmp_path / "with a space"
+    folder_of_environments = Path(libraries_python).parents[2]
+    spaced.symlink_to(folder_of_environments)
+    python = spaced / Path(libraries_python).relative_to(folder_of_environments)
+    environments = ["--environment.num-envs", "4", "--environment.engine", "process", "--agent", "gru"]
+    sizes = ["--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "6", "--checkpoint-interval", "1"]
+    sizes += ["--recurrence.hidden-size", "16"]
+    searched = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single"]
+    pruning = ["--period", "1", "--warm-up", "4", "--startup-trials", "1"]
+    command = ["--preset", "quick", "--folder", "search", *environments, *sizes, *searched, *pruning]
+    # Ray's processes are in the session of the search, which can be ended as a whole.
+    with subprocess.Popen(
+        [python, SCRIPT, *command, "--ray", "--workers", "2"],
+        cwd=tmp_path,
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as ran:
+        try:
+            output, _ = ran.communicate(timeout=280)
+        except BaseException:
+            _kill_session(ran.pid)
+            raise
+    assert ran.returncode == 0, output
+    folder = tmp_path / "search"
+    study = optuna.load_study(study_name="search", storage=f"sqlite:///{folder / 'study.db'}")
+    ended = [(trial.params["ppo.epochs"], trial.state.name, trial.value) for trial in study.trials]
+    # Also the trial whose process was killed is one trial: Tune resumed it.
+    assert ended == [(3, "COMPLETE", 1.0), (2, "PRUNED", 0.5), (4, "COMPLETE", 2.0)]
+    reported = [list(trial.intermediate_values) for trial in study.trials]
+    assert reported == [[1, 2, 3, 4, 5]] * 3
+    # Nothing is reported at the last update; the pruned trial has not reached it.
+    assert len(_rows(folder / "trial-0001")) == 5
+    assert json.loads((folder / "best.json").read_text())["settings"]["ppo"]["epochs"] == 4
+    assert (folder / "threads").read_text() == "1 1"
+
+    # The rows up to the checkpoint are those of the killed process, with its times.
+    before = (folder / "killed").read_text().splitlines()
+    rows = _rows(folder / "trial-0000")
+    assert [json.loads(row)["update"] for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert len(before) == 3
+    assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
+
+    assert [file.name for file in (folder / "locks").iterdir()] == ["study"]
+    assert not segments()
+    assert not _left_by(ray_folder)
+
+
+def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
+    tmp_path: Path,
+    ray_folder: str,
+    libraries_python: str,
+    segments: Callable[[], set[str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ctrl-C in a terminal, which all processes of its group receive."""
+    sizes = [
+        "--environment.num-envs",
+        "4",
+        "--environment.engine",
+        "process",
+        "--ppo.steps",
+        "16",
+        "--ppo.minibatches",
+        "1",
+    ]
+    sizes += ["--ppo.updates", "100000", "--checkpoint-interval", "1", "--recurrence.hidden-size", "16"]
+    given = ["--preset", "quick", "--folder", str(tmp_path / "search"), "--env", "MortarMayhem-Grid-v0", *sizes]
+    given += ["--parameters", "ppo.epochs", "--stage", "single", "--agent", "gru"]
+    runs = [tmp_path / "search" / f"trial-000{number}" for number in (0, 1)]
+    with (tmp_path / "output").open("w") as output:
+        started = subprocess.Popen(
+            [libraries_python, "-m", "endless_gym_agents.search", *given, "--ray", "--workers", "2"],
+            cwd=tmp_path,
+            env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        while not all((run / "progress.jsonl").exists() and len(_rows(run)) >= 2 for run in runs):
+            assert started.poll() is None, (tmp_path / "output").read_text()
+            time.sleep(0.05)
+        os.killpg(started.pid, signal.SIGINT)
+        assert started.wait(60) == 130, (tmp_path / "output").read_text()
+        # The engines end by themselves when their trainers have.
+        assert not psutil.wait_procs(_session(started.pid), timeout=30)[1]
+    finally:
+        _kill_session(started.pid)
+    assert "endless-search: stopped" in (tmp_path / "output").read_text()
+    assert not _left_by(ray_folder)
+    assert not segments()
+
+    # Without Ray, for one more update.
+    def one_more(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
+        return train(given, lambda update, means: watch(update, means) or True)
+
+    monkeypatch.setattr(search, "train", one_more)
+    before = [checkpoint.load(run).update for run in runs]
+    trials = Trials(search.parse(given), Console(quiet=True))
+    assert trials.remaining() == (0, 3)
+    for _ in range(3):  # the third trial first, since it was not interrupted
+        with pytest.raises(KeyboardInterrupt):
+            search.run_trials(trials)
+    for run, done in zip(runs, before, strict=True):
+        assert checkpoint.load(run).update == done + 1
+        assert [json.loads(row)["update"] for row in _rows(run)] == list(range(1, done + 2))
+
+
+#: One run of six updates, with checkpoints every second.
+EXPERIMENT: dict[str, Any] = {
+    "title": "Mine",
+    "section": "-",
+    "about": "A test.",
+    "kind": "curves",
+    "seeds": 1,
+    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
+    "runs": [
+        {
+            "name": "gru",
+            "env": "MortarMayhem-Grid-v0",
+            "flags": {
+                "preset": "quick",
+                "agent": "gru",
+                "environment.engine": "process",
+                "environment.num-envs": 8,
+                "ppo.updates": 6,
+                "ppo.steps": 256,
+                "recurrence.hidden-size": 16,
+            },
+        }
+    ],
+}
+
+
+def test_an_experiment_on_ray_is_stopped_and_resumed(
+    tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
+) -> None:
+    """Ctrl-C stops its run after an update, with a checkpoint; the same command completes it, and then has nothing to do."""
+    (tmp_path / "mine.json").write_text(json.dumps(EXPERIMENT))
+    run = tmp_path / "out" / "runs" / "MortarMayhem-Grid-v0" / "gru" / "seed-1"
+    program = [libraries_python, "-m", "endless_gym_agents.reproduce", "mine.json", "--out", "out", "--device", "cpu"]
+
+    def reproduced(is_interrupted: bool) -> str:
+        with (tmp_path / "output").open("w") as output:
+            started = subprocess.Popen(
+                [*program, "--ray", "--jobs", "1", "--nice", "0"],
+                cwd=tmp_path,
+                env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        try:
+            while is_interrupted and not ((run / "progress.jsonl").exists() and len(_rows(run)) >= 2):
+                assert started.poll() is None, (tmp_path / "output").read_text()
+                time.sleep(0.01)
+            if is_interrupted:
+                os.killpg(started.pid, signal.SIGINT)
+            assert started.wait(250) == (130 if is_interrupted else 0), (tmp_path / "output").read_text()
+        finally:
+            _kill_session(started.pid)
+        assert not _left_by(ray_folder)
+        assert not segments()
+        return (tmp_path / "output").read_text()
+
+    text, done = reproduced(True), len(_rows(run))
+    assert f"stopped at update {done} of 6" in text
+    assert 2 <= done < 6
+    assert checkpoint.load(run).update == done
+    assert f"resumed at update {done} of 6" in reproduced(False)
+    assert [json.loads(row)["update"] for row in _rows(run)] == [1, 2, 3, 4, 5, 6]
+    assert "1 of 1 runs are done" in (tmp_path / "out" / "mine" / "README.md").read_text()
+    again = reproduced(False)
+    assert "1 of 1 jobs done" in again
+    assert "Ray instance" not in again
+
+
+def _left_by(ray_folder: str) -> list[str]:
+    """The command lines of Ray's processes."""
+    return [" ".join(line) for line in map(_command_line, psutil.process_iter()) if ray_folder in " ".join(line)]
+
+
+def _rows(run: Path) -> list[str]:
+    return (run / "progress.jsonl").read_text().splitlines()
+
+
+def _session(session: int) -> list[psutil.Process]:
+    """The processes of a session."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(ProcessLookupError):
+            if os.getsid(process.pid) == session:
+                found.append(process)
+    return found
+
+
+def _kill_session(session: int) -> None:
+    for process in _session(session):
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+
+
+def _command_line(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []

@@ -1,0 +1,100 @@
+"""Data sets of a trained agent's episodes."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from agents_helpers import settings
+
+from endless_gym.recording import record
+from endless_gym.specs import spec
+from endless_gym_agents import checkpoint
+from endless_gym_agents.agent import make_agent
+from endless_gym_agents.evaluate import evaluate
+from endless_gym_agents.record import AgentPlayer
+from endless_gym_agents.settings import to_dict
+
+pytestmark = pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
+
+ID = "MysteryPath-Grid-v0"
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return tmp_path / "datasets"
+
+
+def make(agent: str, **options: Any) -> Any:
+    given = settings(agent)
+    environment = replace(given.environment, option=tuple(f"{name}={value}" for name, value in options.items()))
+    torch.manual_seed(0)
+    made = make_agent(replace(given, env=ID, environment=environment), spec(ID))
+    made.eval()
+    return made
+
+
+def load(dataset: str) -> Any:
+    import minari
+
+    return minari.load_dataset(dataset)
+
+
+@pytest.mark.parametrize("agent", ["gru", "trxl", "stack"])
+def test_the_agent_plays_as_it_is_evaluated(agent: str) -> None:
+    made = make(agent, max_steps=20)
+    recorded = record(
+        ID,
+        6,
+        policy=AgentPlayer(made, greedy=True),
+        options=made.settings.options(),
+        observation="features",
+        seed=200_000,
+        num_threads=1,
+    )
+    assert recorded.dataset == f"endless-gym/{ID}/agent-v0"
+    results = evaluate(made, range(200_000, 200_006), 1, greedy=True)
+    episodes = list(load(recorded.dataset))
+    assert [len(episode) for episode in episodes] == [result["length"] for result in results]
+    assert [episode.rewards.sum() for episode in episodes] == pytest.approx([result["reward"] for result in results])
+
+
+def test_sampled_actions_follow_from_the_seed_alone() -> None:
+    made = make("gru", max_steps=20)
+
+    def actions(name: str, seed: int, threads: int) -> list[list[int]]:
+        player = AgentPlayer(made, seed)
+        given = {"policy": player, "observation": "features", "options": made.settings.options()}
+        recorded = record(ID, 40, dataset=f"{name}-v0", num_threads=threads, **given)
+        return [episode.actions.tolist() for episode in load(recorded.dataset)]
+
+    first = actions("first", 1, 1)
+    assert actions("second", 1, 2) == first
+    assert actions("third", 2, 2) != first
+
+
+@pytest.mark.slow
+def test_the_command_records_a_checkpoint(tmp_path: Path, root: Path) -> None:
+    made = make("gru", max_steps=20)
+    state = {"settings": to_dict(made.settings), "update": 1, "steps": 64, "model": made.state_dict()}
+    checkpoint.save(tmp_path / "run", state, keep=False)
+    command = [sys.executable, "-m", "endless_gym_agents.record", tmp_path / "run", "--episodes", "3", "--json"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 0, ran.stderr
+    result = json.loads(ran.stdout)
+    dataset = load(result["dataset"])
+    assert len(dataset) == result["episodes"] == 3
+    assert dataset.storage.metadata["algorithm_name"] == "PPO, agent gru"
+    (metadata,) = dataset.storage.get_episode_metadata([0])
+    assert metadata["options"] == {"max_steps": 20}
+    assert np.isfinite(dataset[0].observations).all()
+    ran = subprocess.run([*command[:3], tmp_path / "none"], capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 1
+    assert ran.stderr.startswith("endless-record: ")
+    assert ran.stderr.count("\n") == 1

@@ -1,0 +1,176 @@
+"""Training runs whose engine process is killed: the same results as without, a checkpoint, or an error."""
+
+import os
+import random
+import re
+import signal
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_agents_training import GRID, progress, same, small
+
+import endless_gym_agents.train as train_module
+from endless_gym import EngineLost, make_vec, serve
+from endless_gym_agents import checkpoint
+from endless_gym_agents.environments import Environments
+from endless_gym_agents.recovery import MAX_RESTARTS, RecoverableEngine
+from endless_gym_agents.train import train
+
+UPDATES = 4
+PARTS = ("update", "steps", "model", "optimizer", "generators", "player", "episodes")
+
+
+def kill(engine: RecoverableEngine) -> None:
+    """Kill the engine process, if there is one."""
+    process = engine._envs._backend._engine if engine.failure is None else None
+    if process is not None:
+        os.kill(process.pid, signal.SIGKILL)
+
+
+def kill_before(monkeypatch: pytest.MonkeyPatch, place: str, calls: set[int]) -> None:
+    """Kill the engine process before these calls of a method of the environments, or of `learn`; calls count from 0."""
+    engines: list[RecoverableEngine] = []
+    started = RecoverableEngine.__init__
+    owner, name = (train_module, place) if place == "learn" else (Environments, place)
+    called, number = getattr(owner, name), 0
+
+    def start(self: RecoverableEngine, *args: Any) -> None:
+        engines.append(self)
+        started(self, *args)
+
+    def call(*args: Any) -> Any:
+        nonlocal number
+        if number in calls:
+            kill(engines[-1])
+        number += 1
+        return called(*args)
+
+    monkeypatch.setattr(RecoverableEngine, "__init__", start)
+    monkeypatch.setattr(owner, name, call)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(small("gru", tmp_path_factory.mktemp("undisturbed") / "run", UPDATES))
+
+
+def compare(run: Path, other: Path) -> None:
+    assert progress(run) == progress(other)
+    one, two = (checkpoint.load(each).state for each in (run, other))
+    for part in PARTS:
+        assert same(one[part], two[part]), part
+
+
+#: Each update has 32 calls of `send` and `receive`, 16 for each of two groups.
+PLACES = [
+    ("send", 1),
+    ("receive", 1),
+    ("send", 32 * UPDATES),
+    ("receive", 32 * UPDATES),
+    ("mark", UPDATES),
+    ("learn", UPDATES),
+    ("snapshots", 2),
+]
+
+
+@pytest.mark.parametrize(("place", "number"), PLACES)
+def test_a_run_whose_engine_is_killed_equals_an_undisturbed_run(
+    place: str,
+    number: int,
+    undisturbed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    at = random.Random(f"{place} {number}").randrange(number)
+    kill_before(monkeypatch, place, {at})
+    run = train(small("gru", tmp_path / "run", UPDATES, engine="process"))
+    compare(run, undisturbed)
+    output = capsys.readouterr().out
+    assert output.count(f"the engine process has ended; restart 1 of {MAX_RESTARTS}") == 1, at
+    assert re.search(r"a new engine process continues the update, after \d+ steps that were played again", output)
+
+
+def test_restarts_are_counted_anew_in_each_update(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill_before(monkeypatch, "receive", {3, 17, 40, 41, 60, 90, 127})
+    compare(train(small("gru", tmp_path / "run", UPDATES, engine="process")), undisturbed)
+
+
+@pytest.mark.parametrize("policy", ["restart", "save"])
+def test_a_run_without_an_engine_saves_its_checkpoint(
+    policy: str,
+    undisturbed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    # From the second update on, and not in an update whose end is an interval of checkpoints.
+    given = replace(
+        small("gru", tmp_path / "run", UPDATES, engine="process"), on_engine_failure=policy, checkpoint_interval=100
+    )
+    with monkeypatch.context() as patch:
+        kill_before(patch, "receive", set(range(40, 1000)))
+        reason = "the engine process has ended"
+        if policy == "restart":
+            reason += f" after {MAX_RESTARTS} restarts without a completed update"
+        with pytest.raises(
+            EngineLost,
+            match=f"^{reason}; the checkpoint is of update 2; continue with: endless-train --resume {given.run}$",
+        ):
+            train(given)
+    assert f"{reason}; the update is completed in this process" in capsys.readouterr().out
+    assert checkpoint.load(given.run).update == 2
+    assert len(progress(Path(given.run))) == 2
+    train(replace(given, resume=given.run))
+    compare(Path(given.run), undisturbed)
+
+
+def test_a_run_can_fail_at_once(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = replace(small("gru", tmp_path / "run", UPDATES, engine="process"), on_engine_failure="fail")
+    with monkeypatch.context() as patch:
+        kill_before(patch, "receive", {100})
+        with pytest.raises(EngineLost, match="has ended"):
+            train(given)
+    assert checkpoint.load(given.run).update == 2
+    train(replace(given, resume=given.run))
+    compare(Path(given.run), undisturbed)
+
+
+def test_a_resumed_run_recovers(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = train(small("gru", tmp_path / "run", 2, engine="process"))
+    with monkeypatch.context() as patch:
+        # After the restoration of the checkpoint, before the first mark.
+        kill_before(patch, "mark", {0})
+        train(replace(small("gru", tmp_path, UPDATES, engine="process"), resume=str(run)))
+    compare(run, undisturbed)
+
+
+@pytest.mark.slow
+def test_an_engine_that_does_not_answer_is_replaced() -> None:
+    """A stopped process is alive, and no signal but SIGKILL ends it."""
+    arguments = {"num_envs": 2, "groups": 2, "seed": 1, "autoreset": "same_step"}
+    serving = partial(serve, GRID, timeout=5.0, **arguments)
+    engine = RecoverableEngine("restart", serving, partial(make_vec, GRID, **arguments))
+    lines: list[str] = []
+    engine.report = lines.append
+    first = engine._envs
+    with first, make_vec(GRID, **arguments) as twin:
+        for group in range(2):
+            np.testing.assert_array_equal(engine.reset(group=group)[0], twin.reset(group=group)[0])
+        for step in range(40):
+            for envs in (engine, twin):
+                for group in range(2):
+                    envs.send(np.full(2, (step + group) % 4), group)
+            if step == 20:
+                os.kill(first._backend._engine.pid, signal.SIGSTOP)
+            for group in range(2):
+                for given, wanted in zip(engine.recv(group)[:4], twin.recv(group)[:4], strict=True):
+                    np.testing.assert_array_equal(given, wanted)
+        engine.close()
+    assert lines[0] == f"the engine process does not answer; restart 1 of {MAX_RESTARTS}"

@@ -1,0 +1,362 @@
+"""The experiments of the paper as data: files, scales, plans, and runs that are stopped and resumed."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import torch
+
+from endless_gym_agents import checkpoint, reproduce
+from endless_gym_agents.curves import published
+from endless_gym_agents.experiments import definitions, planning, report, running
+from endless_gym_agents.reproduce import ReproduceArguments, execute
+from endless_gym_agents.settings import to_dict
+from endless_gym_agents.train import parse
+
+NAMES = definitions.names()
+
+#: One run of six updates, with checkpoints every second.
+OWN: dict[str, Any] = {
+    "title": "Mine",
+    "section": "-",
+    "about": "A test.",
+    "kind": "curves",
+    "seeds": 1,
+    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
+    "runs": [
+        {
+            "name": "gru",
+            "env": "MortarMayhem-Grid-v0",
+            "flags": {
+                "preset": "quick",
+                "agent": "gru",
+                "environment.option": ["command_count=[1, 2]"],
+                "environment.num-envs": 8,
+                "ppo.updates": 6,
+                "ppo.steps": 256,
+                "recurrence.hidden-size": 16,
+            },
+        }
+    ],
+}
+
+
+def own(folder: Path, **changes: Any) -> Path:
+    file = folder / "mine.json"
+    file.write_text(json.dumps(OWN | changes))
+    return file
+
+
+def start(folder: Path, out: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "endless_gym_agents.reproduce", str(folder / "mine.json"), "--jobs", "1"]
+    command += ["--out", str(folder / out), "--device", "cpu", "--nice", "0"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def run_folder(folder: Path, out: str) -> Path:
+    return folder / out / "runs" / "MortarMayhem-Grid-v0" / "gru" / "seed-1"
+
+
+def wait_for_updates(run: Path, count: int) -> None:
+    log, deadline = run / "progress.jsonl", time.monotonic() + 250
+    while not log.exists() or log.read_text().count("\n") < count:
+        assert time.monotonic() < deadline, "the run did not reach its update"
+        time.sleep(0.01)
+
+
+def outcome(run: Path) -> tuple[list[dict[str, Any]], dict[str, torch.Tensor]]:
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    rows = [{k: v for k, v in row.items() if not k.startswith("seconds/") and k != "steps_per_second"} for row in rows]
+    return rows, checkpoint.load(run).state["model"]
+
+
+def log_of(job: planning.Job, updates: int, seconds: float) -> None:
+    """A run's log with that many updates of that many seconds."""
+    job.folder.mkdir(parents=True)
+    rows = [
+        json.dumps({"update": 1 + n, "seconds/a": seconds / 4, "seconds/b": seconds * 3 / 4}) for n in range(updates)
+    ]
+    (job.folder / "progress.jsonl").write_text("\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_flags_are_those_of_the_programs(name: str) -> None:
+    """The settings of a run are those that its command line gives, also at a small scale."""
+    experiment = definitions.load(name)
+    for one in (experiment, planning.scaled(experiment, planning.TINY)):
+        run = one.runs[-1]
+        given = parse(["--env", run.env, *planning.flags(run.flags)])
+        assert given.validated() == run.settings()
+        if experiment.kind == "curves" and run.published:
+            assert published(run.env, [run.published]), run
+    assert all(run.settings().ppo.updates <= 2 for run in planning.scaled(experiment, planning.TINY).runs)
+
+
+def test_runs_of_one_name_are_the_same_run() -> None:
+    known: dict[tuple[str, str], dict[str, Any]] = {}
+    for name in NAMES:
+        experiment = definitions.load(name)
+        if experiment.kind == "simulation-speed":
+            continue
+        for run in experiment.runs:
+            values = to_dict(run.settings())
+            assert known.setdefault((run.env, run.name), values) == values, run
+    lists = [(definitions.load(name).section, name) for name in NAMES]
+    assert lists == sorted(lists)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sede": 1}, "experiment mine: unknown key `sede`; allowed: title, section, about, kind, seeds, runs, "),
+        ({"kind": "curve"}, "experiment mine: `kind` must be one of curves, ablation, .*, got 'curve'"),
+        ({"seeds": 0}, "experiment mine: `seeds` must be 1 or more, got 0"),
+        ({"seeds": "5"}, "experiment mine: `seeds` must be int, got '5'"),
+        ({"runs": []}, "experiment mine: `runs` must contain at least one run"),
+        ({"aggregate": "both"}, "experiment mine: `aggregate` must be finite or endless, got 'both'"),
+        ({"evaluation": {"seed": 3}}, "mine, `evaluation`: unknown key `seed`; allowed: interval, seeds, repetitions"),
+        (
+            {"runs": [{"name": "a"}]},
+            "experiment mine, run 1: `env` is missing; allowed: name, env, flags, published, values",
+        ),
+        ({"runs": [{"name": "a", "env": "Nope-v0"}]}, "experiment mine, run 1: id must be one of "),
+        (
+            {"runs": [{"name": "a", "env": "MortarMayhem-v0", "flags": {"epochs": 3}}]},
+            "unknown flag `epochs`; allowed: ",
+        ),
+        ({"runs": [{"name": "a", "env": "MortarMayhem-v0", "flags": {"run": "x"}}]}, "unknown flag `run`; allowed: "),
+        (
+            {"runs": [{"name": "a", "env": "MortarMayhem-v0", "flags": {"ppo.epochs": 0.5}}]},
+            "flag `ppo.epochs` must be int, got 0.5",
+        ),
+        ({"runs": 2 * [{"name": "a", "env": "MortarMayhem-v0"}]}, "names of runs in an environment must differ"),
+    ],
+)
+def test_mistakes_in_a_file(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        definitions.parse("mine", json.dumps(OWN | changes))
+
+
+def test_errors_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for arguments, message in {
+        "": "no experiment given; `endless-reproduce --list` lists them",
+        "nope": "experiment must be one of finite, .*; got `nope`",
+        "nope.json": "no such file: nope.json",
+        "finite --scale 2": "--scale must be greater than 0 and at most 1, or tiny; got `2`",
+        "finite --scale small": "--scale must be .* got `small`",
+        "finite --nice 20 --status": "--nice must be 0 to 19, got 20",
+        "finite --jobs -1 --status": "--jobs must be 0 or more, got -1",
+    }.items():
+        monkeypatch.setattr(sys, "argv", ["endless-reproduce", *arguments.split()])
+        assert reproduce.main() == 1
+        error = capsys.readouterr().err
+        assert re.match(f"endless-reproduce: {message}", error), error
+        assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scale_makes_everything_smaller() -> None:
+    full = definitions.load("finite")
+    assert planning.scaled(full, 1) is full
+    small = planning.scaled(full, 0.01)
+    (before, after) = (one.runs[0].settings() for one in (full, small))
+    assert (before.ppo.updates, before.ppo.steps, before.environment.num_envs) == (30_000, 512, 32)
+    assert (after.ppo.updates, after.ppo.steps, after.environment.num_envs) == (300, 64, 3)
+    assert (small.seeds, small.evaluation) == (1, definitions.Evaluation(5, 5, 1))
+    assert after.recurrence == before.recurrence
+
+
+def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -> None:
+    """Two of six jobs have begun; the others take as long as those of the same agent, or as the mean of all."""
+    runs = [
+        {"name": agent, "env": "MortarMayhem-v0", "flags": {"agent": agent, "ppo.updates": 10}}
+        for agent in ("gru", "lstm", "trxl")
+    ]
+    experiment = definitions.parse("mine", json.dumps(OWN | {"runs": runs, "seeds": 2}))
+    planned = planning.jobs(experiment, tmp_path, 1)
+    assert [(job.run.name, job.seed) for job in planned] == [(a, s) for s in (1, 2) for a in ("gru", "lstm", "trxl")]
+    assert planning.remaining_seconds(planned, 1) is None
+    assert "time unknown" in running.left(planned, 1)
+    log_of(planned[0], 4, 2.0)
+    log_of(planned[1], 5, 8.0)
+    # gru: 6 and 10 updates of 2 s; lstm: 5 and 10 of 8 s; trxl: twice 10 of 5 s.
+    assert planning.remaining_seconds(planned, 1) == pytest.approx(12 + 20 + 40 + 80 + 50 + 50)
+    assert planning.remaining_seconds(planned, 3) == pytest.approx(252 / 3)
+    # No division makes the longest job shorter.
+    assert planning.remaining_seconds(planned, 100) == pytest.approx(80)
+    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 4.2 minutes, and its evaluation")
+    # One evaluation is measured: five others of the same duration.
+    (planned[1].folder / "evaluation.json").write_text('{"seconds": 12.0}')
+    assert planning.remaining_seconds(planned, 1) == pytest.approx(252 + 5 * 12)
+    assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 5.2 minutes")
+
+
+def test_the_status_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ReproduceArguments((str(own(tmp_path)),), status=True, out=tmp_path / "out", jobs=1)
+    execute(given)
+    assert capsys.readouterr().out.startswith("not started  MortarMayhem-Grid-v0 gru seed 1, update 0 of 6\n")
+    (job,) = planning.jobs(definitions.parse("mine", json.dumps(OWN)), tmp_path / "out", 1)
+    log_of(job, 6, 2.0)
+    execute(given)
+    assert "MortarMayhem-Grid-v0 gru seed 1, update 6 of 6, evaluation left\n" in capsys.readouterr().out
+
+
+def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
+    experiment = definitions.parse("mine", json.dumps(OWN))
+    (job,) = planning.jobs(experiment, tmp_path, 1)
+    job.folder.mkdir(parents=True)
+    given = job.run.settings()
+    (job.folder / "settings.json").write_text(json.dumps(to_dict(given)))
+    planning.check_folders([job])
+    (job.folder / "settings.json").write_text(json.dumps(to_dict(replace(given, ppo=replace(given.ppo, gamma=0.9)))))
+    with pytest.raises(ValueError, match="has a run with another `ppo`"):
+        planning.check_folders([job])
+
+
+def test_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    execute(ReproduceArguments((str(own(tmp_path)),), dry_run=True, out=tmp_path / "out", jobs=1))
+    train, test = capsys.readouterr().out.splitlines()
+    assert "OMP_NUM_THREADS=1" in train
+    assert " nice -n 19 endless-train --env MortarMayhem-Grid-v0 --preset quick " in train
+    assert train.endswith("--checkpoint-interval 2 --keep-checkpoints")
+    assert " endless-eval " in test
+    assert not (tmp_path / "out").exists()
+
+
+def test_each_job_gets_a_gpu() -> None:
+    machine = running.Machine(4, ("0", "3"))
+    assert [machine.environment(slot)["CUDA_VISIBLE_DEVICES"] for slot in range(4)] == ["0", "3", "0", "3"]
+    assert running.Machine(2).environment(0) == {"OMP_NUM_THREADS": "1"}
+
+
+def test_numbers_of_the_ablation_table() -> None:
+    """The best update is that with the highest mean over the runs; updates before the first end of an episode do not count."""
+    nan = float("nan")
+    found = report.ablation_numbers([[nan, 0.2, 0.8, 0.1], [nan, 0.4, 0.4, 0.3]], [[1, 2, 3, 99], [1, 2, 3, 99]])
+    assert found["success_mean"] == pytest.approx(0.6)
+    assert found["success_std"] == pytest.approx(0.2)
+    assert found["duration"] == 0.75
+    assert found["gradient_norm_mean"] == 2
+    assert found["gradient_norm_std"] == pytest.approx(np.std([1, 2, 3]))
+
+
+def test_wall_time_draws_the_published_curves_over_both_times(tmp_path: Path) -> None:
+    values = {"mean": 4.0}
+    flags = {"agent": "gru", "ppo.updates": 3}
+    runs = [{"name": "gru", "env": "MysteryPath-v0", "flags": flags, "published": "gru", "values": values}]
+    experiment = definitions.parse("mine", json.dumps(OWN | {"kind": "wall-time", "runs": runs}))
+    (job,) = planning.jobs(experiment, tmp_path, 1)
+    log_of(job, 3, 2.0)
+    (row,), (figure,) = report._wall_time([job], tmp_path / "out")
+    # The paper's run has 25,000 updates, and a checkpoint every 500.
+    assert (row["mean"], row["mean (paper)"], row["hours"]) == (2.0, 4.0, pytest.approx(2 * 25_000 / 3600))
+    theirs, ours = json.loads(figure.with_suffix(".json").read_text())["curves"]
+    assert theirs["seconds"] == list(range(0, 25_001 * 4, 500 * 4))
+    assert ours["seconds"] == list(range(0, 25_001 * 2, 500 * 2))
+    assert theirs["scores"] == ours["scores"] == published("MysteryPath-v0", ["gru"])[0].scores.tolist()
+
+
+def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
+    execute(ReproduceArguments(list=True))
+    table = capsys.readouterr().out
+    for name in NAMES:
+        assert re.search(rf"^ *{name} .*\d+ x \d", table, re.MULTILINE), name
+    execute(ReproduceArguments(list=True, json=True))
+    listed = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in listed] == NAMES
+    assert listed[NAMES.index("endless")]["runs"][0]["updates"] == 50_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--ray", "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"),
+        ("--ray auto --job-cpus 0", "--job-cpus must be 1 or more, got 0"),
+        ("--ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
+    ],
+)
+def test_errors_of_ray(
+    arguments: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["endless-reproduce", "endless", *arguments.split()])
+    assert reproduce.main() == 1
+    assert re.match(f"endless-reproduce: {message}", capsys.readouterr().err)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["kill", "interrupt"])
+def test_stopped_run_equals_an_uninterrupted_one(how: str, tmp_path: Path) -> None:
+    """A run that is killed, or stopped by Ctrl-C, continues; then everything is done, and nothing runs again."""
+    own(tmp_path)
+    through = start(tmp_path, "through")
+    text, _ = through.communicate(timeout=280)
+    assert through.returncode == 0, text
+    assert (tmp_path / "through" / "mine" / "README.md").exists()
+    begun = start(tmp_path, "stopped")
+    wait_for_updates(run_folder(tmp_path, "stopped"), 3)
+    if how == "kill":
+        (child,) = psutil.Process(begun.pid).children()
+        child.kill()
+    else:
+        begun.send_signal(signal.SIGINT)
+    text, _ = begun.communicate(timeout=280)
+    assert begun.returncode == (1 if how == "kill" else 130), text
+    done = checkpoint.load(run_folder(tmp_path, "stopped")).update
+    assert 2 <= done < 6
+    again = start(tmp_path, "stopped")
+    text, _ = again.communicate(timeout=280)
+    assert again.returncode == 0, text
+    assert "resumed at update" in text
+    (rows, model), (expected_rows, expected) = (outcome(run_folder(tmp_path, out)) for out in ("stopped", "through"))
+    assert len(rows) == 6
+    assert rows == expected_rows
+    assert all(torch.equal(model[name], expected[name]) for name in expected)
+    tables = [(tmp_path / out / "mine" / "table.csv").read_text() for out in ("stopped", "through")]
+    assert tables[0] == tables[1]
+    before = os.stat(run_folder(tmp_path, "stopped") / "progress.jsonl").st_mtime_ns
+    skipped = start(tmp_path, "stopped")
+    text, _ = skipped.communicate(timeout=280)
+    assert skipped.returncode == 0, text
+    assert "1 of 1 jobs done" in text
+    assert "started" not in text
+    assert "resumed" not in text
+    assert os.stat(run_folder(tmp_path, "stopped") / "progress.jsonl").st_mtime_ns == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_the_smallest_version_of_an_experiment(name: str, tmp_path: Path) -> None:
+    """One run with one update, through evaluation and report."""
+    file = tmp_path / f"{name}.json"
+    experiment = definitions.load(name)
+    folder = Path(definitions.__file__).parent
+    given = json.loads((folder / f"{name}.json").read_text())
+    last = {run["env"]: run for run in given["runs"]}
+    given["runs"] = list(last.values())[-1:]
+    for run in given["runs"]:
+        # Compilation takes minutes, and is tested with the agents.
+        run.get("flags", {}).pop("compile", None)
+    given.pop("aggregate", None)
+    file.write_text(json.dumps(given))
+    execute(ReproduceArguments((str(file),), scale="tiny", out=tmp_path / "out", device="cpu", nice=0))
+    page = (tmp_path / "out" / "scale-2e-05" / name / "README.md").read_text()
+    assert page.startswith(f"# {experiment.title}\n")
+    assert f"{len(given['runs'])} of {len(given['runs'])} runs are done." in page
+    for run in given["runs"]:
+        assert re.search(rf"^\| {run['env']}.* \| ", page, re.MULTILINE), page
+    assert (tmp_path / "out" / "scale-2e-05" / name / "table.csv").exists()
+    if experiment.kind in ("curves", "ablation"):
+        assert list((tmp_path / "out" / "scale-2e-05" / name).glob("*.png"))

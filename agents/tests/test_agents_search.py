@@ -1,0 +1,395 @@
+"""The hyperparameter search: search space, order of the trials, pruning, and resumption."""
+
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import psutil
+import pytest
+from agents_helpers import settings
+from rich.console import Console
+
+from endless_gym_agents import search, search_ray, search_workers
+from endless_gym_agents.command import load_checkpoint
+from endless_gym_agents.logs import read_progress
+from endless_gym_agents.search import parse
+from endless_gym_agents.search_space import single_changes, space, value, with_choices
+from endless_gym_agents.search_study import SearchArguments, Trials
+from endless_gym_agents.settings import PRESETS, Settings
+from endless_gym_agents.train import train
+
+pytestmark = pytest.mark.slow
+
+QUIET = Console(quiet=True)
+
+
+def small(folder: Path, **changes: Any) -> SearchArguments:
+    given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, checkpoint_interval=100)
+    environment = replace(given.environment, num_envs=4, option=("command_count=[1]",))
+    ppo = replace(given.ppo, steps=16, minibatches=1, updates=3)
+    start = replace(given, environment=environment, ppo=ppo)
+    return replace(
+        SearchArguments(str(folder), parameters=("ppo.epochs",), trials=1, period=1, settings=start), **changes
+    )
+
+
+def states(trials: Trials) -> list[str]:
+    return [trial.state.name for trial in trials.study.trials]
+
+
+def test_search_space_is_the_table_of_the_paper() -> None:
+    gru, trxl = (space(replace(PRESETS["paper"], agent=agent)) for agent in ("gru", "trxl"))
+    assert gru["ppo.learning_rate"] == (2.75e-4, 2.0e-4, 3.0e-4, 3.5e-4)
+    assert gru["recurrence.hidden_size"] == (512, 256, 384)
+    assert trxl["transformer.initialisation"] == ("xavier", "orthogonal", "kaiming", "tfixup")
+    assert "transformer.layers" not in gru
+    assert "recurrence.layers" not in trxl
+    # The table has 8 parameters for all with 16 other choices; 4 with 5 for recurrence; 5 with 10 for the Transformer-XL.
+    assert (len(gru), len(single_changes(gru))) == (12, 1 + 16 + 5)
+    assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 16 + 10)
+    rebuilt = replace(PRESETS["paper"], ppo=replace(PRESETS["paper"].ppo, reconstruction_coefficient=0.1))
+    assert space(rebuilt)["ppo.reconstruction_coefficient"] == (0.1, 0.5, 1.0)
+    # Every single change gives valid settings.
+    for agent, choices in (("gru", gru), ("trxl", trxl)):
+        for change in single_changes(choices):
+            with_choices(replace(PRESETS["paper"], agent=agent), change).validated()
+
+
+def test_single_changes_differ_in_one_parameter() -> None:
+    base = PRESETS["quick"]
+    choices = space(base, ("ppo.epochs", "ppo.max-gradient-norm", "agent"))
+    start, *changes = single_changes(choices)
+    assert with_choices(base, start) == base
+    different = [[name for name in change if change[name] != start[name]] for change in changes]
+    assert all(len(names) == 1 for names in different)
+    assert len(changes) == 2 + 3 + 1
+    lstm = with_choices(base, {"agent": "lstm", "ppo.epochs": 4})
+    assert (value(lstm, "agent"), lstm.ppo.epochs, lstm.ppo.gamma) == ("lstm", 4, base.ppo.gamma)
+
+
+def test_search_from_start_to_end(tmp_path: Path) -> None:
+    """Single changes, then a combination; restarting a complete search runs no trial."""
+    first = Trials(small(tmp_path, stage="single"), QUIET)
+    search.run_trials(first)
+    assert [trial.params["ppo.epochs"] for trial in first.study.trials] == [3, 2, 4]
+    second = Trials(small(tmp_path), QUIET)
+    search.run_trials(second)
+    assert states(second) == ["COMPLETE"] * 4
+    third = Trials(small(tmp_path), QUIET)
+    search.run_trials(third)
+    assert len(third.study.trials) == 4
+    third.report()
+    best = json.loads((tmp_path / "best.json").read_text())
+    assert best["reward"] == max(trial.value for trial in third.study.trials)
+    (chosen,) = [trial for trial in best["trials"] if trial["trial"] == best["trial"]]
+    assert chosen["choices"]["ppo.epochs"] == best["settings"]["ppo"]["epochs"]
+    # The value of a trial is the last mean reward of its run.
+    for trial in third.study.trials:
+        lines = (tmp_path / f"trial-{trial.number:04d}" / "progress.jsonl").read_text().splitlines()
+        assert json.loads(lines[-1])["episode/reward"] == trial.value
+    with pytest.raises(ValueError, match="started with other settings"):
+        Trials(small(tmp_path, parameters=("ppo.minibatches",)), QUIET)
+
+
+def test_the_best_settings_are_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has the old file open reads it to its end."""
+
+    def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
+        watch(given.ppo.updates, {"episode/reward": float(given.ppo.epochs)})
+
+    monkeypatch.setattr(search, "train", played)
+    trials = Trials(small(tmp_path, stage="single"), QUIET)
+    first = trials.begin()
+    assert first is not None
+    search.run_trial(first, first.settings)
+    trials.report()
+    with (tmp_path / "best.json").open() as old:
+        search.run_trials(trials)
+        trials.report()
+        assert json.loads(old.read())["reward"] == 3.0
+    assert json.loads((tmp_path / "best.json").read_text())["reward"] == 4.0
+    assert {file.name for file in tmp_path.iterdir()} == {"best.json", "locks", "study.db"}
+
+
+def test_no_trial_is_begun_after_the_time_limit(tmp_path: Path) -> None:
+    trials = Trials(small(tmp_path, stage="single", minutes=1e-9), QUIET)
+    search.run_trials(trials)
+    assert states(trials) == []
+    assert Trials(small(tmp_path, stage="single"), QUIET).remaining() == (0, 3)
+
+
+def test_a_failed_trial_is_resumed_by_the_next_call_only(tmp_path: Path) -> None:
+    """Ray reports a trial that failed too often. One that ran out of memory is never resumed."""
+    first = search_ray._Study(Trials(small(tmp_path, trials=2, stage="combinations"), QUIET))
+    configuration = first.begin("a")
+    assert configuration is not None
+    run = configuration["settings"]["run"]
+    first.end("a", is_error=True)
+    assert first.begin("b") is not None
+    first._ended["b"] = "exhausted"
+    first.end("b", is_error=False)
+    # The failed trial counts as one of the combinations.
+    assert first.begin("c") is None
+    assert first.failed == [0]
+
+    trials = Trials(small(tmp_path, trials=2, stage="combinations"), QUIET)
+    assert trials.remaining() == (0, 1)
+    second = search_ray._Study(trials)
+    resumed = second.begin("d")
+    assert resumed is not None
+    assert resumed["settings"]["run"] == run
+    second.observe("d", {"update": 3, "reward": 1.0, "end": "done"})
+    second.end("d", is_error=False)
+    assert second.begin("e") is None
+    assert states(trials) == ["FAIL", "FAIL", "COMPLETE"]
+
+
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that is interrupted after the first update has the results of an uninterrupted search."""
+    through = Trials(small(tmp_path / "through", stage="single"), QUIET)
+    search.run_trials(through)
+
+    def stopped(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
+        return train(given, lambda update, means: watch(update, means) or update == 1)
+
+    monkeypatch.setattr(search, "train", stopped)
+    broken = Trials(small(tmp_path / "broken", stage="single"), QUIET)
+    with pytest.raises(KeyboardInterrupt):
+        search.run_trials(broken)
+    assert states(broken) == ["FAIL", "WAITING", "WAITING"]
+    if not with_checkpoint:
+        (tmp_path / "broken" / "trial-0000" / "checkpoints" / "last.pt").unlink()
+    monkeypatch.setattr(search, "train", train)
+    resumed = Trials(small(tmp_path / "broken", stage="single"), QUIET)
+    search.run_trials(resumed)
+    assert states(resumed) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
+
+    def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
+        done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
+        return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
+
+    assert values(resumed) == values(through)
+    assert not (tmp_path / "broken" / "trial-0003").exists()
+
+
+def test_trials_are_pruned_after_the_warm_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rewards, watched = {3: 1.0, 2: 0.5, 4: 2.0}, {}
+
+    def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
+        for update in range(1, given.ppo.updates + 1):
+            watched[given.ppo.epochs] = update
+            if watch(update, {"episode/reward": rewards[given.ppo.epochs]}):
+                break
+        return Path(given.run)
+
+    monkeypatch.setattr(search, "train", played)
+    given = small(tmp_path, stage="single", warm_up=6, startup_trials=1, period=2)
+    given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
+    trials = Trials(given, QUIET)
+    search.run_trials(trials)
+    assert watched == {3: 10, 2: 6, 4: 10}
+    assert states(trials) == ["COMPLETE", "PRUNED", "COMPLETE"]
+    assert trials.study.best_params == {"ppo.epochs": 4}
+
+
+@pytest.mark.parametrize(("pruner", "updates"), [("asha", {3: 10, 2: 2, 4: 10}), ("none", {3: 10, 2: 10, 4: 10})])
+def test_other_pruners(
+    pruner: Literal["asha", "none"], updates: dict[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ASHA keeps the best of the trials that have reached an update, from the first trial on."""
+    rewards, watched = {3: 1.0, 2: 0.5, 4: 2.0}, {}
+
+    def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
+        for update in range(1, given.ppo.updates + 1):
+            watched[given.ppo.epochs] = update
+            if watch(update, {"episode/reward": rewards[given.ppo.epochs]}):
+                break
+
+    monkeypatch.setattr(search, "train", played)
+    given = small(tmp_path, stage="single", warm_up=2, period=2, pruner=pruner)
+    given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
+    search.run_trials(Trials(given, QUIET))
+    assert watched == updates
+
+
+def killed_once(trials: Trials, share: search_workers.Share | None) -> None:
+    """The work of a worker whose first two trials wait for each other; the process of the first trial is then killed, once."""
+    folder = trials.folder
+
+    def trained(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
+        def watched(update: int, means: dict[str, float]) -> bool:
+            stops = watch(update, means)
+            if update == 3:
+                (folder / f"met-{Path(given.run).name}").touch()
+                while len(list(folder.glob("met-*"))) < 2:
+                    time.sleep(0.01)
+                if given.run.endswith("trial-0000") and not (folder / "killed").exists():
+                    shutil.copy(Path(given.run) / "progress.jsonl", folder / "killed")
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return stops
+
+        return train(given, watched)
+
+    search.train = trained
+    search.run_trials(trials, share)
+
+
+def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -> None:
+    def given(name: str) -> SearchArguments:
+        given = small(tmp_path / name, stage="single", workers=2)
+        ppo = replace(given.settings.ppo, updates=4)
+        return replace(given, settings=replace(given.settings, ppo=ppo, checkpoint_interval=1))
+
+    through = Trials(given("through"), QUIET)
+    search.run_trials(through)
+    shared = Trials(given("shared"), QUIET)
+    search_workers.run_workers(shared, killed_once)
+    assert states(shared) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
+    assert [file.name for file in (tmp_path / "shared/locks").iterdir()] == ["study"]
+
+    def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
+        done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
+        return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
+
+    assert values(shared) == values(through)
+    # The rows up to the checkpoint are those of the killed process, with its times.
+    before = (tmp_path / "shared/killed").read_text().splitlines()
+    rows = (tmp_path / "shared/trial-0000/progress.jsonl").read_text().splitlines()
+    assert [json.loads(row)["update"] for row in rows] == [1, 2, 3, 4]
+    assert len(before) == 3
+    assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
+    assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
+
+
+def killed_and_replaced(trials: Trials, share: search_workers.Share | None) -> None:
+    """The work of a worker that is killed, once."""
+    with (trials.folder / "ends").open("a") as ends:
+        print(repr(trials.end), file=ends)
+    if len((trials.folder / "ends").read_text().splitlines()) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_the_time_limit_of_a_replaced_worker_is_that_of_the_search(tmp_path: Path) -> None:
+    trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
+    search_workers.run_workers(trials, killed_and_replaced)
+    assert (tmp_path / "ends").read_text() == f"{trials.end!r}\n" * 2
+
+
+def test_a_worker_is_not_replaced_after_the_time_limit(tmp_path: Path) -> None:
+    trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
+    trials.end = time.monotonic()
+    with pytest.raises(ValueError, match="1 of 1 workers failed; repeat the command"):
+        search_workers.run_workers(trials, killed_and_replaced)
+    assert len((tmp_path / "ends").read_text().splitlines()) == 1
+
+
+def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:
+    given = settings("gru", run=str(tmp_path / "trial-0000"))
+    with pytest.raises(RuntimeError), search_workers.output_of(given):
+        print("before")
+        raise RuntimeError("the cause")
+    first, *_, last = (tmp_path / "trial-0000.log").read_text().splitlines()
+    assert (first, last) == ("before", "RuntimeError: the cause")
+
+
+def interrupted_or_late(trials: Trials, share: search_workers.Share | None) -> None:
+    """The work of a worker that only a signal ends in time."""
+    time.sleep(30)
+    (trials.folder / "late").touch()
+
+
+def test_a_signal_while_workers_are_started_stops_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    process = multiprocessing.get_context("spawn").Process
+    start, started = process.start, []
+
+    def interrupting(self: Any) -> None:
+        start(self)
+        started.append(self.name)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(process, "start", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        search_workers.run_workers(Trials(small(tmp_path, stage="single", workers=2), QUIET), interrupted_or_late)
+    assert started == ["endless-search-0"]
+    assert not (tmp_path / "late").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) -> None:
+    """Also if it is killed: they stop after their update, with checkpoints, as if they had been interrupted."""
+    command = [sys.executable, "-m", "endless_gym_agents.search", "--preset", "quick", "--folder", str(tmp_path)]
+    sizes = ["--environment.num-envs", "4", "--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "100000"]
+    choice = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single", "--workers", "2"]
+    with subprocess.Popen([*command, *sizes, *choice], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as started:
+        try:
+            runs = [tmp_path / f"trial-000{number}" for number in (0, 1)]
+            while not all((run / "progress.jsonl").exists() and read_progress(run) for run in runs):
+                assert started.poll() is None, started.communicate()[0]
+                time.sleep(0.05)
+            workers = [
+                child for child in psutil.Process(started.pid).children() if "spawn_main" in " ".join(child.cmdline())
+            ]
+            assert len(workers) == 2
+            started.send_signal(number)
+            assert started.wait(60) == (130 if number == signal.SIGINT else -number)
+            assert not psutil.wait_procs(workers, timeout=60)[1]
+        finally:
+            started.kill()  # its workers stop with it
+    for run in runs:
+        assert load_checkpoint(run, "cpu").update == read_progress(run)[-1]["update"]
+    given = parse([*command[3:], *sizes, *choice])
+    left = Trials(given, QUIET)
+    assert states(left) == ["FAIL", "FAIL", "WAITING"]
+    assert left.remaining() == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--env NoSuch-v0", "id must be one of .*, got 'NoSuch-v0'"),
+        ("--parameters ppo.gamma", "--parameters for gru must be among ppo.epochs, "),
+        ("--percentile 0", "--percentile must be greater than 0 and at most 100, got 0.0"),
+        ("--run mine", "--run and --resume are not supported: the search names its runs; use --folder"),
+        ("--time-limit 3", "--time-limit and --target-reward are not supported: "),
+        ("--ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
+        ("--trials -1", "--trials must be 0 or more, got -1"),
+        ("--period 0", "--period must be 1 or more, got 0"),
+        ("--workers -1", "--workers must be 0 or more, got -1"),
+        ("--trial-cpus 0", "--trial-cpus must be 1 or more, got 0"),
+        ("--ray", "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["endless-search", *arguments.split()])
+    assert search.main() == 1
+    error = capsys.readouterr().err
+    assert re.match(f"endless-search: {message}", error)
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_line_includes_the_training_flags() -> None:
+    given = parse(["--preset", "quick", "--agent", "trxl", "--ppo.updates", "7", "--trials", "3"])
+    assert (given.trials, given.warm_up, given.percentile) == (3, 2000, 25.0)
+    assert [parse(line.split()).ray for line in ("", "--ray", "--ray --trials 3", "--ray auto")] == [
+        "",
+        "local",
+        "local",
+        "auto",
+    ]
+    expected = PRESETS["quick"]
+    assert given.settings == replace(expected, agent="trxl", ppo=replace(expected.ppo, updates=7))

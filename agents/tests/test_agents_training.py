@@ -1,0 +1,441 @@
+"""Complete training runs: exact resumption, interruption, logs, and learning with and without memory."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import wandb
+from agents_helpers import settings
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from endless_gym import make_vec, spec
+from endless_gym_agents import checkpoint
+from endless_gym_agents.agent import make_agent
+from endless_gym_agents.clock import Clock
+from endless_gym_agents.environments import Environments
+from endless_gym_agents.evaluate import evaluate, mean
+from endless_gym_agents.ppo import learn, make_optimizer
+from endless_gym_agents.rollout import RolloutCollector
+from endless_gym_agents.settings import PRESETS, Settings
+from endless_gym_agents.train import check_resumable, choose_device, main, parse, restore_generator, train
+
+pytestmark = pytest.mark.slow
+
+GRID = "MortarMayhem-Grid-v0"
+
+
+def small(agent: str, run: Path, updates: int = 4, **environment: Any) -> Settings:
+    given = settings(agent, env=GRID, run=str(run), checkpoint_interval=2, threads=1)
+    changes = {"num_envs": 8, "groups": 2, "option": ("command_count=[1, 2]",), **environment}
+    return replace(
+        given,
+        environment=replace(given.environment, **changes),
+        ppo=replace(given.ppo, steps=16, minibatches=2, updates=updates),
+    )
+
+
+def progress(run: Path) -> list[dict[str, Any]]:
+    """The metrics of all updates without timings."""
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if not k.startswith("seconds/") and k != "steps_per_second"} for row in rows]
+
+
+def same(one: Any, two: Any) -> bool:
+    """Whether the contents of two checkpoints are bitwise equal."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, two)
+    if isinstance(one, dict):
+        return one.keys() == two.keys() and all(same(one[key], two[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(two) and all(map(same, one, two))
+    return bool(one == two)
+
+
+@pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
+def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: Path) -> None:
+    """Log-probabilities and values of two segments are those of the rollout; between them the agent learns."""
+    given = small(agent, tmp_path)
+    with Environments(given) as environments:
+        torch.manual_seed(1)
+        made = make_agent(given, environments.spec)
+        collector = RolloutCollector(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+        optimizer, shuffle = make_optimizer(made, 0.01), torch.Generator().manual_seed(1)
+        for _ in range(2):
+            segment, _ = collector.collect(Clock())
+            flat, states = segment.flat(), [memory.state for memory in collector.memories]
+            for minibatch in made.memory.minibatches(states, segment.reset_mask, 2, torch.Generator().manual_seed(1)):
+                output = made({key: part[minibatch.indices] for key, part in flat.observation.items()}, minibatch)
+                log_prob = output.log_prob(flat.action[minibatch.indices])
+                torch.testing.assert_close(log_prob, flat.log_prob[minibatch.indices], rtol=1e-5, atol=1e-5)
+                torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
+            before = {name: weight.clone() for name, weight in made.named_parameters()}
+            learn(made, optimizer, segment, states, 0, replace(given.ppo, learning_rate=0.01), shuffle)
+            assert all(not torch.equal(weight, before[name]) for name, weight in made.named_parameters())
+
+
+@pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
+def test_resumed_run_equals_an_uninterrupted_run(agent: str, tmp_path: Path) -> None:
+    through = train(small(agent, tmp_path / "through", 4))
+    halved = train(small(agent, tmp_path / "halved", 2))
+    train(replace(small(agent, tmp_path, 4), resume=str(halved)))
+    assert len(progress(through)) == 4
+    assert progress(halved) == progress(through)
+    one, two = (checkpoint.load(run).state for run in (through, halved))
+    for part in ("update", "model", "optimizer", "generators", "player", "episodes"):
+        assert same(one[part], two[part]), part
+
+
+def test_resumed_run_with_frames_and_all_heads(tmp_path: Path) -> None:
+    def given(run: Path, updates: int) -> Settings:
+        made = small("gru", run, updates)
+        return replace(
+            made,
+            env="Endless-MortarMayhem-v0",
+            environment=replace(made.environment, option=(), observation="rgb"),
+            ppo=replace(made.ppo, reconstruction_coefficient=0.1, ground_truth_coefficient=0.1),
+        )
+
+    through = train(given(tmp_path / "through", 2))
+    halved = train(given(tmp_path / "halved", 1))
+    train(replace(given(tmp_path, 2), resume=str(halved)))
+    assert progress(halved) == progress(through)
+    assert {"reconstruction_loss", "ground_truth_loss"} <= progress(through)[0].keys()
+    assert same(checkpoint.load(through).state["model"], checkpoint.load(halved).state["model"])
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        "--env MortarMayhemB-Grid-v0 --agent gru --environment.observation rgb",
+        "--env MortarMayhemB-v0 --agent stack --environment.observation rgb --model.stack 2",
+        "--env MortarMayhemB-v0 --agent trxl",
+        "--env MysteryPath-Grid-v0 --agent gtrxl --transformer.gate-bias 2",
+        "--env Endless-SearingSpotlights-v0 --agent trxl --ppo.ground-truth-coefficient 0.1",
+        "--env Endless-MysteryPath-v0 --agent position",
+    ],
+)
+def test_all_kinds_of_observations_and_actions(flags: str, tmp_path: Path) -> None:
+    """Frames, features and vectors, with one and two action branches; an update changes every weight."""
+    small_run = "--preset quick --environment.num-envs 4 --ppo.steps 32 --ppo.updates 1 --threads 1"
+    given = parse([*flags.split(), *small_run.split(), "--run", str(tmp_path / "run"), "--ppo.learning-rate", "0.01"])
+    torch.manual_seed(given.seed)
+    before = make_agent(given, spec(given.env)).state_dict()
+    after = checkpoint.load(train(given)).agent.state_dict()
+    assert before.keys() == after.keys()
+    assert all(not torch.equal(before[name], after[name]) for name in before if name.endswith("weight"))
+
+
+def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:
+    """A run that was killed between two checkpoints resumes from the last one."""
+    run = train(small("gru", tmp_path / "run", 2))
+    expected = progress(train(small("gru", tmp_path / "through", 4)))
+    with (run / "progress.jsonl").open("a") as file:
+        file.write(json.dumps({"update": 3, "loss": 1.0}) + '\n{"update": 4, "lo')
+    train(replace(small("gru", tmp_path, 4), resume=str(run)))
+    assert progress(run) == expected
+
+
+def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
+    """The number of threads and an engine process do not change the results."""
+    runs = {
+        "one": train(small("gru", tmp_path / "one", 3)),
+        "threads": train(small("gru", tmp_path / "threads", 3, num_threads=3)),
+        "process": train(small("gru", tmp_path / "process", 3, engine="process")),
+    }
+    assert progress(runs["one"]) == progress(runs["threads"]) == progress(runs["process"])
+
+
+@pytest.mark.parametrize("engines", [("process", "process"), ("process", "thread"), ("thread", "process")])
+def test_run_resumes_exactly_with_another_engine(engines: tuple[str, str], tmp_path: Path) -> None:
+    through = train(small("gru", tmp_path / "through", 4))
+    run = train(small("gru", tmp_path / "run", 2, engine=engines[0]))
+    train(replace(small("gru", tmp_path, 4, engine=engines[1]), resume=str(run)))
+    assert progress(run) == progress(through)
+    assert same(checkpoint.load(run).state["player"], checkpoint.load(through).state["player"])
+
+
+@pytest.mark.parametrize("engine", ["thread", "process"])
+def test_ctrl_c_writes_a_checkpoint_and_frees_shared_memory(
+    engine: str, tmp_path: Path, segments: Callable[[], set[str]]
+) -> None:
+    run = tmp_path / "run"
+    before = segments()
+    arguments = f"--env {GRID} --agent gru --preset quick --run {run} --threads 1 --environment.engine {engine}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "endless_gym_agents.train", *arguments.split()],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    end = time.monotonic() + 120
+    while not (run / "progress.jsonl").exists() or not (run / "progress.jsonl").read_text():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, output
+    assert "stopping after this update" in output
+    done = checkpoint.load(run).update
+    assert 1 <= done < 2000
+    assert f"{done} of 2000 updates done" in output
+    assert len(progress(run)) == done
+    assert segments() <= before
+
+
+def test_a_function_chooses_the_options_of_training_episodes(tmp_path: Path) -> None:
+    calls: list[tuple[int, int, dict[str, Any] | None]] = []
+
+    def choose(env: int, episode: int, final: dict[str, Any] | None) -> dict[str, Any]:
+        calls.append((env, episode, final))
+        return {"command_count": [1 + episode % 2]}
+
+    given = small("none", tmp_path / "run")
+    train(given, episode_options=choose)
+    assert {env for env, _, _ in calls} == set(range(given.environment.num_envs))
+    chosen = [(episode, final["options"]) for _, episode, final in calls if final is not None]
+    assert chosen
+    assert all(options == {"command_count": [1 + episode % 2]} for episode, options in chosen)
+    with pytest.raises(ValueError, match=r"--environment\.engine must be thread, got process"):
+        Environments(small("none", tmp_path / "other", engine="process"), choose)
+
+
+def test_kept_checkpoints_can_be_loaded(tmp_path: Path) -> None:
+    given = replace(small("trxl", tmp_path / "run", 4), keep_checkpoints=True)
+    run = train(given)
+    files = checkpoint.files(run)
+    assert [file.name for file in files] == ["update-000000.pt", "update-000002.pt", "update-000004.pt"]
+    loaded = checkpoint.load(files[1])
+    assert (loaded.update, loaded.steps, loaded.settings) == (2, 2 * 8 * 16, given)
+    assert same(checkpoint.load(run).agent.state_dict(), checkpoint.load(files[2]).agent.state_dict())
+    memory = loaded.agent.initial_memory(3)
+    output = loaded.agent.act(torch.zeros(3, 17).numpy(), memory)
+    assert output.action.shape == (3, 1)
+
+
+def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
+    file = train(small("none", tmp_path / "run", 1)) / "checkpoints" / "last.pt"
+    torch.save(torch.load(file) | {"version": 2}, file)
+    with pytest.raises(ValueError, match=r"last\.pt must be of version 1, got 2"):
+        checkpoint.load(file)
+
+
+def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
+    """As after an interruption of the first update."""
+    run = train(replace(small("gru", tmp_path / "run", 2), time_limit=1e-9, keep_checkpoints=True))
+    assert len(progress(run)) == 1
+    (run / "checkpoints" / "last.pt").unlink()
+    os.link(run / "checkpoints" / "update-000000.pt", run / "checkpoints" / "last.pt")
+    train(parse(["--resume", str(run)]))
+    assert progress(run) == progress(train(small("gru", tmp_path / "through", 2)))
+    board = EventAccumulator(str(run))
+    board.Reload()
+    assert [event.step for event in board.Scalars("steps")] == [1, 2]
+
+
+def test_a_gpu_has_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """`torch.cuda.set_device`, which training calls, refuses a device without one."""
+
+    def set_device(device: torch.device) -> None:
+        assert device.index == 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", set_device)
+    for name in ("auto", "cuda", "cuda:0"):
+        assert choose_device(name) == torch.device("cuda", 0)
+        with pytest.raises(KeyboardInterrupt):
+            train(replace(small("gru", tmp_path / "run"), device=name))
+    assert choose_device("cuda:1") == torch.device("cuda", 1)
+    with pytest.raises(ValueError, match="the index must be 0 to 1"):
+        choose_device("cuda:2")
+
+
+def test_generator_state_of_another_device_is_replaced_by_a_seed() -> None:
+    """The state of a CUDA generator has 16 bytes."""
+    one, two = torch.Generator(), torch.Generator()
+    restore_generator(one, torch.zeros(16, dtype=torch.uint8), 5)
+    assert torch.equal(torch.rand(3, generator=one), torch.rand(3, generator=two.manual_seed(5)))
+    restore_generator(one, two.get_state(), 6)
+    assert torch.equal(torch.rand(3, generator=one), torch.rand(3, generator=two))
+
+
+def test_target_reward_needs_a_hundred_episodes(tmp_path: Path) -> None:
+    run = train(replace(small("none", tmp_path / "run", 40), target_reward=-1.0))
+    ended = len(checkpoint.load(run).state["episodes"])
+    assert ended == 100 and 1 < len(progress(run)) < 40
+
+
+@pytest.mark.parametrize("engine", ["thread", "process"])
+def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: Path) -> None:
+    """Eight segments, against environments with the same seeds that are stepped in a plain loop."""
+    torch.manual_seed(1)
+    given = small("none", tmp_path, engine=engine)
+    ppo = replace(given.ppo, ground_truth_coefficient=0.1)
+    given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))
+    plain = make_vec(
+        given.env, 4, 1, seed=1, seeds=range(100_000), groups=2, autoreset="same_step", observation="features"
+    )
+    now = [plain.reset(group=group) for group in range(2)]
+    reset_mask = [np.ones(4, np.bool_) for _ in range(2)]
+    with Environments(given) as environments:
+        collector = RolloutCollector(
+            make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1)
+        )
+        for _ in range(8):
+            segment, episodes = collector.collect(Clock())
+            ended = []
+            for step in range(16):
+                for group, columns in enumerate((slice(0, 4), slice(4, 8))):
+                    observation, info = now[group]
+                    np.testing.assert_array_equal(segment.observation["features"][step, columns], observation)
+                    truth = torch.tensor(info["ground_truth"]).float()
+                    assert torch.equal(segment.ground_truth[step, columns], truth)
+                    np.testing.assert_array_equal(segment.reset_mask[step, columns], reset_mask[group])
+                    plain.send(segment.action[step, columns].numpy(), group)
+                    observation, reward, terminated, truncated, info = plain.recv(group)
+                    now[group], reset_mask[group] = (observation, info), terminated | truncated
+                    np.testing.assert_array_equal(segment.reward[step, columns], reward.astype(np.float32))
+                    np.testing.assert_array_equal(segment.done[step, columns], reset_mask[group])
+                    ended += [float(info["final_info"]["reward"][env]) for env in np.flatnonzero(reset_mask[group])]
+            assert sorted(episode["reward"] for episode in episodes) == sorted(ended)
+        assert segment.done.any()
+
+
+def test_evaluation_plays_each_seed_equally_often(tmp_path: Path) -> None:
+    agent = checkpoint.load(train(small("gru", tmp_path / "run", 1))).agent
+    results = evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
+    assert [result["seed"] for result in results] == list(range(200_000, 200_007)) * 3
+    assert all(result["length"] > 0 for result in results)
+    assert mean(results) == pytest.approx(sum(result["reward"] for result in results) / 21)
+    # Sampling differs between the repetitions of a seed, and is reproducible with the same `action_seed`.
+    assert results == evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
+    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, action_seed=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--env NoSuch-v0", "id must be one of .*, got 'NoSuch-v0'"),
+        (f"--env {GRID} --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
+        (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
+        ("--resume nowhere", "no run in nowhere; expected a folder with settings.json"),
+        (f"--env {GRID} --environment.option command_count=[1] colour=1", "colour"),
+        (f"--env {GRID} --environment.option colour=1 --environment.engine process", "colour"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["endless-train", *arguments.split()])
+    assert main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith("endless-train: ")
+    assert re.search(message, error)
+    assert error.count("\n") == 1
+    assert not list(tmp_path.rglob("settings.json")), "the folder can be used again"
+
+
+def test_resumed_run_keeps_its_settings(tmp_path: Path) -> None:
+    run = train(small("gru", tmp_path / "run", 2))
+    resumed = parse(["--resume", str(run), "--ppo.updates", "3"])
+    assert resumed.ppo == replace(small("gru", run, 2).ppo, updates=3)
+    train(resumed)
+    assert len(progress(run)) == 3
+    # Changed settings persist; the step count continues.
+    again = parse(["--resume", str(run)])
+    assert again.ppo == resumed.ppo
+    train(replace(again, ppo=replace(again.ppo, updates=4, steps=32)))
+    assert [row["steps"] for row in progress(run)] == [128, 256, 384, 384 + 256]
+    with pytest.raises(ValueError, match=r"reconstruction-coefficient must stay positive \(it was 0\.1\), got 0;"):
+        check_resumable(again, replace(again, ppo=replace(again.ppo, reconstruction_coefficient=0.1)))
+    with pytest.raises(ValueError, match="must keep its agent: expected gru, got lstm"):
+        train(parse(["--resume", str(run), "--agent", "lstm"]))
+    with pytest.raises(ValueError, match="must keep its seed: expected 1, got 2"):
+        train(parse(["--resume", str(run), "--seed", "2"]))
+    assert parse(["--resume", str(run)]).ppo.steps == 32
+    with pytest.raises(FileExistsError, match="already contains a run"):
+        train(small("gru", run, 2))
+
+
+def test_tensorboard_files_contain_the_metrics(tmp_path: Path) -> None:
+    run = train(small("gru", tmp_path / "run", 2))
+    board = EventAccumulator(str(run))
+    board.Reload()
+    losses = [event.value for event in board.Scalars("learning/policy_loss")]
+    assert losses == pytest.approx([row["policy_loss"] for row in progress(run)], rel=1e-5)
+    assert {"episode/reward", "seconds/stepping", "seconds/inference", "seconds/learning"} <= set(
+        board.Tags()["scalars"]
+    )
+
+
+def test_weights_and_biases_logs_contain_the_metrics_under_one_id(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Written by the real library in offline mode; a resumed run keeps its id."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    run = train(replace(small("gru", tmp_path / "run", 1), wandb=True))
+    train(replace(small("gru", tmp_path, 2), wandb=True, resume=str(run)))
+    # `finish` can return before the file is written; the end of the library's process flushes it.
+    wandb.teardown()
+    (id,) = {file.stem.removeprefix("run-") for file in run.glob("wandb/offline-run-*/run-*.wandb")}
+    assert id == (run / "wandb-id.txt").read_text()
+    written = b"".join(file.read_bytes() for file in run.glob("wandb/offline-run-*/run-*.wandb"))
+    for row in progress(run):
+        assert json.dumps(row["policy_loss"]).encode() in written
+    assert b"episode/reward" in written and b"decay_updates" in written
+
+
+@pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
+def test_bf16_runs(agent: str, tmp_path: Path) -> None:
+    """bfloat16 changes the numbers slightly; weights stay float32."""
+    plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
+    one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
+    assert one != two
+    assert one == pytest.approx(two, rel=0.2)
+    assert all(tensor.dtype == torch.float32 for tensor in checkpoint.load(coarse).agent.state_dict().values())
+
+
+def one_command(agent: str, run: Path, **changes: Any) -> Settings:
+    quick = PRESETS["quick"]
+    return replace(
+        quick,
+        env=GRID,
+        agent=agent,
+        run=str(run),
+        threads=1,
+        target_reward=0.097,
+        environment=replace(quick.environment, option=("command_count=[1]",)),
+        ppo=replace(quick.ppo, updates=200),
+        **changes,
+    )
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("agent", ["gru", "trxl"])
+def test_memory_matters(agent: str, tmp_path: Path) -> None:
+    """One command that is shown and then hidden: an agent with memory learns to execute it."""
+    trained = checkpoint.load(train(one_command(agent, tmp_path / agent)))
+    assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085
+
+
+@pytest.mark.timeout(600)
+def test_without_memory_the_task_is_not_learned(tmp_path: Path) -> None:
+    """The task of `test_memory_matters`, with as many updates as those agents need."""
+    given = one_command("none", tmp_path / "none")
+    none = checkpoint.load(train(replace(given, ppo=replace(given.ppo, updates=70))))
+    assert mean(evaluate(none.agent, num_threads=1)) < 0.04

@@ -1,0 +1,34 @@
+"""`endless-train --view`: a page that shows the environments of a training run."""
+
+import urllib.error
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_agents_training import small
+
+from endless_gym_agents.environments import Environments
+
+
+def test_the_page_shows_the_runs_engine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = replace(small("gru", tmp_path / "run", 1, engine="process"), view=True)
+    with Environments(settings) as environments:
+        url = capsys.readouterr().out.split()[-1]
+        with urllib.request.urlopen(url) as page:
+            assert page.status == 200
+            assert b"Endless Gym" in page.read()
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(url.split("?")[0])
+        backend: Any = environments._envs._envs._backend  # type: ignore[union-attr]
+        base, token = url.split("?token=")
+        with urllib.request.urlopen(f"{base}{token}/engines") as engines:
+            assert f'"service":"{backend._engine.service}"'.encode() in engines.read()
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(url)
+
+
+def test_environments_in_this_process_cannot_be_viewed(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"add --environment\.engine process"):
+        replace(small("gru", tmp_path / "run", 1, engine="thread"), view=True).validated()

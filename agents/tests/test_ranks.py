@@ -1,0 +1,268 @@
+"""Data-parallel training: what `torchrun` starts computes what one process computes, and ends as a whole."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import endless_gym
+from endless_gym_agents import checkpoint
+from endless_gym_agents.logs import PROGRESS, read_progress
+from endless_gym_agents.ranks import Ranks
+from endless_gym_agents.train import parse, train
+
+ARGUMENTS = " ".join(
+    (
+        "--env MortarMayhem-Grid-v0 --environment.option command_count=[1] --preset quick --device cpu --threads 1",
+        "--environment.num-envs 8 --environment.groups 2 --ppo.steps 16 --ppo.updates 3 --ppo.minibatches 2",
+        "--checkpoint-interval 1 --recurrence.hidden-size 16 --recurrence.sequence-length 8 --transformer.width 16",
+        "--transformer.window 8 --transformer.sequence-length 8 --model.vector-width 16 --model.head-width 16",
+    )
+).split()
+#: Updates of a run that does not end by itself.
+ENDLESS = ["--ppo.updates", "100000"]
+
+
+def start(run: Path, ranks: int, *arguments: str, restarts: int = 0) -> subprocess.Popen[str]:
+    """Start a run of several ranks. What it prints is beside its folder, in a file."""
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
+    module = [f"--max-restarts={restarts}", "-m", "endless_gym_agents.train", "--"]
+    run.parent.mkdir(parents=True, exist_ok=True)
+    with log(run).open("w") as output:
+        return subprocess.Popen(
+            [*torchrun, *module, *ARGUMENTS, *arguments, "--run", str(run)],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "TERM": "dumb", "COLUMNS": "200"},
+            start_new_session=True,
+        )
+
+
+def log(run: Path) -> Path:
+    return run.with_suffix(".log")
+
+
+def finished(process: subprocess.Popen[str], run: Path, expected: int = 0) -> Path:
+    assert process.wait(timeout=250) == expected, log(run).read_text()
+    return run
+
+
+def last(run: Path) -> dict[str, Any]:
+    state: dict[str, Any] = torch.load(run / checkpoint.FOLDER / checkpoint.LAST, weights_only=True)
+    return state
+
+
+def rows(run: Path) -> list[dict[str, Any]]:
+    return read_progress(run) if (run / PROGRESS).exists() else []
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], run: Path) -> None:
+    deadline = time.monotonic() + 200
+    while not condition():
+        assert process.poll() is None, log(run).read_text()
+        assert time.monotonic() < deadline, log(run).read_text()
+        time.sleep(0.05)
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def ranks_of(process: subprocess.Popen[str]) -> dict[int, int]:
+    """The process of each rank, by its number."""
+    found = {}
+    for child in children(process.pid):
+        variables = Path(f"/proc/{child}/environ").read_bytes().split(b"\0")
+        found |= {int(value[5:]): child for value in variables if value.startswith(b"RANK=")}
+    return found
+
+
+@pytest.fixture
+def stopped() -> Iterator[list[subprocess.Popen[str]]]:
+    """Processes that are killed after the test, with their children."""
+    processes: list[subprocess.Popen[str]] = []
+    yield processes
+    for process in processes:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("agent", "ranks", "arguments"),
+    [
+        ("gru", 2, "--ppo.advantage-normalisation minibatch"),
+        ("lstm", 4, "--ppo.advantage-normalisation none --environment.groups 1"),
+        ("trxl", 2, "--ppo.advantage-normalisation batch"),
+        # One sequence in each minibatch: it belongs to one rank, and the other has no step.
+        ("trxl", 2, "--environment.num-envs 2 --environment.groups 1 --transformer.sequence-length 16"),
+        ("none", 2, "--environment.engine process"),
+    ],
+)
+def test_ranks_compute_what_one_process_computes(tmp_path: Path, agent: str, ranks: int, arguments: str) -> None:
+    given = ["--agent", agent, *arguments.split()]
+    alone = train(parse([*ARGUMENTS, *given, "--run", str(tmp_path / "one")]))
+    together = finished(start(tmp_path / "several", ranks, *given), tmp_path / "several")
+    one, several = last(alone), last(together)
+    assert one["model"].keys() == several["model"].keys()
+    for name, weights in one["model"].items():
+        torch.testing.assert_close(several["model"][name], weights, rtol=0, atol=1e-5)
+    assert one["steps"] == several["steps"]
+    for expected, found in zip(rows(alone), rows(together), strict=True):
+        assert expected.keys() == found.keys()
+        for name in expected:
+            if not name.startswith("seconds/") and name != "steps_per_second":
+                assert math.isclose(expected[name], found[name], rel_tol=1e-4, abs_tol=1e-5), name
+
+
+@pytest.mark.slow
+def test_a_killed_rank_ends_the_run_which_starts_again(
+    tmp_path: Path, segments: Callable[[], set[str]], stopped: list[subprocess.Popen[str]]
+) -> None:
+    run, engines = tmp_path / "run", ("--agent", "gru", "--environment.engine", "process")
+    undisturbed = start(tmp_path / "undisturbed", 2, *engines, "--ppo.updates", "12")
+    stopped.append(undisturbed)
+    finished(undisturbed, tmp_path / "undisturbed")
+    process = start(run, 2, *engines, "--ppo.updates", "12", restarts=1)
+    stopped.append(process)
+    wait_until(lambda: len(rows(run)) >= 2, process, run)
+    os.kill(ranks_of(process)[1], signal.SIGKILL)
+    finished(process, run)
+    assert "rank 0 of 2: another rank has ended" in log(run).read_text()
+    assert [row["update"] for row in rows(run)] == list(range(1, 13))
+    expected, found = last(tmp_path / "undisturbed"), last(run)
+    for name, weights in expected["model"].items():
+        assert torch.equal(found["model"][name], weights), name
+    assert segments() == set()
+
+
+@pytest.mark.slow
+def test_all_ranks_end_within_seconds_of_one(
+    tmp_path: Path, segments: Callable[[], set[str]], stopped: list[subprocess.Popen[str]]
+) -> None:
+    run = tmp_path / "run"
+    process = start(run, 2, "--agent", "none", "--environment.engine", "process", *ENDLESS)
+    stopped.append(process)
+    wait_until(lambda: len(rows(run)) >= 1, process, run)
+    ranks = ranks_of(process)
+    os.kill(ranks[0], signal.SIGKILL)
+    killed = time.monotonic()
+    wait_until(lambda: not Path(f"/proc/{ranks[1]}").exists(), process, run)
+    assert time.monotonic() - killed < 10
+    assert process.wait(timeout=60) != 0
+    assert "rank 1 of 2: another rank has ended" in log(run).read_text()
+    assert segments() == set()
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(
+    tmp_path: Path, stopped: list[subprocess.Popen[str]]
+) -> None:
+    run = tmp_path / "run"
+    process = start(run, 2, "--agent", "trxl", *ENDLESS)
+    stopped.append(process)
+    wait_until(lambda: len(rows(run)) >= 2, process, run)
+    # As Ctrl-C in a terminal does, which torchrun then passes on.
+    os.killpg(process.pid, signal.SIGINT)
+    process.wait(timeout=100)
+    text, done = log(run).read_text(), len(rows(run))
+    assert f"{done} of 100000 updates done" in text
+    assert last(run)["update"] == done
+
+    # Exactly, with the same ranks: two more updates are those of a run that was not interrupted.
+    more = ["--ppo.updates", str(done + 2)]
+    undisturbed = start(tmp_path / "undisturbed", 2, "--agent", "trxl", *more)
+    stopped.append(undisturbed)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    resume = ["-m", "endless_gym_agents.train", "--", "--resume", str(run), *more]
+    subprocess.run(command + resume, check=True, timeout=250, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    finished(undisturbed, tmp_path / "undisturbed")
+    for name, weights in last(tmp_path / "undisturbed")["model"].items():
+        assert torch.equal(last(run)["model"][name], weights), name
+
+    # With another number of ranks the weights are kept, and all environments start an episode.
+    before = last(run)["steps"]
+    train(parse(["--resume", str(run), "--ppo.updates", str(done + 3)]))
+    assert last(run)["steps"] == before + 8 * 16
+    assert [row["update"] for row in rows(run)] == list(range(1, done + 4))
+
+
+@pytest.mark.slow
+def test_no_thread_outlives_the_connection(tmp_path: Path) -> None:
+    """A thread of gloo that runs while the interpreter ends can end the process by a signal."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        f"""
+from pathlib import Path
+from endless_gym_agents.train import parse, train
+
+train(parse({[*ARGUMENTS, "--agent", "gru", "--run", str(tmp_path / "run")]!r}))
+names = [file.read_text() for file in Path("/proc/self/task").glob("*/comm")]
+assert not any("gloo" in name for name in names), names
+"""
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", program]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=250, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(rows(tmp_path / "run")) == 3
+
+
+@pytest.mark.slow
+def test_environments_that_cannot_be_divided_are_an_error(tmp_path: Path) -> None:
+    process = start(tmp_path / "run", 2, "--environment.num-envs", "6")
+    assert process.wait(timeout=200) != 0
+    assert "must be a multiple of 2 groups times 2 ranks, got 6" in log(tmp_path / "run").read_text()
+
+
+@pytest.mark.parametrize("place", [endless_gym.make_vec, endless_gym.serve])
+@pytest.mark.parametrize("seeds", [None, range(100)])
+def test_parts_of_the_environments_equal_the_whole(place: Callable[..., Any], seeds: range | None) -> None:
+    def play(first: int, groups: int, total: int | None) -> list[np.ndarray[Any, Any]]:
+        given = {"seed": 3, "seeds": seeds, "groups": groups, "first_env": first, "total_envs": total}
+        played = []
+        with place("MysteryPath-Grid-v0", 2, 1, autoreset="same_step", options={"max_steps": 3}, **given) as envs:
+            for group in range(groups):
+                frames = [envs.reset(group=group)[0].copy()]
+                for _ in range(8):
+                    envs.send(np.array([3, 3]), group)
+                    frames.append(envs.recv(group)[0].copy())
+                frames.append(envs.reset(seed=11, group=group)[0].copy())
+                mask = np.array([False, True])
+                frames.append(envs.reset(seed=12, group=group, options={"reset_mask": mask})[0].copy())
+                played.append(np.stack(frames))
+        return played
+
+    whole = play(0, 3, None)
+    parts = play(0, 1, 6) + play(2, 2, 6)
+    assert len({frames.tobytes() for frames in whole}) == 3
+    for expected, found in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(expected, found)
+
+
+def test_numbers_of_environments_are_checked() -> None:
+    with pytest.raises(ValueError, match="total_envs"):
+        endless_gym.make_vec("MysteryPath-v0", 2, groups=2, first_env=4, total_envs=7)
+    with pytest.raises(ValueError, match="first_env"):
+        endless_gym.serve("MysteryPath-v0", 2, first_env=-1)
+
+
+def test_a_rank_of_another_program_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RANK", "3")
+    ranks = Ranks()
+    assert (ranks.rank, ranks.size, ranks.threads) == (0, 1, None)
+    assert ranks.share(6) == range(6)
