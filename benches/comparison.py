@@ -23,9 +23,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import endless_gym
 import gymnasium
 import numpy as np
+
+import endless_gym
 from endless_gym.program import program
 
 IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"]

@@ -39,6 +39,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.table import Table
+
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
@@ -48,8 +51,6 @@ from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.rollout import RolloutCollector, Segment
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.train import parse
-from rich.console import Console
-from rich.table import Table
 
 # Also where Python does not look beside the program for modules.
 sys.path.insert(0, str(Path(__file__).parent))

@@ -6,9 +6,10 @@ import subprocess
 import sys
 import urllib.request
 
-import endless_gym
 import gymnasium
 import numpy as np
+
+import endless_gym
 
 ENV = "Endless-MortarMayhem-v0"
 STEPS = 50

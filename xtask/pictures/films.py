@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import matplotlib
 import numpy as np
-from endless_gym.program import program
-from endless_gym.specs import all_specs
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+
+from endless_gym.program import program
+from endless_gym.specs import all_specs
 
 #: An image or a film, uint8 (frames, height, width, 3) or without the first axis.
 Pixels = NDArray[np.uint8]
