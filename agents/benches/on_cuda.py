@@ -1,27 +1,23 @@
-"""The agents on CUDA: equality with the CPU, copies, CUDA graphs, and training throughput. Takes less than ten minutes.
+"""The agents on CUDA: equality with the CPU, copies, and training throughput. Takes less than ten minutes.
 
     python on_cuda.py --json on_cuda.json --markdown on_cuda.md
 
 * Equality: each agent computes a rollout's log-probabilities and values, and a minibatch's loss and gradients, on the CPU and on
   the device, in float32 without TF32. The largest difference, relative to the largest value, must be at most 1e-3.
 * Copies: frames of a group from pageable and from page-locked memory to the device.
-* Graphs: rollouts of the GRU and the Transformer-XL agent with the sizes of the preset `paper`, with CUDA graphs and without,
-  whose contents must be equal to the same tolerance. The first segment captures the graphs and has a time of its own.
 * Training: steps per second with a breakdown, and peak memory, with the networks, frames, environments and steps of the preset
-  `paper`, and with more environments. The first update is excluded as warm-up.
+  `paper`, without and with `--compile`, and with more environments. The first updates are excluded as warm-up.
 
 `--device cpu` runs the parts that need no GPU with small networks and few steps, to test this program; its numbers mean nothing.
-The exit status is 1 if there is no CUDA device, if a result on the device differs from the CPU's, or if rollouts with graphs
-differ from those without, or go on without graphs.
+The exit status is 1 if there is no CUDA device, or if a result on the device differs from the CPU's.
 """
 
 import argparse
 import json
+import math
 import platform
-import statistics
 import sys
 import time
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +29,6 @@ from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.environments import Environments
-from endless_gym_agents.graphs import Graphs, relative_difference
 from endless_gym_agents.ppo import learn, make_optimizer, minibatch_loss
 from endless_gym_agents.rollout import RolloutCollector, Segment
 from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
@@ -42,8 +37,10 @@ from endless_gym_agents.train import choose_device
 AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
 TOLERANCE = 1e-3
 ENV = "Endless-MortarMayhem-v0"
-#: Environments and steps of the training measurements; the first is the paper's.
-BATCHES = ((32, 512), (128, 512), (512, 128))
+#: Environments, steps and `--compile` of the training measurements; the first are the paper's.
+TRAININGS = ((32, 512, False), (32, 512, True), (128, 512, False), (512, 128, False))
+#: Updates before the timed ones. With graphs, a part is compiled in its first call and captured in its third.
+WARM_UPS = 2
 
 
 def networks(agent: str) -> Settings:
@@ -91,6 +88,12 @@ def computed(agent: Agent, draws: torch.Generator) -> dict[str, torch.Tensor]:
     }
 
 
+def relative_difference(one: torch.Tensor, other: torch.Tensor) -> float:
+    """The largest difference, relative to the largest value of the first; infinite if a value is NaN or infinite."""
+    difference = float((one - other).abs().max() / one.abs().max().clamp(min=1e-6))
+    return difference if math.isfinite(difference) else math.inf
+
+
 def equality(device: torch.device) -> list[dict[str, Any]]:
     """The largest differences between the results of the CPU and of the device, relative to the largest value."""
     shapes, rows = {FRAME: (84, 84, 3), "vector_observation": (16,)}, []
@@ -122,67 +125,8 @@ def copies(device: torch.device) -> list[dict[str, Any]]:
     return rows
 
 
-def rollouts(
-    settings: Settings, device: torch.device, graphs: Graphs | None, segments: int
-) -> list[tuple[dict[str, torch.Tensor], float, float]]:
-    """Some segments, after each of which the weights change.
-
-    Args:
-        settings: Settings of the run.
-        device: Device of the agent.
-        graphs: See `RolloutCollector`.
-        segments: Number of segments.
-
-    Returns:
-        For each segment its contents on the CPU, its seconds, and the seconds of `inference` in it.
-    """
-    settings = settings.validated()
-    torch.manual_seed(1)
-    rows = []
-    with Environments(settings) as environments:
-        agent = make_agent(settings, environments.spec, device)
-        generator, clock = torch.Generator(device).manual_seed(1), Clock()
-        collector = RolloutCollector(agent, environments, settings.ppo.steps, generator, graphs=graphs)
-        for _ in range(segments):
-            start = time.perf_counter()
-            segment, _ = collector.collect(clock)
-            contents = {
-                name: getattr(segment, name).cpu() for name in ("action", "log_prob", "value", "reward", "done")
-            }
-            rows.append((contents, time.perf_counter() - start, clock.take()["inference"]))
-            with torch.no_grad():
-                for parameter in agent.parameters():
-                    parameter.mul_(0.9)
-    return rows
-
-
-def compared_rollouts(
-    settings: Settings, device: torch.device, graphs: Graphs | None = None, segments: int = 4
-) -> dict[str, Any]:
-    """Rollouts with and without graphs: seconds of a segment after the first, and the largest difference of their contents."""
-    without = rollouts(replace(settings, cuda_graphs=False), device, None, segments)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        with_graphs = rollouts(settings, device, graphs, segments)
-    refused = [str(warning.message) for warning in caught if issubclass(warning.category, RuntimeWarning)]
-    difference = max(
-        relative_difference(one[name], other[name])
-        for (one, *_), (other, *_) in zip(without, with_graphs, strict=True)
-        for name in one
-    )
-    row: dict[str, Any] = {"agent": settings.agent, "largest_difference": difference, "refused": refused}
-    row["equal"] = difference <= TOLERANCE and not refused
-    for name, rows in (("without", without), ("with", with_graphs)):
-        row[name] = {
-            "first_seconds": rows[0][1],
-            "seconds": statistics.median(seconds for _, seconds, _ in rows[1:]),
-            "inference_seconds": statistics.median(seconds for *_, seconds in rows[1:]),
-        }
-    return row
-
-
 def training(settings: Settings, device: torch.device, updates: int) -> dict[str, Any]:
-    """Steps per second of some updates after the first one, with their breakdown and the peak memory."""
+    """Steps per second of some updates after the warm-up, with their breakdown and the peak memory."""
     settings = settings.validated()
     ppo, cuda = settings.ppo, device.type == "cuda"
     torch.manual_seed(1)
@@ -190,12 +134,14 @@ def training(settings: Settings, device: torch.device, updates: int) -> dict[str
         torch.cuda.reset_peak_memory_stats(device)
     with Environments(settings) as environments:
         agent = make_agent(settings, environments.spec, device)
+        if settings.compile:
+            agent.compile_parts()
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, torch.Generator(device).manual_seed(1))
         clock, shuffle = Clock(), torch.Generator()
         start = time.perf_counter()
-        for update in range(updates + 1):
-            if update == 1:
+        for update in range(updates + WARM_UPS):
+            if update == WARM_UPS:
                 clock.take()
                 start = time.perf_counter()
             segment, _ = collector.collect(clock)
@@ -207,6 +153,7 @@ def training(settings: Settings, device: torch.device, updates: int) -> dict[str
         "agent": settings.agent,
         "num_envs": settings.environment.num_envs,
         "steps": ppo.steps,
+        "compile": settings.compile,
         "steps_per_second": updates * settings.environment.num_envs * ppo.steps / seconds,
         "shares_of_time": {name: spent / seconds for name, spent in clock.take().items()},
         "peak_gigabytes": torch.cuda.max_memory_allocated(device) / 1e9 if cuda else None,
@@ -226,28 +173,21 @@ def markdown(report: dict[str, Any]) -> str:
         for row in report["copies"]:
             kind = "page-locked" if row["page_locked"] else "pageable"
             lines.append(f"| {kind} | {row['gigabytes_per_second']:.1f} |")
-    lines += ["", "## Rollouts with CUDA graphs and without", ""]
-    lines += ["| agent | graphs | segment | of which inference | first segment | difference | equal |"]
-    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
-    for row in report["graphs"]:
-        equal = "yes" if row["equal"] else "**no**"
-        for name in ("without", "with"):
-            times = [f"{row[name][key]:.3f} s" for key in ("seconds", "inference_seconds", "first_seconds")]
-            ending = f"{row['largest_difference']:.1e} | {equal}" if name == "with" else " | "
-            lines.append(f"| {row['agent']} | {name} | {' | '.join(times)} | {ending} |")
-        lines += [f"\n{message}\n" for message in row["refused"]]
     lines += [
         "",
         "## Training",
         "",
-        "| agent | environments x steps | steps per second | share of time | peak memory |",
+        "| agent | environments x steps | compiled | steps per second | share of time | peak memory |",
     ]
-    lines += ["| --- | --- | --- | --- | --- |"]
+    lines += ["| --- | --- | --- | --- | --- | --- |"]
     for row in report["training"]:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in row["shares_of_time"].items())
         memory = "" if row["peak_gigabytes"] is None else f"{row['peak_gigabytes']:.1f} GB"
         batch = f"{row['num_envs']} x {row['steps']}"
-        lines.append(f"| {row['agent']} | {batch} | {row['steps_per_second']:,.0f} | {shares} | {memory} |")
+        compiled = "yes" if row["compile"] else "no"
+        lines.append(
+            f"| {row['agent']} | {batch} | {compiled} | {row['steps_per_second']:,.0f} | {shares} | {memory} |"
+        )
     for left_out in report["left_out"]:
         lines += ["", f"Not measured, since the time was up: {left_out}."]
     return "\n".join(lines) + "\n"
@@ -283,15 +223,13 @@ def main() -> int:
         torch.backends.cudnn.allow_tf32 = True
         torch.set_float32_matmul_precision("high")
     paper = replace(PRESETS["paper"], env=ENV)
-    report["graphs"] = [
-        compared_rollouts(replace(paper, agent=agent) if cuda else networks(agent), device) for agent in ("gru", "trxl")
-    ]
     report["training"], report["left_out"] = [], []
-    for num_envs, steps in BATCHES if cuda else ((4, 16),):
+    for num_envs, steps, compile in TRAININGS if cuda else ((4, 16, False),):
         for agent in ("gru", "trxl"):
             settings = replace(paper, agent=agent) if cuda else networks(agent)
             settings = replace(
                 settings,
+                compile=compile,
                 environment=replace(settings.environment, num_envs=num_envs),
                 ppo=replace(settings.ppo, steps=steps),
             )
@@ -308,7 +246,7 @@ def main() -> int:
         args.json.write_text(json.dumps(report, indent=1) + "\n")
     if args.markdown:
         args.markdown.write_text(text)
-    return 0 if all(row["equal"] for row in report["equality"] + report["graphs"]) else 1
+    return 0 if all(row["equal"] for row in report["equality"]) else 1
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """PPO agents with memory in PyTorch: the baselines of the Memory Gym paper.
 
 Training, from top to bottom: `train` is the training loop and `settings` its configuration; `rollout` collects segments from
-`environments`; `ppo` optimises the agent with `losses`; `agent` combines an observation transform (`naive`), `encoders`, a memory
-(`memory`, `recurrent`, `transformer`) and `heads`; `checkpoint` saves and loads.
+`environments`; `ppo` optimises the agent with `losses`; `agent` combines an observation transform (`transforms`),
+`encoders`, a memory (`memory`, `recurrent`, `transformer`) and `heads`; `checkpoint` saves and loads.
 
 Evaluation: `protocol` is `endless-eval`, with `evaluate`, `metrics`, `statistics` and `results`; `plot` with `curves` is
 `endless-plot`; `enjoy` with `video` is `endless-enjoy`; `search` with `search_space` is `endless-search`;

@@ -7,7 +7,7 @@ transposed copies of the agent's parameters; the policy and the value head are c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import TypeAlias
@@ -34,16 +34,6 @@ def transposed(layer: nn.Module, dtype: torch.dtype) -> Affine:
 def linear_relu(x: Tensor, layer: Affine) -> Tensor:
     """A linear layer followed by a ReLU, float (n, outputs), for inputs float (n, inputs)."""
     return torch.addmm(layer[0], x, layer[1]).relu_()
-
-
-def refill(tensors: Iterable[Tensor], newer: Iterable[Tensor]) -> None:
-    """Copy `newer` into `tensors`.
-
-    Both may be the same parameter: it has its new values already, and must not get a new version.
-    """
-    for mine, others in zip(tensors, newer, strict=True):
-        if mine.data_ptr() != others.data_ptr():
-            mine.copy_(others)
 
 
 def weights_version(parameters: Sequence[Tensor]) -> int:
@@ -75,11 +65,6 @@ class ActingWeights:
     branches: int
     choices: int
 
-    def copy_(self, other: ActingWeights) -> None:
-        """Copy the weights of the same layers, made later, into the tensors of these."""
-        for mine, others in zip(self._layers(), other._layers(), strict=True):
-            refill(mine, others)
-
     def heads(self, x: Tensor) -> Tensor:
         """Logits and value, float32 (n, branches * choices + 1), for outputs of the memory float (n, width)."""
         x = linear_relu(linear_relu(x, self.body), self.hidden)
@@ -94,10 +79,6 @@ class ActingWeights:
         """Log-probabilities of actions int64 (..., branches), float32 (..., branches)."""
         log_probs: Tensor = self.logits(outputs).log_softmax(-1)
         return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
-
-    def _layers(self) -> list[Affine]:
-        layers = (self.vector, self.embedding, self.body, self.hidden, self.output)
-        return [layer for layer in layers if layer is not None]
 
 
 def acting_weights(

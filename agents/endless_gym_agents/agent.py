@@ -40,10 +40,10 @@ from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu
 from endless_gym_agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
 from endless_gym_agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
-from endless_gym_agents.naive import TransformState, make_observation_transform
 from endless_gym_agents.recurrent import RecurrentMemory
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.transformer import TransformerMemory
+from endless_gym_agents.transforms import TransformState, make_observation_transform
 
 #: An array or tensor of n environments, (n, ...).
 Array: TypeAlias = NDArray[Any] | Tensor
@@ -223,7 +223,7 @@ class Agent(nn.Module):
         return sum(parameter.numel() for parameter in self.parameters())
 
     def compile_parts(self) -> None:
-        """Compile, with `torch.compile`, the submodules whose input shapes are constant or nearly so."""
+        """Compile, with `torch.compile`, the submodules whose input shapes are constant or nearly so; on CUDA as CUDA graphs."""
         parts: list[nn.Module | None] = [
             self.encoder,
             self.body,
@@ -236,7 +236,7 @@ class Agent(nn.Module):
             parts += [*self.memory.blocks]
         for part in parts:
             if part is not None:
-                part.compile()
+                part.compile(mode="reduce-overhead" if self.device.type == "cuda" else None)
 
     def initial_memory(self, num_envs: int) -> AgentMemory:
         """A new memory for `num_envs` environments, each of whose next observation is the first of an episode."""
@@ -295,34 +295,11 @@ class Agent(nn.Module):
             noise: Gumbel noise, float32 (n, branches, choices), as `noise` returns it; None for the most likely choices.
             embedded: What `embed` returns for `observed`, if it is known.
         """
-
-        def step(x: Tensor) -> tuple[Tensor, Any]:
-            return self.memory.step(
-                x, memory.state, None if memory.reset_mask is memory.no_reset else memory.reset_mask
-            )
-
-        return self.decide_with(self.acting_weights(), step, observed, noise, embedded)
-
-    @torch.no_grad()
-    def decide_with(
-        self,
-        weights: ActingWeights,
-        step: Callable[[Tensor], tuple[Tensor, Any]],
-        observed: Observation,
-        noise: Tensor | None,
-        embedded: Tensor | None = None,
-    ) -> Decision:
-        """As `decide`, with given weights and a given step of the memory.
-
-        Args:
-            weights: The weights for acting.
-            step: Computes the memory's output and update of embedded observations; see `Memory.step`.
-            observed: As for `decide`.
-            noise: As for `decide`.
-            embedded: As for `decide`.
-        """
+        weights = self.acting_weights()
+        reset_mask = None if memory.reset_mask is memory.no_reset else memory.reset_mask
         with self.autocast():
-            hidden, memory_update = step(self._embed(observed, weights) if embedded is None else embedded)
+            x = self._embed(observed, weights) if embedded is None else embedded
+            hidden, memory_update = self.memory.step(x, memory.state, reset_mask)
             outputs = weights.heads(hidden)
         logits = weights.logits(outputs)
         # The Gumbel-max trick: the largest of the logits with independent Gumbel noise is a sample of the policy.

@@ -135,15 +135,11 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         return y + x if self.settings.residual else y, next_hidden
 
     def update_state(self, state: RecurrentState, update: Tensor) -> None:
-        # Hidden states are replaced and never written in place, so the stored ones stay valid without a copy.
-        self.store(state, copy=False)
-        state.hidden = update
-
-    def store(self, state: RecurrentState, copy: bool) -> None:
-        """Store the hidden state, or a copy of it, if a sequence starts from it, and count the step."""
         if state.time < state.steps and state.time % self.settings.sequence_length == 0:
-            state.stored.append(state.hidden.clone() if copy else state.hidden)
+            # Hidden states are replaced and never written in place, so the stored ones stay valid without a copy.
+            state.stored.append(state.hidden)
         state.time += 1
+        state.hidden = update
 
     def minibatches(
         self,

@@ -25,7 +25,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from endless_gym_agents import command, on_ray
+from endless_gym_agents import command, ray_session
 from endless_gym_agents.experiments import definitions, planning, running, running_ray
 from endless_gym_agents.experiments.definitions import Experiment
 from endless_gym_agents.experiments.planning import Job
@@ -151,7 +151,7 @@ def execute(arguments: ReproduceArguments) -> None:
         return
     machine, out = machine_of(arguments), arguments.out
     if arguments.ray:
-        on_ray.check_installed()
+        ray_session.check_installed()
         out = out.resolve()  # The other processes have other working directories.
     parts = {one.name: planning.jobs(one, out, scale, arguments.seeds) for one in experiments}
     # Runs that several experiments share are run once.
@@ -177,8 +177,8 @@ def execute(arguments: ReproduceArguments) -> None:
     if not arguments.report:
         say = lambda line: console.print(line, soft_wrap=True)  # noqa: E731
         if arguments.ray and any(job.state() != "done" for job in planned):
-            with on_ray.connected(arguments.ray):
-                gpus = on_ray.gpus(arguments.job_gpus, arguments.device)
+            with ray_session.connected(arguments.ray):
+                gpus = ray_session.gpus(arguments.job_gpus, arguments.device)
                 machine = replace(machine, jobs=arguments.jobs or running_ray.jobs_that_fit(arguments.job_cpus, gpus))
                 outcome = run(
                     planned, machine, partial(running_ray.RayRunner, gpus=gpus), say, arguments.keep_checkpoints
@@ -201,7 +201,7 @@ def execute(arguments: ReproduceArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-reproduce`; returns the exit status."""
-    given = on_ray.with_address(sys.argv[1:])
+    given = ray_session.with_address(sys.argv[1:])
     arguments = tyro.cli(
         ReproduceArguments, prog="endless-reproduce", description=command.description(__doc__), args=given
     )

@@ -23,7 +23,6 @@ _PER_RUN = (
     "threads",
     "bind_cores",
     "compile",
-    "cuda_graphs",
     "checkpoint_interval",
     "keep_checkpoints",
     "on_engine_failure",

@@ -10,10 +10,8 @@ the environments step; log-probabilities and values are computed from the stored
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -23,11 +21,10 @@ from endless_gym_agents.agent import Agent, AgentMemory
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.encoders import FRAME, Observation
 from endless_gym_agents.environments import Environments, StepResult
-from endless_gym_agents.graphs import GraphedGroup, Graphs, graphs_for
-from endless_gym_agents.host import HostCopy, Outcome, Upload
-from endless_gym_agents.naive import Identity
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.repeats import EmbeddedFrames
+from endless_gym_agents.transfers import HostCopy, Outcome, Upload
+from endless_gym_agents.transforms import Identity
 
 
 @dataclass
@@ -126,7 +123,6 @@ class RolloutCollector:
         steps: int,
         generator: torch.Generator,
         ranks: Ranks | None = None,
-        graphs: Graphs | None = None,
     ) -> None:
         """Reset the environments and allocate the segment.
 
@@ -136,7 +132,6 @@ class RolloutCollector:
             steps: Steps of a segment.
             generator: Generator that samples the actions, on the agent's device; in the same state at every rank.
             ranks: The ranks of the run; `None` for this process alone.
-            graphs: Captures the steps; `None` for what the settings and the device determine.
         """
         self.agent, self.environments, self.steps, self.generator = agent, environments, steps, generator
         groups, per_group, device = environments.groups, environments.per_group, agent.device
@@ -157,12 +152,10 @@ class RolloutCollector:
         self._ground_truth: Tensor | None = None
         if agent.ground_truth is not None:
             self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
-        self._graphs = graphs or graphs_for(agent.settings, device)
-        self._graphed: list[GraphedGroup] = []
         are_frames = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
         self._frames: EmbeddedFrames | None = None
         # `torch.compile` would compile the encoder again for each number of frames.
-        if are_frames and device.type == "cpu" and not agent.settings.compile and self._graphs is None:
+        if are_frames and device.type == "cpu" and not agent.settings.compile:
             self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
         self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]
@@ -188,22 +181,13 @@ class RolloutCollector:
         for group, memory in enumerate(self.memories):
             self.agent.memory.begin_segment(memory.state, self.steps)
             self._outcome[0, 1, self._slice(group)] = memory.reset_mask
-        if self._graphs is not None:
-            self._try_graphs(lambda: self._begin_graphs(noise))
         noises = [noise[:, self._slice(group)].unbind() for group in range(self.environments.groups)]
         for step in range(self.steps):
             for group in range(self.environments.groups):
                 if step:
                     with clock.measure("stepping"):
                         episodes += self._receive(group, step - 1)
-                if self._graphs is not None and not self._graphed[group].captured:
-                    with clock.measure("inference"):
-                        self._upload(group)
-                        self._try_graphs(partial(self._graphed[group].capture, self._graphs))
-                if self._graphs is None:
-                    self._act(group, step, noises[group][step], clock)
-                else:
-                    self._act_by_graphs(group, step, clock)
+                self._act(group, step, noises[group][step], clock)
         for group, memory in enumerate(self.memories):
             with clock.measure("stepping"):
                 episodes += self._receive(group, self.steps - 1)
@@ -263,56 +247,8 @@ class RolloutCollector:
                     slots[key].copy_(value)
             part.action[step].copy_(decision.action)
             part.outputs[step].copy_(decision.outputs)
-            self._upload_ground_truth(group, step)
-
-    def _act_by_graphs(self, group: int, step: int, clock: Clock) -> None:
-        """As `_act`, with the graphs, which have the noise of all steps."""
-        graphed, actions = self._graphed[group], self._actions[group]
-        with clock.measure("inference"):
-            self._upload(group)
-            actions.start(graphed.decide())
-            actions.wait()
-        with clock.measure("stepping"):
-            self.environments.send(actions.array, group)
-        with clock.measure("inference"):
-            graphed.remember()
-            self._upload_ground_truth(group, step)
-
-    def _upload(self, group: int) -> None:
-        """Begin to copy the group's observation to where the graphs read it."""
-        observation = self.agent.as_mapping(self.current[group].observation)
-        for key, target in self._graphed[group].observation.items():
-            self._uploads[group].copy(key, observation[key], target)
-
-    def _upload_ground_truth(self, group: int, step: int) -> None:
-        ground_truth, targets = self.current[group].ground_truth, self._parts[group].ground_truth
-        if targets and ground_truth is not None:
-            self._uploads[group].copy("ground truth", ground_truth, targets[step])
-
-    def _begin_graphs(self, noise: Tensor) -> None:
-        """Begin a segment with the noise of its steps, float32 (T, N, branches, choices)."""
-        if not all(graphed.is_valid() for graphed in self._graphed):
-            self._graphed = []
-        for group, memory in enumerate(self.memories):
-            columns = self._slice(group)
-            if len(self._graphed) == group:
-                segment = {key: part[:, columns] for key, part in self._observation.items()}
-                tensors = [self._action[:, columns], self._outputs[:, columns], self._outcome[:, :, columns]]
-                self._graphed.append(GraphedGroup(self.agent, memory, segment, *tensors))
-            self._graphed[group].begin_segment(noise[:, columns])
-
-    def _try_graphs(self, prepare: Callable[[], None]) -> None:
-        """Prepare graphs, or go on without any. The memories are as before, or can be used without graphs as well."""
-        try:
-            prepare()
-        except Exception as error:
-            self._graphs, self._graphed = None, []
-            warnings.warn(
-                f"CUDA graphs are not used, training goes on without them ({type(error).__name__}: {error}); "
-                "--no-cuda-graphs turns them off",
-                RuntimeWarning,
-                stacklevel=3,
-            )
+            if part.ground_truth and current.ground_truth is not None:
+                self._uploads[group].copy("ground truth", current.ground_truth, part.ground_truth[step])
 
     def _embedded(self, group: int, step: int) -> Tensor | None:
         """What `Agent.embed` returns for an observation in the segment; None if equal observations are not encoded once."""
@@ -328,10 +264,8 @@ class RolloutCollector:
         self.current[group] = result
         outcome = self._parts[group].outcome[step + 1]
         self._outcomes[group].copy_to(outcome, result.reward, result.done)
-        # The graphs read the outcome itself.
-        if self._graphs is None or step == self.steps - 1:
-            memory = self.memories[group]
-            memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
+        memory = self.memories[group]
+        memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
         return result.episodes
 
     @torch.no_grad()

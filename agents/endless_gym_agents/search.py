@@ -27,7 +27,7 @@ import torch
 import tyro
 from rich.console import Console
 
-from endless_gym_agents import command, on_ray, search_ray, search_workers
+from endless_gym_agents import command, ray_session, search_ray, search_workers
 from endless_gym_agents.search_study import SearchArguments, Trial, Trials, resumable
 from endless_gym_agents.settings import PRESETS, Settings
 from endless_gym_agents.train import train
@@ -89,7 +89,7 @@ def execute(arguments: SearchArguments) -> None:
     arguments = arguments.validated()
     if arguments.ray:
         # Tune imports pyarrow, which Ray alone does not install.
-        on_ray.check_installed("pyarrow")
+        ray_session.check_installed("pyarrow")
     trials = Trials(arguments, Console(highlight=False))
     done, left = trials.remaining()
     trials.say(f"{done} trials done, {left} remaining, in {trials.folder}; Ctrl-C stops the search")
@@ -113,7 +113,7 @@ def parse(arguments: list[str]) -> SearchArguments:
     preset = chosen.parse_known_args(arguments)[0].preset
     default = SearchArguments(settings=PRESETS.get(preset, PRESETS["paper"]))
     text = command.description(__doc__)
-    given = on_ray.with_address(arguments)
+    given = ray_session.with_address(arguments)
     return tyro.cli(SearchArguments, prog="endless-search", description=text, args=given, default=default)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from endless_gym_agents import on_ray
+from endless_gym_agents import ray_session
 from endless_gym_agents.search_study import Trial, Trials, resumable
 from endless_gym_agents.search_workers import Share, output_of
 from endless_gym_agents.settings import from_dict, to_dict
@@ -46,8 +46,8 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
     try:
         # Ray would kill the engine together with its trainer. Nobody would remove their shared memory then, which the engine
         # does when its trainer has ended, before it ends itself.
-        with on_ray.connected(arguments.ray, spare_children=True):
-            _tune(study, trainer, on_ray.gpus(arguments.trial_gpus, arguments.settings.device))
+        with ray_session.connected(arguments.ray, spare_children=True):
+            _tune(study, trainer, ray_session.gpus(arguments.trial_gpus, arguments.settings.device))
     finally:
         # Only now, since another process may begin the trials from here on.
         study.interrupt()

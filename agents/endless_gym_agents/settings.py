@@ -197,10 +197,8 @@ class Settings:
     bind_cores: bool = False
     """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
     compile: bool = False
-    """compile the network with `torch.compile`; the first updates then take minutes longer"""
-    cuda_graphs: bool = True
-    """on CUDA, replay the steps of a rollout as CUDA graphs. If they cannot be captured, or the first steps with them and without
-    differ, a warning says so, and the run goes on without. Not with `--compile`"""
+    """compile the network with `torch.compile`, on CUDA in the mode `reduce-overhead`, which replays CUDA graphs. The first
+    updates then take minutes longer"""
     bf16: bool = False
     """bfloat16 autocast for the network; weights and losses stay float32"""
     run: str = ""
@@ -425,6 +423,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
         KeyError: A group is missing.
     """
     values = dict(values)
+    values.pop("cuda_graphs", None)  # a setting of earlier versions
     groups = {
         "environment": Environment,
         "recurrence": Recurrence,

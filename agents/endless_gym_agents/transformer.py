@@ -41,7 +41,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endless_gym_agents.acting import Affine, linear_relu, refill, transposed
+from endless_gym_agents.acting import Affine, linear_relu, transposed
 from endless_gym_agents.encoders import orthogonal
 from endless_gym_agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
 from endless_gym_agents.settings import Transformer
@@ -343,10 +343,6 @@ class ActingBlock:
         self.content_bias = attention.content_bias.detach() if attention.relative else None
         self.distance_bias = attention.distance_bias.detach() if attention.relative else None
 
-    def copy_(self, other: ActingBlock) -> None:
-        """Copy the weights of the same block, made later, into the tensors of this one."""
-        refill((self.queries, *self.fc_out, *self.fc), (other.queries, *other.fc_out, *other.fc))
-
     def __call__(
         self, x: Tensor, keys: Tensor, values: Tensor, bias: Tensor, first: Tensor | None, encoded: Tensor | None
     ) -> Tensor:
@@ -549,38 +545,13 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             start, length = cache.span(min(self.past, max(1, int(position.numpy().max()))))
         ages = slice(self.settings.window - cache.slot + start, self.settings.window - cache.slot + start + length)
         distances = None if cache.distances is None else [encoded[:, ages] for encoded in cache.distances]
-        slots = cache.keys_and_values(start, length)
-        starts = None if reset_mask is None else reset_mask.unsqueeze(-1)
-        return self.step_with(self.acting_blocks, x, position, starts, self.ages[ages], slots, distances)
-
-    def step_with(
-        self,
-        blocks: Sequence[ActingBlock],
-        x: Tensor,
-        position: Tensor,
-        first: Tensor | None,
-        ages: Tensor,
-        slots: tuple[Sequence[Tensor], Sequence[Tensor]],
-        distances: Sequence[Tensor] | None,
-    ) -> tuple[Tensor, TransformerUpdate]:
-        """As `step`, with given blocks and a given part of the KV cache.
-
-        Args:
-            blocks: The blocks for acting.
-            x: The first block's input, float (n, width).
-            position: Position of the current step in its episode, int64 (n,).
-            first: Whether the step is the first of its episode, bool (n, 1); None if none is.
-            ages: Ages of the slots, int64 (tokens,).
-            slots: Keys and values of each block, float (n, heads, tokens, head size).
-            distances: Projected encodings of the ages for each block, float (heads, tokens, head size); None without relative
-                encoding.
-        """
-        attends = ages <= position.unsqueeze(-1)
+        first = None if reset_mask is None else reset_mask.unsqueeze(-1)
+        attends = self.ages[ages] <= position.unsqueeze(-1)
         bias = torch.where(attends, self._attended, self._masked)[:, None, None].to(self._dtype)
-        keys, values = slots
+        keys, values = cache.keys_and_values(start, length)
         encoding = self._encoding(position) if self.settings.query_encoding else None
         inputs = []
-        for layer, block in enumerate(blocks):
+        for layer, block in enumerate(self.acting_blocks):
             inputs.append(x)
             x = x if encoding is None else x + encoding
             x = block(x, keys[layer], values[layer], bias, first, None if distances is None else distances[layer])

@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endless_gym_agents.acting import refill
-
 
 def ring_ages(slots: int, device: torch.device) -> Tensor:
     """Ages of the slots of a ring in steps, for every current slot: int64 (2 * slots,).
@@ -47,10 +45,6 @@ class Projection:
             # For each head its key, then its value; with shared heads there is one matrix for all.
             matrices.append(torch.cat(parts, dim=1).flatten(0, 1).t())
         self.matrices = torch.stack(matrices)  # (layers, rows, outputs)
-
-    def copy_(self, other: Projection) -> None:
-        """Copy the weights of `other`, of the same blocks."""
-        refill((self.scale, self.shift, self.matrices), (other.scale, other.shift, other.matrices))
 
     def __call__(self, tokens: Tensor) -> Tensor:
         """Keys and values float (layers, m, heads, 2 * head size), of tokens with positions added, float32 (layers, m, width)."""
@@ -107,22 +101,7 @@ class RingCache:
     def append(self, tokens: Tensor) -> None:
         """Write the tokens of the current step, float32 (layers, n, width), with positions added, and go to the next slot."""
         self._columns[self.slot].copy_(self.projection(tokens))
-        self.advance()
-
-    def append_at(self, slot: Tensor, tokens: Tensor) -> None:
-        """As `append`, with the slot of the current step on the device, int64 (1,). `slot` of this object stays."""
-        projected = self.projection(tokens).to(self._ring.dtype)
-        self._ring.index_copy_(3, slot, projected.unsqueeze(3))
-
-    def advance(self) -> None:
-        """Go to the next slot."""
         self.slot = (self.slot + 1) % self.slots
-
-    def copy_(self, other: RingCache) -> None:
-        """Copy a cache of the same shape, and its weights, into the tensors of this one."""
-        self.slot, self.generation = other.slot, other.generation
-        refill((self._ring, *(self.distances or [])), (other._ring, *(other.distances or [])))
-        self.projection.copy_(other.projection)
 
     def _split(self, slots: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         return slots.narrow(4, 0, self.size).unbind(), slots.narrow(4, self.size, self.size).unbind()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 from other_device import WAITING
@@ -44,13 +43,11 @@ class Operations(TorchDispatchMode):
 
     Attributes:
         calls: Number of calls by name of the operation.
-        paused: Whether operations are not counted.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.calls: Counter[str] = Counter()
-        self.paused = False
 
     @property
     def computed(self) -> int:
@@ -62,20 +59,6 @@ class Operations(TorchDispatchMode):
         """Number of operations that wait for a device."""
         return sum(number for name, number in self.calls.items() if name in WAITING)
 
-    def as_one(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, of whose operations together one is counted."""
-
-        def counted(*args: Any) -> Any:
-            self.calls[function.__qualname__] += 1
-            self.paused = True
-            try:
-                return function(*args)
-            finally:
-                self.paused = False
-
-        return counted
-
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if not self.paused:
-            self.calls[operation.overloadpacket.__name__] += 1
+        self.calls[operation.overloadpacket.__name__] += 1
         return operation(*args, **(kwargs or {}))

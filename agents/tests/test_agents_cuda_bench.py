@@ -1,15 +1,12 @@
 """The program that measures the agents on CUDA: its parts that run on the CPU, and its message without a GPU."""
 
-import importlib.util
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from recorded_graphs import RecordedGraphs
 
 PROGRAM = Path(__file__).parents[1] / "benches" / "on_cuda.py"
 
@@ -27,11 +24,6 @@ def test_the_parts_that_need_no_gpu(tmp_path: Path) -> None:
     # On the CPU both sides are the same.
     assert [row["agent"] for row in report["equality"]] == ["none", "stack", "position", "gru", "lstm", "trxl", "gtrxl"]
     assert all(row["largest_difference"] == 0.0 for row in report["equality"])
-    assert [row["agent"] for row in report["graphs"]] == ["gru", "trxl"]
-    for row in report["graphs"]:
-        # On the CPU there are no graphs.
-        assert (row["largest_difference"], row["refused"], row["equal"]) == (0.0, [], True)
-        assert 0 < row["with"]["inference_seconds"] < row["with"]["seconds"]
     assert [(row["agent"], row["num_envs"], row["steps"]) for row in report["training"]] == [
         ("gru", 4, 16),
         ("trxl", 4, 16),
@@ -44,29 +36,6 @@ def test_the_parts_that_need_no_gpu(tmp_path: Path) -> None:
     text = (tmp_path / "cuda.md").read_text()
     assert text.startswith("# The agents on the CPU") and "| gru | 4 " in text
     assert text in done.stdout
-
-
-def test_rollouts_with_graphs_are_compared() -> None:
-    """With graphs on the CPU that behave as CUDA's."""
-    specification = importlib.util.spec_from_file_location("on_cuda", PROGRAM)
-    assert specification is not None and specification.loader is not None
-    program = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(program)
-    device = torch.device("cpu")
-    for agent in ("gru", "trxl"):
-        recorded = RecordedGraphs()
-        row = program.compared_rollouts(program.networks(agent), device, recorded, segments=3)
-        # Without graphs, the attention on the CPU is as short as the episodes, and equal frames are encoded once.
-        assert row["equal"] and row["largest_difference"] < 1e-5
-        assert len(recorded.captures) == 2 and recorded.replays >= 2 * 3 * 16
-
-    class Wrong(RecordedGraphs):
-        def capture(self, function: Callable[[], None]) -> Callable[[], None]:
-            super().capture(function)
-            return lambda: None
-
-    row = program.compared_rollouts(program.networks("gru"), device, Wrong(), segments=2)
-    assert not row["equal"] and "CUDA graphs are not used" in row["refused"][0]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

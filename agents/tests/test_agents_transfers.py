@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from endless_gym_agents.host import HostCopy
+from endless_gym_agents.transfers import HostCopy
 
 
 def test_the_copy_is_waited_for_on_the_stream_of_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
