@@ -49,6 +49,7 @@ def evaluate(
     num_envs = len(episode_seeds)
     memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)
     results: list[dict[str, float]] = [{} for _ in episode_seeds]
+    paths = {seed: path_length(env_spec.id, options, seed) if needs_path_length(env_spec.id) else 0 for seed in seeds}
     with make_vec(
         settings.env,
         num_envs,
@@ -59,9 +60,6 @@ def evaluate(
         observation=settings.environment.observation,
     ) as envs:
         observation, _ = envs.reset()
-        paths = [0] * num_envs
-        if needs_path_length(env_spec.id):
-            paths = [path_length(envs.ground_truth_view(env)) for env in range(num_envs)]
         while not all(results):
             output = agent.act(observation, memory, generator, greedy)
             observation, _, terminated, truncated, info = envs.step(
@@ -76,7 +74,7 @@ def evaluate(
                     final = info["final_info"]
                     names = [name for name in final if not name.startswith("_") and name != "ground_truth"]
                     result = {name: float(final[name][env]) for name in names}
-                    progress = task_progress(env_spec, options, result, paths[env])
+                    progress = task_progress(env_spec, options, result, paths[episode_seeds[env]])
                     results[env] = result | {"seed": float(episode_seeds[env])}
                     if progress is not None:
                         results[env][TASK_PROGRESS] = progress

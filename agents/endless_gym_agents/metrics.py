@@ -12,9 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from endless_gym.env import Env
 from endless_gym.specs import Spec
 
 #: Name of the task progress in the results of an episode.
@@ -26,10 +24,6 @@ METRICS = {
     "Endless-MysteryPath-v0": ("tiles_visited", "Tiles"),
     "Endless-SearingSpotlights-v0": ("coins_collected", "Coins"),
 }
-
-#: Side of a tile in the ground-truth view of Mystery Path, in pixels, and the colours of the path and of its goal.
-_TILE = 48
-_PATH, _GOAL = (255, 255, 255), (0, 255, 0)
 
 
 def metric(env: str) -> tuple[str, str]:
@@ -47,14 +41,18 @@ def counts_failures(env: str) -> tuple[str, ...]:
     return ("success", "commands_completed") if is_finite(env) and env.startswith("MortarMayhem") else ()
 
 
-def path_length(view: NDArray[np.uint8]) -> int:
-    """Number of tiles of a path, with its goal and without its origin.
+def path_length(env: str, options: Mapping[str, Any], seed: int) -> int:
+    """Number of tiles of the path of Mystery Path, with its goal and without its origin.
 
     Args:
-        view: Ground-truth view of Mystery Path at the start of an episode, uint8 (336, 336, 3).
+        env: Environment id.
+        options: Reset parameters that differ from the defaults.
+        seed: Seed of the episode.
     """
-    centres = view[_TILE // 2 :: _TILE, _TILE // 2 :: _TILE]
-    return int(sum((centres == colour).all(-1).sum() for colour in (_PATH, _GOAL)))
+    game = Env(env, options=dict(options), observation="features")
+    game.reset(seed=seed)
+    _, tiles = game.progress()["tiles"]
+    return int(tiles or 0)
 
 
 def needs_path_length(env: str) -> bool:

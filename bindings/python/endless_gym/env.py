@@ -101,6 +101,17 @@ class Env(gymnasium.Env[Any, Any]):
         """The step limit of an episode with the current reset parameters, as in the original; -1 for none."""
         return self._spec.max_episode_steps(self.reset_params)
 
+    def progress(self) -> dict[str, tuple[float, float | None]]:
+        """How far the episode is, such as `{"tiles": (2.0, 9.0), "falls": (1.0, None)}`.
+
+        Returns:
+            By name the number now, and the number at which nothing is missing; `None` if there is none.
+
+        Raises:
+            RuntimeError: The environment has not been reset.
+        """
+        return {name: (value, of) for name, value, of in self._native.progress()}
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:

@@ -95,6 +95,12 @@ impl Single {
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
     }
 
+    /// Names of the numbers that say how far the episode is, with the numbers and those at which nothing is missing.
+    fn progress(&self) -> PyResult<Vec<(&'static str, f64, Option<f64>)>> {
+        let progress = self.pool.progress(0).map_err(errors::pool)?;
+        Ok(progress.iter().map(|shown| (shown.name, shown.value, shown.of)).collect())
+    }
+
     fn snapshot<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
         Ok(PyBytes::new(py, &self.pool.snapshot(0).map_err(errors::snapshot)?))
     }

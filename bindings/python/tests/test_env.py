@@ -299,3 +299,11 @@ def test_observations_that_cannot_be_are_refused() -> None:
     ):
         with pytest.raises(error, match=match):
             endless_gym.Env("MysteryPath-v0", **kwargs)
+
+
+def test_progress_says_how_far_the_episode_is() -> None:
+    env = endless_gym.Env("MysteryPath-Grid-v0")
+    with pytest.raises(RuntimeError):
+        env.progress()
+    env.reset(seed=200_000)
+    assert env.progress() == {"tiles": (0.0, 8.0), "falls": (0.0, None)}

@@ -44,14 +44,16 @@ impl State {
             && (0..i64::MAX / 2).contains(&self.steps)
     }
 
-    /// Tiles of the path that the agent was on, and falls.
+    /// Tiles of the path that the agent was on, without the first one, and falls.
     pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
-        let mut progress = vec![Progress::count("tiles", self.tiles_visited), Progress::count("falls", self.fails)];
+        let falls = Progress::count("falls", self.fails);
         if config.variant == Variant::Endless {
             let of = config.parameters.stamina_level as f64;
-            progress.push(Progress::share("stamina", self.endless.stamina_left() as f64, of));
+            let stamina = Progress::share("stamina", self.endless.stamina_left() as f64, of);
+            return vec![Progress::count("tiles", self.tiles_visited), falls, stamina];
         }
-        progress
+        let tiles = self.tiles_visited + u32::from(self.success);
+        vec![Progress::share("tiles", tiles, self.route.tiles().len() as f64 - 1.0), falls]
     }
 
     /// The final info of the finite ids: success, and the number of falls.
