@@ -14,8 +14,7 @@
 pub mod batch {
     pub use endless_gym_core::batch::{
         ActionLayout, ActionSection, BLOCK_BYTES, Batch, BatchBuffer, BatchSection, Block, Dtype, Element, Frames,
-        LAYOUT_VERSION, Layout, LayoutError, MAX_DIMENSIONS, MAX_STACK, ObservationCopy, ObservationCopyError,
-        ObservationUpdater, RowShape, Section, SectionTable, zeroed,
+        LAYOUT_VERSION, Layout, LayoutError, MAX_DIMENSIONS, MAX_STACK, RowShape, Section, SectionTable, zeroed,
     };
     pub use endless_gym_core::raster::PixelFormat;
 }

@@ -48,7 +48,6 @@ fn steps_and_resets_allocate_nothing() {
                 autoreset,
                 final_observation: true,
                 features: true,
-                changes: true,
                 ..PoolConfig::new(spec.id, num_envs)
             };
             let mut pool = Pool::new(&config, &Threads::new(threads).unwrap()).unwrap();

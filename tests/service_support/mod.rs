@@ -40,11 +40,6 @@ impl Place {
         self.role("engine", service, &[&num_envs.to_string(), &groups.to_string()])
     }
 
-    /// Starts an engine that notes what changes in the frames.
-    pub fn engine_with_changes(&self, service: &str, num_envs: usize) -> Running {
-        self.role("engine_with_changes", service, &[&num_envs.to_string()])
-    }
-
     /// Connects to an engine; waits for it to start.
     pub fn trainer(&self, service: &str) -> Result<Trainer, ServiceError> {
         Trainer::connect(&self.connect_config(service))
@@ -154,12 +149,6 @@ pub fn play_role() {
         ["engine", service, num_envs, groups] => {
             let config =
                 engine_config(&Namespace::default(), service, num_envs.parse().unwrap(), groups.parse().unwrap());
-            let mut engine = Engine::new(&config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
-            engine.run(&stop_at_end_of_input()).unwrap();
-        }
-        ["engine_with_changes", service, num_envs] => {
-            let mut config = engine_config(&Namespace::default(), service, num_envs.parse().unwrap(), 1);
-            config.pool.changes = true;
             let mut engine = Engine::new(&config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
             engine.run(&stop_at_end_of_input()).unwrap();
         }

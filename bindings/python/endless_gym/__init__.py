@@ -22,7 +22,6 @@ from endless_gym.specs import Frames, all_specs, spec
 from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
-    from endless_gym.changes import ObservationCopy
     from endless_gym.engine import serve
     from endless_gym.recording import record
     from endless_gym.vector import EndlessVectorEnv, connect, make_vec
@@ -35,7 +34,6 @@ __all__ = [
     "Env",
     "Experts",
     "Frames",
-    "ObservationCopy",
     "ReplayStep",
     "TooManyBatchesHeld",
     "WindowClosed",
@@ -56,7 +54,6 @@ __all__ = [
 
 # Loaded on first use, since they need Gymnasium 1.1; the rest of the package works with 0.29.
 _LATER = {
-    "ObservationCopy": "changes",
     "serve": "engine",
     "EndlessVectorEnv": "vector",
     "connect": "vector",

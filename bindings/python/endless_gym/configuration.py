@@ -47,7 +47,6 @@ class Arguments:
     frames: Frames | None
     features: bool
     independent_episodes: bool
-    changes: bool
     first_env: int
     total_envs: int
     #: The configuration of each group, which the engine has checked.
@@ -68,7 +67,6 @@ def checked_arguments(
     independent_episodes: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
-    changes: bool = False,
 ) -> Arguments:
     """Check arguments of `make_vec`.
 
@@ -101,7 +99,6 @@ def checked_arguments(
             features=features,
             final_observation=True,
             independent_episodes=bool(independent_episodes),
-            changes=bool(changes),
         )
         for group in range(groups)
     ]
@@ -117,7 +114,6 @@ def checked_arguments(
         frames=frames,
         features=features,
         independent_episodes=bool(independent_episodes),
-        changes=bool(changes),
         first_env=first_env,
         total_envs=total_envs,
         pools=pools,

@@ -134,7 +134,6 @@ def serve(
     resume: bool = False,
     timeout: float = 30.0,
     copy: bool = False,
-    changes: bool = False,
     independent_episodes: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
@@ -172,7 +171,6 @@ def serve(
             exists is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
-        changes: As for `make_vec`.
         independent_episodes: As for `make_vec`.
         first_env: As for `make_vec`.
         total_envs: As for `make_vec`.
@@ -200,7 +198,6 @@ def serve(
         independent_episodes,
         first_env,
         total_envs,
-        changes,
     )
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, VECTOR_MODES)
@@ -233,7 +230,6 @@ def serve(
     command = [f"{name}={value}" for name, value in arguments.items()]
     command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
     command += ["--features"] if given.features else []
-    command += ["--changes"] if given.changes else []
     command += ["--independent-episodes"] if given.independent_episodes else []
     command += given.frames.command() if given.frames else ["--no-frames"]
     if options is None or isinstance(options, Mapping):

@@ -64,18 +64,16 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         episode_options: EpisodeOptions | None = None,
         episode_info: bool = False,
         first_env: int = 0,
-        layout: str | None = None,
     ) -> None:
         """Called by `make_vec` and `connect`.
 
         `options` are those given at creation: one mapping for all environments, or one for each of all groups. `knows_options` is
-        false if the environments may have others. `layout` is the layout of a batch as JSON text.
+        false if the environments may have others.
         """
         shown = checked_view(render_mode, view, VECTOR_MODES)
         self.render_mode = render_mode
         self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
         self._backend = backend
-        self._layout = layout
         self._described = described
         self.num_envs = num_envs
         self.num_groups = backend.groups
@@ -500,7 +498,6 @@ def make_vec(
     frames: Frames | None = None,
     groups: int = 1,
     copy: bool = False,
-    changes: bool = False,
     independent_episodes: bool = False,
     first_env: int = 0,
     total_envs: int | None = None,
@@ -527,7 +524,6 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
-        changes: Note which rows of the frames change in each step, for `ObservationCopy`, which then copies only these.
         independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
             alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
             an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
@@ -559,7 +555,6 @@ def make_vec(
         independent_episodes,
         first_env,
         total_envs,
-        changes,
     )
     # As in an engine, groups share threads.
     threads = _native.Threads(given.num_threads)
@@ -578,7 +573,6 @@ def make_vec(
         episode_options=episode_options,
         episode_info=episode_info,
         first_env=first_env,
-        layout=pools[0].layout(),
     )
 
 
@@ -592,7 +586,6 @@ def specified_envs(backend: Backend, specification: Mapping[str, Any], **argumen
         sections=[section["name"] for section in specification["batch"]["sections"]],
         autoreset=MODES[specification["autoreset"]],
         first_env=specification["first_env"],
-        layout=json.dumps(specification["batch"]),
         **arguments,
     )
 

@@ -36,13 +36,6 @@ impl Buffer {
 #[pyclass(frozen)]
 pub struct Lease(Arc<Buffer>);
 
-impl Lease {
-    /// Whether Python code may have written to the buffer since the pool did.
-    pub fn is_exported(&self) -> bool {
-        self.0.exported.load(Ordering::Relaxed)
-    }
-}
-
 // SAFETY: the buffer is shared with this value, and `Buffers::free` hands out unshared ones only.
 unsafe impl Owner for Lease {
     fn memory(&self) -> (*const Block, usize) {

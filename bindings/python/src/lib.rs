@@ -5,7 +5,6 @@
 mod arguments;
 mod arrays;
 mod buffers;
-mod changes;
 mod connection;
 mod dlpack;
 mod ends;
@@ -50,7 +49,6 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("MAX_BATCHES_HELD", endless_gym::service::MAX_BATCHES_HELD)?;
     module.add("EngineLost", py.get_type::<errors::EngineLost>())?;
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
-    module.add_class::<changes::ObservationUpdates>()?;
     module.add_class::<experts::Experts>()?;
     module.add_class::<observer::Observer>()?;
     module.add_class::<pool::Pool>()?;

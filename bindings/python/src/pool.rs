@@ -33,7 +33,7 @@ pub struct PoolConfig(engine::PoolConfig);
 #[pymethods]
 impl PoolConfig {
     #[new]
-    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation, independent_episodes=false, changes=false))]
+    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation, independent_episodes=false))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         id: &str,
@@ -49,7 +49,6 @@ impl PoolConfig {
         features: bool,
         final_observation: bool,
         independent_episodes: bool,
-        changes: bool,
     ) -> PyResult<Self> {
         let config = engine::PoolConfig {
             options: arguments::pool_options(options)?,
@@ -57,7 +56,6 @@ impl PoolConfig {
             seeding: arguments::seeding(seed, seed_range, seed_list),
             frames: frames.map(arguments::frames),
             features,
-            changes,
             final_observation,
             independent_episodes,
             first_env,
@@ -116,11 +114,6 @@ impl Pool {
     /// Names of the arrays that `reset`, `step` and `receive` return.
     fn sections(&self) -> Vec<&'static str> {
         self.pool.layout().sections().iter().map(|section| section.name().name()).collect()
-    }
-
-    /// The layout of a batch, as JSON text.
-    fn layout(&self) -> PyResult<String> {
-        serde_json::to_string(self.pool.layout()).map_err(|error| PyRuntimeError::new_err(error.to_string()))
     }
 
     #[pyo3(signature = (request=None, options=None))]

@@ -43,9 +43,6 @@ pub struct Args {
     /// Also write the feature observation, a float32 vector that describes what the frame shows.
     #[arg(long)]
     features: bool,
-    /// Also write which rows of the frames have changed since the step before, for trainers that keep a copy of the observations.
-    #[arg(long)]
-    changes: bool,
     #[command(flatten)]
     frames: FrameArgs,
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
@@ -81,7 +78,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         final_observation: args.final_observation,
         frames: args.frames.frames(),
         features: args.features,
-        changes: args.changes,
         ..args.environment.configure(&args.id, args.num_envs)?
     };
     let checkpoint = args.checkpoint.as_ref().map(|path| CheckpointConfig {

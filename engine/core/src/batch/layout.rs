@@ -297,7 +297,7 @@ mod tests {
     use crate::envs;
 
     fn everything() -> Contents {
-        Contents { frames: Some(Frames::default()), features: true, final_observation: true, changes: true }
+        Contents { frames: Some(Frames::default()), features: true, final_observation: true }
     }
 
     fn layout(num_envs: usize) -> Layout {

@@ -13,7 +13,6 @@
 
 mod block;
 mod buffer;
-mod changed_rows;
 mod dtype;
 #[cfg(test)]
 mod forged_tests;
@@ -21,7 +20,6 @@ mod frames;
 mod layout;
 mod layout_error;
 pub(crate) mod limits;
-mod observation_copy;
 mod sealed;
 mod sections;
 mod stamp;
@@ -29,12 +27,10 @@ mod view;
 
 pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use buffer::BatchBuffer;
-pub(crate) use changed_rows::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
 pub use dtype::{Dtype, Element};
 pub use frames::{Frames, MAX_STACK};
 pub use layout::{ActionLayout, Layout, MAX_DIMENSIONS, Section, action_layout, batch_layout};
 pub use layout_error::LayoutError;
-pub use observation_copy::{ObservationCopy, ObservationCopyError, ObservationUpdater};
 pub use sections::{ActionSection, BatchSection, Contents, OPTIONS_BYTES, RowShape, SNAPSHOT_BYTES, SectionTable};
 pub(crate) use stamp::Stamp;
 pub use view::Batch;
@@ -46,6 +42,4 @@ pub(crate) use view::BatchMut;
 /// seed counts the environments of all groups.
 ///
 /// Version 6: the requests that set the options of next episodes, and that ask what the running episodes follow from.
-///
-/// Version 7: the section `changed_rows`.
-pub const LAYOUT_VERSION: u32 = 7;
+pub const LAYOUT_VERSION: u32 = 6;

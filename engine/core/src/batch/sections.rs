@@ -2,7 +2,6 @@
 
 use std::fmt;
 
-use super::changed_rows::FRAME_CHANGES_BYTES;
 use super::dtype::{Dtype, Element};
 use super::frames::Frames;
 use super::sealed::Sealed;
@@ -218,8 +217,6 @@ macro_rules! batch_sections {
                 "`features` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalGroundTruth final_ground_truth: f64, Vector, optional,
                 "`ground_truth` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
-            ChangedRows changed_rows: u8, Vector, optional,
-                "what may differ in `observation` from the batch before: for each frame and each 8 rows of its array a bit for each row, the first pixel and the one behind the last; on request";
         }
     };
 }
@@ -257,8 +254,6 @@ pub struct Contents {
     pub features: bool,
     /// Whether there are the `final_*` sections, for same-step autoreset.
     pub final_observation: bool,
-    /// Whether there is the description of what has changed in the frames.
-    pub changes: bool,
 }
 
 impl BatchSection {
@@ -281,10 +276,6 @@ impl BatchSection {
             BatchSection::FinalVectorObservation => final_of(BatchSection::VectorObservation),
             BatchSection::FinalFeatures => final_of(BatchSection::Features),
             BatchSection::FinalGroundTruth => final_of(BatchSection::GroundTruth),
-            BatchSection::ChangedRows => contents
-                .frames
-                .filter(|_| contents.changes)
-                .map(|frames| vec![frames.stack.saturating_mul(FRAME_CHANGES_BYTES)]),
         }
     }
 }
@@ -322,8 +313,7 @@ mod tests {
     #[test]
     fn final_sections_equal_their_originals() {
         for spec in envs::specs() {
-            let contents =
-                Contents { frames: Some(Frames::default()), features: true, final_observation: true, changes: true };
+            let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
             for section in BatchSection::ALL {
                 let Some(original) = section.name().strip_prefix("final_") else { continue };
                 let original = BatchSection::from_name(original).unwrap();
@@ -340,7 +330,7 @@ mod tests {
         for spec in envs::specs() {
             for stack in [1, 4] {
                 let frames = Some(Frames { stack, ..Frames::default() });
-                let contents = Contents { frames, features: true, final_observation: true, changes: true };
+                let contents = Contents { frames, features: true, final_observation: true };
                 for section in BatchSection::ALL {
                     let shape = section.row_shape(spec, contents);
                     assert!(shape.iter().all(|shape| section.row().admits(shape)), "{section} {shape:?}");

@@ -29,14 +29,6 @@ impl Stamp {
         })
     }
 
-    /// Whether this is the stamp of the write that the same pool made next after that of `before`.
-    pub fn follows(self, before: Stamp) -> bool {
-        self.pool == before.pool
-            && self.generation == before.generation.wrapping_add(1)
-            && self != Stamp::default()
-            && before != Stamp::default()
-    }
-
     /// Stamps a batch.
     pub fn write(self, layout: &Layout, batch: &mut [Block]) {
         if let Some(block) = batch.get_mut(layout.section_blocks()) {
@@ -60,22 +52,6 @@ mod tests {
     use super::super::sections::{BatchSection, Contents};
     use super::*;
     use crate::envs;
-
-    #[test]
-    fn only_the_next_write_of_the_same_pool_follows() {
-        let stamp = |pool, generation| Stamp { pool, buffer: 0, generation };
-        assert!(Stamp { buffer: 1, ..stamp(7, 3) }.follows(stamp(7, 2)));
-        for (stamp, before) in [
-            (stamp(7, 3), stamp(9, 2)),
-            (stamp(7, 4), stamp(7, 2)),
-            (stamp(7, 2), stamp(7, 2)),
-            (stamp(7, 1), stamp(7, 2)),
-            (stamp(0, 1), Stamp::default()),
-            (Stamp::default(), Stamp::default()),
-        ] {
-            assert!(!stamp.follows(before), "{stamp:?} {before:?}");
-        }
-    }
 
     #[test]
     fn the_stamp_lies_behind_the_sections() {

@@ -4,7 +4,6 @@ use super::block::Block;
 use super::dtype::Element;
 use super::layout::Layout;
 use super::sections::{BatchSection, batch_sections};
-use super::stamp::Stamp;
 
 /// Rows of one section for writing, one for each environment. Where the batch lacks the section, the rows are empty.
 #[derive(Debug)]
@@ -137,11 +136,6 @@ impl<'a> Batch<'a> {
     /// All sections and the padding between them, without the writer's stamp.
     pub fn bytes(&self) -> &'a [u8] {
         bytemuck::cast_slice(&self.blocks[..self.blocks.len().min(self.layout.section_blocks())])
-    }
-
-    /// By which write of which pool the frames were drawn.
-    pub(super) fn stamp(&self) -> Stamp {
-        Stamp::read(self.layout, self.blocks)
     }
 
     /// All numbers of a section; empty if the batch lacks the section or if `T` is not its type.

@@ -56,11 +56,6 @@ impl Buffers {
         buffer
     }
 
-    /// The record of the last write, if its drawn scenes are still those of that write.
-    pub fn last(&self) -> Option<usize> {
-        self.writes.iter().position(|write| *write == self.last_write && *write != UNFINISHED)
-    }
-
     /// Stamps a buffer after a write.
     pub fn finish(&mut self, buffer: Buffer, layout: &Layout, batch: &mut [Block]) {
         fence(Ordering::SeqCst);
@@ -109,21 +104,6 @@ mod tests {
                 assert_eq!(write(&mut buffers, &layout, batch), Buffer { index, current });
             }
         }
-    }
-
-    #[test]
-    fn the_last_record_is_that_of_the_last_finished_write() {
-        let (mut buffers, layout) = (Buffers::new(1), layout());
-        let mut batches = [zeroed(layout.blocks()), zeroed(layout.blocks())];
-        assert_eq!(buffers.last(), None);
-        for index in [0, 1, 0, 0] {
-            write(&mut buffers, &layout, &mut batches[index]);
-            assert_eq!(buffers.last(), Some(index));
-        }
-        buffers.begin(&layout, &mut batches[1]);
-        assert_eq!(buffers.last(), Some(0), "the other record has the scenes of the last batch");
-        buffers.begin(&layout, &mut batches[0]);
-        assert_eq!(buffers.last(), None);
     }
 
     #[test]

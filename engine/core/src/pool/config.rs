@@ -102,10 +102,6 @@ pub struct PoolConfig {
     /// Whether the batch has the feature observation.
     #[serde(default)]
     pub features: bool,
-    /// Whether the batch says which parts of the frames have changed since the pool's batch before, for readers that keep a copy
-    /// ([`ObservationCopy`](crate::batch::ObservationCopy)). Without effect without frames.
-    #[serde(default)]
-    pub changes: bool,
     /// Whether every frame is drawn a second time, in full, and compared; a difference is [`PoolError::WrongFrame`]. For tests.
     #[serde(default)]
     pub check_drawing: bool,
@@ -154,7 +150,6 @@ impl PoolConfig {
             independent_episodes: false,
             frames: default_frames(),
             features: false,
-            changes: false,
             check_drawing: false,
             first_env: 0,
             total_envs: num_envs,
@@ -215,7 +210,6 @@ impl PoolConfig {
             frames: self.frames,
             features: self.features,
             final_observation: self.final_observation && self.autoreset == Autoreset::SameStep,
-            changes: self.changes,
         }
     }
 }

@@ -5,9 +5,8 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::batch::{EVERYTHING, FrameChanges, NOTHING, frame_changes};
 use crate::envs::{Environment, SCREEN};
-use crate::raster::{Canvas, DirtyBands, DirtySurface, PixelFormat};
+use crate::raster::{Canvas, DirtySurface, PixelFormat};
 
 /// Settings for drawing frames.
 #[derive(Clone, Copy, Debug)]
@@ -58,85 +57,6 @@ impl<E: Environment> DrawnScene<E> {
             }
         }
         Ok(())
-    }
-}
-
-/// What the frames of the pool's batch before show.
-pub(super) enum Before<'a, E: Environment> {
-    /// Nothing is known.
-    Unknown,
-    /// The buffer is the same: its drawn scenes.
-    SameBuffer,
-    /// These scenes, drawn into another buffer.
-    Scenes(&'a [DrawnScene<E>]),
-}
-
-impl<E: Environment> Clone for Before<'_, E> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-
-impl<E: Environment> Copy for Before<'_, E> {}
-
-impl<'a, E: Environment> Before<'a, E> {
-    /// What frame number `frame` of all environments' showed.
-    pub fn frame(self, frame: usize) -> Self {
-        match self {
-            Before::Scenes(scenes) => Before::Scenes(&scenes[frame..=frame]),
-            other => other,
-        }
-    }
-}
-
-impl<E: Environment> DrawnScene<E> {
-    /// As [`update`](Self::update). Returns what may differ in the frame from the same frame of the pool's batch before.
-    #[inline]
-    pub fn update_with_changes(
-        &mut self,
-        before: Before<'_, E>,
-        assets: &Arc<E::Assets>,
-        scene: E::Scene,
-        settings: DrawSettings,
-        frame: &mut [u8],
-    ) -> Result<FrameChanges, WrongFrame> {
-        let format = settings.format;
-        if matches!(before, Before::SameBuffer)
-            && format.is_canvas()
-            && settings.current
-            && !settings.check
-            && let Some((drawn_with, drawn)) = &mut self.0
-            && Arc::ptr_eq(drawn_with, assets)
-        {
-            if *drawn == scene {
-                return Ok(NOTHING);
-            }
-            // What is painted is what has changed.
-            let mut dirty = DirtyBands::new(format.row_major);
-            E::repaint(assets, drawn, &scene, &mut Canvas::new(frame, SCREEN, SCREEN).tracking_bands(&mut dirty));
-            *drawn = scene;
-            return Ok(frame_changes(&dirty));
-        }
-        let shown = match (before, &self.0) {
-            (Before::SameBuffer, shown) if settings.current => shown,
-            (Before::Scenes([shown]), _) => &shown.0,
-            _ => &None,
-        };
-        let changes = match shown {
-            Some((drawn_with, shown)) if Arc::ptr_eq(drawn_with, assets) => {
-                if *shown == scene {
-                    NOTHING
-                } else {
-                    // The frame may change from an older scene. The change of the last step is noted alone.
-                    let mut dirty = DirtyBands::new(format.row_major);
-                    E::repaint(assets, shown, &scene, &mut Canvas::without_pixels(SCREEN, SCREEN, &mut dirty));
-                    frame_changes(&dirty)
-                }
-            }
-            _ => EVERYTHING,
-        };
-        self.update(assets, scene, settings, frame)?;
-        Ok(changes)
     }
 }
 

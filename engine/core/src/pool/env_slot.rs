@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use super::autoreset::Autoreset;
 use super::config::OptionMap;
-use super::drawn_scene::{Before, DrawSettings, DrawnScene, WrongFrame, draw_in_full};
+use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame, draw_in_full};
 use super::frame_stack::{FrameStack, StackedFrame};
 use super::seeding::Seeds;
-use crate::batch::{BatchMut, EVERYTHING};
+use crate::batch::BatchMut;
 use crate::envs::Environment;
 use crate::random::Generator;
 use crate::raster::PixelFormat;
@@ -173,39 +173,6 @@ impl<E: Environment> EnvSlot<E> {
                 *drawn = DrawnScene::unknown();
                 Ok(())
             }
-        })
-    }
-
-    /// As [`draw`](Self::draw). Writes into `changes` what may have changed since the pool's batch before, whose frames of this
-    /// environment start at number `first` of `before`.
-    #[inline(never)]
-    pub fn draw_with_changes(
-        &self,
-        drawn: &mut [DrawnScene<E>],
-        (before, first): (Before<'_, E>, usize),
-        settings: DrawSettings,
-        frames: &mut [u8],
-        changes: &mut [u8],
-    ) -> Result<(), WrongFrame> {
-        let assets = self.env.shared();
-        if let ([drawn], Some(changes)) = (&mut *drawn, changes.first_chunk_mut()) {
-            *changes = drawn.update_with_changes(before.frame(first), assets, self.env.scene(), settings, frames)?;
-            return Ok(());
-        }
-        let frames = frames.chunks_exact_mut(frames.len() / drawn.len());
-        let mut stacked = self.frames().zip(drawn).zip(frames).zip(changes.as_chunks_mut().0).enumerate();
-        stacked.try_for_each(|(number, (((stacked, drawn), frame), changes))| {
-            *changes = match stacked {
-                StackedFrame::Scene(scene) => {
-                    drawn.update_with_changes(before.frame(first + number), assets, scene, settings, frame)?
-                }
-                StackedFrame::Pixels(pixels) => {
-                    frame.copy_from_slice(&pixels);
-                    *drawn = DrawnScene::unknown();
-                    EVERYTHING
-                }
-            };
-            Ok(())
         })
     }
 

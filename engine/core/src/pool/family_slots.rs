@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use super::autoreset::Autoreset;
 use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 use super::division::EnvRange;
-use super::drawn_scene::{Before, DrawSettings, DrawnScene, WrongFrame};
+use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame};
 use super::env_slot::{EnvSlot, OptionSet};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
@@ -26,8 +26,6 @@ pub(super) struct WriteContext<'a> {
     pub threads: &'a Threads,
     /// Index of the buffer's drawn scenes.
     pub buffer: usize,
-    /// Index of the drawn scenes of the pool's batch before, if they are known and changes are to be noted.
-    pub before: Option<usize>,
     pub draw: DrawSettings,
 }
 
@@ -149,16 +147,7 @@ impl<E: Environment> FamilySlots<E> {
             self.drawn.push((0..self.slots.len() * self.stack).map(|_| DrawnScene::unknown()).collect());
         }
         let stack = self.stack;
-        let (drawn, before) = match context.before {
-            Some(before) if before != context.buffer => match self.drawn.get_disjoint_mut([context.buffer, before]) {
-                Ok([drawn, before]) => (drawn, Before::Scenes(before)),
-                Err(_) => (&mut self.drawn[context.buffer], Before::Unknown),
-            },
-            before => {
-                let before = if before.is_some() { Before::SameBuffer } else { Before::Unknown };
-                (&mut self.drawn[context.buffer], before)
-            }
-        };
+        let drawn = &mut self.drawn[context.buffer];
         let all = EnvRange { first: 0, slots: &mut self.slots, drawn, stack, out };
         all.for_each_piece(context.threads, |piece| {
             let EnvRange { first, slots, drawn, mut out, .. } = piece;
@@ -166,12 +155,7 @@ impl<E: Environment> FamilySlots<E> {
                 play(first + row, slot, &mut out, row);
                 let frames = out.observation.row(row);
                 if !frames.is_empty() {
-                    let changes = out.changed_rows.row(row);
-                    let outcome = if changes.is_empty() {
-                        slot.draw(drawn, context.draw, frames)
-                    } else {
-                        slot.draw_with_changes(drawn, (before, (first + row) * stack), context.draw, frames, changes)
-                    };
+                    let outcome = slot.draw(drawn, context.draw, frames);
                     outcome.map_err(|wrong| WrongFrame { env: first + row, ..wrong })?;
                 }
             }

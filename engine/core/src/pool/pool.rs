@@ -47,8 +47,6 @@ pub struct Pool {
     buffers: Buffers,
     format: PixelFormat,
     check_drawing: bool,
-    /// Whether the batch has the section `changed_rows`.
-    notes_changes: bool,
     autoreset: Autoreset,
     threads: Threads,
     first_env: usize,
@@ -80,7 +78,6 @@ impl Pool {
             buffers: Buffers::new(unseeded.identity()),
             format: config.frames.unwrap_or_default().format,
             check_drawing: config.check_drawing,
-            notes_changes: config.changes,
             autoreset: config.autoreset,
             threads: threads.clone(),
             first_env: config.first_env,
@@ -173,10 +170,9 @@ impl Pool {
         write: impl FnOnce(&mut dyn EnvSlots, WriteContext<'_>, BatchMut<'_>) -> Result<(), WrongFrame>,
     ) -> Result<(), PoolError> {
         self.check_batch(batch)?;
-        let before = if self.notes_changes { self.buffers.last() } else { None };
         let buffer = self.buffers.begin(&self.layout, batch);
         let draw = DrawSettings { current: buffer.current, format: self.format, check: self.check_drawing };
-        let context = WriteContext { threads: &self.threads, buffer: buffer.index, before, draw };
+        let context = WriteContext { threads: &self.threads, buffer: buffer.index, draw };
         let (given, needed) = (batch.len(), self.layout.blocks());
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
         write(&mut *self.slots, context, out)?;

@@ -1,10 +1,8 @@
 //! Borrowed pixels to draw on, and the blocks and rows that all shapes are made of.
 
-use std::fmt::Debug;
 use std::ops::Range;
 
 use super::color::Rgb;
-use super::dirty_bands::DirtyBands;
 use super::rect::Rect;
 use super::runs::{clip, copy_run, fill_run};
 
@@ -20,51 +18,8 @@ pub struct Canvas<'a> {
     /// The pixels that may change.
     columns: Range<usize>,
     rows: Range<usize>,
-    /// What is noted of painted pixels. `None` without dirty tracking.
-    dirty: Option<&'a mut (dyn Dirty + 'static)>,
-}
-
-/// What is noted of painted pixels.
-trait Dirty: Debug {
-    /// Whether every pixel that is not marked was not painted, and the reverse.
-    fn is_exact(&self) -> bool;
-
-    /// Marks some rows of some columns.
-    fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>);
-
-    /// Marks in each column the rows from `firsts` to the one before `ends`, which is 0 where there are none.
-    fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]);
-}
-
-/// The dirty mask: for each column a bit for each row.
-impl Dirty for Vec<u128> {
-    fn is_exact(&self) -> bool {
-        true
-    }
-
-    fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>) {
-        mark_rows(&mut self[columns], rows);
-    }
-
-    fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
-        for ((column, first), end) in self.iter_mut().zip(firsts).zip(ends) {
-            mark_rows(std::slice::from_mut(column), &(usize::from(*first)..usize::from(*end)));
-        }
-    }
-}
-
-impl Dirty for DirtyBands {
-    fn is_exact(&self) -> bool {
-        false
-    }
-
-    fn mark(&mut self, columns: Range<usize>, rows: &Range<usize>) {
-        DirtyBands::mark(self, &columns, rows);
-    }
-
-    fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
-        DirtyBands::mark_spans(self, firsts, ends);
-    }
+    /// For each column a bit for each row, set where a pixel was painted. `None` without dirty tracking.
+    dirty: Option<&'a mut [u128]>,
 }
 
 impl<'a> Canvas<'a> {
@@ -85,29 +40,9 @@ impl<'a> Canvas<'a> {
     /// # Panics
     ///
     /// If there are more columns than masks, or more than 128 rows.
-    pub(super) fn tracking_dirty(self, dirty: &'a mut Vec<u128>) -> Self {
+    pub(super) fn tracking_dirty(self, dirty: &'a mut [u128]) -> Self {
         assert!(dirty.len() >= self.width && self.height <= u128::BITS as usize);
         Self { dirty: Some(dirty), ..self }
-    }
-
-    /// The same canvas with coarser dirty tracking: for each band of a frame's rows, one span that has all painted pixels.
-    ///
-    /// # Panics
-    ///
-    /// If the canvas has more than [`DirtyBands::SIDE`] columns or rows.
-    pub fn tracking_bands(self, dirty: &'a mut DirtyBands) -> Self {
-        assert!(self.width <= DirtyBands::SIDE && self.height <= DirtyBands::SIDE);
-        Self { dirty: Some(dirty), ..self }
-    }
-
-    /// A canvas without pixels, for a repaint of which only the dirty tracking is wanted. Painting on it panics.
-    ///
-    /// # Panics
-    ///
-    /// If there are more than [`DirtyBands::SIDE`] columns or rows.
-    pub fn without_pixels(width: usize, height: usize, dirty: &'a mut DirtyBands) -> Self {
-        let canvas = Self { pixels: &mut [], width, height, columns: 0..width, rows: 0..height, dirty: None };
-        canvas.tracking_bands(dirty)
     }
 
     /// Whether there are pixels to paint. Otherwise what would be painted is only to be marked as dirty.
@@ -125,7 +60,7 @@ impl<'a> Canvas<'a> {
     /// Whether painted pixels are marked one by one, so that no other pixel may be marked.
     #[inline]
     pub fn tracks_pixels(&self) -> bool {
-        self.dirty.as_ref().is_some_and(|dirty| dirty.is_exact())
+        self.tracks_dirty()
     }
 
     /// Marks some rows of some columns as dirty. Nothing happens without dirty tracking.
@@ -136,7 +71,7 @@ impl<'a> Canvas<'a> {
     #[inline]
     pub fn mark_dirty(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         if let Some(dirty) = &mut self.dirty {
-            dirty.mark(columns, rows);
+            mark_rows(&mut dirty[columns], rows);
         }
     }
 
@@ -149,24 +84,10 @@ impl<'a> Canvas<'a> {
     #[inline]
     pub fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
         if let Some(dirty) = &mut self.dirty {
-            dirty.mark_spans(firsts, ends);
+            for ((column, first), end) in dirty.iter_mut().zip(firsts).zip(ends) {
+                mark_rows(std::slice::from_mut(column), &(usize::from(*first)..usize::from(*end)));
+            }
         }
-    }
-
-    /// Marks rectangles, of which every pixel will be painted, as dirty. Returns `false` without a mark if the tracking is exact, and
-    /// so needs those that are painted.
-    pub(super) fn mark_rects(&mut self, rects: &[Rect]) -> bool {
-        let exact = self.tracks_pixels();
-        if !exact {
-            rects.iter().for_each(|rect| self.mark_rect(*rect));
-        }
-        !exact
-    }
-
-    /// Ends dirty tracking.
-    #[inline]
-    pub(super) fn stop_tracking(&mut self) {
-        self.dirty = None;
     }
 
     /// Marks the part of a rectangle that may change as dirty. Nothing happens without dirty tracking.

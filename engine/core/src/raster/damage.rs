@@ -55,29 +55,10 @@ impl Damage {
         &self.rects[..self.count]
     }
 
-    /// Calls `paint` for each rectangle, with the canvas clipped to it. Without pixels the rectangles are only marked as dirty.
+    /// Calls `paint` for each rectangle, with the canvas clipped to it.
     #[inline]
     pub fn repair(&self, canvas: &mut Canvas<'_>, mut paint: impl FnMut(&mut Canvas<'_>)) {
-        if canvas.tracks_dirty() {
-            return self.repair_tracked(canvas, &mut paint);
-        }
         self.rects().iter().for_each(|rect| paint(&mut canvas.clipped(*rect)));
-    }
-
-    /// Apart from [`repair`](Self::repair), which most pools need without dirty tracking.
-    #[inline(never)]
-    fn repair_tracked(&self, canvas: &mut Canvas<'_>, paint: &mut dyn FnMut(&mut Canvas<'_>)) {
-        let marked = canvas.mark_rects(self.rects());
-        if marked && !canvas.has_pixels() {
-            return;
-        }
-        for rect in self.rects() {
-            let mut clipped = canvas.clipped(*rect);
-            if marked {
-                clipped.stop_tracking();
-            }
-            paint(&mut clipped);
-        }
     }
 }
 
@@ -104,7 +85,6 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::raster::DirtyBands;
 
     fn covers(rects: &[Rect], x: i32, y: i32) -> usize {
         rects.iter().filter(|rect| rect.overlaps(&Rect::new(x, y, 1, 1))).count()
@@ -125,23 +105,6 @@ mod tests {
                 prop_assert!(painted == 1 || !on_canvas || covers(&added, x, y) == 0);
             }
         }
-    }
-
-    #[test]
-    fn repaired_rectangles_are_marked() {
-        let mut damage = Damage::new(84, 84);
-        damage.add(Rect::new(3, 5, 4, 6));
-        damage.add(Rect::new(20, 80, 2, 9));
-        let (mut painted, mut noted, mut pixels) =
-            (DirtyBands::new(false), DirtyBands::new(false), vec![0; 84 * 84 * 3]);
-        let mut calls = 0;
-        damage.repair(&mut Canvas::new(&mut pixels, 84, 84).tracking_bands(&mut painted), |canvas| {
-            canvas.fill([1; 3]);
-            calls += 1;
-        });
-        damage.repair(&mut Canvas::without_pixels(84, 84, &mut noted), |_| panic!("there is nothing to paint"));
-        assert_eq!((calls, painted.bands()), (2, noted.bands()));
-        assert_eq!(painted.bands()[..3], [[0b0111_1000, 5, 11], [0; 3], [0b0011_0000, 80, 84]]);
     }
 
     #[test]
