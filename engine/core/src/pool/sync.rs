@@ -3,11 +3,7 @@
 use std::sync::PoisonError;
 
 #[cfg(loom)]
-pub(super) use loom::sync::atomic::{AtomicBool, Ordering};
-#[cfg(loom)]
 pub(super) use loom::sync::{Mutex, MutexGuard};
-#[cfg(not(loom))]
-pub(super) use std::sync::atomic::{AtomicBool, Ordering};
 #[cfg(not(loom))]
 pub(super) use std::sync::{Mutex, MutexGuard};
 
@@ -20,7 +16,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 #[cfg(all(feature = "threads", not(loom)))]
 pub(super) mod threads {
     pub(in crate::pool) use std::sync::Arc;
-    pub(in crate::pool) use std::sync::atomic::{AtomicPtr, AtomicU64, AtomicUsize, fence};
+    pub(in crate::pool) use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Ordering, fence};
     pub(in crate::pool) use std::thread;
 
     pub(in crate::pool) use crossbeam_utils::Backoff;
@@ -29,11 +25,11 @@ pub(super) mod threads {
     pub(in crate::pool) const PARK_AFTER: std::time::Duration = std::time::Duration::from_millis(3);
 }
 
-/// The same under loom. `crossbeam_utils::sync::Parker` itself is modelled, by `--cfg crossbeam_loom`.
+/// The same under loom. `--cfg crossbeam_loom` models `crossbeam_utils::sync::Parker` itself.
 #[cfg(all(feature = "threads", loom))]
 pub(super) mod threads {
     pub(in crate::pool) use loom::sync::Arc;
-    pub(in crate::pool) use loom::sync::atomic::{AtomicPtr, AtomicU64, AtomicUsize, fence};
+    pub(in crate::pool) use loom::sync::atomic::{AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Ordering, fence};
     pub(in crate::pool) use loom::thread;
 
     /// Workers park at once: a model has no time, and a worker that spins cannot miss a call.

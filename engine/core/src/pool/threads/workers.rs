@@ -14,8 +14,10 @@ use std::time::Instant;
 use crossbeam_utils::CachePadded;
 use crossbeam_utils::sync::{Parker, Unparker};
 
-use crate::pool::sync::threads::{Arc, AtomicPtr, AtomicU64, AtomicUsize, Backoff, PARK_AFTER, fence, thread};
-use crate::pool::sync::{AtomicBool, Mutex, Ordering, lock};
+use crate::pool::sync::threads::{
+    Arc, AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Backoff, Ordering, PARK_AFTER, fence, thread,
+};
+use crate::pool::sync::{Mutex, lock};
 
 /// Workers that each thread wakes.
 const WAKES: usize = 3;
