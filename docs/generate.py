@@ -26,7 +26,6 @@ MESSAGES = messages.Messages(ROOT, DATA / "errors.json")
 
 #: Documents of the repository that are pages of the site, too.
 PAGES = {
-    "design/architecture.md": "ARCHITECTURE.md",
     "design/comparison.md": "benches/comparison.md",
     "reference/changes.md": "CHANGELOG.md",
     "train/learning.md": "agents/benches/learning/README.md",
