@@ -26,7 +26,8 @@ pub fn ignored_test(program: &str, name: &str) -> Result<(), String> {
 /// Compares `steps` steps of each environment with the original, from new seeds; optimised, since it is long.
 pub fn live(steps: u64) -> Result<(), String> {
     original::python()?;
-    let arguments = ["test", "--release", "--locked", "--test", "live", "--", "--include-ignored", "--nocapture"];
+    let arguments =
+        ["test", "--release", "--locked", "--test", "integration", "--", "--include-ignored", "--nocapture", "live::"];
     execute(with_original(&arguments)?.env("ENDLESS_LIVE_STEPS", steps.to_string()))
 }
 

@@ -1,4 +1,4 @@
-//! `cargo xtask faults` and `cargo xtask soak`: the program of `engine/faults`.
+//! `cargo xtask faults` and `cargo xtask soak`: the program of `tests/faults`.
 
 use std::process::Command;
 

@@ -21,8 +21,8 @@ type Imports = BTreeMap<Module, BTreeSet<Module>>;
 pub fn check() -> Result<(), String> {
     println!("==> import cycles");
     let mut cycles = Vec::new();
-    for name in ["core", "service", "view", "cli", "faults"] {
-        let crate_root = workspace().join("engine").join(name).join("src");
+    for name in ["engine/core", "engine/service", "engine/view", "engine/cli", "tests/faults"] {
+        let crate_root = workspace().join(name).join("src");
         let mut files = BTreeMap::new();
         collect(&crate_root, &[], &mut files)?;
         let modules: BTreeSet<Module> = files.keys().cloned().collect();

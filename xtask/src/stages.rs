@@ -54,10 +54,7 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "rust tests",
-        run: || {
-            let skipped: Vec<&str> = SLOW.iter().flat_map(|name| ["--skip", *name]).collect();
-            cargo::run(&[RUST_TESTS, &skipped].concat())
-        },
+        run: || cargo::run(RUST_TESTS),
         after: &["rust build"],
         needs: &[SharedMemory],
         ..QUICK
@@ -96,7 +93,7 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "rust tests slow",
-        run: || cargo::run(&[RUST_TESTS, SLOW].concat()),
+        run: || cargo::run(&[RUST_TESTS, &["--ignored"], SLOW].concat()),
         after: &["rust build"],
         needs: &[SharedMemory],
         ..STAGE
@@ -145,11 +142,20 @@ pub const STAGES: &[Stage] = &[
     Stage {
         name: "shared memory of other sizes",
         run: || {
-            cargo::ignored_test("service", "too_little_shared_memory_is_an_error_and_not_a_signal")?;
-            cargo::ignored_test("service_faults", "inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing")?;
-            cargo::ignored_test("service_faults", "inside_memory_that_dead_processes_fill_an_engine_starts")?;
-            cargo::ignored_test("service_faults", "inside_small_shared_memory_observers_get_what_is_left")?;
-            cargo::ignored_test("service_faults", "two_directories_of_one_path_share_nothing")
+            cargo::ignored_test("integration", "service::too_little_shared_memory_is_an_error_and_not_a_signal")?;
+            cargo::ignored_test(
+                "integration",
+                "service_faults::inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing",
+            )?;
+            cargo::ignored_test(
+                "integration",
+                "service_faults::inside_memory_that_dead_processes_fill_an_engine_starts",
+            )?;
+            cargo::ignored_test(
+                "integration",
+                "service_faults::inside_small_shared_memory_observers_get_what_is_left",
+            )?;
+            cargo::ignored_test("integration", "service_faults::two_directories_of_one_path_share_nothing")
         },
         needs: &[MountNamespaces],
         after: &["rust build"],
@@ -157,7 +163,12 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "segments of another user",
-        run: || cargo::ignored_test("service_faults", "as_root_a_segment_of_another_user_is_reported_or_avoided"),
+        run: || {
+            cargo::ignored_test(
+                "integration",
+                "service_faults::as_root_a_segment_of_another_user_is_reported_or_avoided",
+            )
+        },
         needs: &[Root],
         after: &["rust build"],
         ..STAGE
@@ -173,7 +184,7 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "live comparison with the original",
-        run: || cargo::run(&["test", "--locked", "--test", "live", "--", "--include-ignored"]),
+        run: || cargo::run(&["test", "--locked", "--test", "integration", "--", "--include-ignored", "live::"]),
         after: &["rust build", "original environment"],
         ..STAGE
     },

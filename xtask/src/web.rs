@@ -60,7 +60,10 @@ pub fn test() -> Result<(), String> {
     build()?;
     // Not what only measures or makes pictures.
     let tests = ["--ignored", "--test-threads", "1", "--skip", "measure"];
-    cargo::run(&[&["test", "--workspace", "--locked", "--test", "browser", "--"], tests.as_slice()].concat())
+    cargo::run(
+        &[&["test", "--locked", "--package", "endless-gym-web", "--test", "browser", "--"], tests.as_slice()].concat(),
+    )?;
+    cargo::run(&[&["test", "--locked", "--test", "integration", "--"], tests.as_slice(), &["browser::"]].concat())
 }
 
 /// Writes the list of files, and a checksum of them all, into the service worker, which keeps them for use without a network.

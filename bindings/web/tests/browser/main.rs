@@ -1,7 +1,7 @@
 //! The page in a real browser. `cargo xtask stage web` builds the page and runs these tests.
 
 mod agents;
-#[path = "../../../../tests/browser_support/mod.rs"]
+#[path = "../../../../tests/integration/support/chromium.rs"]
 mod chromium;
 mod server;
 

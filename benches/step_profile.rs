@@ -1,0 +1,498 @@
+//! Where the time of a step goes, by id and number of environments: `cargo bench --bench step_profile`.
+//!
+//! Phases are cumulative variants of a step, each with environments of its own, and a phase's cost is the
+//! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
+//!
+//! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--caches` simulates caches and the
+//! translation of addresses; `--memory` measures the memory; `--on-request` steps for `benches/compare_builds.py`.
+
+mod actions;
+
+use std::collections::HashMap;
+use std::hint::black_box;
+use std::process::Command;
+use std::sync::Arc;
+
+use endless_gym_core::batch::Block;
+use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
+use endless_gym_core::envs::mystery_path::MysteryPath;
+use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
+use endless_gym_core::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters, SCREEN};
+use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
+use memmap2::{Advice, MmapMut};
+use rustix::time::{ClockId, clock_gettime};
+use serde_json::Map;
+
+use actions::Actions;
+
+const SIZES: [usize; 3] = [64, 1024, 16384];
+const ROUNDS: usize = 9;
+/// Environment steps of a variant in one round, at least four steps of all environments.
+const ROUND_STEPS: usize = 16384;
+/// Steps before the first round: episodes that began together have spread.
+const WARM_UP: usize = 150;
+/// Numbers of environments, and environment steps of each, whose caches are simulated.
+const SIMULATED_SIZES: [usize; 3] = [64, 1024, 4096];
+const SIMULATED_STEPS: usize = 16384;
+
+/// The rules with their random draws, and resets.
+const RULES: u8 = 0;
+/// The scene is made.
+const SCENE: u8 = 1;
+/// The scene is compared with the shown one, and stored.
+const COMPARED: u8 = 2;
+/// What differs is painted.
+const PAINTED: u8 = 3;
+/// The pool's own step.
+const POOL: u8 = 4;
+
+/// One environment, with what a pool keeps for it.
+struct Player<E: Environment> {
+    env: E,
+    random: Generator,
+    shown: E::Scene,
+    ended: bool,
+}
+
+/// Environments that play and paint up to a phase.
+struct Players<E: Environment> {
+    assets: Arc<E::Assets>,
+    players: Vec<Player<E>>,
+    actions: Actions,
+}
+
+impl<E: Environment> Players<E> {
+    fn new(spec: &'static EnvSpec, variant: E::Variant, num_envs: usize, warm_up: usize) -> Self {
+        let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
+        let assets = Arc::new(E::assets(variant, &parameters));
+        let player = |number| {
+            let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1 + number as u64));
+            env.reset(&assets, &mut random);
+            Player { shown: env.scene(), env, random, ended: false }
+        };
+        let players = (0..num_envs).map(player).collect();
+        let mut players = Players { players, assets, actions: Actions::new(spec, num_envs) };
+        for _ in 0..warm_up {
+            players.step::<COMPARED>(&mut []);
+        }
+        players
+    }
+
+    /// Paints the first pictures, which also touches the memory.
+    fn paint(&self, frames: &mut [u8]) {
+        for (player, frame) in self.players.iter().zip(frames.chunks_exact_mut(FRAME_BYTES)) {
+            E::paint(&self.assets, &player.shown, &mut Canvas::new(frame, SCREEN, SCREEN));
+        }
+    }
+
+    /// Steps all environments. `frames` has one frame for all, which stays in the cache, or one for each.
+    fn step<const PHASE: u8>(&mut self, frames: &mut [u8]) {
+        let actions = self.actions.next();
+        let branches = actions.len() / self.players.len();
+        let own = frames.len() > FRAME_BYTES;
+        for (number, player) in self.players.iter_mut().enumerate() {
+            if player.ended {
+                start_episode(&self.assets, player);
+            } else {
+                let action = &actions[number * branches..][..branches];
+                player.ended = black_box(player.env.step(action, &mut player.random)).terminated;
+            }
+            if PHASE >= SCENE {
+                let scene = player.env.scene();
+                if PHASE == SCENE {
+                    black_box(&scene);
+                } else if scene != player.shown {
+                    if PHASE == PAINTED {
+                        let frame = &mut frames[if own { number * FRAME_BYTES } else { 0 }..][..FRAME_BYTES];
+                        let mut canvas = Canvas::new(frame, SCREEN, SCREEN);
+                        E::repaint(&self.assets, &player.shown, &scene, &mut canvas);
+                    }
+                    player.shown = scene;
+                }
+            }
+        }
+    }
+}
+
+/// A call of its own, so that callgrind counts what it includes.
+#[inline(never)]
+fn start_episode<E: Environment>(assets: &Arc<E::Assets>, player: &mut Player<E>) {
+    player.env.reset(assets, &mut player.random);
+    player.ended = false;
+}
+
+/// A step of all environments.
+type Step = Box<dyn FnMut()>;
+
+fn pool(spec: &'static EnvSpec, num_envs: usize) -> Pool {
+    let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) };
+    Pool::new(&config, &Threads::new(1).unwrap()).unwrap()
+}
+
+/// Memory that a step writes to, in small or in huge pages.
+fn memory(bytes: usize, huge: bool) -> MmapMut {
+    let memory = MmapMut::map_anon(bytes).unwrap();
+    if huge {
+        memory.advise(Advice::HugePage).unwrap();
+    } else {
+        memory.advise(Advice::NoHugePage).unwrap();
+    }
+    memory
+}
+
+fn pool_step(spec: &'static EnvSpec, num_envs: usize, huge: bool) -> Step {
+    let mut pool = pool(spec, num_envs);
+    let mut batch = memory(pool.layout().blocks() * size_of::<Block>(), huge);
+    let mut actions = Actions::new(spec, num_envs);
+    pool.reset(ResetRequest::All, bytemuck::cast_slice_mut(&mut batch)).unwrap();
+    let mut step = move || pool.step(actions.next(), bytemuck::cast_slice_mut(&mut batch)).unwrap();
+    for _ in 0..WARM_UP {
+        step();
+    }
+    Box::new(step)
+}
+
+fn player_step<E: Environment + 'static, const PHASE: u8>(
+    spec: &'static EnvSpec,
+    variant: E::Variant,
+    num_envs: usize,
+    frames: usize,
+    huge: bool,
+) -> Step {
+    let mut players = Players::<E>::new(spec, variant, num_envs, WARM_UP);
+    let mut frames = memory(frames * FRAME_BYTES, huge);
+    players.paint(&mut frames);
+    Box::new(move || players.step::<PHASE>(&mut frames))
+}
+
+/// Processor time of this thread, in nanoseconds.
+fn processor_time() -> f64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    time.tv_sec as f64 * 1e9 + time.tv_nsec as f64
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Prints the rows of one id.
+fn times<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant) {
+    for num_envs in SIZES {
+        let mut steps = [
+            player_step::<E, RULES>(spec, variant, num_envs, 1, false),
+            player_step::<E, SCENE>(spec, variant, num_envs, 1, false),
+            player_step::<E, COMPARED>(spec, variant, num_envs, 1, false),
+            player_step::<E, PAINTED>(spec, variant, num_envs, 1, false),
+            player_step::<E, PAINTED>(spec, variant, num_envs, num_envs, false),
+            pool_step(spec, num_envs, false),
+            pool_step(spec, num_envs, true),
+        ];
+        let repeats = (ROUND_STEPS / num_envs).max(4);
+        let mut times = vec![Vec::new(); steps.len()];
+        for _ in 0..ROUNDS {
+            for (step, times) in steps.iter_mut().zip(&mut times) {
+                // Its memory returns to the caches.
+                step();
+                let start = processor_time();
+                for _ in 0..repeats {
+                    step();
+                }
+                times.push((processor_time() - start) / (repeats * num_envs) as f64);
+            }
+        }
+        let [rules, scene, compared, painted, frames, pool, huge] =
+            times.into_iter().map(median).collect::<Vec<_>>().try_into().unwrap();
+        println!(
+            "| {} | {num_envs} | {rules:.0} | {:.0} | {:.0} | {:.0} | {:.0} | {:.0} | {pool:.0} | {huge:.0} |",
+            spec.id,
+            scene - rules,
+            compared - scene,
+            painted - compared,
+            frames - painted,
+            pool - frames,
+        );
+    }
+}
+
+/// Environments and steps that valgrind counts.
+const COUNTED_ENVS: usize = 16;
+const COUNTED_STEPS: usize = 250;
+
+/// What callgrind counts; the caller is this program under valgrind.
+fn count<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant, phase: u8) {
+    if phase == POOL {
+        return counted(&mut pool_step(spec, COUNTED_ENVS, false), COUNTED_STEPS);
+    }
+    let mut players = Players::<E>::new(spec, variant, COUNTED_ENVS, WARM_UP);
+    let mut frame = vec![0; FRAME_BYTES];
+    let mut step = || match phase {
+        RULES => players.step::<RULES>(&mut frame),
+        SCENE => players.step::<SCENE>(&mut frame),
+        COMPARED => players.step::<COMPARED>(&mut frame),
+        _ => players.step::<PAINTED>(&mut frame),
+    };
+    counted(&mut step, COUNTED_STEPS);
+}
+
+/// Reads a number of steps from each line of the standard input, takes them, and prints the processor time of an environment's step in
+/// nanoseconds.
+fn on_request(spec: &'static EnvSpec, num_envs: usize) {
+    let mut step = pool_step(spec, num_envs, false);
+    for line in std::io::stdin().lines() {
+        let steps: usize = line.unwrap().parse().unwrap();
+        // Its memory returns to the caches.
+        step();
+        let start = processor_time();
+        for _ in 0..steps {
+            step();
+        }
+        println!("{}", (processor_time() - start) / (steps * num_envs) as f64);
+    }
+}
+
+#[inline(never)]
+fn counted(step: &mut dyn FnMut(), steps: usize) {
+    for _ in 0..steps {
+        step();
+    }
+}
+
+/// Runs this program under callgrind, which counts what happens in [`counted`], and returns its output.
+fn callgrind(options: &[&str], arguments: &[&str]) -> String {
+    let file = std::env::temp_dir().join(format!("endless-step-profile-{}", std::process::id()));
+    let output = Command::new("valgrind")
+        .args(["--tool=callgrind", "--toggle-collect=step_profile::counted"])
+        .arg(format!("--callgrind-out-file={}", file.display()))
+        .args(options)
+        .arg(std::env::current_exe().unwrap())
+        .args(arguments)
+        // No `rep movsb` and `rep stosb`, of which callgrind counts every byte as an instruction.
+        .env(
+            "GLIBC_TUNABLES",
+            "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000",
+        )
+        .output()
+        .expect("valgrind must be installed");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::remove_file(&file).unwrap();
+    text
+}
+
+/// A cache of 48 KiB and one of 2 MiB, with lines of 64 bytes.
+const CACHES: [&str; 2] = ["--D1=49152,12,64", "--LL=2097152,16,64"];
+/// The translation of addresses as caches with a page for a line: 64 and 2,048 entries, for pages of 4 KiB.
+const PAGES: [&str; 2] = ["--D1=262144,4,4096", "--LL=8388608,16,4096"];
+
+/// Prints the rows of one id: simulated misses in the two caches, and in the tables of address translations.
+fn caches(spec: &EnvSpec) {
+    for num_envs in SIMULATED_SIZES {
+        let steps = SIMULATED_STEPS / num_envs;
+        let misses = [CACHES, PAGES].map(|sizes| {
+            // What the first steps miss because nothing was simulated before them is in both runs.
+            let [less, more] = [steps, 2 * steps].map(|steps| {
+                let text = callgrind(
+                    &["--cache-sim=yes", "--I1=65536,8,64", sizes[0], sizes[1]],
+                    &["--touch", spec.id, &num_envs.to_string(), &steps.to_string()],
+                );
+                let totals = text.lines().find_map(|line| line.strip_prefix("totals: ")).expect("totals");
+                // Ir Dr Dw I1mr D1mr D1mw ILmr DLmr DLmw, of which zeros at the end are left out.
+                let mut counts = [0.0; 9];
+                for (count, text) in counts.iter_mut().zip(totals.split(' ')) {
+                    *count = text.parse::<f64>().unwrap();
+                }
+                [counts[4] + counts[5], counts[7] + counts[8]]
+            });
+            [0, 1].map(|level| (more[level] - less[level]) / (num_envs * steps) as f64)
+        });
+        let columns: Vec<String> = misses.as_flattened().iter().map(|misses| format!("{misses:.2}")).collect();
+        println!("| {} | {num_envs} | {} |", spec.id, columns.join(" | "));
+    }
+}
+
+/// Instructions that callgrind noted.
+#[derive(Default)]
+struct Counts {
+    all: u64,
+    /// In the files of `random`, with what is inlined there.
+    random: u64,
+    /// In `start_episode`, with everything that it calls.
+    resets: u64,
+    num_resets: u64,
+}
+
+impl Counts {
+    /// Reads callgrind's output: lines `fl=`, `fi=` and `fe=` name the file of the lines of costs after them, and `calls=` says that
+    /// the next cost is that of a call.
+    fn read(text: &str) -> Counts {
+        let mut counts = Counts::default();
+        // A name is given once, as `(number) name`, and then by its number.
+        let (mut files, mut functions) = (HashMap::new(), HashMap::new());
+        let (mut in_random, mut is_reset, mut call) = (false, false, None);
+        for line in text.lines() {
+            let (key, value) = line.split_once('=').unwrap_or(("", line));
+            match key {
+                "fl" | "fi" | "fe" | "cfi" | "cfl" => {
+                    let file = name(&mut files, value);
+                    if !key.starts_with('c') {
+                        in_random = file.contains("/src/random/") || file.contains("rand_pcg");
+                    }
+                }
+                "fn" => _ = name(&mut functions, value),
+                "cfn" => is_reset = name(&mut functions, value).contains("start_episode"),
+                "calls" => call = value.split(' ').next().and_then(|calls| calls.parse::<u64>().ok()),
+                "" if line.starts_with(|first: char| first.is_ascii_digit() || "+-*".contains(first)) => {
+                    let cost: u64 = line.split(' ').nth(1).and_then(|cost| cost.parse().ok()).unwrap_or(0);
+                    match call.take() {
+                        Some(calls) if is_reset => {
+                            counts.resets += cost;
+                            counts.num_resets += calls;
+                        }
+                        Some(_) => {}
+                        None => {
+                            counts.all += cost;
+                            counts.random += if in_random { cost } else { 0 };
+                        }
+                    }
+                }
+                _ => {}
+            }
+        }
+        counts
+    }
+}
+
+fn name<'a>(names: &mut HashMap<&'a str, &'a str>, value: &'a str) -> &'a str {
+    match value.split_once(' ') {
+        Some((number, name)) => {
+            names.insert(number, name);
+            name
+        }
+        None => names.get(value).copied().unwrap_or(""),
+    }
+}
+
+/// Prints the row of one id: instructions of an environment's step, by phase.
+fn instructions(spec: &EnvSpec) {
+    let counts = [RULES, SCENE, COMPARED, PAINTED, POOL]
+        .map(|phase| Counts::read(&callgrind(&[], &["--count", spec.id, &phase.to_string()])));
+    let steps = (COUNTED_ENVS * COUNTED_STEPS) as f64;
+    let each = counts.each_ref().map(|counts| counts.all as f64 / steps);
+    let rules = &counts[0];
+    let [random, resets] = [rules.random, rules.resets].map(|count| count as f64 / steps);
+    println!(
+        "| {} | {:.0} | {random:.0} | {resets:.0} | {} | {:.0} | {:.0} | {:.0} | {:.0} | {:.0} |",
+        spec.id,
+        each[0],
+        if rules.num_resets == 0 {
+            "-".to_owned()
+        } else {
+            (COUNTED_ENVS * COUNTED_STEPS / rules.num_resets as usize).to_string()
+        },
+        each[1] - each[0],
+        each[2] - each[1],
+        each[3] - each[2],
+        each[4] - each[3],
+        each[4],
+    );
+}
+
+/// Prints what memory of a batch's size gives: bytes a nanosecond in order, nanoseconds a line in no order.
+fn memory_speed() {
+    println!("| environments | pages | fill, GB/s | copy, GB/s | line changed, ns | line after line, ns |");
+    println!("| ---: | --- | ---: | ---: | ---: | ---: |");
+    for num_envs in SIZES {
+        for huge in [false, true] {
+            let bytes = num_envs * FRAME_BYTES / 64 * 64;
+            let mut memory = memory(bytes, huge);
+            let mut other = self::memory(bytes, huge);
+            let repeats = ((256 << 20) / bytes).max(1);
+            let mut results = [const { Vec::new() }; 4];
+            for round in 0..ROUNDS as u8 {
+                let mut timed = |result: usize, per: usize, work: &mut dyn FnMut()| {
+                    work();
+                    let start = processor_time();
+                    (0..repeats).for_each(|_| work());
+                    results[result].push((processor_time() - start) / (repeats * per) as f64);
+                };
+                timed(0, bytes, &mut || black_box(&mut memory[..]).fill(round));
+                timed(1, bytes, &mut || black_box(&mut other[..]).copy_from_slice(&memory));
+                let lines = bytes / 64;
+                // A congruential generator: the next address depends on nothing in memory.
+                let draw = |state: &mut u64| {
+                    *state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+                    (((*state >> 32) * lines as u64) >> 32) as usize * 64
+                };
+                let mut state = u64::from(round);
+                timed(2, lines / 8, &mut || {
+                    for _ in 0..lines / 8 {
+                        let line = draw(&mut state);
+                        memory[line] = memory[line].wrapping_add(1);
+                    }
+                });
+                memory.fill(0);
+                timed(3, lines / 8, &mut || {
+                    for _ in 0..lines / 8 {
+                        let line = draw(&mut state);
+                        // Each address depends on the byte before, which is 0.
+                        state = state.wrapping_add(u64::from(black_box(memory[line])));
+                    }
+                });
+            }
+            let [fill, copy, changed, latency] = results.map(median);
+            let pages = if huge { "huge" } else { "4 KiB" };
+            println!("| {num_envs} | {pages} | {:.0} | {:.0} | {changed:.1} | {latency:.0} |", 1.0 / fill, 1.0 / copy);
+        }
+    }
+}
+
+/// Calls the function for the family of `spec`.
+macro_rules! for_family {
+    ($spec:expr, $function:ident ($($argument:expr),*)) => {
+        match $spec.family {
+            Family::MortarMayhem(variant) => $function::<MortarMayhem>($spec, variant $(, $argument)*),
+            Family::MysteryPath(variant) => $function::<MysteryPath>($spec, variant $(, $argument)*),
+            Family::SearingSpotlights(variant) => $function::<SearingSpotlights>($spec, variant $(, $argument)*),
+        }
+    };
+}
+
+fn main() {
+    // Cargo adds `--bench`.
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    if let ["--count", id, phase] = arguments[..] {
+        let spec = envs::spec(id).unwrap();
+        return for_family!(spec, count(phase.parse().unwrap()));
+    }
+    if let ["--touch", id, num_envs, steps] = arguments[..] {
+        let mut step = pool_step(envs::spec(id).unwrap(), num_envs.parse().unwrap(), false);
+        return counted(&mut step, steps.parse().unwrap());
+    }
+    if let ["--on-request", id, num_envs] = arguments[..] {
+        return on_request(envs::spec(id).unwrap(), num_envs.parse().unwrap());
+    }
+    if arguments == ["--memory"] {
+        return memory_speed();
+    }
+    let ids: Vec<&str> = arguments.iter().copied().filter(|argument| !argument.starts_with("--")).collect();
+    let specs = envs::specs().filter(|spec| ids.is_empty() || ids.contains(&spec.id));
+    if arguments.contains(&"--instructions") {
+        println!("| id | rules | of these: random | resets | steps a reset | scene | compare | paint | pool | all |");
+        println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
+        return specs.for_each(instructions);
+    }
+    if arguments.contains(&"--caches") {
+        println!("| id | environments | first cache | second | first table of pages | second |");
+        println!("| --- | ---: | ---: | ---: | ---: | ---: |");
+        return specs.for_each(caches);
+    }
+    println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
+    println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
+    for spec in specs {
+        for_family!(spec, times());
+    }
+}

@@ -1,0 +1,119 @@
+//! What the pool takes from the allocator. Each test runs in a process of its own, since others at the same time would be counted too.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use endless_gym::batch::{Block, zeroed};
+use endless_gym::envs;
+use endless_gym::pool::{Autoreset, NextOptions, Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+
+use crate::support::alone;
+
+/// The system's allocator, with a count of the allocations and of the bytes in use.
+struct Counting;
+
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+static BYTES: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: All calls are forwarded unchanged to the system's allocator.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        BYTES.fetch_add(layout.size(), Ordering::Relaxed);
+        // SAFETY: as our caller promises.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        BYTES.fetch_sub(layout.size(), Ordering::Relaxed);
+        // SAFETY: as our caller promises.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+#[test]
+#[ignore = "slow"]
+fn steps_and_resets_allocate_nothing() {
+    if !alone("allocation::steps_and_resets_allocate_nothing") {
+        return;
+    }
+    for spec in envs::specs() {
+        // As few as one thread steps, and enough for two.
+        for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
+            let config = PoolConfig {
+                seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
+                autoreset,
+                final_observation: true,
+                features: true,
+                ..PoolConfig::new(spec.id, num_envs)
+            };
+            let mut pool = Pool::new(&config, &Threads::new(threads).unwrap()).unwrap();
+            let mut buffers = [zeroed(pool.layout().blocks()), zeroed(pool.layout().blocks())];
+            let mut random = SmallRng::seed_from_u64(1);
+            let branches = spec.action_space.branches();
+            let mut actions = vec![0; num_envs * branches.len()];
+            let mut play = |steps: usize| {
+                for step in 0..steps {
+                    let buffer = &mut buffers[step % 2];
+                    if step % 500 == 0 {
+                        pool.reset(ResetRequest::All, buffer).unwrap();
+                    }
+                    for action in actions.chunks_exact_mut(branches.len()) {
+                        action.iter_mut().zip(branches).for_each(|(action, n)| *action = random.random_range(0..*n));
+                    }
+                    pool.step(&actions, buffer).unwrap();
+                }
+            };
+            // Long enough for every list to have been as long as it gets.
+            play(1500);
+            let mut allocations = || {
+                let before = ALLOCATIONS.load(Ordering::Relaxed);
+                play(500);
+                ALLOCATIONS.load(Ordering::Relaxed) - before
+            };
+            // Twice, since the test harness allocates when it says, once, that a test takes long.
+            assert!(allocations() == 0 || allocations() == 0, "{}, {autoreset:?}", spec.id);
+        }
+    }
+}
+
+/// The options of environment `env` in round `round`: another set for each, with pictures of its own.
+fn options(round: usize, env: usize) -> NextOptions {
+    let scale = 0.2 + 0.001 * ((round * 4 + env) % 64) as f64;
+    NextOptions { options: [("agent_scale".to_owned(), scale.into())].into_iter().collect(), envs: vec![env] }
+}
+
+/// Gives each environment options of its own and plays long enough to use what is made on first use, such as darker pictures.
+fn play(pool: &mut Pool, round: usize, buffer: &mut [Block]) {
+    let sets: Vec<_> = (0..4).map(|env| options(round, env)).collect();
+    pool.set_options(&sets).unwrap();
+    pool.reset(ResetRequest::All, buffer).unwrap();
+    let actions = vec![0; 4 * pool.spec().action_space.branches().len()];
+    for _ in 0..40 {
+        pool.step(&actions, buffer).unwrap();
+    }
+}
+
+#[test]
+fn replaced_options_leave_no_memory_behind() {
+    if !alone("allocation::replaced_options_leave_no_memory_behind") {
+        return;
+    }
+    for spec in envs::specs() {
+        let mut pool = Pool::new(&PoolConfig::new(spec.id, 4), &Threads::new(1).unwrap()).unwrap();
+        let mut buffer = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::Seed(1), &mut buffer).unwrap();
+        let mut used = |rounds: std::ops::Range<usize>| {
+            rounds.clone().for_each(|round| play(&mut pool, round, &mut buffer));
+            BYTES.load(Ordering::Relaxed)
+        };
+        let (first, last) = (used(0..16), used(16..128));
+        // One picture more or less is in use at a time; the options of 112 rounds have thousands.
+        assert!(last < first + (256 << 10), "{}: {first} bytes after 16 rounds, {last} bytes after 128", spec.id);
+    }
+}

@@ -1,0 +1,284 @@
+//! The page of a running engine in a real browser. `cargo xtask stage web` runs these tests.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use crate::support::chromium::{Chromium, REBOUND};
+use crate::support::page::Server;
+use crate::support::program::{Engine, Room};
+use endless_gym::pool::ResetRequest;
+use serde_json::Value as Json;
+
+const ID: &str = "MortarMayhem-Grid-v0";
+const NUM_ENVS: usize = 20;
+const FRAME: usize = 84 * 84 * 3;
+
+/// The page is shown and has received a batch.
+const SHOWN: &str = "globalThis.endless?.newest && document.getElementById('state').dataset.state === 'live'";
+
+/// The pixels of a canvas, in rows with alpha.
+const PIXELS: &str = "((canvas) => Array.from(canvas.getContext('2d').getImageData(0, 0, 84, 84).data))";
+
+fn start(name: &str) -> Chromium {
+    Chromium::start(&PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("browser").join(name), (1400, 900))
+}
+
+fn serve(room: &Room) -> Engine {
+    Engine::start(room, &["--env", ID, "--num-envs", &NUM_ENVS.to_string(), "--seed", "1"])
+}
+
+/// A trainer that steps until it is stopped, or until the engine ends.
+struct Training {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<(u64, Vec<u8>)>,
+}
+
+impl Training {
+    fn start(room: &Room) -> Self {
+        let (stop, mut trainer) = (Arc::new(AtomicBool::new(false)), room.connect("endless"));
+        let flag = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || {
+            let timeout = Duration::from_secs(60);
+            trainer.reset(0, ResetRequest::Seed(1)).unwrap();
+            let mut last = (0, Vec::new());
+            for step in 0.. {
+                let Ok(lease) = trainer.receive(0, timeout) else { return last };
+                last = (lease.step(), lease.batch().observation().to_vec());
+                drop(lease);
+                let action = |(env, action): (usize, &mut i32)| *action = (step + env as i32) % 4;
+                if flag.load(Ordering::Relaxed)
+                    || trainer.send_with(0, |all| all.iter_mut().enumerate().for_each(action)).is_err()
+                {
+                    return last;
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            last
+        });
+        Training { stop, thread }
+    }
+
+    /// The number of the last batch, and its observations.
+    fn end(self) -> (u64, Vec<u8>) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().unwrap()
+    }
+}
+
+/// A canvas shows that environment's observation.
+fn assert_shown(browser: &mut Chromium, canvas: &str, observations: &[u8], env: usize) {
+    let shown = browser.value(&format!("{PIXELS}({canvas})"));
+    let observation = &observations[env * FRAME..][..FRAME];
+    let expected = (0..84 * 84).flat_map(|place| {
+        let at = (place % 84 * 84 + place / 84) * 3;
+        [observation[at], observation[at + 1], observation[at + 2], 255]
+    });
+    assert!(shown == expected.collect::<Json>(), "{canvas} does not show environment {env}");
+}
+
+fn grid(place: usize) -> String {
+    format!("document.querySelectorAll('#grid canvas')[{place}]")
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn a_running_engine_is_shown_lost_and_found() {
+    let room = Room::new("browser");
+    let mut engine = serve(&room);
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let mut browser = start("view");
+    let training = Training::start(&room);
+    browser.load(&server.url);
+    browser.wait(SHOWN);
+    assert_eq!(browser.value("document.querySelectorAll('#grid canvas').length"), 16);
+    // Frames change.
+    browser.value(&format!("globalThis.before = {PIXELS}({}).join(); 0", grid(0)));
+    browser.wait(&format!("{PIXELS}({}).join() !== before", grid(0)));
+    // One environment is shown large, beside the grid.
+    browser.value("document.querySelectorAll('#grid button')[3].click()");
+    browser.wait("document.getElementById('caption').textContent.startsWith('Environment 3: step ')");
+    assert_eq!(browser.value("document.getElementById('enlarged').checkVisibility()"), true);
+    // Each curve is a line, and says its last value.
+    browser
+        .wait("[...document.querySelectorAll('#curves path')].every((path) => path.getAttribute('d').includes('L'))");
+    let values = browser.value("[...document.querySelectorAll('#curves b')].map((value) => value.textContent)");
+    assert!(values.as_array().unwrap().len() == 4 && !values.to_string().contains('–'), "{values}");
+    let numbers = browser.value("document.getElementById('numbers').textContent");
+    assert!(numbers.as_str().unwrap().contains(ID), "{numbers}");
+
+    // The last batch stays, also for other environments than those that were shown.
+    let (step, observations) = training.end();
+    browser.wait(&format!("endless.about.batch.step === {step}"));
+    (0..16).for_each(|env| assert_shown(&mut browser, &grid(env), &observations, env));
+    assert_shown(&mut browser, "document.getElementById('enlarged')", &observations, 3);
+    browser.value("document.getElementById('after').click()");
+    browser.wait("document.querySelectorAll('#grid canvas').length === 4");
+    (0..4).for_each(|place| assert_shown(&mut browser, &grid(place), &observations, 16 + place));
+    browser.value("document.getElementById('smaller').click()");
+    assert_eq!(browser.value("document.getElementById('enlarged').checkVisibility()"), false);
+
+    // Killed, without a chance to say so.
+    engine.0.kill().unwrap();
+    engine.0.wait().unwrap();
+    browser.wait("document.getElementById('state').dataset.state === 'lost'");
+    assert_eq!(browser.value("document.getElementById('state').textContent"), "lost: waiting for the engine");
+    drop(engine);
+    let _engine = serve(&room);
+    browser.wait("document.getElementById('state').dataset.state === 'live'");
+    let training = Training::start(&room);
+    browser.value("globalThis.shown = endless.frames; 0");
+    browser.wait("endless.frames > shown + 3");
+    training.end();
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn a_page_in_the_background_gets_no_frames() {
+    let room = Room::new("background");
+    let _engine = serve(&room);
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let mut browser = start("background");
+    let training = Training::start(&room);
+    browser.load(&server.url);
+    browser.wait(SHOWN);
+    let hide = |hidden| {
+        format!(
+            "Object.defineProperty(document, 'hidden', {{ value: {hidden}, configurable: true }}); \
+             document.dispatchEvent(new Event('visibilitychange')); 0"
+        )
+    };
+    browser.value(&hide(true));
+    // The curves continue, and the last frame is still there.
+    browser.wait("endless.about.batch.envs.length === 0");
+    browser.value("globalThis.points = endless.curves.points.length; globalThis.shown = endless.frames; 0");
+    browser.wait("endless.curves.points.length > points");
+    assert_eq!(browser.value("endless.frames - shown"), 0);
+    assert_eq!(browser.value("document.querySelectorAll('#grid canvas').length"), 16);
+    browser.value(&hide(false));
+    browser.wait("endless.frames > shown + 3");
+    training.end();
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn other_sites_and_addresses_without_the_token_are_refused() {
+    let room = Room::new("refused");
+    let _engine = serve(&room);
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let mut browser = start("refused");
+    let (port, token) = (server.address().port(), server.token().to_owned());
+    for address in [format!("http://127.0.0.1:{port}/"), format!("http://127.0.0.1:{port}/?token={}", "0".repeat(32))] {
+        browser.load(&address);
+        browser.wait("document.body.innerText.startsWith('the address must have the token')");
+    }
+    // How a WebSocket to the engine ends: `open` or `refused`.
+    let open = format!(
+        "new Promise((done) => {{ const socket = new WebSocket('ws://127.0.0.1:{port}/{token}/socket?service=endless'); \
+         socket.onopen = () => done('open'); socket.onerror = () => done('refused') }})"
+    );
+    browser.load(&server.url);
+    browser.wait("document.getElementById('state')?.dataset.state === 'live'");
+    assert_eq!(browser.value(&open), "open", "the page's own");
+    // Another site's name leads to this machine, and its page knows the token.
+    browser.load(&format!("http://{REBOUND}:{port}/?token={token}"));
+    browser.wait("document.body.innerText.startsWith('the Host header must name this server')");
+    assert_eq!(browser.value(&open), "refused", "with the Origin of another site");
+    let read = format!(
+        "fetch('http://127.0.0.1:{port}/{token}/engines').then((answer) => answer.text()).catch(() => 'refused')"
+    );
+    assert_eq!(browser.value(&read), "refused");
+    browser.load("about:blank");
+    assert_eq!(browser.value(&open), "refused", "without an Origin of its own");
+}
+
+#[test]
+#[ignore = "needs Chromium"]
+fn nothing_jumps_and_nothing_is_cut_off() {
+    let room = Room::new("layout");
+    let _engine = serve(&room);
+    let list = Server::start(room.endless(&["view"]));
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let mut browser = start("view-layout");
+    let training = Training::start(&room);
+    // Less than nothing where there is a place for a scroll bar.
+    let cut = "Math.max(0, document.documentElement.scrollWidth - document.documentElement.clientWidth)";
+    // The sum of what moved, as browsers measure it.
+    let shifts = "new Promise((done) => { let sum = 0; const moved = []; const observer = new PerformanceObserver((list) => { \
+                  for (const entry of list.getEntries()) { sum += entry.value; moved.push(...entry.sources.map(({ node, \
+                  previousRect, currentRect }) => [node?.id || node?.nodeName, node?.textContent, previousRect.toJSON(), currentRect.toJSON()])) } }); \
+                  observer.observe({ type: 'layout-shift', buffered: true }); setTimeout(() => done({ sum, moved }), 300) })";
+    for (width, height, phone) in [(1400, 900, false), (1024, 700, false), (390, 844, true), (320, 640, true)] {
+        browser.resize(width, height, phone);
+        browser.load("about:blank");
+        browser.load(&server.url);
+        browser.wait(SHOWN);
+        browser.wait("document.querySelector('#curves path').getAttribute('d').includes('L')");
+        let shifted = browser.value(shifts);
+        assert!(shifted["sum"].as_f64() < Some(0.02), "{width}x{height}: {shifted}");
+        assert_eq!(browser.value(cut), 0, "{width}x{height}");
+        browser.value("document.querySelectorAll('#grid button')[3].click()");
+        assert_eq!(browser.value(cut), 0, "enlarged, {width}x{height}");
+        browser.load("about:blank");
+        browser.load(&list.url);
+        browser.wait("document.querySelectorAll('#engines tr').length === 1");
+        assert_eq!(browser.value(cut), 0, "the list, {width}x{height}");
+    }
+    training.end();
+    assert_eq!(browser.complaints, Vec::<String>::new());
+}
+
+/// Not a test: pictures of the page in target/tmp/view-*.png.b64, to look at.
+#[test]
+#[ignore = "pictures to look at"]
+fn measure_by_eye() {
+    let room = Room::new("eye");
+    let mut engine = serve(&room);
+    let server = Server::start(room.endless(&["view", "endless"]));
+    let list = Server::start(room.endless(&["view"]));
+    let mut browser = start("view-eye");
+    let training = Training::start(&room);
+    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let picture = |browser: &mut Chromium, name: &str| {
+        std::fs::write(folder.join(format!("view-{name}.png.b64")), browser.screenshot()).unwrap();
+    };
+    for (name, size, phone, theme, large) in [
+        ("wide-light", (1400, 900), false, "light", false),
+        ("wide-dark", (1400, 900), false, "dark", true),
+        ("narrow-light", (390, 844), true, "light", true),
+        ("narrow-dark", (390, 844), true, "dark", false),
+    ] {
+        browser.resize(size.0, size.1, phone);
+        browser.load("about:blank");
+        browser.load(&server.url);
+        browser.wait(SHOWN);
+        browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
+        if large {
+            browser.value("document.querySelectorAll('#grid button')[3].click()");
+        }
+        // Points of its own, and buttons with their colours.
+        browser.value("globalThis.points = endless.curves.points.length; 0");
+        browser.wait("endless.curves.points.length > points + 1");
+        picture(&mut browser, name);
+        browser.value("scrollTo(0, 1e6)");
+        picture(&mut browser, &format!("{name}-end"));
+        browser.load("about:blank");
+        browser.load(&list.url);
+        browser.wait("document.querySelectorAll('#engines tr').length === 1");
+        browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
+        browser.value("new Promise((done) => setTimeout(done, 2500))");
+        picture(&mut browser, &format!("{name}-list"));
+    }
+    browser.resize(1400, 900, false);
+    browser.load("about:blank");
+    browser.load(&server.url);
+    browser.wait(SHOWN);
+    training.end();
+    engine.end();
+    browser.wait("document.getElementById('state').dataset.state === 'lost'");
+    picture(&mut browser, "lost");
+}

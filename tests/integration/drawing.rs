@@ -1,0 +1,161 @@
+//! Updated frames equal frames that are drawn in full, in every buffer.
+//!
+//! Every pool here checks what it draws, so that a step fails if a frame is wrong. The replay of the recorded
+//! traces checks the same.
+
+use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
+use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, SCREEN};
+use endless_gym::pool::{
+    Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads, WrongFrame,
+};
+use proptest::prelude::*;
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::json;
+
+const NUM_ENVS: usize = 3;
+
+fn config(spec: &EnvSpec) -> PoolConfig {
+    let seeding = Seeding::Continue { seed: Some(3) };
+    PoolConfig { seeding, check_drawing: true, ..PoolConfig::new(spec.id, NUM_ENVS) }
+}
+
+fn pool(config: &PoolConfig) -> Pool {
+    Pool::new(config, &Threads::new(1).unwrap()).unwrap()
+}
+
+fn random_actions(spec: &EnvSpec, random: &mut SmallRng) -> Vec<i32> {
+    let branches = spec.action_space.branches();
+    (0..NUM_ENVS).flat_map(|_| branches).map(|choices| random.random_range(0..*choices)).collect()
+}
+
+/// Plays with several buffers, to which happens what can happen to buffers, and with everything that changes environments.
+fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mut SmallRng) -> Result<(), PoolError> {
+    let spec = pool.spec();
+    let mut buffers: Vec<Vec<Block>> = vec![zeroed(pool.layout().blocks()); 4];
+    pool.reset(ResetRequest::All, &mut buffers[0])?;
+    other.reset(ResetRequest::All, &mut buffers[1])?;
+    for _ in 0..steps {
+        let used = random.random_range(0..buffers.len());
+        match random.random_range(0..60) {
+            0 => buffers[used].fill(bytemuck::Zeroable::zeroed()),
+            1 => buffers[used] = buffers[(used + 1) % 4].clone(),
+            2 => {
+                let frames = pool.layout().clone();
+                frames.write::<u8>(&mut buffers[used], BatchSection::Observation).fill(77);
+                frames.forget_frames(&mut buffers[used]);
+            }
+            3 => other.observe(&mut buffers[used])?,
+            4 => {
+                let snapshot = [&*pool, &*other][random.random_range(0..2)].snapshot(0).unwrap();
+                pool.restore(random.random_range(0..NUM_ENVS), &snapshot).unwrap();
+            }
+            5 => {
+                let reset = [0; NUM_ENVS].map(|_| random.random_range(0..3));
+                let seed = [0; NUM_ENVS].map(|_| random.random_range(0..1000));
+                pool.reset(ResetRequest::Each { reset: &reset, seed: &seed }, &mut buffers[used])?;
+            }
+            6 => pool.reset(ResetRequest::Seed(random.random()), &mut buffers[used])?,
+            7 => pool.ground_truth_view(0, &mut vec![0; envs::view::VIEW_BYTES])?,
+            8 => other.step(&random_actions(spec, random), &mut buffers[used])?,
+            // Most of the time a few of them in turn, as a trainer holds them.
+            _ => {
+                for buffer in &mut buffers[used..] {
+                    pool.step(&random_actions(spec, random), buffer)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+#[ignore = "slow"]
+fn every_environment_is_drawn_alike_in_irregular_buffers() {
+    for spec in envs::specs() {
+        let mut random = SmallRng::seed_from_u64(1);
+        let (mut one, mut other) = (pool(&config(spec)), pool(&config(spec)));
+        let played = play_irregularly(&mut one, &mut other, 1000, &mut random);
+        assert!(played.is_ok(), "{}: {}", spec.id, played.unwrap_err());
+    }
+}
+
+/// Circles of light are tested in blocks of 16, and up to 32 are searched for moves: numbers on both sides of each.
+#[test]
+#[ignore = "slow"]
+fn many_circles_of_light_are_drawn_alike_in_irregular_buffers() {
+    let spec = envs::spec("SearingSpotlights-v0").unwrap();
+    for spotlights in [15, 24, 34] {
+        let options =
+            [("initial_spawns", json!(spotlights)), ("spot_min_speed", json!(0.002)), ("spot_damage", json!(0.0))];
+        let options = options.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+        let config = PoolConfig { options: ResetOptions::Shared(options), ..config(spec) };
+        let mut random = SmallRng::seed_from_u64(spotlights);
+        let played = play_irregularly(&mut pool(&config), &mut pool(&config), 300, &mut random);
+        assert!(played.is_ok(), "{spotlights} spotlights: {}", played.unwrap_err());
+    }
+}
+
+proptest! {
+    #![proptest_config(crate::support::recorded::property_cases(100))]
+
+    #[test]
+    #[ignore = "slow"]
+    fn environments_of_any_options_are_drawn_alike_in_irregular_buffers(
+        (spec, given, others) in prop::sample::select(envs::specs().collect::<Vec<_>>())
+            .prop_flat_map(|spec| (Just(spec), crate::support::recorded::options(spec), crate::support::recorded::options(spec))),
+        same_step: bool,
+        format in crate::support::recorded::pixel_format(),
+        stack in prop::sample::select(vec![1, 1, 2, 3]),
+        seed: u64,
+    ) {
+        let autoreset = if same_step { Autoreset::SameStep } else { Autoreset::NextStep };
+        let with = |given| PoolConfig {
+            options: ResetOptions::Shared(given),
+            autoreset,
+            final_observation: true,
+            frames: Some(Frames { format, stack }),
+            ..config(spec)
+        };
+        let (mut one, mut other) = (pool(&with(given)), pool(&with(others)));
+        let mut random = SmallRng::seed_from_u64(seed);
+        let played = play_irregularly(&mut one, &mut other, 120, &mut random);
+        prop_assert!(played.is_ok(), "{}: {}", spec.id, played.unwrap_err());
+    }
+}
+
+/// A check that never fails would prove nothing.
+#[test]
+fn a_pixel_changed_from_outside_is_found() {
+    let spec = envs::spec("MortarMayhem-Grid-v0").unwrap();
+    let mut pool = pool(&config(spec));
+    let layout = pool.layout().clone();
+    let mut buffer = zeroed(layout.blocks());
+    pool.reset(ResetRequest::All, &mut buffer).unwrap();
+    let (env, x, y) = (1, 83, 2);
+    let corrupt = |buffer: &mut [Block]| {
+        layout.write::<u8>(buffer, BatchSection::Observation)[env * FRAME_BYTES + (x * SCREEN + y) * 3 + 1] ^= 1;
+    };
+
+    corrupt(&mut buffer);
+    let error = pool.step(&[0; NUM_ENVS], &mut buffer).unwrap_err();
+    let PoolError::WrongFrame(WrongFrame { expected, found, .. }) = &error else { panic!("{error}") };
+    assert_eq!(expected ^ 1, *found);
+    assert!(matches!(error, PoolError::WrongFrame(WrongFrame { env: 1, pixel: (83, 2), .. })), "{error}");
+    assert!(error.to_string().contains("environment 1 is wrong at pixel (83, 2)"), "{error}");
+
+    // What is half written is not trusted, and what is announced is no mistake.
+    pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();
+    corrupt(&mut buffer);
+    layout.forget_frames(&mut buffer);
+    pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();
+
+    // Without the check, it stays.
+    let mut unchecked =
+        Pool::new(&PoolConfig { check_drawing: false, ..config(spec) }, &Threads::new(1).unwrap()).unwrap();
+    unchecked.reset(ResetRequest::All, &mut buffer).unwrap();
+    let before = Batch::new(&layout, &buffer).observation().to_vec();
+    corrupt(&mut buffer);
+    unchecked.observe(&mut buffer).unwrap();
+    assert!(Batch::new(&layout, &buffer).observation() != before);
+}

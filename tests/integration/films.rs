@@ -1,0 +1,293 @@
+//! `endless record --film`: the written files, decoded again, against the frames of a pool in this process.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use crate::support::program::{Room, text};
+use endless_gym::batch::{Batch, Frames, PixelFormat, zeroed};
+use endless_gym::envs::{self, view::VIEW_BYTES};
+use endless_gym::pool::{Autoreset, Experts, Pool, PoolConfig, ResetRequest, Threads};
+
+const SIDE: usize = 84;
+const GAP: usize = 2;
+
+type Picture = Vec<[u8; 3]>;
+
+/// The observation and the ground-truth view, 84x84 in rows, of each step of an expert's episode.
+fn frames(id: &str, seed: u64, max_steps: usize) -> Vec<(Picture, Picture)> {
+    let format = PixelFormat { row_major: true, ..PixelFormat::default() };
+    let config = PoolConfig {
+        features: true,
+        frames: Some(Frames { format, stack: 1 }),
+        autoreset: Autoreset::Disabled,
+        ..PoolConfig::new(id, 1)
+    };
+    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
+    let mut experts = Experts::new(pool.spec(), 1, config.autoreset);
+    let mut action = vec![0; pool.spec().action_space.branches().len()];
+    let mut frames = Vec::new();
+    loop {
+        let mut view = vec![0; VIEW_BYTES];
+        pool.ground_truth_view(0, &mut view).unwrap();
+        let view = (0..SIDE * SIDE).map(|place| {
+            let at = (place / SIDE * 4 * SIDE * 4 + place % SIDE * 4) * 3;
+            [view[at], view[at + 1], view[at + 2]]
+        });
+        let batch = Batch::new(pool.layout(), &blocks);
+        frames.push((batch.observation().as_chunks::<3>().0.to_vec(), view.collect()));
+        if batch.terminated()[0] == 1 || frames.len() > max_steps {
+            return frames;
+        }
+        experts.act(&batch, &mut action).unwrap();
+        pool.step(&action, &mut blocks).unwrap();
+    }
+}
+
+/// Both views side by side, magnified.
+fn both((agent, view): &(Picture, Picture), scale: usize) -> Picture {
+    let width = 2 * SIDE + GAP;
+    let pixel = |row: usize, column: usize| match column {
+        column if column < SIDE => agent[row * SIDE + column],
+        column if column < SIDE + GAP => [24; 3],
+        column => view[row * SIDE + column - SIDE - GAP],
+    };
+    (0..width * SIDE * scale * scale)
+        .map(|place| pixel(place / (width * scale) / scale, place % (width * scale) / scale))
+        .collect()
+}
+
+fn record(room: &Room, arguments: &[&str], file: &Path) -> String {
+    let output = room.run(&[&["record"], arguments, &["--film", file.to_str().unwrap()]].concat());
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    text(&output.stdout).to_owned()
+}
+
+/// Pictures and delays in seconds of an animated PNG.
+fn decode_png(file: &Path) -> Vec<(Picture, f64)> {
+    let mut reader = png::Decoder::new(BufReader::new(File::open(file).unwrap())).read_info().unwrap();
+    let count = reader.info().animation_control().unwrap().num_frames;
+    let mut buffer = vec![0; reader.output_buffer_size().unwrap()];
+    let pictures = (0..count).map(|_| {
+        reader.next_frame(&mut buffer).unwrap();
+        let control = reader.info().frame_control().unwrap();
+        let delay = f64::from(control.delay_num) / f64::from(control.delay_den);
+        (buffer.as_chunks::<3>().0.to_vec(), delay)
+    });
+    pictures.collect()
+}
+
+/// Pictures and delays in seconds of a GIF.
+fn decode_gif(file: &Path) -> Vec<(Picture, f64)> {
+    let mut options = gif::DecodeOptions::new();
+    options.set_color_output(gif::ColorOutput::RGBA);
+    let mut decoder = options.read_info(File::open(file).unwrap()).unwrap();
+    let mut pictures = Vec::new();
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        let pixels = frame.buffer.as_chunks::<4>().0.iter().map(|[r, g, b, alpha]| {
+            assert_eq!(*alpha, 255);
+            [*r, *g, *b]
+        });
+        pictures.push((pixels.collect(), f64::from(frame.delay) / 100.0));
+    }
+    pictures
+}
+
+#[test]
+fn png_films_have_every_pixel_of_every_episode() {
+    let room = Room::new("film-png");
+    let (id, file) = ("MysteryPath-Grid-v0", room.root.join("film.png"));
+    let said = record(&room, &[id, "--seed", "3", "--episodes", "2", "--scale", "2"], &file);
+    let episodes = [frames(id, 3, 1000), frames(id, 4, 1000)];
+    for (seed, episode) in (3..).zip(&episodes) {
+        assert!(said.contains(&format!("seed {seed}: return 1.000 in {} steps\n", episode.len() - 1)), "{said}");
+    }
+    let decoded = decode_png(&file);
+    assert_eq!(decoded.len(), episodes[0].len() + episodes[1].len());
+    let fps = f64::from(envs::spec(id).unwrap().render_fps);
+    for (number, ((picture, delay), frame)) in decoded.iter().zip(episodes.iter().flatten()).enumerate() {
+        assert!(*picture == both(frame, 2), "picture {number}");
+        let is_last = number == episodes[0].len() - 1 || number == decoded.len() - 1;
+        assert_eq!(*delay, 1.0 / fps + f64::from(u8::from(is_last)), "picture {number}");
+    }
+    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "only the film is left");
+}
+
+/// Pictures and delays in seconds of an animated WebP.
+fn decode_webp(file: &Path) -> Vec<(Picture, f64)> {
+    let mut decoder = image_webp::WebPDecoder::new(BufReader::new(File::open(file).unwrap())).unwrap();
+    assert!(decoder.is_animated() && !decoder.has_alpha() && !decoder.is_lossy());
+    assert_eq!(decoder.loop_count(), image_webp::LoopCount::Forever);
+    let mut buffer = vec![0; decoder.output_buffer_size().unwrap()];
+    let pictures = (0..decoder.num_frames()).map(|_| {
+        let delay = f64::from(decoder.read_frame(&mut buffer).unwrap()) / 1000.0;
+        (buffer.as_chunks::<3>().0.to_vec(), delay)
+    });
+    pictures.collect()
+}
+
+#[test]
+fn webp_films_have_every_pixel_of_every_episode() {
+    let room = Room::new("film-webp");
+    let file = room.root.join("film.webp");
+    for (id, scale, steps, options) in [
+        ("MysteryPath-Grid-v0", 2, 1000, &[][..]),
+        ("SearingSpotlights-v0", 1, 20, &[][..]),
+        ("MortarMayhem-v0", 3, 15, &["--fps", "7"]),
+    ] {
+        let (scale_text, steps_text) = (scale.to_string(), steps.to_string());
+        let arguments = [id, "--seed", "3", "--episodes", "2", "--scale", &scale_text, "--max-steps", &steps_text];
+        record(&room, &[&arguments, options].concat(), &file);
+        let episodes = [frames(id, 3, steps), frames(id, 4, steps)];
+        let decoded = decode_webp(&file);
+        assert_eq!(decoded.len(), episodes[0].len() + episodes[1].len(), "{id}");
+        for (number, ((picture, _), frame)) in decoded.iter().zip(episodes.iter().flatten()).enumerate() {
+            assert!(*picture == both(frame, scale), "{id}, picture {number}");
+        }
+        // Milliseconds, but the film as a whole is as long as it has to be.
+        let fps = options.get(1).map_or(f64::from(envs::spec(id).unwrap().render_fps), |fps| fps.parse().unwrap());
+        let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
+        let expected = decoded.len() as f64 / fps + 2.0;
+        assert!((duration - expected).abs() < 0.0006, "{id}: {duration} s, expected {expected} s");
+        // Length and padding, as decoders that read chunk by chunk need them.
+        let bytes = std::fs::read(&file).unwrap();
+        assert_eq!(u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize + 8, bytes.len());
+    }
+    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "only the film is left");
+}
+
+#[test]
+fn films_show_one_view_or_both() {
+    let room = Room::new("film-view");
+    let (id, file) = ("MortarMayhem-Grid-v0", room.root.join("film.PNG"));
+    let frames = frames(id, 0, 5);
+    for view in ["agent", "ground-truth"] {
+        record(&room, &[id, "--view", view, "--scale", "1", "--max-steps", "5", "--fps", "10"], &file);
+        let decoded = decode_png(&file);
+        assert_eq!(decoded.len(), 6);
+        for ((picture, _), (agent, ground_truth)) in decoded.iter().zip(&frames) {
+            assert!(picture == if view == "agent" { agent } else { ground_truth }, "{view}");
+        }
+        assert_eq!(decoded[0].1, 0.1);
+    }
+    // The command is hidden from the agent in none of these steps, but its place in the arena is.
+    assert!(frames.iter().any(|(agent, ground_truth)| agent != ground_truth));
+}
+
+/// A palette has 256 colours. A picture with no more of them is exact, and others are near.
+#[test]
+fn gif_films_are_as_exact_as_their_palettes() {
+    let room = Room::new("film-gif");
+    let file = room.root.join("film.gif");
+    let (mut exact, mut near) = (0, 0);
+    for (id, steps) in [("MortarMayhem-Grid-v0", 30), ("SearingSpotlights-v0", 10)] {
+        record(&room, &[id, "--max-steps", &steps.to_string(), "--scale", "1", "--seed", "1"], &file);
+        let (decoded, frames) = (decode_gif(&file), frames(id, 1, steps));
+        assert_eq!(decoded.len(), frames.len());
+        for (number, ((picture, _), frame)) in decoded.iter().zip(&frames).enumerate() {
+            let expected = both(frame, 1);
+            let colours = expected.iter().collect::<std::collections::BTreeSet<_>>().len();
+            if colours <= 256 {
+                assert!(*picture == expected, "{id}, picture {number} with {colours} colours");
+                exact += 1;
+            } else {
+                let difference =
+                    |(a, b): (&[u8; 3], &[u8; 3])| (0..3).map(|i| f64::from(a[i].abs_diff(b[i]))).sum::<f64>();
+                let mean = picture.iter().zip(&expected).map(difference).sum::<f64>() / (3 * expected.len()) as f64;
+                assert!(mean < 3.0, "{id}, picture {number} with {colours} colours: {mean} of 255 on average");
+                near += 1;
+            }
+        }
+        // Hundredths of a second, but the film as a whole is as long as it has to be.
+        let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
+        let expected = frames.len() as f64 / f64::from(envs::spec(id).unwrap().render_fps) + 1.0;
+        assert!((duration - expected).abs() < 0.006, "{id}: {duration} s, expected {expected} s");
+    }
+    assert!(exact > 0, "no picture has few colours: {exact}, {near}");
+}
+
+/// What ffmpeg is given. A stand-in writes its input to the file, its last argument.
+#[test]
+fn mp4_films_are_encoded_by_ffmpeg() {
+    let room = Room::new("film-mp4");
+    let (id, file, ffmpeg) = ("MysteryPath-Grid-v0", room.root.join("film.mp4"), room.root.join("ffmpeg"));
+    let install = |script: &str| {
+        std::fs::write(&ffmpeg, format!("#!/bin/sh\n{script}\n")).unwrap();
+        std::fs::set_permissions(&ffmpeg, std::fs::Permissions::from_mode(0o700)).unwrap();
+    };
+    let run = || {
+        let arguments = ["record", id, "--max-steps", "4", "--scale", "2", "--film", file.to_str().unwrap()];
+        room.endless(&arguments).env("IMAGEIO_FFMPEG_EXE", &ffmpeg).output().unwrap()
+    };
+    let missing = run();
+    assert_eq!(missing.status.code(), Some(1));
+    assert!(
+        text(&missing.stderr).contains("an .mp4 needs ffmpeg, and there is no program"),
+        "{}",
+        text(&missing.stderr)
+    );
+
+    install("echo no such codec >&2; exit 3");
+    let failed = run();
+    assert_eq!(failed.status.code(), Some(1));
+    let message = text(&failed.stderr);
+    assert!(message.contains("ffmpeg failed to write") && message.contains("no such codec"), "{message}");
+    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "nothing half-written is left");
+
+    install("echo \"$@\" > \"$0.arguments\"; while [ $# -gt 1 ]; do shift; done; cat > \"$1\"");
+    let written = run();
+    assert!(written.status.success(), "{}", text(&written.stderr));
+    let fps = envs::spec(id).unwrap().render_fps as usize;
+    let mut expected: Vec<Picture> = frames(id, 0, 4).iter().map(|frame| both(frame, 2)).collect();
+    let last = expected[4].clone();
+    expected.extend(std::iter::repeat_n(last, fps));
+    assert!(std::fs::read(&file).unwrap() == expected.concat().into_flattened());
+    let arguments = std::fs::read_to_string(room.root.join("ffmpeg.arguments")).unwrap();
+    assert!(arguments.contains(&format!("-pix_fmt rgb24 -s 340x168 -r {fps} -i -")), "{arguments}");
+}
+
+#[test]
+fn random_play_follows_from_its_seeds() {
+    let room = Room::new("film-random");
+    let file = room.root.join("film.png");
+    let film = |seed: &str, policy: &str| {
+        let arguments =
+            ["MysteryPath-v0", "--max-steps", "20", "--scale", "1", "--policy", policy, "--action-seed", seed];
+        record(&room, &arguments, &file);
+        std::fs::read(&file).unwrap()
+    };
+    let first = film("1", "random");
+    assert!(first == film("1", "random"));
+    assert!(first != film("2", "random"));
+    assert!(film("1", "expert") == film("2", "expert"));
+}
+
+#[test]
+fn what_cannot_be_recorded_is_an_error_and_leaves_no_file() {
+    let room = Room::new("film-errors");
+    let run = |arguments: &[&str]| {
+        let output = room.endless(&[&["record"], arguments].concat()).current_dir(&room.root).output().unwrap();
+        (output.status.code(), text(&output.stderr).to_owned())
+    };
+    for (arguments, status, message) in [
+        (&["MysteryPath-v0", "--film", "a.apng"][..], 1, "--film must end in .gif, .webp, .png or .mp4, got `a.apng`"),
+        (&["MysteryPath-v1", "--film", "a.gif"], 1, "no environment `MysteryPath-v1`; there are"),
+        (&["MysteryPath-v0", "--film", "no/a.gif"], 1, "cannot write no/a.gif: "),
+        (&["MysteryPath-v0", "--film", "a.gif", "--option", "x"], 1, "--option x: expected NAME=VALUE"),
+        (&["MortarMayhem-v0", "--film=a.gif", "--option", "arena_size=9"], 1, "arena_size"),
+        (&["MysteryPath-v0", "--film", "a.gif", "--fps", "0"], 2, "0 is not in 1..=100"),
+        (&["--film", "a.gif"], 2, "<ID>"),
+        (&["MysteryPath-v0", "--error-rate", "0", "0.1"], 1, "Python package's program"),
+    ] {
+        let (code, said) = run(arguments);
+        assert_eq!(code, Some(status), "{arguments:?}: {said}");
+        assert!(said.contains(message), "{arguments:?}: {said}");
+    }
+    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 0);
+    let help = room.run(&["record", "--help"]);
+    assert!(help.status.success());
+    assert!(text(&help.stdout).contains("[default: 4]"), "{}", text(&help.stdout));
+}

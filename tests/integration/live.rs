@@ -1,0 +1,198 @@
+//! The original, live: random seeds, options and actions, of which nothing may differ.
+//!
+//! The engine plays first, with experts that err now and then, so that episodes get far; the original plays the same actions; the
+//! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original. Without it these tests cannot run, so they are
+//! ignored unless asked for; `cargo xtask test` sets the original up and asks for them. With `ENDLESS_LIVE_STEPS`, the steps to
+//! compare for each id, as `cargo xtask live` sets it, every run is another one; without, all runs are the same.
+
+use std::io::{BufRead, BufReader, Write};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::envs::{self, EnvSpec};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::trace::{Trace, replay};
+use proptest::prelude::*;
+use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::{Map, Value as Json, json};
+
+/// Steps that an episode is played at most.
+const MAX_STEPS: usize = 400;
+
+/// The original in a separate process.
+struct Original {
+    child: Child,
+    requests: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+impl Original {
+    fn start() -> Self {
+        let python = std::env::var("ENDLESS_ORIGINAL_PYTHON").expect(
+            "run `cargo xtask test`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
+        );
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/reference/play.py");
+        let mut child = Command::new(python)
+            .arg(script)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("the original's Python starts");
+        let (requests, answers) = (child.stdin.take().unwrap(), child.stdout.take().unwrap());
+        Original { child, requests, answers: BufReader::new(answers) }
+    }
+
+    fn play(&mut self, request: &Json) -> Json {
+        writeln!(self.requests, "{request}").unwrap();
+        let mut line = String::new();
+        self.answers.read_line(&mut line).unwrap();
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("the original answers `{line:.300}`: {error}"))
+    }
+}
+
+impl Drop for Original {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// One environment object that plays a few episodes.
+#[derive(Clone, Debug)]
+struct Case {
+    options: Map<String, Json>,
+    /// The first episode needs a seed: an unseeded one differs by nature.
+    first_seed: u64,
+    seeds: Vec<Option<u64>>,
+    /// How often an action is random instead of the expert's.
+    error_rate: f64,
+    action_seed: u64,
+}
+
+fn case(spec: &'static EnvSpec) -> impl Strategy<Value = Case> {
+    let seeds = prop::collection::vec(prop::option::of(any::<u64>()), 1..4);
+    let error_rate = prop_oneof![Just(0.0), Just(0.03), Just(0.3), Just(1.0)];
+    let options = crate::support::recorded::options(spec).prop_map(|mut options| {
+        NEWER.iter().for_each(|name| drop(options.remove(*name)));
+        options
+    });
+    (options, any::<u64>(), seeds, error_rate, any::<u64>()).prop_map(
+        |(options, first_seed, seeds, error_rate, action_seed)| Case {
+            options,
+            first_seed,
+            seeds,
+            error_rate,
+            action_seed,
+        },
+    )
+}
+
+/// Plays a case in the engine: the request that makes the original play the same.
+fn play(spec: &'static EnvSpec, case: &Case) -> Json {
+    let config = PoolConfig {
+        options: ResetOptions::Shared(case.options.clone()),
+        autoreset: Autoreset::Disabled,
+        features: true,
+        ..PoolConfig::new(spec.id, 1)
+    };
+    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks: Vec<Block> = zeroed(pool.layout().blocks());
+    let mut random = SmallRng::seed_from_u64(case.action_seed);
+    let branches = spec.action_space.branches();
+    let mut episodes = Vec::new();
+    for seed in std::iter::once(Some(case.first_seed)).chain(case.seeds.iter().copied()) {
+        match seed {
+            Some(seed) => pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap(),
+            None => pool.reset(ResetRequest::All, &mut blocks).unwrap(),
+        }
+        let mut expert = envs::expert(spec);
+        let mut actions = Vec::new();
+        for _ in 0..MAX_STEPS {
+            let batch = Batch::new(pool.layout(), &blocks);
+            let mut action = vec![0; branches.len()];
+            expert.act(batch.features(), batch.vector_observation(), &mut action);
+            if random.random::<f64>() < case.error_rate {
+                action.iter_mut().zip(branches).for_each(|(number, n)| *number = random.random_range(0..*n));
+            }
+            pool.step(&action, &mut blocks).unwrap();
+            actions.push(action);
+            if Batch::new(pool.layout(), &blocks).terminated()[0] == 1 {
+                break;
+            }
+        }
+        episodes.push(json!({"seed": seed, "actions": actions}));
+    }
+    json!({"env": spec.id, "options": case.options, "views": true, "episodes": episodes})
+}
+
+/// Reset parameters of version 1.0.3 that the original from PyPI, 1.0.2, does not know; the traces cover them.
+const NEWER: [&str; 3] = ["reward_new_command_success", "reward_path_progress_dense", "coin_enabled"];
+
+fn compare(id: &str) {
+    let spec = envs::spec(id).unwrap();
+    let asked: Option<usize> = std::env::var("ENDLESS_LIVE_STEPS").ok().map(|text| text.parse().unwrap());
+    let wanted = asked.unwrap_or(1500);
+    let mut seeds = SmallRng::seed_from_u64(asked.map_or(0, |_| rand::random()));
+    let original = std::cell::RefCell::new(Original::start());
+    let (steps, raised) = (std::cell::Cell::new(0), std::cell::Cell::new(0));
+    while steps.get() < wanted {
+        let config = Config { cases: 4, failure_persistence: None, ..Config::default() };
+        let random = TestRng::from_seed(RngAlgorithm::ChaCha, &seeds.random::<[u8; 32]>());
+        TestRunner::new_with_rng(config, random)
+            .run(&case(spec), |case| {
+                let answer = original.borrow_mut().play(&play(spec, &case));
+                if answer.get("error").is_some() {
+                    raised.set(raised.get() + 1);
+                    return Ok(());
+                }
+                let trace: Trace = serde_json::from_value(answer).unwrap();
+                let replay = replay(&trace).unwrap();
+                prop_assert_eq!(replay.first, None);
+                steps.set(steps.get() + replay.steps);
+                Ok(())
+            })
+            .unwrap();
+        assert!(raised.get() < 20 + steps.get() / 50, "{id}: the original raises too often to compare with");
+    }
+    println!(
+        "{id}: {} steps without a difference, {} option sets at which the original raises",
+        steps.get(),
+        raised.get()
+    );
+}
+
+macro_rules! live {
+    ($($name:ident: $id:literal,)*) => {
+        $(
+            #[test]
+            #[ignore = "needs the original, in the Python that ENDLESS_ORIGINAL_PYTHON names: run `cargo xtask test`"]
+            fn $name() {
+                compare($id);
+            }
+        )*
+
+        #[test]
+        fn no_id_is_forgotten() {
+            let mut compared = vec![$($id),*];
+            let mut all: Vec<&str> = envs::specs().map(|spec| spec.id).collect();
+            compared.sort_unstable();
+            all.sort_unstable();
+            assert_eq!(compared, all);
+        }
+    };
+}
+
+live! {
+    mortar_mayhem: "MortarMayhem-v0",
+    mortar_mayhem_grid: "MortarMayhem-Grid-v0",
+    mortar_mayhem_b: "MortarMayhemB-v0",
+    mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
+    endless_mortar_mayhem: "Endless-MortarMayhem-v0",
+    mystery_path: "MysteryPath-v0",
+    mystery_path_grid: "MysteryPath-Grid-v0",
+    endless_mystery_path: "Endless-MysteryPath-v0",
+    searing_spotlights: "SearingSpotlights-v0",
+    endless_searing_spotlights: "Endless-SearingSpotlights-v0",
+}

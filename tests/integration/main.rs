@@ -1,0 +1,39 @@
+//! The tests across crates, as one program.
+
+mod allocation;
+mod browser;
+mod checkpoints;
+mod drawing;
+mod examples;
+mod experts;
+mod films;
+mod formats;
+mod independent_episodes;
+mod live;
+mod meanings;
+mod next_options;
+mod play_page;
+mod pool;
+mod program;
+mod recordings;
+mod service;
+mod service_episodes;
+mod service_faults;
+mod service_forged;
+mod service_frames;
+mod service_pause;
+mod service_promise;
+mod service_snapshots;
+mod serving;
+mod snapshots;
+mod support;
+mod terminal;
+mod traces;
+mod view;
+
+/// A child process of other tests, in the role that its environment names.
+#[test]
+#[ignore = "does nothing on its own"]
+fn role() {
+    support::service::play_role();
+}

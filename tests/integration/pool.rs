@@ -1,0 +1,380 @@
+//! Many environments in lockstep: auto-reset, seeding, options, threads, and what is refused.
+
+use std::collections::HashSet;
+
+use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::envs::{self, ActionError};
+use endless_gym::pool::{
+    Autoreset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
+};
+use proptest::prelude::*;
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::{Map, Value as Json, json};
+
+const ID: &str = "Endless-MortarMayhem-v0";
+
+fn options(value: Json) -> Map<String, Json> {
+    value.as_object().unwrap().clone()
+}
+
+/// Short episodes: an agent that does nothing fails at the first command that asks it to move.
+fn config(num_envs: usize) -> PoolConfig {
+    PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new(ID, num_envs) }
+}
+
+/// A pool with the memory of its batch.
+struct Player {
+    pool: Pool,
+    blocks: Vec<Block>,
+    random: SmallRng,
+}
+
+impl Player {
+    fn new(config: &PoolConfig, threads: usize) -> Self {
+        let mut pool = Pool::new(config, &Threads::new(threads).unwrap()).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        pool.reset(ResetRequest::All, &mut blocks).unwrap();
+        Player { pool, blocks, random: SmallRng::seed_from_u64(5) }
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        Batch::new(self.pool.layout(), &self.blocks)
+    }
+
+    fn step(&mut self, actions: &[i32]) {
+        self.pool.step(actions, &mut self.blocks).unwrap();
+    }
+
+    fn step_at_random(&mut self) {
+        let branches = self.pool.spec().action_space.branches();
+        let num_envs = self.pool.layout().num_envs();
+        let actions: Vec<i32> = (0..num_envs)
+            .flat_map(|_| branches.iter().map(|n| self.random.random_range(0..*n)).collect::<Vec<_>>())
+            .collect();
+        self.step(&actions);
+    }
+
+    fn frame(&self, env: usize) -> Vec<u8> {
+        self.batch().observation()[env * envs::FRAME_BYTES..][..envs::FRAME_BYTES].to_vec()
+    }
+}
+
+/// The first observation of the environment with that seed.
+fn first_frame(seed: u64) -> Vec<u8> {
+    Player::new(&PoolConfig { seeding: Seeding::Continue { seed: Some(seed) }, ..PoolConfig::new(ID, 1) }, 1).frame(0)
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    for spec in envs::specs() {
+        let config = PoolConfig {
+            seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
+            features: true,
+            ..PoolConfig::new(spec.id, 331)
+        };
+        let mut players: Vec<Player> = [1, 2, 3, 64].map(|threads| Player::new(&config, threads)).into();
+        for step in 0..80 {
+            for player in &mut players {
+                player.step_at_random();
+            }
+            let (first, others) = players.split_first().unwrap();
+            for other in others {
+                assert!(first.batch().bytes() == other.batch().bytes(), "{}, step {step}", spec.id);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_group_is_a_slice_of_all_environments() {
+    let whole = Player::new(&config(6), 1);
+    let half = Player::new(&PoolConfig { first_env: 3, total_envs: 6, ..config(3) }, 1);
+    assert_eq!(half.frame(0), whole.frame(3));
+}
+
+#[test]
+fn next_step_autoreset_starts_an_episode_in_the_step_after_its_end() {
+    let mut player = Player::new(&config(64), 1);
+    let mut ended = [false; 64];
+    let mut starts = 0;
+    for _ in 0..200 {
+        player.step_at_random();
+        let batch = player.batch();
+        for (env, ended) in ended.iter_mut().enumerate() {
+            if *ended {
+                starts += 1;
+                assert_eq!((batch.reward()[env], batch.terminated()[env]), (0.0, 0));
+                assert_eq!((batch.episode_return()[env], batch.episode_length()[env]), (0.0, 0));
+            }
+            let longest = batch.info()[env * 2 + 1];
+            assert!(longest == 0.0 || batch.terminated()[env] == 1);
+            *ended = batch.terminated()[env] == 1;
+        }
+    }
+    assert!(starts > 100, "{starts} episodes");
+}
+
+#[test]
+fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
+    let next = PoolConfig { autoreset: Autoreset::NextStep, features: true, ..config(1) };
+    let same = PoolConfig { autoreset: Autoreset::SameStep, final_observation: true, ..next.clone() };
+    let (mut next, mut same) = (Player::new(&next, 1), Player::new(&same, 1));
+    let mut ends = 0;
+    for _ in 0..300 {
+        next.step(&[0, 0]);
+        same.step(&[0, 0]);
+        assert_eq!(next.batch().reward(), same.batch().reward());
+        assert_eq!(next.batch().terminated(), same.batch().terminated());
+        assert_eq!(next.batch().episode_length(), same.batch().episode_length());
+        assert_eq!(next.batch().info(), same.batch().info());
+        if next.batch().terminated()[0] == 0 {
+            assert_eq!(next.frame(0), same.frame(0));
+            continue;
+        }
+        ends += 1;
+        let kept = same.batch().final_ground_truth();
+        assert_eq!(next.batch().ground_truth(), kept);
+        assert_eq!(next.batch().features(), same.batch().final_features());
+        assert_eq!(next.batch().observation(), same.batch().final_observation());
+        next.step(&[0, 0]);
+        assert_eq!(next.frame(0), same.frame(0), "the new episode's first observation");
+        assert_eq!(next.batch().ground_truth(), same.batch().ground_truth());
+    }
+    assert!(ends > 5, "{ends} episodes");
+}
+
+#[test]
+fn the_vector_observation_is_kept_too() {
+    let config = PoolConfig {
+        autoreset: Autoreset::SameStep,
+        final_observation: true,
+        ..PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new("MortarMayhemB-Grid-v0", 1) }
+    };
+    let mut player = Player::new(&config, 1);
+    let commands = player.batch().vector_observation().to_vec();
+    while player.batch().terminated()[0] == 0 {
+        player.step(&[1]);
+    }
+    assert_eq!(player.batch().final_vector_observation(), commands);
+    assert_ne!(player.batch().vector_observation(), commands);
+}
+
+#[test]
+fn disabled_autoreset_leaves_resets_to_the_trainer() {
+    let mut player = Player::new(&PoolConfig { autoreset: Autoreset::Disabled, ..config(3) }, 2);
+    for _ in 0..30 {
+        player.step_at_random();
+    }
+    assert_eq!(player.batch().episode_length(), [30; 3], "no environment resets");
+    let before = player.frame(0);
+    player.pool.reset(ResetRequest::Each { reset: &[0, 1, 2], seed: &[0, 0, 77] }, &mut player.blocks).unwrap();
+    assert_eq!(player.batch().episode_length(), [30, 0, 0]);
+    assert_eq!(player.frame(0), before);
+    assert_eq!(player.frame(2), first_frame(77));
+}
+
+#[test]
+fn seeds_follow_the_seeding() {
+    let first_frames = |seeding: Seeding, episodes: usize| -> Vec<Vec<u8>> {
+        let mut player = Player::new(&PoolConfig { seeding, ..PoolConfig::new(ID, 2) }, 1);
+        let mut frames = vec![player.frame(0), player.frame(1)];
+        for _ in 1..episodes {
+            player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
+            frames.extend([player.frame(0), player.frame(1)]);
+        }
+        frames
+    };
+    let seeds = |seeds: &[u64]| seeds.iter().map(|seed| first_frame(*seed)).collect::<Vec<_>>();
+    assert_eq!(first_frames(Seeding::List(vec![10, 11, 12]), 3), seeds(&[10, 11, 12, 10, 11, 12]));
+    assert_eq!(first_frames(Seeding::Continue { seed: Some(20) }, 1), seeds(&[20, 21]));
+    assert_eq!(first_frames(Seeding::Range { start: 30, end: 31, step: 1, seed: None }, 2), seeds(&[30; 4]));
+    let drawn = first_frames(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) }, 20);
+    assert_eq!(drawn, first_frames(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) }, 20));
+    assert_ne!(drawn, first_frames(Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(2) }, 20));
+    assert_ne!(drawn[0], drawn[1], "environments draw independently");
+}
+
+#[test]
+fn ranges_of_seeds_may_have_a_step() {
+    let seeding = Seeding::Range { start: 4, end: 12, step: 3, seed: Some(1) };
+    let player = Player::new(&PoolConfig { seeding, ..PoolConfig::new(ID, 64) }, 1);
+    let expected: HashSet<Vec<u8>> = [4, 7, 10].map(first_frame).into();
+    assert_eq!((0..64).map(|env| player.frame(env)).collect::<HashSet<_>>(), expected);
+}
+
+#[test]
+fn all_episodes_after_a_seeded_reset_follow_from_its_seed() {
+    let range = |seed| Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(seed) };
+    let pairs = [
+        [Seeding::Continue { seed: Some(3) }, Seeding::Continue { seed: Some(4) }],
+        [range(3), range(4)],
+        [Seeding::List(vec![5, 6, 7]), Seeding::List(vec![5, 6, 7])],
+    ];
+    for pair in pairs {
+        // One reset by the seed of all, the other one environment at a time and after another number of episodes.
+        let each = [ResetRequest::Seed(50), ResetRequest::Each { reset: &[2, 2], seed: &[50, 51] }];
+        let shown = pair.clone().into_iter().zip(each).enumerate().map(|(before, (seeding, request))| {
+            let mut player = Player::new(&PoolConfig { seeding, ..config(2) }, 1);
+            for _ in 0..before {
+                player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
+            }
+            player.pool.reset(request, &mut player.blocks).unwrap();
+            let mut frames = vec![player.frame(0), player.frame(1)];
+            for _ in 0..4 {
+                player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
+                frames.extend([player.frame(0), player.frame(1)]);
+            }
+            frames
+        });
+        let [one, other] = shown.collect::<Vec<_>>().try_into().unwrap();
+        assert!(one == other, "{pair:?}");
+        let seeds = |seeds: &[u64]| seeds.iter().map(|seed| first_frame(*seed)).collect::<Vec<_>>();
+        match pair[0] {
+            Seeding::Continue { .. } => {
+                let mut twin =
+                    Player::new(&PoolConfig { seeding: Seeding::Continue { seed: Some(50) }, ..config(2) }, 1);
+                twin.pool.reset(ResetRequest::All, &mut twin.blocks).unwrap();
+                assert!(one[2..4] == [twin.frame(0), twin.frame(1)], "the generator of the seed continues");
+            }
+            Seeding::Range { .. } => assert_ne!(one[2], one[3], "environments draw independently"),
+            Seeding::List(_) => assert!(one == seeds(&[50, 51, 5, 6, 7, 5, 6, 7, 5, 6]), "the list starts again"),
+        }
+    }
+}
+
+#[test]
+fn the_number_of_threads_is_limited() {
+    assert!(matches!(Threads::new(MAX_THREADS + 1), Err(PoolError::ThreadCount { given }) if given == MAX_THREADS + 1));
+    assert!(matches!(Threads::new(usize::MAX), Err(PoolError::ThreadCount { .. })));
+}
+
+#[test]
+fn a_seeded_reset_resets_all() {
+    let mut player = Player::new(&config(2), 1);
+    player.step_at_random();
+    player.pool.reset(ResetRequest::Seed(50), &mut player.blocks).unwrap();
+    assert_eq!((player.frame(0), player.frame(1)), (first_frame(50), first_frame(51)));
+}
+
+#[test]
+fn each_environment_may_have_its_own_options() {
+    let each = vec![options(json!({})), options(json!({"agent_scale": 0.4})), options(json!({}))];
+    let seeding = Seeding::List(vec![8]);
+    let player = Player::new(
+        &PoolConfig { options: ResetOptions::Each(each), seeding: seeding.clone(), ..PoolConfig::new(ID, 3) },
+        1,
+    );
+    assert_eq!(player.frame(0), first_frame(8));
+    assert_ne!(player.frame(1), first_frame(8));
+    assert_eq!(player.frame(2), first_frame(8));
+}
+
+#[test]
+fn a_reset_may_change_the_options() {
+    let other = options(json!({"initial_command_count": 4, "agent_scale": 0.5}));
+    let mut fresh = Player::new(&PoolConfig { options: ResetOptions::Shared(other.clone()), ..config(2) }, 1);
+    let mut player = Player::new(&config(2), 1);
+    let before = player.frame(1);
+    let request = ResetRequest::Each { reset: &[2, 0], seed: &[3, 0] };
+    player.pool.reset_with(request, Some(&other), &mut player.blocks).unwrap();
+    assert_eq!(player.frame(1), before, "an environment that is not reset keeps its options");
+    for _ in 0..200 {
+        assert_eq!(player.frame(0), fresh.frame(0));
+        fresh.step(&[0, 0, 1, 1]);
+        player.step(&[0, 0, 1, 1]);
+    }
+    let before = player.pool.snapshot(0).unwrap();
+    let wrong = options(json!({"agent_scale": "large"}));
+    let refused = player.pool.reset_with(ResetRequest::All, Some(&wrong), &mut player.blocks);
+    assert!(matches!(refused, Err(PoolError::Parameters(_))));
+    assert_eq!(player.pool.snapshot(0).unwrap(), before, "nothing has changed");
+}
+
+#[test]
+fn without_frames_nothing_else_changes() {
+    let mut with = Player::new(&PoolConfig { features: true, ..config(3) }, 1);
+    let mut without = Player::new(&PoolConfig { features: true, frames: None, ..config(3) }, 1);
+    for _ in 0..100 {
+        with.step_at_random();
+        without.step_at_random();
+        assert!(without.batch().observation().is_empty());
+        assert_eq!(with.batch().reward(), without.batch().reward());
+        assert_eq!(with.batch().features(), without.batch().features());
+    }
+}
+
+#[test]
+fn wrong_configurations_are_refused() {
+    let refused = |config: PoolConfig| {
+        let error = Pool::new(&config, &Threads::new(1).unwrap()).err().unwrap();
+        assert_eq!(config.validate().unwrap_err().to_string(), error.to_string());
+        error
+    };
+    assert!(config(2).validate().is_ok());
+    let with =
+        |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
+    assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
+    assert_eq!(refused(config(0)).to_string(), "num_envs must be 1 to 1048576, got 0");
+    for (first_env, total_envs) in [(1, 3), (usize::MAX, usize::MAX), (0, 2), (0, 1 << 32)] {
+        let outside = PoolConfig { first_env, total_envs, ..config(3) };
+        assert!(matches!(refused(outside), PoolError::EnvNumbers { num_envs: 3, .. }));
+    }
+    assert!(matches!(refused(PoolConfig { seeding: Seeding::List(vec![]), ..config(1) }), PoolError::NoSeeds));
+    let empty = Seeding::Range { start: 5, end: 5, step: 1, seed: None };
+    assert!(matches!(refused(PoolConfig { seeding: empty, ..config(1) }), PoolError::SeedRange { .. }));
+    let still = Seeding::Range { start: 4, end: 12, step: 0, seed: None };
+    assert!(matches!(refused(PoolConfig { seeding: still, ..config(1) }), PoolError::SeedStep));
+    let two = ResetOptions::Each(vec![Map::new(); 2]);
+    assert!(matches!(refused(PoolConfig { options: two, ..config(3) }), PoolError::OptionsCount { .. }));
+    assert!(with(json!({"arena_sise": 5})).contains("`arena_sise`; it has max_steps, agent_scale"));
+    assert!(with(json!({"allowed_commands": 3})).contains("`allowed_commands` must be an integer, 4 to 9, got 3"));
+    assert!(with(json!({"visual_feedback": 1})).contains("`visual_feedback` must be true or false, got 1"));
+    let one_of_two = ResetOptions::Each(vec![Map::new(), options(json!({"agent_speed": "fast"}))]);
+    let text = refused(PoolConfig { options: one_of_two, first_env: 4, total_envs: 6, ..config(2) }).to_string();
+    assert!(text.contains("environment 5") && text.contains("agent_speed"), "{text}");
+}
+
+#[test]
+fn wrong_calls_are_refused_and_change_nothing() {
+    let mut pool = Pool::new(&config(2), &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    assert!(matches!(pool.step(&[0; 4], &mut blocks), Err(PoolError::NotReset)));
+    pool.reset(ResetRequest::All, &mut blocks).unwrap();
+    let before = blocks.clone();
+    assert!(matches!(pool.step(&[0; 3], &mut blocks), Err(PoolError::Action(ActionError::Count { given: 3, .. }))));
+    assert!(matches!(pool.step(&[0, 0, 0, 3], &mut blocks), Err(PoolError::Action(ActionError::Range { env: 1, .. }))));
+    assert!(matches!(
+        pool.step(&[-1, 0, 0, 0], &mut blocks),
+        Err(PoolError::Action(ActionError::Range { env: 0, .. }))
+    ));
+    assert!(matches!(pool.step(&[0; 4], &mut blocks[1..]), Err(PoolError::BatchTooShort { .. })));
+    let request = ResetRequest::Each { reset: &[1], seed: &[1] };
+    assert!(matches!(pool.reset(request, &mut blocks), Err(PoolError::ResetCount { .. })));
+    assert!(bytemuck::cast_slice::<_, u8>(&before) == bytemuck::cast_slice::<_, u8>(&blocks));
+}
+
+proptest! {
+    #![proptest_config(crate::support::recorded::property_cases(64))]
+
+    /// Any options within the limits, any seed, any actions: nothing panics, and two pools agree.
+    #[test]
+    fn any_options_within_the_limits_can_be_played(
+        (spec, given) in prop::sample::select(envs::specs().collect::<Vec<_>>())
+            .prop_flat_map(|spec| (Just(spec), crate::support::recorded::options(spec))),
+        seed: u64,
+    ) {
+        let config = PoolConfig {
+            options: ResetOptions::Shared(given),
+            seeding: Seeding::Continue { seed: Some(seed) },
+            features: true,
+            ..PoolConfig::new(spec.id, 3)
+        };
+        let (mut one, mut other) = (Player::new(&config, 1), Player::new(&config, 2));
+        for _ in 0..60 {
+            one.step_at_random();
+            other.step_at_random();
+            prop_assert!(one.batch().bytes() == other.batch().bytes());
+        }
+    }
+}

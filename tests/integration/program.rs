@@ -1,0 +1,346 @@
+//! The `endless` program, as a user runs it: real processes, their output, exit status and what they leave behind.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::support::program::{Room, signal, text, wait};
+use rustix::process::Signal;
+use rustix::pty::OpenptFlags;
+use rustix::termios::Winsize;
+use serde_json::Value as Json;
+
+#[test]
+fn list_shows_environments_and_parameters() {
+    let room = Room::new("list");
+    let all = room.run(&["list"]);
+    assert!(all.status.success());
+    assert!(text(&all.stdout).contains("Endless-MortarMayhem-v0"));
+    let one = room.run(&["list", "MortarMayhem-v0"]);
+    for part in ["command_show_duration", "[3]", "integer, 2 to 6", "commands_completed"] {
+        assert!(text(&one.stdout).contains(part), "{part}");
+    }
+    let json: Json = serde_json::from_slice(&room.run(&["list", "--json"]).stdout).unwrap();
+    assert_eq!(json[0]["id"], "MortarMayhem-v0");
+    assert_eq!(json[0]["parameters"][2]["name"], "arena_size");
+    assert_eq!(json[0]["parameters"][2]["max"], 6);
+    let unknown = room.run(&["list", "MortarMayhem-v1"]);
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; there are MortarMayhem-v0"));
+    assert_eq!(text(&unknown.stderr).lines().count(), 1);
+}
+
+/// Standard output of a program that runs in a terminal with this number of columns.
+fn in_terminal(columns: u16, command: &mut Command) -> String {
+    let terminal = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    rustix::pty::grantpt(&terminal).unwrap();
+    rustix::pty::unlockpt(&terminal).unwrap();
+    let size = Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 };
+    rustix::termios::tcsetwinsize(&terminal, size).unwrap();
+    let name = rustix::pty::ptsname(&terminal, Vec::new()).unwrap().into_string().unwrap();
+    let program_side = File::options().read(true).write(true).open(name).unwrap();
+    let mut child = command.stdout(program_side).spawn().unwrap();
+    // The command holds the program's side too; without it, reading ends when the program has ended.
+    command.stdout(Stdio::null());
+    let mut output = Vec::new();
+    // The end of a terminal's other side is the error EIO.
+    let _ = File::from(terminal).read_to_end(&mut output);
+    assert!(wait(&mut child).success());
+    text(&output).to_owned()
+}
+
+#[test]
+fn list_shows_pictures_in_terminals_with_colours() {
+    let room = Room::new("picture");
+    let list = |arguments: &[&str]| {
+        let mut command = room.endless(&[&["list", "MysteryPath-v0"], arguments].concat());
+        command.env("COLORTERM", "truecolor").env_remove("NO_COLOR");
+        command
+    };
+    let pixels = |output: &str| output.matches('▀').count();
+    let piped = |arguments: &[&str]| text(&list(arguments).output().unwrap().stdout).to_owned();
+    assert!(piped(&[]).starts_with("MysteryPath-v0: Find an invisible path"));
+    assert!(!piped(&[]).contains('\x1b'));
+    let always = piped(&["--picture", "always"]);
+    assert!(always.starts_with("observation  "), "{always}");
+    assert!(always.contains("\x1b[38;2;255;255;255;"), "no white of the path");
+    assert_eq!(pixels(&always), 2 * 42 * 21);
+    assert!(always.ends_with(&piped(&[])));
+
+    let (narrow, wide) = (in_terminal(80, &mut list(&[])), in_terminal(90, &mut list(&[])));
+    assert_eq!([pixels(&narrow), pixels(&wide)], [42 * 21, 2 * 42 * 21]);
+    let table = |output: &str| output.lines().map(|line| line.matches('─').count()).max();
+    assert_eq!([table(&narrow), table(&wide)], [Some(80), Some(90)]);
+    assert_eq!(pixels(&in_terminal(90, list(&[]).env("NO_COLOR", "1"))), 0);
+    assert_eq!(pixels(&in_terminal(90, list(&[]).env("COLORTERM", ""))), 0);
+    assert_eq!(pixels(&in_terminal(90, &mut list(&["--picture", "never"]))), 0);
+    assert_eq!(pixels(&in_terminal(90, &mut list(&["--json"]))), 0);
+}
+
+#[test]
+fn frames_are_those_of_an_episode() {
+    let room = Room::new("frames");
+    let frames = |steps: &str| room.run(&["frames", "--env", "MysteryPath-Grid-v0", "--seed", "1", "--steps", steps]);
+    let bytes = 84 * 84 * 3 + 336 * 336 * 3;
+    let whole = frames("1000").stdout;
+    assert_eq!(whole.len(), 19 * bytes); // the expert needs 18 steps
+    assert_eq!(frames("3").stdout, whole[..4 * bytes]);
+    let (observation, view) = whole[..bytes].split_at(84 * 84 * 3);
+    let pixel = |frame: &[u8], side: usize, row: usize, column: usize| frame[(row * side + column) * 3..][..3].to_vec();
+    // The path leads along the sixth of seven rows.
+    assert_eq!(pixel(view, 336, 260, 100), [255; 3]);
+    assert_ne!(pixel(view, 336, 100, 260), [255; 3]);
+    // The agent is where it is in the view.
+    let skin: Vec<usize> = (0..84 * 84).filter(|place| observation[place * 3..][..3] == [250, 204, 153]).collect();
+    assert!(!skin.is_empty());
+    for place in skin {
+        assert_eq!(pixel(view, 336, place / 84 * 4, place % 84 * 4), [250, 204, 153]);
+    }
+}
+
+#[test]
+fn verify_counts_and_exits_by_differences() {
+    let room = Room::new("verify");
+    let files = crate::support::recorded::traces("MortarMayhem-Grid-v0");
+    let verify = |files: &[&Path]| {
+        let files: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
+        room.run(&[&["verify"], &files[..]].concat())
+    };
+    let same = verify(&[&files[0], &files[1]]);
+    assert_eq!(same.status.code(), Some(0));
+    let lines: Vec<&str> = text(&same.stdout).lines().collect();
+    assert_eq!(lines.len(), 3);
+    assert!(lines[0].ends_with("6 episodes, 276 steps, no difference"), "{}", lines[0]);
+    assert_eq!(lines[2], "verified 2 traces: 12 episodes, 552 steps, 0 differences");
+
+    let mut recorded = String::new();
+    std::io::Read::read_to_string(
+        &mut flate2::read::GzDecoder::new(std::fs::File::open(&files[0]).unwrap()),
+        &mut recorded,
+    )
+    .unwrap();
+    let write = |name: &str, trace: &Json| {
+        let path = room.root.join(name);
+        let mut file = flate2::write::GzEncoder::new(std::fs::File::create(&path).unwrap(), Default::default());
+        std::io::Write::write_all(&mut file, trace.to_string().as_bytes()).unwrap();
+        path
+    };
+    let mut trace: Json = serde_json::from_str(&recorded).unwrap();
+    trace["episodes"][2]["steps"][4][1] = 0.5.into();
+    let other = verify(&[&write("other.json.gz", &trace)]);
+    assert_eq!(other.status.code(), Some(1));
+    assert!(
+        text(&other.stdout).contains("1 differences, the first in episode 2, step 5: reward expected 0.5, found 0.0"),
+        "{}",
+        text(&other.stdout)
+    );
+    let mut truncated: Json = serde_json::from_str(&recorded).unwrap();
+    truncated["episodes"][5]["steps"].as_array_mut().unwrap().pop();
+    let truncated = verify(&[&write("truncated.json.gz", &truncated)]);
+    assert_eq!(truncated.status.code(), Some(1));
+    assert!(text(&truncated.stdout).contains("not replayed: the trace is truncated: episode 5 must end with `done`"));
+    trace["env"] = "Chess-v0".into();
+    let unknown = verify(&[&files[0], &write("unknown.json.gz", &trace)]);
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(text(&unknown.stdout).contains("not replayed: no environment `Chess-v0`"));
+    assert!(text(&unknown.stdout).ends_with("verified 1 traces: 6 episodes, 276 steps, 0 differences\n"));
+    assert_eq!(verify(&[Path::new("/nowhere.json.gz")]).status.code(), Some(1));
+}
+
+#[test]
+fn the_demo_plays_through_shared_memory_and_leaves_nothing() {
+    let room = Room::new("demo");
+    let demo = room.run(&["demo", "--env", "MortarMayhem-Grid-v0", "--num-envs", "8", "--seconds", "2", "--json"]);
+    assert!(demo.status.success(), "{}", text(&demo.stderr));
+    let json: Json = serde_json::from_slice(&demo.stdout).unwrap();
+    assert!(json["episodes"].as_u64().unwrap() >= 16, "{json}");
+    assert_eq!(json["mean_length"], 118.0);
+    assert_eq!(json["mean_info"]["commands_completed"], 1.0);
+    let random = room.run(&["demo", "--policy", "random", "--num-envs", "8", "--seconds", "0.5"]);
+    assert!(text(&random.stdout).contains("steps per second"), "{}", text(&random.stderr));
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn ctrl_c_ends_the_demo_with_its_summary() {
+    let room = Room::new("ctrlc");
+    let mut demo =
+        room.endless(&["demo", "--num-envs", "8", "--seconds", "60"]).stdout(Stdio::piped()).spawn().unwrap();
+    room.wait_for_engine();
+    signal(&demo, Signal::INT);
+    assert!(wait(&mut demo).success());
+    assert!(text(&demo.wait_with_output().unwrap().stdout).contains("steps per second"));
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn an_engine_does_not_outlive_a_killed_demo() {
+    let room = Room::new("orphan");
+    let mut demo = room.endless(&["demo", "--num-envs", "8"]).stdout(Stdio::null()).spawn().unwrap();
+    room.wait_for_engine();
+    signal(&demo, Signal::KILL);
+    wait(&mut demo);
+    let start = Instant::now();
+    // The engine goes by itself and takes its own segments along; the next process clears up after the killed trainer.
+    while start.elapsed() < Duration::from_secs(10) && !room.segments().is_empty() {
+        std::thread::sleep(Duration::from_millis(500));
+        room.run(&["demo", "--num-envs", "1", "--seconds", "0.1"]);
+    }
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn serve_serves_until_a_signal_and_leaves_nothing() {
+    let room = Room::new("serve");
+    for end in [Signal::INT, Signal::TERM] {
+        let arguments = ["serve", "--num-envs", "4", "--groups", "2", "--service", "one", "--option", "max_steps=50"];
+        let mut engine = room.endless(&arguments).stdout(Stdio::piped()).spawn().unwrap();
+        let mut trainer = room.connect("one");
+        assert_eq!(trainer.specification().groups, 2);
+        assert_eq!(trainer.specification().options[0]["max_steps"], 50);
+        trainer.reset(1, endless_gym::pool::ResetRequest::All).unwrap();
+        trainer.receive(1, Duration::from_secs(5)).unwrap();
+        drop(trainer);
+        signal(&engine, end);
+        assert!(wait(&mut engine).success());
+        assert!(
+            text(&engine.wait_with_output().unwrap().stdout).starts_with("serving Endless-MortarMayhem-v0 as `one`")
+        );
+        assert_eq!(room.segments(), [""; 0]);
+    }
+}
+
+#[test]
+fn wrong_arguments_are_one_clear_line() {
+    let room = Room::new("wrong");
+    for (arguments, part) in [
+        (vec!["serve", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (vec!["serve", "--option", "arena_sise=3"], "no reset parameter `arena_sise`"),
+        (vec!["serve", "--option", "max_steps"], "expected NAME=VALUE"),
+        (vec!["serve", "--option", "agent_speed=fast"], "`agent_speed` must be a number, 0 to 84, got \"fast\""),
+        (vec!["serve", "--env-options", "3"], "expected a JSON object"),
+        (vec!["serve", "--num-envs", "2", "--env-options", "{}"], "1 "),
+        (vec!["serve", "--num-envs", "0"], "num_envs must be 1 to 1048576, got 0"),
+        (vec!["serve", "--groups", "0"], "groups must be 1 to 64, got 0"),
+        (vec!["serve", "--num-envs", "9223372036854775808", "--groups", "4"], "9223372036854775808"),
+        (vec!["serve", "--batches-held", "20"], "batches_held must be 1 to 16, got 20"),
+        (vec!["serve", "--service", "a/b"], "engine name must be 1 to 64 letters, digits, `.`, `_` or `-`, got `a/b`"),
+        (vec!["demo", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (vec!["demo", "--num-envs", "0"], "num_envs must be 1 to 1048576, got 0"),
+        (vec!["demo", "--option", "arena_size=7"], "`arena_size` must be an integer, 2 to 6, got 7"),
+        (vec!["demo", "--seconds=-1"], "--seconds must be finite and positive, got -1"),
+        (vec!["demo", "--seconds", "nan"], "--seconds must be finite and positive, got NaN"),
+        (vec!["bench", "--seconds", "inf"], "--seconds must be finite and positive, got inf"),
+        (vec!["bench", "--seconds", "0"], "--seconds must be finite and positive, got 0"),
+        (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
+        (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "cannot run /no/python: "),
+    ] {
+        let output = room.run(&arguments);
+        let stderr = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
+        assert!(stderr.starts_with("endless: ") && stderr.contains(part), "{arguments:?}: {stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
+    }
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn bench_measures_every_method() {
+    let room = Room::new("bench");
+    let output = room.run(&["bench", "--num-envs", "16", "--seconds", "0.05", "--rounds", "1", "--json"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let json: Json = serde_json::from_slice(&output.stdout).unwrap();
+    let measurements = json[0]["measurements"].as_array().unwrap();
+    let methods: Vec<&str> = measurements.iter().map(|m| m["method"].as_str().unwrap()).collect();
+    for method in ["in process, 1 thread", "service, only receives", "service, reads every byte"] {
+        assert!(methods.contains(&method), "{methods:?}");
+    }
+    assert!(measurements.iter().all(|m| m["steps_per_second"].as_f64().unwrap() > 0.0));
+    assert!(measurements.iter().all(|m| m["batch_bytes"].as_u64().unwrap() > 16 * 84 * 84 * 3));
+    // No batch of 16 environments is large enough for huge pages in process.
+    assert!(measurements.iter().all(|m| m["huge_page_bytes"].as_u64().unwrap() <= m["batch_bytes"].as_u64().unwrap()));
+}
+
+#[test]
+fn output_that_cannot_be_written_is_a_failure() {
+    let room = Room::new("full");
+    let traces = crate::support::recorded::traces("MortarMayhem-Grid-v0");
+    let trace = traces[0].to_str().unwrap();
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    for arguments in [
+        vec!["--help"],
+        vec!["--version"],
+        vec!["serve", "--help"],
+        vec!["list"],
+        vec!["list", "--json"],
+        vec!["list", "MortarMayhem-v0"],
+        vec!["list", "MortarMayhem-v0", "--json"],
+        vec!["serve", "--num-envs", "1"],
+        vec!["demo", "--num-envs", "1", "--seconds", "0.1"],
+        vec!["demo", "--num-envs", "1", "--seconds", "0.1", "--json"],
+        vec!["bench", "--num-envs", "1", "--seconds", "0.01", "--rounds", "1"],
+        vec!["bench", "--num-envs", "1", "--seconds", "0.01", "--rounds", "1", "--json"],
+        vec!["verify", trace],
+        vec!["verify", "--json", trace],
+    ] {
+        let output = room.endless(&arguments).stdout(full()).output().unwrap();
+        let stderr = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
+        assert!(
+            stderr.starts_with("endless: cannot write to standard output: No space left"),
+            "{arguments:?}: {stderr}"
+        );
+        assert_eq!(stderr.lines().count(), 1, "{arguments:?}: {stderr}");
+    }
+    for (arguments, code) in [(["list", "Chess-v0"], 1), (["list", "--chess"], 2)] {
+        assert_eq!(room.endless(&arguments).stderr(full()).output().unwrap().status.code(), Some(code));
+    }
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn a_closed_pipe_is_no_failure() {
+    let room = Room::new("pipe");
+    let traces = crate::support::recorded::traces("MortarMayhem-Grid-v0");
+    let trace = traces[0].to_str().unwrap();
+    let closed = || std::io::pipe().unwrap().1;
+    for (arguments, code) in [
+        (vec!["--help"], 0),
+        (vec!["list"], 0),
+        (vec!["list", "--json"], 0),
+        (vec!["demo", "--num-envs", "1", "--seconds", "0.1"], 0),
+        (vec!["bench", "--num-envs", "1", "--seconds", "0.01", "--rounds", "1"], 0),
+        (vec!["verify", trace], 0),
+        (vec!["verify", trace, "/nowhere.json.gz"], 1),
+    ] {
+        let output = room.endless(&arguments).stdout(closed()).output().unwrap();
+        assert_eq!(output.status.code(), Some(code), "{arguments:?}");
+        assert_eq!(text(&output.stderr), "", "{arguments:?}");
+    }
+    let mut engine = room.endless(&["serve", "--num-envs", "1"]).stdout(closed()).spawn().unwrap();
+    room.wait_for_engine();
+    signal(&engine, Signal::INT);
+    assert!(wait(&mut engine).success());
+    assert_eq!(room.segments(), [""; 0]);
+}
+
+#[test]
+fn every_command_explains_itself() {
+    let room = Room::new("help");
+    for (command, part) in [
+        ("list", "--json"),
+        ("demo", "--seconds"),
+        ("serve", "--checkpoint"),
+        ("status", "--watch"),
+        ("view", "--terminal"),
+        ("play", "--option"),
+        ("bench", "--rounds"),
+        ("verify", "FILES"),
+    ] {
+        let help = room.run(&[command, "--help"]);
+        assert!(help.status.success() && text(&help.stdout).contains(part), "{command}");
+    }
+    assert!(text(&room.run(&["demo", "--help"]).stdout).contains("[default: 10"), "defaults are shown");
+}

@@ -1,0 +1,148 @@
+//! Recordings of this engine in the format of the original's traces, and the progress that a viewer is shown.
+
+use endless_gym::batch::{Batch, zeroed};
+use endless_gym::envs::{self, specs};
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::trace::{Recorder, Trace, replay};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::{Value as Json, json};
+
+/// JSON without the difference of 1 and 1.0: the original writes some ground truths as integers.
+fn as_floats(json: Json) -> Json {
+    match json {
+        Json::Number(number) => json!(number.as_f64()),
+        Json::Array(items) => items.into_iter().map(as_floats).collect(),
+        Json::Object(fields) => fields.into_iter().map(|(name, value)| (name, as_floats(value))).collect(),
+        other => other,
+    }
+}
+
+/// What the original returned, played here with its actions and recorded, is the original's file.
+#[test]
+fn a_recording_equals_the_originals() {
+    for spec in specs() {
+        let expected =
+            Trace::open(&crate::support::recorded::reference().join(format!("traces/{}.03.mixed02.json.gz", spec.id)))
+                .unwrap();
+        let config = PoolConfig {
+            options: ResetOptions::Shared(expected.options.clone()),
+            autoreset: Autoreset::Disabled,
+            ..PoolConfig::new(spec.id, 1)
+        };
+        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut blocks = zeroed(pool.layout().blocks());
+        let mut recorder = Recorder::new(spec.id, &expected.options);
+        for episode in &expected.episodes {
+            match episode.seed {
+                Some(seed) => pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap(),
+                None => pool.reset(ResetRequest::All, &mut blocks).unwrap(),
+            }
+            recorder.reset(episode.seed, &pool, &blocks);
+            for step in &episode.steps {
+                pool.step(&step.action, &mut blocks).unwrap();
+                recorder.step(&step.action, &pool, &blocks);
+            }
+        }
+        let mut file = Vec::new();
+        recorder.write(&mut file).unwrap();
+        let recorded = Trace::read(file.as_slice()).unwrap();
+        assert_eq!(as_floats(json!(recorded.episodes)), as_floats(json!(expected.episodes)), "{}", spec.id);
+        assert_eq!(json!(recorded.options), json!(expected.options), "{}", spec.id);
+    }
+}
+
+/// An episode that has not ended is complete as it was recorded, and not as a part of a longer one.
+#[test]
+fn unfinished_recordings_are_replayed() {
+    let mut random = SmallRng::seed_from_u64(1);
+    for spec in specs() {
+        for steps in [0, 1, 25] {
+            let config = PoolConfig { autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
+            let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+            let mut blocks = zeroed(pool.layout().blocks());
+            let mut recorder = Recorder::new(spec.id, &Default::default());
+            pool.reset(ResetRequest::Seed(steps), &mut blocks).unwrap();
+            recorder.reset(Some(steps), &pool, &blocks);
+            for _ in 0..steps {
+                let branches = spec.action_space.branches().iter();
+                let action: Vec<i32> = branches.map(|choices| random.random_range(0..*choices)).collect();
+                pool.step(&action, &mut blocks).unwrap();
+                recorder.step(&action, &pool, &blocks);
+                if Batch::new(pool.layout(), &blocks).terminated()[0] == 1 {
+                    break;
+                }
+            }
+            let mut file = Vec::new();
+            recorder.write(&mut file).unwrap();
+            let mut trace = Trace::read(file.as_slice()).unwrap();
+            let replayed = replay(&trace).unwrap();
+            assert_eq!(replayed.differences, 0, "{}: {:?}", spec.id, replayed.first);
+            if trace.max_steps.is_some() {
+                trace.max_steps = Some(26);
+                trace.check_complete().unwrap_err();
+            }
+        }
+    }
+}
+
+/// The numbers that a viewer is shown during an episode arrive at those of the final info.
+#[test]
+fn progress_ends_at_the_final_info() {
+    for spec in specs() {
+        let config = PoolConfig { features: true, autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
+        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        pool.progress(0).unwrap_err();
+        let mut blocks = zeroed(pool.layout().blocks());
+        let mut expert = envs::expert(spec);
+        let mut random = SmallRng::seed_from_u64(2);
+        // The expert is interrupted by random actions, so that episodes end in all ways.
+        for seed in 0..4 {
+            pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
+            expert.reset();
+            let mut action = vec![0; spec.action_space.branches().len()];
+            for step in 0..5000 {
+                let batch = Batch::new(pool.layout(), &blocks);
+                expert.act(batch.features(), batch.vector_observation(), &mut action);
+                if step > 100 && random.random_bool(0.2) {
+                    let choices = spec.action_space.branches()[0];
+                    action[0] = random.random_range(0..choices);
+                }
+                pool.step(&action, &mut blocks).unwrap();
+                if Batch::new(pool.layout(), &blocks).terminated()[0] == 1 {
+                    break;
+                }
+            }
+            let batch = Batch::new(pool.layout(), &blocks);
+            assert_eq!(batch.terminated(), [1], "{}", spec.id);
+            let info = |name: &str| {
+                let place = spec.info.iter().position(|column| column.name == name);
+                place.map(|place| batch.info()[place])
+            };
+            let progress = pool.progress(0).unwrap();
+            let shown = |name: &str| progress.iter().find(|shown| shown.name == name);
+            let share = |name: &str| shown(name).map(|shown| shown.value / shown.of.unwrap_or(1.0));
+            match spec.id {
+                "Endless-MortarMayhem-v0" => assert_eq!(share("commands"), info("commands_completed")),
+                // The original counts a failed last command as executed, and one whose tile the agent left too early as failed.
+                id if id.starts_with("Mortar") => {
+                    let (shown, of) = shown("commands").map(|shown| (shown.value, shown.of.unwrap())).unwrap();
+                    let counted = (info("commands_completed").unwrap() * of).round();
+                    let differs = shown - counted;
+                    assert!(
+                        [0.0, 1.0].contains(&differs) || (differs == -1.0 && counted == of),
+                        "{id}: {shown} {counted}"
+                    );
+                }
+                id if id.contains("MysteryPath") => {
+                    assert_eq!(share("falls"), info("num_fails"));
+                    assert!(info("tiles_visited").is_none_or(|tiles| share("tiles") == Some(tiles)), "{id}");
+                }
+                _ => {
+                    assert_eq!(share("coins"), info("coins_collected"));
+                    assert_eq!(share("health"), info("agent_health"));
+                }
+            }
+        }
+    }
+}

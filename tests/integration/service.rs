@@ -1,0 +1,593 @@
+//! The service between real processes: engines and trainers that are started, killed and restarted.
+//!
+//! The test program starts itself as a child process for them: the ignored test `role` runs the role that the environment names.
+
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::support::foreign::{Foreign, RequestHeader};
+use crate::support::service::{ID, Place, ROLE_ARGUMENTS, engine_config};
+use endless_gym::envs::{ActionError, ActionSpace, spec};
+use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::service::{
+    ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
+};
+use endless_gym_core::batch::{ActionSection, Batch, Contents, action_layout, batch_layout, zeroed};
+use rustix::process::{Pid, Signal, kill_process};
+
+const SECONDS: Duration = Duration::from_secs(5);
+
+/// Resets a group and steps it.
+fn play(trainer: &mut Trainer, group: usize, steps: u64) {
+    trainer.reset(group, ResetRequest::Seed(3)).unwrap();
+    let first = trainer.receive(group, SECONDS).unwrap().step();
+    for step in 1..=steps {
+        trainer.send_with(group, |actions| actions.fill(1)).unwrap();
+        let received = trainer.receive(group, SECONDS).unwrap();
+        assert_eq!(received.step(), first + step);
+        assert_eq!(received.batch().reward().len(), trainer.specification().num_envs);
+    }
+}
+
+#[test]
+fn groups_are_reset_and_stepped_independently() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 4, 2);
+    let mut trainer = place.trainer("gym").unwrap();
+    let specification = trainer.specification().clone();
+    assert_eq!((specification.groups, specification.num_envs), (2, 4));
+    assert_eq!(specification.service, "gym");
+
+    trainer.reset(0, ResetRequest::Seed(7)).unwrap();
+    trainer.reset(1, ResetRequest::Seed(7)).unwrap();
+    let second = trainer.receive(1, SECONDS).unwrap();
+    let first = trainer.receive(0, SECONDS).unwrap();
+    assert_eq!((first.group(), second.group()), (0, 1));
+    // Seeds are counted over the groups: environment i of group g is seeded with 7 + 4 g + i, as in one pool of all of them.
+    let pool_config = PoolConfig::new(ID, 8);
+    let mut pool = Pool::new(&pool_config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    pool.reset(ResetRequest::Seed(7), &mut blocks).unwrap();
+    let expected = Batch::new(pool.layout(), &blocks);
+    let (expected_first, expected_second) = expected.observation().split_at(expected.observation().len() / 2);
+    assert!(first.batch().observation() == expected_first);
+    assert!(second.batch().observation() == expected_second);
+    assert!(expected_first != expected_second);
+    assert_eq!(first.batch().episode_length(), [0; 4]);
+
+    let actions = vec![1; 4 * specification.action_space.branches().len()];
+    trainer.send(0, &actions).unwrap();
+    let stepped = trainer.receive_any(SECONDS).unwrap();
+    assert_eq!((stepped.group(), stepped.step()), (0, 2));
+    assert_eq!(stepped.batch().episode_length(), [1; 4]);
+    assert_eq!(first.batch().episode_length(), [0; 4], "a held batch does not change");
+
+    trainer.reset(0, ResetRequest::Each { reset: &[0, 2, 0, 1], seed: &[0, 7, 0, 0] }).unwrap();
+    let again = trainer.receive(0, SECONDS).unwrap();
+    assert_eq!(again.batch().episode_length(), [1, 0, 1, 0]);
+    drop((first, stepped));
+
+    let options = serde_json::from_str(r#"{"arena_size": 3}"#).unwrap();
+    trainer.reset_with(1, ResetRequest::Seed(7), Some(&options)).unwrap();
+    let smaller = trainer.receive(1, SECONDS).unwrap();
+    assert!(smaller.batch().observation() != second.batch().observation());
+    let wrong = serde_json::from_str(r#"{"agent_size": 1}"#).unwrap();
+    trainer.reset_with(1, ResetRequest::All, Some(&wrong)).unwrap();
+    let refused = trainer.receive(1, SECONDS).unwrap_err();
+    assert!(refused.to_string().contains("agent_size"), "{refused}");
+    let long = serde_json::from_value(serde_json::json!({"command_show_delay": vec![1; 20_000]})).unwrap();
+    let refused = trainer.reset_with(1, ResetRequest::All, Some(&long)).unwrap_err();
+    assert!(matches!(refused, ServiceError::OptionsTooLong { .. }));
+}
+
+#[test]
+fn mistakes_of_a_trainer_are_typed_errors() {
+    let place = Place::new();
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let mut engine = Engine::new(&engine_config(place.namespace(), "gym", 2, 1)).unwrap();
+        let stop = &stop;
+        let running = scope.spawn(move || engine.run(stop).unwrap());
+        let mut trainer = place.trainer("gym").unwrap();
+        let width = trainer.specification().action_space.branches().len();
+
+        assert!(matches!(trainer.reset(1, ResetRequest::All), Err(ServiceError::NoSuchGroup { given: 1, .. })));
+        assert!(matches!(trainer.receive(0, SECONDS), Err(ServiceError::NothingSent { group: 0 })));
+        assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingPending)));
+        assert!(matches!(
+            trainer.reset(0, ResetRequest::Each { reset: &[1, 1], seed: &[1] }),
+            Err(ServiceError::ResetCount { given: 1, num_envs: 2 })
+        ));
+        assert!(matches!(
+            trainer.send(0, &[0]),
+            Err(ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }))
+        ));
+
+        // The environments must be reset before the first step.
+        trainer.send(0, &vec![0; 2 * width]).unwrap();
+        let rejected = trainer.receive(0, SECONDS).unwrap_err();
+        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+
+        trainer.reset(0, ResetRequest::All).unwrap();
+        assert!(matches!(trainer.reset(0, ResetRequest::All), Err(ServiceError::AnswerPending { group: 0 })));
+        // The number of actions is checked before the pending answer, and their range after it.
+        assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::Action(ActionError::Count { .. }))));
+        assert!(matches!(trainer.send(0, &vec![99; 2 * width]), Err(ServiceError::AnswerPending { group: 0 })));
+        trainer.receive(0, SECONDS).unwrap();
+
+        let mut actions = vec![0; 2 * width];
+        actions[width] = 99;
+        let error = trainer.send(0, &actions).unwrap_err();
+        assert!(
+            matches!(&error, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given[0] == 99),
+            "{error}"
+        );
+
+        let mut held = Vec::new();
+        for _ in 0..trainer.specification().batches_held {
+            trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+            held.push(trainer.receive(0, SECONDS).unwrap());
+        }
+        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+        let error = trainer.receive(0, SECONDS).unwrap_err();
+        assert!(matches!(error, ServiceError::TooManyBatchesHeld { group: 0, limit: 3 }), "{error}");
+        held.remove(0);
+        held.push(trainer.receive(0, SECONDS).unwrap());
+        assert!(held.windows(2).all(|pair| pair[0].step() + 1 == pair[1].step()));
+
+        stop.store(true, Ordering::Relaxed);
+        let summary = running.join().unwrap();
+        assert_eq!((summary.batches, summary.env_steps, summary.rejected), (5, 8, 1));
+    });
+}
+
+#[test]
+fn a_second_trainer_and_a_second_engine_are_refused() {
+    let place = Place::new();
+    let engine = place.engine("gym", 1, 1);
+    let _trainer = place.trainer("gym").unwrap();
+    let refused = place.trainer("gym").map(drop).unwrap_err();
+    let own = std::process::id();
+    assert!(matches!(refused, ServiceError::TrainerExists { pid: Some(pid), .. } if pid == own), "{refused}");
+    let refused = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).map(drop).unwrap_err();
+    assert!(matches!(refused, ServiceError::EngineExists { pid: Some(pid), .. } if pid == engine.id()), "{refused}");
+    assert!(refused.to_string().contains("gym"));
+}
+
+#[test]
+fn an_unknown_engine_is_named_among_those_that_exist() {
+    let place = Place::new();
+    let alone = place.trainer_now("gym").map(drop).unwrap_err();
+    assert!(alone.to_string().contains("running engines: none"), "{alone}");
+    let _engine = place.engine("other", 1, 1);
+    place.trainer("other").unwrap();
+    let error = place.trainer_now("gym").map(drop).unwrap_err();
+    assert!(matches!(&error, ServiceError::UnknownEngine { service, .. } if service == "gym"), "{error}");
+    assert!(error.to_string().contains("running engines: other"), "{error}");
+    assert_eq!(running_engines(place.namespace()).unwrap(), ["other"]);
+    let config = ConnectConfig { namespace: place.namespace().clone(), ..ConnectConfig::new("a/b") };
+    assert!(matches!(Trainer::connect(&config), Err(ServiceError::InvalidName { .. })));
+}
+
+#[test]
+fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    let config = place.connect_config("gym");
+    let mut observer = Observer::connect(&config, 0).unwrap();
+    assert!(observer.newest().unwrap().is_none());
+    play(&mut trainer, 0, 10);
+    let seen = observer.newest().unwrap().unwrap();
+    assert_eq!(seen.step(), 11);
+    // An observer that holds its batches reaches its own limit and does not affect the trainer.
+    let mut held = vec![seen];
+    while held.len() < 3 {
+        play(&mut trainer, 0, 1);
+        held.push(observer.next(SECONDS).unwrap());
+    }
+    play(&mut trainer, 0, 10);
+    assert!(matches!(observer.newest(), Err(ServiceError::TooManyBatchesHeld { .. })));
+    assert!(matches!(Observer::connect(&config, 1), Err(ServiceError::NoSuchGroup { .. })));
+    let others: Vec<_> = (0..2).map(|_| Observer::connect(&config, 0).unwrap()).collect();
+    let error = Observer::connect(&config, 0).map(drop).unwrap_err();
+    assert!(matches!(error, ServiceError::TooManyObservers { limit: 3, .. }), "{error}");
+    drop(others);
+    play(&mut trainer, 0, 1);
+}
+
+#[test]
+fn after_a_killed_trainer_the_next_one_plays_on() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 2);
+    for _ in 0..2 {
+        let mut killed = place.role("trainer", "gym", &[]);
+        // The observer shows that the trainer steps.
+        let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
+        observer.next(SECONDS).unwrap();
+        killed.kill();
+        let mut trainer = place.trainer("gym").unwrap();
+        // The environments are in the episodes of the dead trainer.
+        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+        let rejected = trainer.receive(0, SECONDS).unwrap_err();
+        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+        play(&mut trainer, 0, 5);
+        play(&mut trainer, 1, 5);
+    }
+}
+
+#[test]
+fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 2, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 3);
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    let held = trainer.receive(0, SECONDS).unwrap();
+    let frame = held.batch().observation().to_vec();
+
+    engine.kill();
+    let start = Instant::now();
+    let error = trainer
+        .send_with(0, |actions| actions.fill(0))
+        .and_then(|()| trainer.receive(0, Duration::from_secs(60)).map(drop))
+        .unwrap_err();
+    assert!(matches!(error, ServiceError::EngineLost { pid, .. } if pid == engine.id()), "{error}");
+    assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
+    let error = trainer.reconnect(Duration::ZERO).unwrap_err();
+    assert!(matches!(error, ServiceError::UnknownEngine { .. }), "{error}");
+
+    let mut engine = place.engine("gym", 2, 1);
+    trainer.reconnect(SECONDS).unwrap();
+    play(&mut trainer, 0, 3);
+    assert_eq!(held.batch().observation(), frame, "a batch of a dead engine remains readable");
+
+    // The engine is replaced before the trainer checks whether it is running.
+    engine.kill();
+    let mut engine = place.engine("gym", 2, 1);
+    Observer::connect(&place.connect_config("gym"), 0).unwrap();
+    let error = trainer
+        .send_with(0, |actions| actions.fill(0))
+        .and_then(|()| trainer.receive(0, SECONDS).map(drop))
+        .unwrap_err();
+    assert!(matches!(error, ServiceError::EngineRestarted { .. }), "{error}");
+    trainer.reconnect(SECONDS).unwrap();
+    play(&mut trainer, 0, 3);
+
+    // An engine that serves something else is not a successor.
+    engine.kill();
+    let _engine = place.engine("gym", 3, 1);
+    let error = trainer.reconnect(SECONDS).unwrap_err();
+    assert!(matches!(error, ServiceError::SpecificationChanged { what: "number of environments", .. }), "{error}");
+    drop(trainer);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
+}
+
+/// Kills processes at any moment, also while they start and connect. `ENDLESS_TEST_ROUNDS=1000` tests rarer moments.
+#[test]
+#[ignore = "slow"]
+fn deaths_at_any_moment_are_survived() {
+    let place = Place::new();
+    let rounds = std::env::var("ENDLESS_TEST_ROUNDS").map_or(60, |rounds| rounds.parse().unwrap());
+    for round in 0..rounds {
+        // A process takes about 30 milliseconds to start, connect and step.
+        let moment = |step: u64| Duration::from_micros(round * step % 40_000);
+        let mut engine = place.engine("gym", 3, 2);
+        std::thread::sleep(moment(7919));
+        if round % 2 == 0 {
+            engine.kill();
+            engine = place.engine("gym", 3, 2);
+        }
+        let mut killed = place.role("trainer", "gym", &[]);
+        std::thread::sleep(moment(6007));
+        killed.kill();
+        let mut trainer = place.trainer("gym").unwrap_or_else(|e| panic!("round {round}: {e}"));
+        play(&mut trainer, 0, 3);
+        play(&mut trainer, 1, 3);
+    }
+    assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
+#[test]
+fn an_engine_that_ends_keeps_its_services_until_its_specification_is_removed() {
+    let place = Place::new();
+    let engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
+    let before = place.leftovers();
+    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    lock.lock().unwrap();
+    std::thread::scope(|scope| {
+        let ending = scope.spawn(|| drop(engine));
+        // The specification cannot be removed without the lock.
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!(place.leftovers(), before);
+        lock.unlock().unwrap();
+        ending.join().unwrap();
+    });
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
+#[test]
+fn a_trainer_notices_that_its_engine_has_ended() {
+    let place = Place::new();
+    let engine = place.engine("gym", 1, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 1);
+    engine.end();
+    let error = trainer
+        .send_with(0, |actions| actions.fill(0))
+        .and_then(|()| trainer.receive(0, SECONDS).map(drop))
+        .unwrap_err();
+    assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+}
+
+#[test]
+fn a_trainer_reports_a_lost_engine_while_the_namespace_is_locked() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 1, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 1);
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    trainer.receive(0, SECONDS).unwrap();
+    engine.kill();
+    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    lock.lock().unwrap();
+    let (report, reported) = std::sync::mpsc::channel();
+    std::thread::scope(|scope| {
+        scope.spawn(move || {
+            let sent = trainer.send_with(0, |actions| actions.fill(0));
+            report.send(sent.and_then(|()| trainer.receive(0, Duration::from_secs(60)).map(drop))).unwrap();
+        });
+        // Waiting for the lock to the end takes 5 seconds.
+        let result = reported.recv_timeout(Duration::from_secs(4));
+        lock.unlock().unwrap();
+        let error = result.expect("the trainer waits for the lock").unwrap_err();
+        assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+    });
+}
+
+#[test]
+fn a_waiting_observer_notices_that_its_engine_has_died() {
+    let place = Place::new();
+    let mut engine = place.engine("gym", 1, 1);
+    let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
+    engine.kill();
+    let (report, reported) = std::sync::mpsc::channel();
+    std::thread::spawn(move || report.send(observer.next(Duration::MAX).map(drop)));
+    let error = reported.recv_timeout(Duration::from_secs(60)).expect("the observer still waits").unwrap_err();
+    assert!(matches!(error, ServiceError::EngineLost { pid, .. } if pid == engine.id()), "{error}");
+}
+
+#[test]
+fn a_late_answer_can_be_received_after_a_timeout() {
+    let place = Place::new();
+    let engine = place.engine("gym", 1, 1);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 0, 1);
+    let pid = Pid::from_raw(engine.id() as i32).unwrap();
+    kill_process(pid, Signal::STOP).unwrap();
+    std::thread::sleep(Duration::from_millis(50));
+    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    let error = trainer.receive(0, Duration::from_millis(700)).unwrap_err();
+    assert!(matches!(error, ServiceError::TimedOut { .. }), "{error}");
+    assert!(matches!(trainer.receive(0, Duration::ZERO), Err(ServiceError::TimedOut { .. })));
+    kill_process(pid, Signal::CONT).unwrap();
+    assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), 3);
+}
+
+#[test]
+fn nothing_is_left_behind() {
+    let place = Place::new();
+    let engine = place.engine("gym", 2, 2);
+    let mut trainer = place.trainer("gym").unwrap();
+    play(&mut trainer, 1, 2);
+    assert!(!place.leftovers().is_empty());
+    trainer.reset(0, ResetRequest::All).unwrap();
+    let held = trainer.receive(0, SECONDS).unwrap();
+    engine.end();
+    drop(trainer);
+    drop(held);
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+
+    // After a crash, the next process that joins removes everything.
+    let mut engine = place.engine("gym", 2, 2);
+    place.trainer("gym").unwrap();
+    engine.kill();
+    assert!(!place.leftovers().is_empty());
+    assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
+    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+}
+
+#[test]
+fn bad_messages_are_answered_with_rejections() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 1);
+    let specification = place.trainer("gym").unwrap().specification().clone();
+    let foreign = Foreign::new(place.namespace(), &specification);
+    let good = RequestHeader::reset_all(&specification);
+    assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
+
+    let version = RequestHeader { layout_version: 77, ..good };
+    let (status, text) = foreign.ask(version, foreign.blocks(), |_| {}).unwrap();
+    assert!(status != 0 && text.contains("77"), "{text}");
+    let (status, text) = foreign.ask(RequestHeader { kind: 55, ..good }, foreign.blocks(), |_| {}).unwrap();
+    assert!(status != 0 && text.contains("55"), "{text}");
+    let step = RequestHeader { kind: 1, ..good };
+    let (status, text) = foreign.ask(step, 1, |_| {}).unwrap();
+    assert!(status != 0 && text.contains("got 1"), "{text}");
+    let out_of_range = |blocks: &mut [endless_gym::batch::Block]| {
+        specification.action.write::<i32>(blocks, ActionSection::Action).fill(-1);
+    };
+    let (status, text) = foreign.ask(step, foreign.blocks(), out_of_range).unwrap();
+    assert!(status != 0 && text.contains("-1"), "{text}");
+    let earlier = RequestHeader { incarnation: specification.incarnation.wrapping_sub(1), ..good };
+    assert_eq!(foreign.ask(earlier, foreign.blocks(), |_| {}), None, "a request for another incarnation is dropped");
+
+    // The engine still answers.
+    let fine = |blocks: &mut [endless_gym::batch::Block]| {
+        specification.action.write::<i32>(blocks, ActionSection::Action).fill(0);
+    };
+    assert_eq!(foreign.ask(step, foreign.blocks(), fine).unwrap().0, 0);
+    drop(foreign);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
+}
+
+#[test]
+fn another_version_is_refused_with_both_numbers() {
+    let place = Place::new();
+    let _old = crate::support::foreign::engine_of_version(place.namespace(), "old", 999);
+    let error = place.trainer_now("old").map(drop).unwrap_err();
+    assert!(matches!(&error, ServiceError::Version { layout, .. } if layout == "999"), "{error}");
+    assert!(error.to_string().contains("install the same version"), "{error}");
+}
+
+const CONTENTS: Contents = Contents { frames: None, features: false, final_observation: false };
+
+#[test]
+fn a_malformed_specification_is_an_error_and_not_a_panic() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 1, 1);
+    let published = place.trainer("gym").unwrap().specification().clone();
+    let valid = ServiceSpecification { service: "malformed".to_owned(), ..published.clone() };
+    let malformed = [
+        ("groups", ServiceSpecification { groups: 0, ..valid.clone() }),
+        ("num_envs", ServiceSpecification { num_envs: 0, ..valid.clone() }),
+        ("batches_held", ServiceSpecification { batches_held: 0, ..valid.clone() }),
+        ("Chess-v0", ServiceSpecification { id: "Chess-v0".to_owned(), ..valid.clone() }),
+        ("action", ServiceSpecification { action: action_layout(spec(ID).unwrap(), 2).unwrap(), ..valid.clone() }),
+        (
+            "batch",
+            ServiceSpecification { batch: batch_layout(spec(ID).unwrap(), 2, CONTENTS).unwrap(), ..valid.clone() },
+        ),
+        ("action space", ServiceSpecification { action_space: ActionSpace::Discrete(9), ..valid.clone() }),
+        ("info must name", ServiceSpecification { info: vec![], ..valid.clone() }),
+        ("features must name", ServiceSpecification { features: vec!["x".to_owned()], ..valid.clone() }),
+        ("service must be `malformed`, got `gym`", published),
+    ];
+    for (part, specification) in malformed {
+        let _published = crate::support::foreign::specification(place.namespace(), "malformed", &specification);
+        let error = place.trainer_now("malformed").map(drop).unwrap_err();
+        assert!(matches!(&error, ServiceError::Specification { reason, .. } if reason.contains(part)), "{error}");
+    }
+}
+
+#[test]
+fn messages_of_another_type_are_refused() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 1, 1);
+    let specification = place.trainer("gym").unwrap().specification().clone();
+    let _other = crate::support::foreign::engine_of_other_type(place.namespace(), "other", &specification);
+    let error = place.trainer_now("other").map(drop).unwrap_err();
+    assert!(matches!(error, ServiceError::IncompatibleTypes { .. }), "{error}");
+}
+
+/// More than the time after which an engine removes the service of a dead engine of the same name.
+const LONGER_THAN_A_REMOVAL: Duration = Duration::from_millis(2500);
+
+/// Leaves the specification service of a killed engine, which the removal of dead nodes keeps until the returned reader is dropped.
+fn remains(place: &Place, service: &str) -> Box<dyn std::any::Any> {
+    let mut engine = place.engine(service, 1, 1);
+    place.trainer(service).unwrap();
+    let reader = crate::support::foreign::reader(place.namespace(), service);
+    engine.kill();
+    reader
+}
+
+#[test]
+fn remains_of_a_dead_engine_do_not_block_its_name() {
+    let place = Place::new();
+    let _reader = remains(&place, "gym");
+    let _engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
+    assert_eq!(running_engines(place.namespace()).unwrap(), ["gym"]);
+}
+
+#[test]
+fn remains_are_not_removed_while_another_process_holds_the_lock() {
+    let place = Place::new();
+    let reader = remains(&place, "gym");
+    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    lock.lock().unwrap();
+    std::thread::scope(|scope| {
+        let late = scope.spawn(|| Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).map(drop));
+        std::thread::sleep(LONGER_THAN_A_REMOVAL);
+        // A successor takes the name while the other engine waits.
+        drop(reader);
+        crate::support::foreign::force_remove(place.namespace(), "gym");
+        let _successor = crate::support::foreign::engine_of_version(place.namespace(), "gym", 999);
+        lock.unlock().unwrap();
+        let refused = late.join().unwrap().unwrap_err();
+        assert!(matches!(refused, ServiceError::EngineExists { .. }), "{refused}");
+        let error = place.trainer_now("gym").map(drop).unwrap_err();
+        assert!(
+            matches!(&error, ServiceError::Version { layout, .. } if layout == "999"),
+            "the successor is gone: {error}"
+        );
+    });
+}
+
+#[test]
+fn of_several_engines_one_takes_the_name_of_a_dead_one() {
+    let place = Place::new();
+    let _reader = remains(&place, "gym");
+    std::thread::scope(|scope| {
+        let start = || Engine::new(&engine_config(place.namespace(), "gym", 1, 1));
+        let threads: Vec<_> = (0..4).map(|_| scope.spawn(start)).collect();
+        let started: Vec<_> = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
+        assert_eq!(started.iter().filter(|engine| engine.is_ok()).count(), 1);
+        for error in started.iter().filter_map(|engine| engine.as_ref().err()) {
+            assert!(matches!(error, ServiceError::EngineExists { .. }), "{error}");
+        }
+        assert_eq!(running_engines(place.namespace()).unwrap(), ["gym"]);
+    });
+}
+
+#[test]
+fn a_header_that_changes_after_its_check_is_not_read_again() {
+    let place = Place::new();
+    let engine = place.engine("model", 1, 1);
+    let specification = place.trainer("model").unwrap().specification().clone();
+    let mut foreign = crate::support::foreign::Engine::new(place.namespace(), "foreign", &specification);
+    let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    let mut header = foreign.send(5);
+    let received = observer.newest().unwrap().unwrap();
+    assert_eq!((received.group(), received.step()), (0, 5));
+    let blocks = received.blocks().len();
+    assert_eq!(blocks, specification.batch.blocks());
+    for forged in [0, 1 << 40] {
+        header.overwrite(7, 99, forged);
+        assert_eq!((received.group(), received.step(), received.blocks().len()), (0, 5, blocks));
+        assert_eq!(received.batch().reward(), [0.0]);
+    }
+    engine.end();
+}
+
+#[test]
+#[ignore = "needs permission to create mount namespaces (unshare --mount --map-root-user)"]
+fn too_little_shared_memory_is_an_error_and_not_a_signal() {
+    let place = Place::new();
+    let script = "mount -t tmpfs -o size=4M tmpfs /dev/shm && exec \"$0\" \"$@\"";
+    let output = Command::new("unshare")
+        .args(["--mount", "--map-root-user", "sh", "-c", script])
+        .arg(std::env::current_exe().unwrap())
+        .args(ROLE_ARGUMENTS)
+        .envs(place.role_environment("engine", "gym", &["64", "1"]))
+        .stdin(std::process::Stdio::null())
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    assert!(text.contains("running 1 test"), "the engine was not started: {text}");
+    assert!(text.contains("SharedMemoryTooSmall") && text.contains("/dev/shm"), "{text}");
+    assert!(text.contains("fewer environments"), "{text}");
+}
+
+#[test]
+fn trainers_and_batches_may_move_between_threads() {
+    fn check<T: Send + Sync>() {}
+    check::<Trainer>();
+    check::<endless_gym::service::BatchLease>();
+    check::<Observer>();
+    fn movable<T: Send>() {}
+    movable::<Engine>();
+    check::<Namespace>();
+}

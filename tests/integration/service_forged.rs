@@ -1,0 +1,187 @@
+//! Peers that write anything: forged specifications, requests and responses, and memory that changes while it is read. None makes
+//! the other side panic, hang or read beyond its memory.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::support::foreign::{self, Foreign, RequestHeader};
+use crate::support::recorded::property_cases;
+use crate::support::service::Place;
+use endless_gym::batch::LAYOUT_VERSION;
+use endless_gym::pool::ResetRequest;
+use endless_gym::service::{ConnectConfig, Observer, ServiceError};
+use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+
+/// How long a message is waited for.
+const SECONDS: Duration = Duration::from_secs(30);
+
+/// Plays some steps with the library.
+fn plays(place: &Place) {
+    let mut trainer = place.trainer("gym").unwrap();
+    trainer.reset(0, ResetRequest::All).unwrap();
+    for _ in 0..3 {
+        drop(trainer.receive(0, SECONDS).unwrap());
+        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    }
+    trainer.receive(0, SECONDS).unwrap();
+}
+
+/// A number that a forger would try.
+fn numbers() -> impl Strategy<Value = u64> {
+    prop_oneof![
+        0..9_u64,
+        (0..64_u32, -1..2_i64).prop_map(|(bit, more)| (1_u64 << bit).wrapping_add_signed(more)),
+        any::<u64>()
+    ]
+}
+
+#[test]
+fn any_text_can_be_a_specification() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 1, 1);
+    let valid = serde_json::to_vec(place.trainer("gym").unwrap().specification()).unwrap();
+    let text = String::from_utf8(valid).unwrap().replace("\"service\":\"gym\"", "\"service\":\"forged\"");
+    let parts = prop_oneof![
+        3 => numbers().prop_map(|number| number.to_string().into_bytes()),
+        1 => prop::sample::select(vec!["null", "[]", "{}", "-1", "0.5", "\"x\"", ",", ""]).prop_map(|part| part.as_bytes().to_vec()),
+        1 => prop::collection::vec(any::<u8>(), 0..9),
+    ];
+    // Any place, or the first number behind it.
+    let change = (any::<prop::sample::Index>(), any::<bool>(), parts);
+    let mut runner = TestRunner::new(ProptestConfig { failure_persistence: None, ..property_cases(60) });
+    runner
+        .run(&prop::collection::vec(change, 1..4), |changes| {
+            let mut text = text.clone().into_bytes();
+            for (place, number, part) in changes {
+                let mut start = place.index(text.len());
+                let mut end = (start + 1).min(text.len());
+                if number && let Some(digit) = text[start..].iter().position(u8::is_ascii_digit) {
+                    start += digit;
+                    end = start + text[start..].iter().take_while(|byte| byte.is_ascii_digit()).count();
+                }
+                text.splice(start..end, part);
+            }
+            let _published = foreign::specification_text(place.namespace(), "forged", &text);
+            let config = ConnectConfig { timeout: Duration::ZERO, ..place.connect_config("forged") };
+            // Valid or not, there is nothing behind it.
+            prop_assert!(place.trainer_now("forged").is_err());
+            prop_assert!(Observer::connect(&config, 0).is_err());
+            Ok(())
+        })
+        .unwrap();
+    plays(&place);
+}
+
+#[test]
+fn any_request_is_answered() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 2, 1);
+    let specification = place.trainer("gym").unwrap().specification().clone();
+    let foreign = Foreign::new(place.namespace(), &specification);
+    let good = RequestHeader::reset_all(&specification);
+    assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
+    let header = (0..11_u32, [(); 3].map(|()| numbers()), any::<bool>());
+    let requests = (header, 1..=foreign.blocks(), any::<u64>(), 0..=8_usize);
+    let mut runner = TestRunner::new(ProptestConfig { failure_persistence: None, ..property_cases(300) });
+    runner
+        .run(&requests, |((kind, [seed, env, bytes], whole), blocks, noise, density)| {
+            let blocks = if whole { foreign.blocks() } else { blocks };
+            let header = RequestHeader { kind, seed, env, bytes, ..good };
+            let answer = foreign.ask(header, blocks, |payload| {
+                let mut random = SmallRng::seed_from_u64(noise);
+                for byte in bytemuck::cast_slice_mut::<_, u8>(payload) {
+                    *byte = if random.random_range(0..8) < density { random.random() } else { 0 };
+                }
+            });
+            prop_assert!(answer.is_some(), "no answer");
+            Ok(())
+        })
+        .unwrap();
+    drop(foreign);
+    plays(&place);
+}
+
+#[test]
+fn requests_may_change_while_the_engine_reads_them() {
+    let place = Place::new();
+    let _engine = place.engine("gym", 4, 1);
+    let specification = place.trainer("gym").unwrap().specification().clone();
+    let foreign = Foreign::new(place.namespace(), &specification);
+    let mut random = SmallRng::seed_from_u64(1);
+    for _ in 0..300 {
+        let (kind, bytes) = (random.random_range(1..10), random.random_range(0..5000));
+        let header = RequestHeader { kind, bytes, ..RequestHeader::reset_all(&specification) };
+        foreign
+            .ask_while_changing(header, || if random.random() { random.random_range(0..8) } else { random.random() });
+    }
+    drop(foreign);
+    plays(&place);
+}
+
+#[test]
+fn batches_may_change_while_an_observer_reads_them() {
+    let place = Place::new();
+    let engine = place.engine("model", 2, 1);
+    let specification = place.trainer("model").unwrap().specification().clone();
+    engine.end();
+    let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
+    let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    let done = AtomicBool::new(false);
+    let (received, refused) = (AtomicU64::new(0), AtomicU64::new(0));
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                match observer.newest() {
+                    Ok(None) => {}
+                    Ok(Some(lease)) => {
+                        let batch = lease.batch();
+                        assert_eq!(lease.group(), 0);
+                        assert_eq!(batch.reward().len(), 2);
+                        std::hint::black_box(batch.observation().iter().map(|byte| u64::from(*byte)).sum::<u64>());
+                        received.fetch_add(1, Ordering::Relaxed);
+                    }
+                    Err(ServiceError::IncompatibleTypes { .. }) => drop(refused.fetch_add(1, Ordering::Relaxed)),
+                    Err(error) => panic!("{error}"),
+                }
+            }
+        });
+        let mut random = SmallRng::seed_from_u64(1);
+        let start = Instant::now();
+        let both = || received.load(Ordering::Relaxed) > 0 && refused.load(Ordering::Relaxed) > 0;
+        for step in 0.. {
+            // What the reader meets depends on the scheduler.
+            if step >= 2_000 && (both() || start.elapsed() > Duration::from_secs(60)) {
+                break;
+            }
+            let mut sent = foreign.send(step);
+            for _ in 0..200 {
+                let word = if random.random() { u64::from(LAYOUT_VERSION) } else { random.random() };
+                sent.words.change(random.random_range(0..40), word);
+                sent.payload.change(random.random_range(0..1 << 20), random.random());
+            }
+        }
+        done.store(true, Ordering::Relaxed);
+        assert!(both(), "{received:?} received, {refused:?} refused");
+    });
+}
+
+#[test]
+fn a_forged_length_is_cut() {
+    let place = Place::new();
+    let engine = place.engine("model", 1, 1);
+    let specification = place.trainer("model").unwrap().specification().clone();
+    engine.end();
+    let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
+    let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
+    for (step, blocks) in [(5, 1 << 24), (6, 1 << 40)] {
+        foreign.send(step).overwrite(0, step, blocks);
+        let received = observer.newest().unwrap().unwrap();
+        assert!(received.blocks().len() < 1 << 20, "{}", received.blocks().len());
+        assert_eq!(received.batch().reward(), [0.0]);
+    }
+    foreign.send(5).overwrite(0, 5, 0);
+    assert!(matches!(observer.newest(), Err(ServiceError::IncompatibleTypes { .. })));
+}

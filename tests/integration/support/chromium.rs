@@ -1,0 +1,200 @@
+//! A headless Chromium, driven over pipes by the DevTools protocol.
+#![allow(dead_code)] // The tests of the page that plays use it too.
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value as Json, json};
+
+/// How long a condition may take; the machine may be busy with other tests.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The programs that may be Chromium, beside the one that the environment variable CHROMIUM names. `cargo xtask` looks for the same.
+const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
+
+/// The name of a site that resolves to this machine, as an attacker's would after a change of its address.
+pub const REBOUND: &str = "rebound.test";
+
+/// A browser with one tab.
+pub struct Chromium {
+    process: Child,
+    to: ChildStdin,
+    from: BufReader<ChildStdout>,
+    calls: u64,
+    session: Option<String>,
+    /// What the page complained about: exceptions, errors of the console, files that could not be loaded.
+    pub complaints: Vec<String>,
+    /// The profile, with the folder of downloads.
+    folder: PathBuf,
+}
+
+impl Chromium {
+    /// Starts a browser whose files are in `folder`, with a window of that size.
+    pub fn start(folder: &Path, (width, height): (u32, u32)) -> Self {
+        let _ = std::fs::remove_dir_all(folder);
+        std::fs::create_dir_all(folder.join("downloads")).unwrap();
+        // Commands come from descriptor 3, and answers go to descriptor 4.
+        let mut command = Command::new("sh");
+        command.args(["-c", r#"exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null"#, &program()]);
+        // It only loads the page of this test, and not every container permits its sandbox.
+        command.args(["--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu", "--no-first-run"]);
+        command.args(["--disable-background-networking", "--disable-dev-shm-usage", "--disable-extensions"]);
+        command.arg(format!("--host-resolver-rules=MAP {REBOUND} 127.0.0.1"));
+        command.arg(format!("--user-data-dir={}", folder.join("profile").display()));
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null());
+        let mut process = command.spawn().expect("Chromium starts");
+        let (to, from) = (process.stdin.take().unwrap(), BufReader::new(process.stdout.take().unwrap()));
+        let folder = folder.to_owned();
+        let mut chromium = Chromium { process, to, from, calls: 0, session: None, complaints: Vec::new(), folder };
+        let tab = chromium.call("Target.createTarget", &json!({"url": "about:blank"}));
+        let attach = json!({"targetId": tab["targetId"], "flatten": true});
+        let session = chromium.call("Target.attachToTarget", &attach)["sessionId"].as_str().map(str::to_owned);
+        let downloads = json!({"behavior": "allow", "downloadPath": chromium.folder.join("downloads")});
+        chromium.call("Browser.setDownloadBehavior", &downloads);
+        chromium.session = session;
+        for domain in ["Page", "Runtime", "Log", "DOM"] {
+            chromium.call(&format!("{domain}.enable"), &json!({}));
+        }
+        chromium.resize(width, height, false);
+        chromium
+    }
+
+    /// Another size of the window; a phone has a touch screen.
+    pub fn resize(&mut self, width: u32, height: u32, phone: bool) {
+        let metrics = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": phone});
+        self.call("Emulation.setDeviceMetricsOverride", &metrics);
+        self.call("Emulation.setTouchEmulationEnabled", &json!({"enabled": phone}));
+    }
+
+    /// Loads a page.
+    pub fn load(&mut self, url: &str) {
+        let answer = self.call("Page.navigate", &json!({"url": url}));
+        assert!(answer["errorText"].is_null(), "{url}: {}", answer["errorText"]);
+    }
+
+    /// The value of an expression in the page, once it is settled.
+    pub fn value(&mut self, expression: &str) -> Json {
+        let arguments = json!({"expression": expression, "awaitPromise": true, "returnByValue": true});
+        let answer = self.call("Runtime.evaluate", &arguments);
+        assert!(answer["exceptionDetails"].is_null(), "{expression}: {}", answer["exceptionDetails"]);
+        answer["result"]["value"].clone()
+    }
+
+    /// Waits until an expression is true; until then it may fail, as while a page is loading.
+    pub fn wait(&mut self, expression: &str) {
+        let start = Instant::now();
+        loop {
+            let arguments = json!({"expression": format!("!!({expression})"), "returnByValue": true});
+            let answer = self.call("Runtime.evaluate", &arguments);
+            if answer["result"]["value"] == true {
+                return;
+            }
+            if start.elapsed() >= PATIENCE {
+                let page = "[location.href, document.readyState, document.body?.innerText].join()";
+                let page = self.call("Runtime.evaluate", &json!({"expression": page, "returnByValue": true}));
+                panic!("{expression} is not true: {answer}; {page}; {:?}", self.complaints);
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Presses and releases a key, named by its code.
+    pub fn press(&mut self, code: &str) {
+        self.key("rawKeyDown", code);
+        self.key("keyUp", code);
+    }
+
+    /// `rawKeyDown` or `keyUp`.
+    pub fn key(&mut self, kind: &str, code: &str) {
+        self.call("Input.dispatchKeyEvent", &json!({"type": kind, "code": code, "key": code}));
+    }
+
+    /// `touchStart` or `touchEnd` in the middle of an element.
+    pub fn touch(&mut self, kind: &str, selector: &str) {
+        let middle = format!(
+            "(() => {{ const e = document.querySelector({}); e.scrollIntoView({{block: 'center', behavior: 'instant'}}); \
+             const b = e.getBoundingClientRect(); return {{x: b.x + b.width / 2, y: b.y + b.height / 2}} }})()",
+            json!(selector)
+        );
+        let point = self.value(&middle);
+        let points = if kind == "touchStart" { json!([point]) } else { json!([]) };
+        self.call("Input.dispatchTouchEvent", &json!({"type": kind, "touchPoints": points}));
+    }
+
+    /// Chooses a file in the page's field for files.
+    pub fn choose(&mut self, selector: &str, file: &Path) {
+        let root = self.call("DOM.getDocument", &json!({}))["root"]["nodeId"].clone();
+        let field = self.call("DOM.querySelector", &json!({"nodeId": root, "selector": selector}))["nodeId"].clone();
+        self.call("DOM.setFileInputFiles", &json!({"nodeId": field, "files": [file]}));
+    }
+
+    /// The file that the page has saved, once it is complete.
+    pub fn download(&mut self) -> PathBuf {
+        let start = Instant::now();
+        loop {
+            let files = std::fs::read_dir(self.folder.join("downloads")).unwrap().map(|entry| entry.unwrap().path());
+            if let Some(file) = files.into_iter().find(|path| path.extension().is_some_and(|ending| ending == "gz")) {
+                return file;
+            }
+            assert!(start.elapsed() < PATIENCE, "nothing was saved");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// The page as a PNG, in base64.
+    pub fn screenshot(&mut self) -> String {
+        self.call("Page.captureScreenshot", &json!({"format": "png"}))["data"].as_str().unwrap().to_owned()
+    }
+
+    /// Calls a method and waits for its answer.
+    pub fn call(&mut self, method: &str, arguments: &Json) -> Json {
+        self.calls += 1;
+        let mut message = json!({"id": self.calls, "method": method, "params": arguments});
+        if let Some(session) = &self.session {
+            message["sessionId"] = json!(session);
+        }
+        self.to.write_all(format!("{message}\0").as_bytes()).expect("Chromium listens");
+        loop {
+            let mut bytes = Vec::new();
+            self.from.read_until(0, &mut bytes).expect("Chromium answers");
+            let end = bytes.pop();
+            assert_eq!(end, Some(0), "Chromium ended during {method}");
+            let answer: Json = serde_json::from_slice(&bytes).expect("Chromium answers with JSON");
+            if answer["id"] == self.calls {
+                assert!(answer["error"].is_null(), "{method}: {}", answer["error"]);
+                return answer["result"].clone();
+            }
+            self.note(&answer);
+        }
+    }
+
+    fn note(&mut self, event: &Json) {
+        let of = &event["params"];
+        match event["method"].as_str().unwrap_or_default() {
+            "Runtime.exceptionThrown" => self.complaints.push(of["exceptionDetails"].to_string()),
+            "Runtime.consoleAPICalled" if of["type"] == "error" => self.complaints.push(of["args"].to_string()),
+            "Log.entryAdded" if of["entry"]["level"] == "error" => self.complaints.push(of["entry"].to_string()),
+            _ => {}
+        }
+    }
+}
+
+impl Drop for Chromium {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+        let _ = std::fs::remove_dir_all(&self.folder);
+    }
+}
+
+fn program() -> String {
+    let starts = |name: &str| {
+        let version = Command::new(name).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+        version.is_ok_and(|status| status.success())
+    };
+    std::env::var("CHROMIUM").unwrap_or_else(|_| {
+        PROGRAMS.iter().find(|name| starts(name)).unwrap_or_else(|| panic!("none of {PROGRAMS:?} is there")).to_string()
+    })
+}

@@ -1,0 +1,145 @@
+//! The web servers of the program `endless` as real processes, and what asks them.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value as Json, json};
+use tungstenite::client::IntoClientRequest;
+use tungstenite::{Message, WebSocket};
+
+/// How long anything may take; the machine may be busy with other tests.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A script in place of a browser: it writes down its arguments, in a file that is complete when it has its name.
+pub const BROWSER: &str = "echo \"$@\" > \"$0.part\"; mv \"$0.part\" \"$0.given\"";
+
+/// What such a browser was given, once it was started; it may be started again.
+pub fn given(browser: &Path) -> String {
+    let (file, start) = (PathBuf::from(format!("{}.given", browser.display())), Instant::now());
+    while !file.exists() {
+        assert!(start.elapsed() < PATIENCE, "{} was not started", browser.display());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::remove_file(&file).unwrap();
+    text.trim().to_owned()
+}
+
+/// A server process. It is killed when this is dropped.
+pub struct Server {
+    pub child: Child,
+    /// The address that it has printed.
+    pub url: String,
+}
+
+impl Server {
+    pub fn start(mut command: Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        stdout.read_line(&mut line).unwrap();
+        let url = line.trim().split(' ').find(|word| word.starts_with("http://")).map(str::to_owned);
+        // What it prints later is not needed, but must have a reader.
+        std::thread::spawn(move || drop(stdout.read_to_end(&mut Vec::new())));
+        let Some(url) = url else {
+            let output = child.wait_with_output().unwrap();
+            panic!("no address: `{line}` {}", String::from_utf8_lossy(&output.stderr));
+        };
+        Server { child, url }
+    }
+
+    pub fn address(&self) -> SocketAddr {
+        let rest = self.url.strip_prefix("http://").unwrap();
+        rest.split('/').next().unwrap().parse().unwrap()
+    }
+
+    pub fn token(&self) -> &str {
+        self.url.split("token=").nth(1).unwrap()
+    }
+
+    /// Asks for a path as a browser would, with further headers, and returns the status, the headers and the body.
+    pub fn get(&self, path: &str, headers: &[(&str, &str)]) -> (u16, String, Vec<u8>) {
+        let host = self.address().to_string();
+        let mut all = vec![("Host", &*host), ("Connection", "close")];
+        for (name, value) in headers {
+            all.retain(|(other, _)| other != name);
+            all.push((name, value));
+        }
+        let headers: String = all.iter().map(|(name, value)| format!("{name}: {value}\r\n")).collect();
+        let mut stream = TcpStream::connect(self.address()).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        write!(stream, "GET {path} HTTP/1.1\r\n{headers}\r\n").unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        let end = answer.windows(4).position(|four| four == b"\r\n\r\n").expect("an answer has headers");
+        let head = String::from_utf8(answer[..end].to_vec()).unwrap();
+        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+        (status, head, answer[end + 4..].to_vec())
+    }
+
+    pub fn status(&self, path: &str, headers: &[(&str, &str)]) -> u16 {
+        self.get(path, headers).0
+    }
+
+    /// A browser's connection that shows an engine.
+    pub fn show(&self, service: &str) -> Socket {
+        let address = format!("ws://{}/{}/socket?service={service}", self.address(), self.token());
+        let stream = TcpStream::connect(self.address()).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let (socket, _) = tungstenite::client(address.into_client_request().unwrap(), stream).unwrap();
+        Socket { socket }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// What a browser receives.
+pub struct Socket {
+    socket: WebSocket<TcpStream>,
+}
+
+impl Socket {
+    /// The next message with frames: what it says, and the pixels.
+    pub fn next(&mut self) -> (Json, Vec<u8>) {
+        loop {
+            if let Message::Binary(bytes) = self.socket.read().unwrap() {
+                let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
+                return (serde_json::from_slice(&bytes[4..4 + length]).unwrap(), bytes[4 + length..].to_vec());
+            }
+        }
+    }
+
+    /// The next message with points of the curves.
+    pub fn points(&mut self) -> Json {
+        loop {
+            if let Message::Text(text) = self.socket.read().unwrap() {
+                return serde_json::from_str(&text).unwrap();
+            }
+        }
+    }
+
+    /// The first message for which a condition holds.
+    pub fn wait(&mut self, condition: impl Fn(&Json) -> bool) -> (Json, Vec<u8>) {
+        let start = Instant::now();
+        loop {
+            let message = self.next();
+            if condition(&message.0) {
+                return message;
+            }
+            assert!(start.elapsed() < PATIENCE, "the last message: {}", message.0);
+        }
+    }
+
+    pub fn select(&mut self, group: usize, envs: &[usize]) {
+        let text = json!({"group": group, "envs": envs}).to_string();
+        self.socket.send(Message::text(text)).unwrap();
+    }
+}

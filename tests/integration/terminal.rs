@@ -1,0 +1,199 @@
+//! `endless play --terminal` and `endless view --terminal` in a pseudo-terminal, whose screen a terminal emulator keeps.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use crate::support::program::{Room, signal, text, wait};
+use endless_gym::batch::{Batch, zeroed};
+use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use rustix::process::Signal;
+use rustix::pty::OpenptFlags;
+use rustix::termios::{LocalModes, Winsize, tcgetattr};
+
+const COLUMNS: u16 = 84;
+const ROWS: u16 = 46;
+
+/// A program in a terminal.
+struct Session {
+    child: Child,
+    terminal: File,
+    screen: Arc<Mutex<vt100::Parser>>,
+}
+
+impl Session {
+    fn start(command: &mut Command) -> Self {
+        let terminal = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+        rustix::pty::grantpt(&terminal).unwrap();
+        rustix::pty::unlockpt(&terminal).unwrap();
+        let size = Winsize { ws_row: ROWS, ws_col: COLUMNS, ws_xpixel: 0, ws_ypixel: 0 };
+        rustix::termios::tcsetwinsize(&terminal, size).unwrap();
+        let name = rustix::pty::ptsname(&terminal, Vec::new()).unwrap().into_string().unwrap();
+        let open = || File::options().read(true).write(true).open(&name).unwrap();
+        let child = command.stdin(open()).stdout(open()).stderr(open()).spawn().unwrap();
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let terminal = File::from(terminal);
+        let screen = Arc::new(Mutex::new(vt100::Parser::new(ROWS, COLUMNS, 0)));
+        let (mut output, written) = (terminal.try_clone().unwrap(), Arc::clone(&screen));
+        std::thread::spawn(move || {
+            let mut bytes = [0; 4096];
+            while let Ok(count @ 1..) = output.read(&mut bytes) {
+                written.lock().unwrap().process(&bytes[..count]);
+            }
+        });
+        Session { child, terminal, screen }
+    }
+
+    fn press(&mut self, keys: &str) {
+        self.terminal.write_all(keys.as_bytes()).unwrap();
+    }
+
+    fn contents(&self) -> String {
+        self.screen.lock().unwrap().screen().contents()
+    }
+
+    /// Waits until the screen has that text.
+    fn wait_for(&self, text: &str) {
+        let start = Instant::now();
+        while !self.contents().contains(text) {
+            assert!(start.elapsed() < Duration::from_secs(60), "no `{text}`:\n{}", self.contents());
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// The picture of a frame's size in the upper left corner, in rows.
+    fn picture(&self) -> Vec<[u8; 3]> {
+        let parser = self.screen.lock().unwrap();
+        let pixel = |place: u16| {
+            let cell = parser.screen().cell(place / 84 / 2, place % 84).unwrap();
+            match if (place / 84).is_multiple_of(2) { cell.fgcolor() } else { cell.bgcolor() } {
+                vt100::Color::Rgb(r, g, b) => [r, g, b],
+                other => panic!("pixel {place} is {other:?}"),
+            }
+        };
+        (0..84 * 84).map(pixel).collect()
+    }
+
+    /// Whether the terminal reads lines and shows what is typed, as a shell needs it, outside the alternate screen.
+    fn is_left(&self) -> bool {
+        let modes = tcgetattr(&self.terminal).unwrap().local_modes;
+        let has_lines = modes.contains(LocalModes::ICANON | LocalModes::ECHO);
+        let parser = self.screen.lock().unwrap();
+        assert_eq!(has_lines, !parser.screen().alternate_screen());
+        has_lines && !parser.screen().hide_cursor()
+    }
+
+    fn end(&mut self) -> Option<i32> {
+        let status = wait(&mut self.child);
+        // What it wrote last may not have been read yet.
+        std::thread::sleep(Duration::from_millis(300));
+        assert!(self.is_left(), "{}", self.contents());
+        status.code()
+    }
+}
+
+/// The observation of an episode after these actions, in rows.
+fn frame(id: &str, seed: u64, actions: &[&[i32]]) -> Vec<[u8; 3]> {
+    let mut pool = Pool::new(&PoolConfig::new(id, 1), &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
+    for action in actions {
+        pool.step(action, &mut blocks).unwrap();
+    }
+    let observation = Batch::new(pool.layout(), &blocks).observation().as_chunks::<3>().0.to_vec();
+    (0..84 * 84).map(|place| observation[place % 84 * 84 + place / 84]).collect()
+}
+
+#[test]
+fn a_game_is_played_with_keys() {
+    let room = Room::new("play");
+    let id = "MysteryPath-Grid-v0";
+    let mut session = Session::start(&mut room.endless(&["play", id, "--terminal", "--seed", "3", "--fps", "1"]));
+    session.wait_for("seed 3");
+    assert!(!session.is_left());
+    session.press(" ");
+    session.wait_for("paused");
+    session.press("r");
+    session.wait_for("step 0 ");
+    assert!(session.picture() == frame(id, 3, &[]));
+    // Up, and left by the other key.
+    session.press("\x1b[A");
+    session.wait_for("step 1 ");
+    session.press("a");
+    session.wait_for("step 2 ");
+    assert!(session.picture() == frame(id, 3, &[&[3], &[1]]));
+    assert!(frame(id, 3, &[&[3], &[1]]) != frame(id, 3, &[&[0], &[0]]));
+    session.press("n");
+    session.wait_for("step 3 ");
+    session.press("\x1b[5~");
+    session.wait_for("seed 4  step 0 ");
+    assert!(session.picture() == frame(id, 4, &[]));
+    session.press("\x1b[6~\x1b[6~");
+    session.wait_for("seed 2 ");
+    session.press(" ");
+    session.wait_for("step 1 ");
+    session.press("\x1b");
+    assert_eq!(session.end(), Some(0));
+}
+
+#[test]
+fn the_terminal_is_left_after_signals() {
+    let room = Room::new("play-signals");
+    for (given, name) in [(Signal::TERM, "TERM"), (Signal::HUP, "HUP")] {
+        let mut session = Session::start(&mut room.endless(&["play", "--terminal"]));
+        session.wait_for("MortarMayhem-v0");
+        assert!(!session.is_left());
+        signal(&session.child, given);
+        assert_eq!(session.end(), Some(0), "{name}");
+    }
+    let mut session = Session::start(&mut room.endless(&["play", "--terminal"]));
+    session.wait_for("MortarMayhem-v0");
+    session.press("\x03");
+    assert_eq!(session.end(), Some(0));
+}
+
+#[test]
+fn what_cannot_be_played_is_an_error() {
+    let room = Room::new("play-errors");
+    let run = |arguments: &[&str]| {
+        let output = room.endless(arguments).stdin(Stdio::null()).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        text(&output.stderr).to_owned()
+    };
+    for command in ["play", "view"] {
+        let message = "endless: --terminal needs a terminal, and standard input is none\n";
+        assert_eq!(run(&[command, "--terminal"]), message);
+    }
+    assert!(run(&["play", "Chess-v0", "--terminal"]).starts_with("endless: no environment `Chess-v0`"));
+    assert!(run(&["play", "--terminal", "--option", "arena_size=9"]).contains("arena_size"));
+    assert!(run(&["play", "--terminal", "--hold=-1"]).contains("--hold must be finite and 0 or more, got -1"));
+}
+
+#[test]
+fn a_training_is_viewed_until_the_engine_ends() {
+    let room = Room::new("view");
+    let id = "SearingSpotlights-v0";
+    let mut engine = room.endless(&["serve", "--env", id, "--num-envs", "1", "--seed", "5"]).spawn().unwrap();
+    room.wait_for_engine();
+    let mut trainer = room.connect("endless");
+    let mut session = Session::start(&mut room.endless(&["view", "--terminal", "--timeout", "20"]));
+    session.wait_for("no trainer has stepped");
+    trainer.reset(0, ResetRequest::All).unwrap();
+    trainer.receive(0, Duration::from_secs(20)).unwrap();
+    session.wait_for("1 of 1 environments are shown");
+    session.wait_for(&format!("endless {id}: "));
+    let start = Instant::now();
+    while session.picture() != frame(id, 5, &[]) {
+        assert!(start.elapsed() < Duration::from_secs(20), "another picture");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    engine.kill().unwrap();
+    wait(&mut engine);
+    session.wait_for("the engine has ended; Q, Esc or Ctrl-C quits");
+    assert!(!session.is_left());
+    session.press("q");
+    assert_eq!(session.end(), Some(0));
+    session.wait_for("the engine has ended");
+}

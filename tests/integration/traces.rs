@@ -1,0 +1,207 @@
+//! Recorded episodes of the original replay without a difference.
+
+use std::io::Read;
+
+use endless_gym::batch::{Batch, zeroed};
+use endless_gym::envs;
+use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::trace::{Trace, TraceError, replay};
+
+/// Replays all traces of an id, those with ground-truth views last.
+fn replay_all(id: &str) {
+    let mut views = 0;
+    for file in crate::support::recorded::traces(id).into_iter().chain(crate::support::recorded::traces_with_views(id))
+    {
+        let trace = Trace::open(&file).unwrap();
+        let replay = replay(&trace).unwrap();
+        assert_eq!(replay.first, None, "{}", file.display());
+        assert_eq!(replay.differences, 0, "{}", file.display());
+        assert_eq!(replay.episodes, trace.episodes.len());
+        assert_eq!(replay.steps, trace.episodes.iter().map(|episode| episode.steps.len()).sum::<usize>());
+        views += replay.views;
+    }
+    assert!(views > 0, "no ground-truth view of {id} was compared");
+}
+
+macro_rules! traces {
+    ($($name:ident: $id:literal,)*) => { $(
+        #[test]
+        fn $name() {
+            replay_all($id);
+        }
+    )* };
+}
+
+traces! {
+    mortar_mayhem: "MortarMayhem-v0",
+    mortar_mayhem_grid: "MortarMayhem-Grid-v0",
+    mortar_mayhem_b: "MortarMayhemB-v0",
+    mortar_mayhem_b_grid: "MortarMayhemB-Grid-v0",
+    endless_mortar_mayhem: "Endless-MortarMayhem-v0",
+    mystery_path: "MysteryPath-v0",
+    mystery_path_grid: "MysteryPath-Grid-v0",
+    endless_mystery_path: "Endless-MysteryPath-v0",
+    searing_spotlights: "SearingSpotlights-v0",
+    endless_searing_spotlights: "Endless-SearingSpotlights-v0",
+}
+
+/// A replay that finds nothing wrong with a wrong trace would prove nothing.
+#[test]
+fn every_kind_of_difference_is_found() {
+    let open = |id: &str, file: usize| {
+        let files = [crate::support::recorded::traces(id), crate::support::recorded::traces_with_views(id)].concat();
+        Trace::open(&files[file.min(files.len() - 1)]).unwrap()
+    };
+    type Change = fn(&mut Trace);
+    let changes: [(&str, &str, usize, Change); 8] = [
+        ("observation checksum", "MortarMayhem-v0", 0, |trace| trace.episodes[1].reset_crc ^= 1),
+        ("observation checksum", "MortarMayhem-v0", 3, |trace| trace.episodes[1].steps[3].crc ^= 1),
+        ("reward", "MortarMayhem-v0", 3, |trace| trace.episodes[1].steps[3].reward += 1e-16),
+        ("done", "MortarMayhem-v0", 3, |trace| trace.episodes[1].steps[3].done = true),
+        ("vector observation", "MortarMayhemB-v0", 0, |trace| trace.episodes[1].reset_vector[0] += 1.0),
+        ("ground-truth view checksum", "MortarMayhem-v0", usize::MAX, |trace| {
+            *trace.episodes[1].steps[3].render_crc.as_mut().unwrap() ^= 1;
+        }),
+        ("info `success`", "MortarMayhem-v0", 0, |trace| {
+            trace.episodes[1].steps.last_mut().unwrap().info["success"] = 0.5.into();
+        }),
+        ("info `ground_truth`", "Endless-MortarMayhem-v0", 0, |trace| {
+            trace.episodes[1].steps[3].info.remove("ground_truth");
+        }),
+    ];
+    for (what, id, file, change) in changes {
+        let mut trace = open(id, file);
+        change(&mut trace);
+        let first = replay(&trace).unwrap().first.unwrap_or_else(|| panic!("{what} was not compared"));
+        assert_eq!((first.what.as_str(), first.episode), (what, 1), "{first}");
+    }
+}
+
+/// A checksum tells that a frame differs; the recorded frames tell where.
+#[test]
+fn the_first_frames_are_the_same_byte_by_byte() {
+    for spec in envs::specs() {
+        let trace =
+            Trace::open(&crate::support::recorded::reference().join(format!("traces/{}.04.mixed20.json.gz", spec.id)))
+                .unwrap();
+        let expected = recorded_frames(spec.id);
+        let found = frames(&trace, expected.len());
+        assert_eq!((expected.len(), found.len()), (40, 40), "{}", spec.id);
+        for (number, (expected, (found, crc))) in expected.iter().zip(&found).enumerate() {
+            assert_eq!(
+                difference(expected, found),
+                None,
+                "{}, frame {number}: [x, y, channel], expected, found",
+                spec.id
+            );
+            assert_eq!(crc32fast::hash(expected), *crc, "{}, frame {number}: the trace's checksum is another", spec.id);
+        }
+    }
+}
+
+/// The traces alone cover these reset parameters: the published original, with which `tests/live.rs` compares, lacks them.
+#[test]
+fn traces_have_the_newest_reset_parameters() {
+    for (trace, parameter) in [
+        ("Endless-MortarMayhem-v0.05.mixed02", "reward_new_command_success"),
+        ("Endless-MysteryPath-v0.05.mixed02", "reward_path_progress_dense"),
+        ("Endless-SearingSpotlights-v0.13.mixed02", "coin_enabled"),
+    ] {
+        let trace =
+            Trace::open(&crate::support::recorded::reference().join(format!("traces/{trace}.json.gz"))).unwrap();
+        assert!(trace.options.contains_key(parameter), "{parameter}: {:?}", trace.options);
+    }
+}
+
+#[test]
+fn a_byte_that_differs_is_found() {
+    let frame = recorded_frames("MysteryPath-v0").remove(0);
+    let mut other = frame.clone();
+    other[(7 * 84 + 30) * 3 + 2] ^= 4;
+    assert_eq!(difference(&frame, &frame), None);
+    let (place, expected, found) = difference(&frame, &other).unwrap();
+    assert_eq!((place, expected ^ found), ([7, 30, 2], 4));
+}
+
+/// The raw frames that were recorded of an id.
+fn recorded_frames(id: &str) -> Vec<Vec<u8>> {
+    let file = std::fs::File::open(crate::support::recorded::reference().join(format!("frames/{id}.gz"))).unwrap();
+    let mut bytes = Vec::new();
+    flate2::read::GzDecoder::new(file).read_to_end(&mut bytes).unwrap();
+    let frames = bytes.chunks_exact(84 * 84 * 3);
+    assert!(frames.remainder().is_empty(), "{id}: {} bytes are no whole number of frames", bytes.len());
+    frames.map(<[u8]>::to_vec).collect()
+}
+
+/// The first `count` frames of the engine when it plays a trace, with the checksums of the trace.
+fn frames(trace: &Trace, count: usize) -> Vec<(Vec<u8>, u32)> {
+    let config = PoolConfig {
+        options: ResetOptions::Shared(trace.options.clone()),
+        autoreset: Autoreset::Disabled,
+        ..PoolConfig::new(&trace.env, 1)
+    };
+    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+    let mut blocks = zeroed(pool.layout().blocks());
+    let mut frames = Vec::new();
+    for episode in &trace.episodes {
+        if frames.len() == count {
+            break;
+        }
+        let request = episode.seed.map_or(ResetRequest::All, ResetRequest::Seed);
+        pool.reset(request, &mut blocks).unwrap();
+        frames.push((Batch::new(pool.layout(), &blocks).observation().to_vec(), episode.reset_crc));
+        for step in &episode.steps {
+            if frames.len() == count {
+                break;
+            }
+            pool.step(&step.action, &mut blocks).unwrap();
+            frames.push((Batch::new(pool.layout(), &blocks).observation().to_vec(), step.crc));
+        }
+    }
+    frames
+}
+
+/// The first byte that differs, as [x, y, channel] and both values.
+fn difference(expected: &[u8], found: &[u8]) -> Option<([usize; 3], u8, u8)> {
+    assert_eq!(expected.len(), found.len());
+    let index = expected.iter().zip(found).position(|(expected, found)| expected != found)?;
+    Some(([index / 3 / 84, index / 3 % 84, index % 3], expected[index], found[index]))
+}
+
+#[test]
+fn a_trace_without_its_last_steps_is_an_error() {
+    for (id, views) in [("MortarMayhem-v0", false), ("Endless-MortarMayhem-v0", false), ("MysteryPath-v0", true)] {
+        for file in
+            if views { crate::support::recorded::traces_with_views(id) } else { crate::support::recorded::traces(id) }
+        {
+            let truncated = |change: fn(&mut Trace)| {
+                let mut trace = Trace::open(&file).unwrap();
+                change(&mut trace);
+                trace.check_complete()
+            };
+            let last = Trace::open(&file).unwrap().episodes.len() - 1;
+            for change in [
+                |trace: &mut Trace| drop(trace.episodes.last_mut().unwrap().steps.pop()),
+                |trace: &mut Trace| trace.episodes.last_mut().unwrap().steps.truncate(1),
+                |trace: &mut Trace| trace.episodes.last_mut().unwrap().steps.clear(),
+            ] {
+                let error = truncated(change).unwrap_err();
+                assert!(matches!(error, TraceError::Truncated { episode, .. } if episode == last), "{error}");
+            }
+            assert!(matches!(truncated(|trace| trace.episodes.clear()), Err(TraceError::Empty)));
+            // A recording with another limit states it.
+            let limited = truncated(|trace| {
+                trace.max_steps = Some(10);
+                trace.episodes.iter_mut().for_each(|episode| episode.steps.truncate(10));
+            });
+            assert!(limited.is_ok(), "{limited:?}");
+        }
+    }
+}
+
+#[test]
+fn a_trace_of_an_unknown_environment_is_an_error() {
+    let mut trace = Trace::open(&crate::support::recorded::traces("MortarMayhem-v0")[0]).unwrap();
+    trace.env = "NoSuchThing-v0".to_owned();
+    assert!(matches!(replay(&trace), Err(TraceError::Pool(_))));
+}
