@@ -58,33 +58,20 @@ class DLPackView:
 def torch_view(array: NDArray[Any]) -> torch.Tensor:
     """A tensor that shares the array's memory and keeps it alive.
 
-    A tensor of a read-only array is read-only, and so are its views: an operation that would write to it raises RuntimeError. All
-    other operations read the memory without a copy and return ordinary tensors, such as `tensor.to("cuda")` and `tensor.float()`.
-    `tensor.clone()` is a writable copy. Operations of PyTorch cost some microseconds more on a read-only tensor.
-
-    `torch.from_numpy` and `torch.from_dlpack` take the arrays, too, but ignore that they are read-only. Writing to such a tensor
-    corrupts later frames of environments in this process, and kills the process for environments in another process.
+    Only read it: PyTorch has no read-only tensors. A write to the memory of environments in this process corrupts later frames;
+    a write to that of environments in another process kills this process. `tensor.clone()` is a copy that may be written to.
 
     Raises:
         TypeError: The array's dtype has no counterpart in DLPack.
-    """
-    tensor = unchecked_torch_view(array)
-    if array.flags.writeable:
-        return tensor
-    from endless_gym.readonly_tensor import ReadOnlyTensor
-
-    return ReadOnlyTensor(tensor)
-
-
-def unchecked_torch_view(array: NDArray[Any]) -> torch.Tensor:
-    """As `torch_view`, but an ordinary tensor, without the cost of the checks. The caller must not write to it.
-
-    For this package's own code that only reads the tensor. A write corrupts later frames, or kills the process.
     """
     from torch.utils.dlpack import from_dlpack
 
     tensor: torch.Tensor = from_dlpack(_native.dlpack_unchecked(array))
     return tensor
+
+
+#: The former name, for the agents.
+unchecked_torch_view = torch_view
 
 
 def pin_memory(array: NDArray[Any]) -> bool:

@@ -36,8 +36,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
     of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. Observations and
     `ground_truth` are read-only views of the memory that the engine wrote; their contents do not change while references to them
-    exist. With `copy=True` they are writable copies, as rewards and flags always are. `endless_gym.torch_view` returns read-only
-    tensors that share their memory.
+    exist. With `copy=True` they are writable copies, as rewards and flags always are. `endless_gym.torch_view` returns tensors
+    that share their memory.
 
     `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
     (n, k) if the original has it; in steps that end episodes the original's final infos: `reward`, the episode's return, float64
