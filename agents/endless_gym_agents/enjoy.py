@@ -19,8 +19,9 @@ import torch
 import tyro
 from rich.console import Console
 
+from endless_gym.create import make_vec
 from endless_gym.specs import ObservationName, spec
-from endless_gym.vector import EndlessVectorEnv, make_vec
+from endless_gym.vector import EndlessVectorEnv
 from endless_gym_agents import command, video
 from endless_gym_agents.agent import Agent, observation_shapes
 from endless_gym_agents.encoders import FRAME

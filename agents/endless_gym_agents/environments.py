@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from endless_gym.create import make_vec
 from endless_gym.engine import serve
 from endless_gym.episodes import EpisodeOptions
 from endless_gym.specs import Spec, spec
-from endless_gym.vector import EndlessVectorEnv, make_vec
+from endless_gym.vector import EndlessVectorEnv
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.recovery import RecoverableEngine
 from endless_gym_agents.settings import TRAINING_SEEDS, Settings

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from endless_gym.create import make_vec
 from endless_gym.specs import spec
-from endless_gym.vector import make_vec
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.metrics import TASK_PROGRESS, needs_path_length, path_length, task_progress
 

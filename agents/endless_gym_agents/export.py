@@ -32,8 +32,8 @@ import numpy as np
 import torch
 import tyro
 
+from endless_gym.create import make_vec
 from endless_gym.specs import spec
-from endless_gym.vector import make_vec
 from endless_gym_agents import command
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.checkpoint import Checkpoint

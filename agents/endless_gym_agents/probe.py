@@ -25,8 +25,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
+from endless_gym.create import make_vec
 from endless_gym.specs import spec
-from endless_gym.vector import make_vec
 from endless_gym_agents import command
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.evaluate import EVALUATION_SEEDS

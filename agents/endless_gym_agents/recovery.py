@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.vector import EndlessVectorEnv, Step
+from endless_gym.results import Step
+from endless_gym.vector import EndlessVectorEnv
 
 T = TypeVar("T")
 

@@ -30,9 +30,9 @@ class ViewProcess:
         Raises:
             RuntimeError: The server cannot start.
         """
-        backend: Any = envs._backend
+        engine: Any = envs._engine
         self._process = subprocess.Popen(
-            [*program(), "view", backend._engine.service, f"--child={os.getpid()}"],
+            [*program(), "view", engine.service, f"--child={os.getpid()}"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -26,7 +26,7 @@ PARTS = ("update", "steps", "model", "optimizer", "generators", "player", "episo
 
 def kill(engine: RecoverableEngine) -> None:
     """Kill the engine process, if there is one."""
-    process = engine._envs._backend._engine if engine.failure is None else None
+    process = engine._envs._engine if engine.failure is None else None
     if process is not None:
         os.kill(process.pid, signal.SIGKILL)
 
@@ -168,7 +168,7 @@ def test_an_engine_that_does_not_answer_is_replaced() -> None:
                 for group in range(2):
                     envs.send(np.full(2, (step + group) % 4), group)
             if step == 20:
-                os.kill(first._backend._engine.pid, signal.SIGSTOP)
+                os.kill(first._engine.pid, signal.SIGSTOP)
             for group in range(2):
                 for given, wanted in zip(engine.recv(group)[:4], twin.recv(group)[:4], strict=True):
                     np.testing.assert_array_equal(given, wanted)

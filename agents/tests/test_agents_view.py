@@ -21,10 +21,10 @@ def test_the_page_shows_the_runs_engine(tmp_path: Path, capsys: pytest.CaptureFi
             assert b"Endless Gym" in page.read()
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(url.split("?")[0])
-        backend: Any = environments._envs._envs._backend  # type: ignore[union-attr]
+        engine: Any = environments._envs._envs._engine  # type: ignore[union-attr]
         base, token = url.split("?token=")
         with urllib.request.urlopen(f"{base}{token}/engines") as engines:
-            assert f'"service":"{backend._engine.service}"'.encode() in engines.read()
+            assert f'"service":"{engine.service}"'.encode() in engines.read()
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(url)
 

@@ -22,9 +22,10 @@ from endless_gym.specs import Frames, all_specs, spec
 from endless_gym.window import WindowClosed
 
 if TYPE_CHECKING:
+    from endless_gym.create import connect, make_vec
     from endless_gym.engine import serve
     from endless_gym.recording import record
-    from endless_gym.vector import EndlessVectorEnv, connect, make_vec
+    from endless_gym.vector import EndlessVectorEnv
     from endless_gym.watching import watch
 
 __all__ = [
@@ -56,8 +57,8 @@ __all__ = [
 _LATER = {
     "serve": "engine",
     "EndlessVectorEnv": "vector",
-    "connect": "vector",
-    "make_vec": "vector",
+    "connect": "create",
+    "make_vec": "create",
     "record": "recording",
     "watch": "watching",
 }

@@ -60,12 +60,8 @@ def timeout(given: float) -> float:
     return seconds
 
 
-def seed_source(
-    seed: int | None, seeds: range | Sequence[int] | None
-) -> tuple[int | None, tuple[int, int, int] | None, list[int] | None]:
-    """The arguments `seed` and `seeds` as a seed, start, stop and positive step of a range, and a list.
-
-    The last two exclude each other.
+def seeding(seed: int | None, seeds: range | Sequence[int] | None) -> dict[str, Any]:
+    """The source of the episodes' seeds, from the arguments `seed` and `seeds`: the JSON object of the engine's `Seeding`.
 
     Raises:
         TypeError: A seed is not an integer.
@@ -73,13 +69,14 @@ def seed_source(
     """
     seed = None if seed is None else integer("seed", seed)
     if seeds is None:
-        return seed, None, None
+        return {"continue": {"seed": seed}}
     if not isinstance(seeds, range):
         seeds = [integer("seeds", each) for each in seeds]
     if not seeds:
         raise ValueError(f"seeds must have at least one seed, got {seeds}")
     if isinstance(seeds, list):
-        return seed, None, seeds
+        return {"list": seeds}
     # The order does not matter, since seeds are drawn from the range.
     first, last = sorted((seeds[0], seeds[-1]))
-    return seed, (integer("seeds", first), integer("seeds", last, 0, MAX_I64 - 1) + 1, abs(seeds.step)), None
+    start, end = integer("seeds", first), integer("seeds", last, 0, MAX_I64 - 1) + 1
+    return {"range": {"start": start, "end": end, "step": abs(seeds.step), "seed": seed}}

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import gymnasium
 
 from endless_gym import _native
-from endless_gym.arguments import integer, mapping, seed_source
-from endless_gym.specs import Frames, ObservationName, Spec, contents, options_text, spec
+from endless_gym.arguments import integer, mapping, seeding
+from endless_gym.specs import Frames, ObservationName, Spec, contents, json_text, spec
 
 try:
     from gymnasium.vector import AutoresetMode as AutoresetMode
@@ -33,24 +33,42 @@ MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
 
 
 @dataclass(frozen=True)
+class PoolConfig:
+    """The configuration of a group of environments: the JSON object that the engine's `PoolConfig` reads, field by field."""
+
+    id: str
+    num_envs: int
+    #: One mapping for all environments, or one for each.
+    options: Options | Sequence[Options]
+    #: A name in `MODES`.
+    autoreset: str
+    final_observation: bool
+    #: `{"continue": {"seed": s}}`, `{"range": {"start": a, "end": b, "step": c, "seed": s}}` or `{"list": [...]}`.
+    seeding: Mapping[str, Any]
+    independent_episodes: bool
+    #: `None` omits the frames.
+    frames: Mapping[str, Any] | None
+    features: bool
+    #: Number of the first environment among those of all groups.
+    first_env: int
+    #: Environments of all groups of the trainer together.
+    total_envs: int
+
+    def json(self) -> str:
+        """The configuration as JSON text."""
+        return json_text(vars(self))
+
+
+@dataclass(frozen=True)
 class Arguments:
     """The checked arguments that `make_vec` and `serve` share."""
 
     described: Spec
-    num_envs: int
     num_threads: int
-    groups: int
-    seed: int | None
-    seed_range: tuple[int, int, int] | None
-    seed_list: list[int] | None
     autoreset: AutoresetMode
     frames: Frames | None
-    features: bool
-    independent_episodes: bool
-    first_env: int
-    total_envs: int
     #: The configuration of each group, which the engine has checked.
-    pools: list[_native.PoolConfig]
+    pools: list[PoolConfig]
 
 
 def checked_arguments(
@@ -78,46 +96,31 @@ def checked_arguments(
     num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
     groups = integer("groups", groups, 1, _native.MAX_GROUPS)
     threads = integer("num_threads", num_threads or 0, 0, _native.MAX_THREADS)
-    seed, seed_range, seed_list = seed_source(seed, seeds)
+    source = seeding(seed, seeds)
     first_env = integer("first_env", first_env, 0, MAX_TOTAL_ENVS)
     end = first_env + groups * num_envs
     total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
     frames, features = contents(observation, frames)
     pools = [
-        _native.PoolConfig(
-            described.id,
-            num_envs,
+        PoolConfig(
+            id=described.id,
+            num_envs=num_envs,
             options=_pool_options(options, group * num_envs, num_envs, groups),
             autoreset=mode.name.lower(),
+            final_observation=True,
+            seeding=source,
+            independent_episodes=bool(independent_episodes),
+            frames=frames.configuration() if frames else None,
+            features=features,
             # Environments are numbered over all groups.
             first_env=first_env + group * num_envs,
             total_envs=total_envs,
-            seed=seed,
-            seed_range=seed_range,
-            seed_list=seed_list,
-            frames=frames.arguments() if frames else None,
-            features=features,
-            final_observation=True,
-            independent_episodes=bool(independent_episodes),
         )
         for group in range(groups)
     ]
-    return Arguments(
-        described=described,
-        num_envs=num_envs,
-        num_threads=threads,
-        groups=groups,
-        seed=seed,
-        seed_range=seed_range,
-        seed_list=seed_list,
-        autoreset=mode,
-        frames=frames,
-        features=features,
-        independent_episodes=bool(independent_episodes),
-        first_env=first_env,
-        total_envs=total_envs,
-        pools=pools,
-    )
+    for pool in pools:
+        _native.check_pool_config(pool.json())
+    return Arguments(described, threads, mode, frames, pools)
 
 
 def autoreset_mode(given: AutoresetName | AutoresetMode) -> AutoresetMode:
@@ -133,14 +136,16 @@ def options_list(given: Options | Sequence[Options] | None) -> Sequence[Options]
     return [given or {}] if given is None or isinstance(given, Mapping) else given
 
 
-def _pool_options(given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int) -> str:
-    """The reset parameters of the environments of one group, in the native module's format."""
+def _pool_options(
+    given: Options | Sequence[Options] | None, first: int, num_envs: int, groups: int
+) -> Options | Sequence[Options]:
+    """The reset parameters of the environments of one group."""
     if given is None or isinstance(given, Mapping):
-        return options_text(given)
+        return dict(given or {})
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise TypeError(f"options must be a mapping, or a sequence of mappings, got {given!r}")
     if len(given) != groups * num_envs:
         raise ValueError(
             f"options must have one mapping for each of {groups * num_envs} environments, got {len(given)}"
         )
-    return f"[{', '.join(options_text(mapping('options', each)) for each in given[first : first + num_envs])}]"
+    return [mapping("options", each) for each in given[first : first + num_envs]]

@@ -18,12 +18,13 @@ from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
 from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.create import connect
 from endless_gym.engine_log import EngineLog, level
-from endless_gym.episodes import EpisodeOptions, checked_choice
+from endless_gym.episodes import EpisodeOptions, validate_episode_options
 from endless_gym.program import program
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.specs import Frames, ObservationName, json_text
-from endless_gym.vector import EndlessVectorEnv, connect
+from endless_gym.vector import EndlessVectorEnv
 
 _numbers = count()
 
@@ -201,25 +202,26 @@ def serve(
     )
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, VECTOR_MODES)
-    checked_choice(episode_options)
+    validate_episode_options(episode_options)
+    pool = given.pools[0]
     arguments: dict[str, Any] = {
-        "--env": given.described.id,
-        "--num-envs": given.num_envs,
+        "--env": pool.id,
+        "--num-envs": pool.num_envs,
         "--threads": given.num_threads,
-        "--groups": given.groups,
+        "--groups": len(given.pools),
         "--batches-held": min(
             integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
             _native.MAX_BATCHES_HELD,
         ),
-        "--autoreset": given.autoreset.name.lower(),
-        "--first-env": given.first_env,
-        "--total-envs": given.total_envs,
+        "--autoreset": pool.autoreset,
+        "--first-env": pool.first_env,
+        "--total-envs": pool.total_envs,
     }
-    if given.seed is not None and given.seed_list is None:
-        arguments["--seed"] = given.seed
-    if given.seed_range is not None:
-        start, stop, step = given.seed_range
-        arguments["--seed-range"] = f"{start}..{stop}:{step}"
+    ((kind, source),) = pool.seeding.items()
+    if kind != "list" and source["seed"] is not None:
+        arguments["--seed"] = source["seed"]
+    if kind == "range":
+        arguments["--seed-range"] = f"{source['start']}..{source['end']}:{source['step']}"
     if checkpoint is None and (checkpoint_every is not None or resume):
         raise ValueError("checkpoint must name a file if checkpoint_every or resume is given")
     if checkpoint is not None:
@@ -229,15 +231,15 @@ def serve(
         arguments["--every"] = f"{round(checked_timeout(checkpoint_every) * 1e9)}ns"
     command = [f"{name}={value}" for name, value in arguments.items()]
     command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
-    command += ["--features"] if given.features else []
-    command += ["--independent-episodes"] if given.independent_episodes else []
+    command += ["--features"] if pool.features else []
+    command += ["--independent-episodes"] if pool.independent_episodes else []
     command += given.frames.command() if given.frames else ["--no-frames"]
     if options is None or isinstance(options, Mapping):
         long = [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
     else:
         long = [f"--env-options={json_text(dict(each))}" for each in options]
-    if given.seed_list is not None:
-        long.append(f"--seed-list={','.join(map(str, given.seed_list))}")
+    if kind == "list":
+        long.append(f"--seed-list={','.join(map(str, source))}")
     command += ["--resume"] if resume else []
     engine = EngineProcess(command, long)
     try:

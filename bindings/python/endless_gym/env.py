@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
+from endless_gym.descriptions import documented, metadata
 from endless_gym.keyboard import keys_to_action
-from endless_gym.meanings import documented, metadata
 from endless_gym.rendering import SINGLE_MODES, SnapshotRenderer, View, checked_view
-from endless_gym.specs import Frames, ObservationName, all_specs, contents, options_text, spec
+from endless_gym.specs import Frames, ObservationName, all_specs, contents, json_text, options_text, spec
 from endless_gym.window import Window, WindowClosed
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
-
-#: Ids whose ground truth is an integer array in the original.
-_INTEGER_GROUND_TRUTH = ("Endless-MysteryPath-v0",)
 
 
 @documented(all_specs().values())
@@ -84,7 +81,7 @@ class Env(gymnasium.Env[Any, Any]):
         self.has_ground_truth_info = self._spec.ground_truth > 0
         if self.has_ground_truth_info:
             self.ground_truth_space = self._spec.ground_truth_space()
-        self._truth_dtype = np.int64 if self._spec.id in _INTEGER_GROUND_TRUTH else np.float64
+        self._truth_dtype = np.int64 if self._spec.ground_truth_is_integer else np.float64
         self._options = mapping("options", options)
         self._native = self._new_native()
         self._renderer: SnapshotRenderer | None = None
@@ -211,10 +208,16 @@ class Env(gymnasium.Env[Any, Any]):
             self._native.resume(*saved)
 
     def _new_native(self) -> _native.Single:
-        frames = None if self._frames is None else self._frames.arguments()
-        return _native.Single(
-            self._spec.id, options_text(self._options), frames, self._features, self._independent_episodes
-        )
+        config = {
+            "id": self._spec.id,
+            "num_envs": 1,
+            "options": self._options,
+            "autoreset": "disabled",
+            "frames": None if self._frames is None else self._frames.configuration(),
+            "features": self._features,
+            "independent_episodes": self._independent_episodes,
+        }
+        return _native.Single(json_text(config))
 
     def _check_window(self) -> None:
         """Raises `WindowClosed` if the user has closed the window."""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from endless_gym import _native
 from endless_gym.arguments import mapping
 from endless_gym.backends import Backend
 from endless_gym.configuration import AutoresetMode
-from endless_gym.next_options import NextOptions, Options
+from endless_gym.next_options import NextOptions, Options, RunningEpisode, running_episodes
+from endless_gym.results import Results, Step
+from endless_gym.specs import Spec
+from endless_gym.vector import EndlessVectorEnv
 
 #: Chooses the options of an environment's next episode. It is called with the number of the environment over all groups, the
 #: number of the episode in this environment, from 0, and the final infos of the environment's last episode: `reward`, `length`,
@@ -22,7 +25,7 @@ from endless_gym.next_options import NextOptions, Options
 EpisodeOptions = Callable[[int, int, dict[str, Any] | None], "Options | None"]
 
 
-def checked_choice(given: Any) -> EpisodeOptions | None:
+def validate_episode_options(given: Any) -> EpisodeOptions | None:
     """The argument `episode_options`.
 
     Raises:
@@ -33,23 +36,6 @@ def checked_choice(given: Any) -> EpisodeOptions | None:
             f"episode_options must be a function of environment, episode and final infos, or None, got {given!r}"
         )
     return given  # type: ignore[no-any-return]
-
-
-class RunningEpisode(NamedTuple):
-    """What the running episode of an environment follows from."""
-
-    #: The seed that the episode started with; `None` if it continues the generator of the episode before.
-    seed: int | None
-    #: The reset parameters that were given for the episode, those given at creation included; the others have their defaults.
-    options: dict[str, Any]
-    #: Whether the last step ended it, so that with next-step auto-reset the next step starts another.
-    ended: bool
-
-
-def running_episodes(backend: Backend, group: int, envs: Iterable[int]) -> dict[int, RunningEpisode]:
-    """What the running episodes of environments follow from."""
-    found = backend.running_episodes(group, list(envs))
-    return {env: RunningEpisode(seed, json.loads(options), ended) for env, seed, options, ended in found}
 
 
 class EpisodeTracker:
@@ -199,3 +185,75 @@ class EpisodeTracker:
         for name, array in arrays.items():
             array.flags.writeable = False
             info[name] = array.copy() if self._copy else array
+
+
+class TrackedVectorEnv(EndlessVectorEnv):
+    """Environments whose episodes are followed, for `episode_options` and `episode_info`."""
+
+    def __init__(
+        self,
+        backend: Backend,
+        results: Results,
+        described: Spec,
+        autoreset: AutoresetMode,
+        *,
+        episode_options: EpisodeOptions | None,
+        episode_info: bool,
+        **arguments: Any,
+    ) -> None:
+        """As for `EndlessVectorEnv`, with the arguments of `make_vec`."""
+        super().__init__(backend, results, described, autoreset, **arguments)
+        self._chooses = episode_options is not None
+        self._trackers = [
+            EpisodeTracker(
+                group, self.num_envs, backend, self._options, autoreset, episode_options, episode_info, results.copy
+            )
+            for group in range(backend.groups)
+        ]
+
+    def step(self, actions: Any) -> Step:
+        self._trackers[0].before_step()
+        return self._followed(0, super().step(actions))
+
+    def send(self, actions: Any, group: int = 0) -> None:
+        self._trackers[self._group(group)].before_step()
+        super().send(actions, group)
+
+    def recv(self, group: int | None = None) -> Step:
+        step = super().recv(group)
+        return self._followed(step[4]["group"], step)
+
+    def set_options(
+        self,
+        options: Options | Sequence[Options | None],
+        *,
+        mask: NDArray[np.bool_] | None = None,
+        group: int | None = None,
+    ) -> None:
+        if self._chooses:
+            raise ValueError("options must not be set, since `episode_options` chooses those of each episode")
+        super().set_options(options, mask=mask, group=group)
+
+    def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
+        start = super().restore(snapshots, group)
+        self._trackers[group].after_restore(list(snapshots) or range(self.num_envs), start[1])
+        return start
+
+    def _before_reset(self, group: int, envs: Sequence[int], given: Options) -> str | None:
+        self._trackers[group].before_reset(envs)
+        return super()._before_reset(group, envs, given)
+
+    def _reset(
+        self, group: int, request: _native.Reset | None, mask: Any, given: Options
+    ) -> tuple[Any, dict[str, Any]]:
+        start = super()._reset(group, request, mask, given)
+        self._trackers[group].after_reset(self._resets.envs(mask), start[1])
+        return start
+
+    def _sent_reset(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:
+        super()._sent_reset(group, envs, given, text)
+        self._trackers[group].sent_reset(envs)
+
+    def _followed(self, group: int, step: Step) -> Step:
+        self._trackers[group].after_step(step[2], step[4])
+        return step

@@ -1,9 +1,10 @@
-"""The reset parameters of the episodes that environments play next."""
+"""The reset parameters of running episodes and of those that environments play next."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from endless_gym.arguments import mapping
 from endless_gym.backends import Backend
@@ -14,6 +15,23 @@ Options = Mapping[str, Any]
 _NONE: Options = {}
 #: The text of options that are not known, such as those of a snapshot.
 _UNKNOWN = ""
+
+
+class RunningEpisode(NamedTuple):
+    """The seed and the options of an environment's running episode."""
+
+    #: The seed that the episode started with; `None` if it continues the generator of the episode before.
+    seed: int | None
+    #: The reset parameters that were given for the episode, those given at creation included; the others have their defaults.
+    options: dict[str, Any]
+    #: Whether the last step ended it, so that with next-step auto-reset the next step starts another.
+    ended: bool
+
+
+def running_episodes(backend: Backend, group: int, envs: Iterable[int]) -> dict[int, RunningEpisode]:
+    """Seeds and options of the running episodes of environments."""
+    found = backend.running_episodes(group, list(envs))
+    return {env: RunningEpisode(seed, json.loads(options), ended) for env, seed, options, ended in found}
 
 
 class NextOptions:

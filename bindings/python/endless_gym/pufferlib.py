@@ -24,8 +24,8 @@ except ImportError as error:
         "pip install --no-deps pufferlib==3.0.0 gym==0.26.2 pettingzoo shimmy; see examples/pufferlib_rollout.py"
     ) from error
 
+from endless_gym.create import make_vec
 from endless_gym.specs import DEFAULT_ENV_ID
-from endless_gym.vector import make_vec
 
 __all__ = ["EndlessPufferEnv"]
 

@@ -46,6 +46,6 @@ single.metadata = Env.metadata  # type: ignore[attr-defined]
 def vector(env_id: str, num_envs: int = 1, **kwargs: Any) -> EndlessVectorEnv:
     """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
     # It needs Gymnasium 1.1, single environments do not.
-    from endless_gym.vector import make_vec
+    from endless_gym.create import make_vec
 
     return make_vec(env_id, num_envs, **kwargs)

@@ -30,7 +30,8 @@ except ImportError as error:
     ) from error
 
 from endless_gym.adapters import check_adaptable
-from endless_gym.vector import EndlessVectorEnv, make_vec
+from endless_gym.create import make_vec
+from endless_gym.vector import EndlessVectorEnv
 
 __all__ = ["EndlessVecEnv"]
 

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer
-from endless_gym.meanings import ActionBranch, Meaning, meanings
+from endless_gym.descriptions import ActionBranch, Meaning, meanings
 
 #: The environment id that programs use by default.
 DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
-
-SCREEN = 84
 
 #: The kinds of observations.
 ObservationName = Literal["rgb", "features", "rgb+features"]
@@ -52,17 +50,16 @@ class Frames:
 
     def shape(self) -> tuple[int, ...]:
         """Shape of one environment's observation."""
-        channels = () if self.grayscale else (3,)
-        frame = (*channels, SCREEN, SCREEN) if self.channels_first else (SCREEN, SCREEN, *channels)
-        return frame if self.stack == 1 else (self.stack, *frame)
+        return tuple(_native.frame_shape(json_text(self.configuration())))
 
-    def arguments(self) -> tuple[bool, bool, bool, int]:
-        """The native module's argument.
+    def configuration(self) -> dict[str, Any]:
+        """The JSON object of the engine's `Frames`.
 
         Raises:
             ValueError: The stack is negative.
         """
-        return bool(self.grayscale), bool(self.channels_first), bool(self.row_major), integer("stack", self.stack)
+        order = {name: bool(getattr(self, name)) for name in ("grayscale", "channels_first", "row_major")}
+        return {"format": order, "stack": integer("stack", self.stack)}
 
     def command(self) -> list[str]:
         """The arguments of `endless serve`.
@@ -101,6 +98,8 @@ class Spec:
     ground_truth: int
     #: What its numbers mean.
     ground_truth_columns: tuple[Meaning, ...]
+    #: Whether the original's `info["ground_truth"]` is an int array, of a single environment.
+    ground_truth_is_integer: bool
     #: Names of the final infos besides `reward` and `length`, and whether the original's value is an int.
     info: tuple[tuple[str, bool], ...]
     #: Names of the feature observation's columns.
@@ -223,6 +222,7 @@ def _spec(described: dict[str, Any]) -> Spec:
         vector_observation=described["vector_observation"],
         ground_truth=len(described["ground_truth"]),
         ground_truth_columns=meanings(described["ground_truth"]),
+        ground_truth_is_integer=described["ground_truth_is_integer"],
         info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
         features=tuple(column["name"] for column in described["features"]),
         feature_columns=meanings(described["features"]),

@@ -27,8 +27,9 @@ except ImportError as error:
 
 from endless_gym import torch_view
 from endless_gym.adapters import check_adaptable
+from endless_gym.create import make_vec
 from endless_gym.engine import serve
-from endless_gym.vector import EndlessVectorEnv, make_vec
+from endless_gym.vector import EndlessVectorEnv
 
 __all__ = ["EndlessEnv"]
 

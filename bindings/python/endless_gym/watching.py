@@ -7,13 +7,13 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.backends import Backend
-from endless_gym.vector import specified_envs
+from endless_gym.create import specified_results
 
 
 class WatchedBatch(NamedTuple):
@@ -58,12 +58,12 @@ class Watch:
         # As for a timeout of iceoryx2's calls, a year counts as no limit.
         observer = _native.Observer(service, group, 3e7 if self._timeout is None else self._timeout)
         specification = json.loads(observer.specification())
-        self._backend = _Observed(observer, specification["groups"])
-        # Names the arrays of a batch as for a trainer.
-        self._envs = specified_envs(self._backend, specification, copy=copy)
+        self._observer: _native.Observer | None = observer
+        described, self._results = specified_results(specification, copy)
         self.id: str = specification["id"]
-        self.num_envs, self.num_groups = self._envs.num_envs, self._envs.num_groups
-        self.observation_space, self.action_space = self._envs.observation_space, self._envs.action_space
+        self.num_envs, self.num_groups = specification["num_envs"], specification["groups"]
+        self.observation_space = batch_space(self._results.observation_space, self.num_envs)
+        self.action_space = batch_space(described.action_space(), self.num_envs)
         self.missed = 0
 
     def __iter__(self) -> Watch:
@@ -77,20 +77,20 @@ class Watch:
             TimeoutError: There was no batch in time. The next call waits again.
             TooManyBatchesHeld: Arrays of as many batches as the engine lends are referenced; delete them, or use `copy=True`.
         """
+        if self._observer is None:
+            raise StopIteration
         try:
-            self._backend.wait(self._timeout)
+            group, step, missed, arrays = self._observer.next(self._timeout)
         except _native.EngineLost:
             self.close()
-        if self._backend.is_closed:
-            raise StopIteration
-        step, missed = self._backend.step_number, self._backend.missed
+            raise StopIteration from None
         self.missed += missed
-        observation, reward, terminated, truncated, info = self._envs.recv()
-        return WatchedBatch(observation, reward, terminated, truncated, info, step, info.pop("group"), missed)
+        observation, reward, terminated, truncated, info = self._results.step(arrays)
+        return WatchedBatch(observation, reward, terminated, truncated, info, step, group, missed)
 
     def close(self) -> None:
         """Disconnect. Arrays remain valid."""
-        self._backend.close()
+        self._observer = None
 
     def __enter__(self) -> Watch:
         return self
@@ -99,36 +99,6 @@ class Watch:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-class _Observed(Backend):
-    """An observer in the place of a trainer's connection."""
-
-    def __init__(self, observer: _native.Observer, groups: int) -> None:
-        self._observer: _native.Observer | None = observer
-        self.groups = groups
-        self.step_number, self.missed = 0, 0
-        self._received: tuple[int, _native.Arrays] | None = None
-
-    @property
-    def is_closed(self) -> bool:
-        return self._observer is None
-
-    def wait(self, timeout: float | None) -> None:
-        """Wait for a batch, which `receive` then returns."""
-        if self._observer is not None:
-            group, self.step_number, self.missed, arrays = self._observer.next(timeout)
-            self._received = group, arrays
-
-    def receive(self, group: int | None) -> tuple[int, _native.Arrays]:
-        if self._received is None:
-            raise RuntimeError("a watch has no trainer's methods; iterate over it")
-        # Not kept, since the engine lends a limited number of batches.
-        received, self._received = self._received, None
-        return received
-
-    def close(self) -> None:
-        self._observer = None
 
 
 def watch(service: str, *, group: int | None = None, timeout: float | None = 30.0, copy: bool = False) -> Watch:

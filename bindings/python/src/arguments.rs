@@ -3,11 +3,8 @@
 use std::time::Duration;
 
 use endless_gym::batch::Frames;
-use endless_gym::batch::PixelFormat;
 use endless_gym::envs::ActionSpace;
-use endless_gym::pool::{
-    Autoreset, NextOptions, ResetOptions, ResetRequest, RunningEpisode, Seeding, UnknownAutoreset,
-};
+use endless_gym::pool::{NextOptions, PoolConfig, ResetRequest, RunningEpisode};
 use endless_gym::service::timeout_from_seconds;
 use numpy::{
     Element, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
@@ -15,6 +12,7 @@ use numpy::{
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyByteArray;
+use serde::de::DeserializeOwned;
 use serde_json::{Map, Value as Json};
 
 use crate::errors;
@@ -122,9 +120,20 @@ pub fn action(given: i64) -> PyResult<i32> {
     i32::try_from(given).map_err(range)
 }
 
-/// The frames of an observation, from grayscale, channels first, row-major and number of stacked frames.
-pub fn frames((grayscale, channels_first, row_major, stack): (bool, bool, bool, usize)) -> Frames {
-    Frames { format: PixelFormat { grayscale, channels_first, row_major }, stack }
+/// The shape of an observation, from the JSON text of its frames' format.
+#[pyfunction]
+pub fn frame_shape(frames: &str) -> PyResult<Vec<usize>> {
+    Ok(json::<Frames>(frames)?.shape())
+}
+
+/// The configuration of a pool, from JSON text.
+pub fn pool_config(text: &str) -> PyResult<PoolConfig> {
+    json(text)
+}
+
+/// A value from JSON text that the package has written.
+fn json<T: DeserializeOwned>(text: &str) -> PyResult<T> {
+    serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("invalid configuration: {error}")))
 }
 
 /// A timeout from a number of seconds.
@@ -148,31 +157,6 @@ pub type Episode = (usize, Option<u64>, String, bool);
 /// A running episode for Python.
 pub fn episode(RunningEpisode { env, seed, options, ended }: RunningEpisode) -> Episode {
     (env, seed, Json::from(options).to_string(), ended)
-}
-
-/// The reset parameters of a pool, from the JSON text of one object for all environments, or of a list with one for each.
-pub fn pool_options(text: &str) -> PyResult<ResetOptions> {
-    if text.starts_with('[') {
-        let each = serde_json::from_str(text);
-        each.map(ResetOptions::Each)
-            .map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
-    } else {
-        options(text).map(ResetOptions::Shared)
-    }
-}
-
-/// The auto-reset mode of that name.
-pub fn autoreset(name: &str) -> PyResult<Autoreset> {
-    name.parse().map_err(|error: UnknownAutoreset| PyValueError::new_err(error.to_string()))
-}
-
-/// The source of the episodes' seeds.
-pub fn seeding(seed: Option<u64>, range: Option<(u64, u64, u64)>, list: Option<Vec<u64>>) -> Seeding {
-    match (range, list) {
-        (Some((start, end, step)), _) => Seeding::Range { start, end, step, seed },
-        (None, Some(list)) => Seeding::List(list),
-        (None, None) => Seeding::Continue { seed },
-    }
 }
 
 /// The environments that a reset applies to, and their seeds.

@@ -1,4 +1,6 @@
 //! Environments in another process, through shared memory.
+//!
+//! [`Connection`] has the methods of the groups in this process ([`Pools`](crate::pool::Pools)).
 
 use std::time::{Duration, Instant};
 
@@ -36,7 +38,11 @@ unsafe impl Owner for Lease {
 /// The trainer of an engine in another process.
 #[pyclass(module = "endless_gym._native")]
 pub struct Connection {
-    trainer: Trainer,
+    /// `None` after `close`.
+    trainer: Option<Trainer>,
+    groups: usize,
+    /// Seconds to wait for each answer.
+    timeout: f64,
     action_shape: ActionShape,
     actions: Vec<i32>,
     process: u32,
@@ -44,7 +50,7 @@ pub struct Connection {
 
 #[pymethods]
 impl Connection {
-    /// Connects to the engine named `service`, and waits up to `timeout` seconds for it to start.
+    /// Connects to the engine named `service`. Waits up to `timeout` seconds for it to start, and for each of its answers.
     #[new]
     fn new(py: Python<'_>, service: &str, timeout: f64) -> PyResult<Self> {
         logs::start(py)?;
@@ -54,37 +60,61 @@ impl Connection {
         logs::flush(py)?;
         let specification = trainer.specification();
         let action_shape = ActionShape::group(&specification.action_space, specification.num_envs);
-        Ok(Connection { trainer, action_shape, actions: Vec::new(), process: std::process::id() })
+        let groups = specification.groups;
+        let (actions, process) = (Vec::new(), std::process::id());
+        Ok(Connection { trainer: Some(trainer), groups, timeout, action_shape, actions, process })
+    }
+
+    /// Number of groups.
+    #[getter]
+    fn groups(&self) -> usize {
+        self.groups
     }
 
     /// The engine's specification, as JSON text.
-    fn specification(&self) -> PyResult<String> {
-        let text = serde_json::to_string(self.trainer.specification());
+    fn specification(&mut self) -> PyResult<String> {
+        let text = serde_json::to_string(self.trainer()?.specification());
         text.map_err(|error| PyRuntimeError::new_err(error.to_string()))
     }
 
+    /// Resets a group.
     #[pyo3(signature = (group, request=None, options=None))]
-    fn reset(&mut self, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
-        self.check_process()?;
-        let options = options.map(arguments::options).transpose()?;
-        let request = Reset::request(request.as_ref());
-        self.trainer.reset_with(group, request, options.as_ref()).map_err(errors::service)
+    fn reset<'py>(
+        &mut self,
+        py: Python<'py>,
+        group: usize,
+        request: Option<Reset>,
+        options: Option<&str>,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        self.send_reset(group, request, options)?;
+        Ok(self.receive(py, Some(group))?.1)
     }
 
-    fn send(&mut self, group: usize, actions: &Bound<'_, PyAny>) -> PyResult<()> {
-        self.check_process()?;
+    /// Steps group 0.
+    fn step<'py>(&mut self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
+        self.send(actions, 0)?;
+        Ok(self.receive(py, Some(0))?.1)
+    }
+
+    /// Requests a step, whose result `receive` returns.
+    fn send(&mut self, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
+        self.trainer()?;
         self.action_shape.copy(actions, &mut self.actions)?;
-        self.trainer.send(group, &self.actions).map_err(errors::service)
+        let trainer = self.trainer.as_mut().ok_or_else(errors::closed)?;
+        trainer.send(group, &self.actions).map_err(errors::service)
+    }
+
+    /// Requests a reset, whose result `receive` returns.
+    #[pyo3(signature = (group, request=None, options=None))]
+    fn send_reset(&mut self, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
+        let options = options.map(arguments::options).transpose()?;
+        let request = Reset::request(request.as_ref());
+        self.trainer()?.reset_with(group, request, options.as_ref()).map_err(errors::service)
     }
 
     /// The number and the arrays of a group that has answered: of `group`, or of the first to answer for `None`.
-    fn receive<'py>(
-        &mut self,
-        py: Python<'py>,
-        group: Option<usize>,
-        timeout: f64,
-    ) -> PyResult<(usize, Bound<'py, PyTuple>)> {
-        let received = self.wait(py, timeout, |trainer, slice| match group {
+    fn receive<'py>(&mut self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
+        let received = self.wait(py, |trainer, slice| match group {
             Some(group) => trainer.receive(group, slice),
             None => trainer.receive_any(slice),
         })?;
@@ -95,51 +125,38 @@ impl Connection {
     }
 
     /// The state of one environment of a group.
-    fn snapshot<'py>(
-        &mut self,
-        py: Python<'py>,
-        group: usize,
-        env: usize,
-        timeout: f64,
-    ) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self.wait(py, timeout, |trainer, slice| trainer.snapshot(group, env, slice))?;
+    fn snapshot<'py>(&mut self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.wait(py, |trainer, slice| trainer.snapshot(group, env, slice))?;
         Ok(PyBytes::new(py, &bytes))
     }
 
     /// Sets the state of one environment of a group to that of a snapshot.
-    fn restore(&mut self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8], timeout: f64) -> PyResult<()> {
-        self.wait(py, timeout, |trainer, slice| trainer.restore(group, env, snapshot, slice))
+    fn restore(&mut self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
+        self.wait(py, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
     /// Sets the options of next episodes; see `arguments::next_options`.
-    fn set_options(&mut self, py: Python<'_>, group: usize, sets: &str, timeout: f64) -> PyResult<()> {
+    fn set_options(&mut self, py: Python<'_>, group: usize, sets: &str) -> PyResult<()> {
         let sets = arguments::next_options(sets)?;
-        self.wait(py, timeout, |trainer, slice| trainer.set_options(group, &sets, slice))
+        self.wait(py, |trainer, slice| trainer.set_options(group, &sets, slice))
     }
 
-    /// What the running episodes of environments follow from.
-    fn running_episodes(
-        &mut self,
-        py: Python<'_>,
-        group: usize,
-        envs: Vec<usize>,
-        timeout: f64,
-    ) -> PyResult<Vec<Episode>> {
-        let episodes = self.wait(py, timeout, |trainer, slice| trainer.running_episodes(group, &envs, slice))?;
+    /// Seeds and options of the running episodes.
+    fn running_episodes(&mut self, py: Python<'_>, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
+        let episodes = self.wait(py, |trainer, slice| trainer.running_episodes(group, &envs, slice))?;
         Ok(episodes.into_iter().map(arguments::episode).collect())
     }
 
     /// Saves all environments of the engine to its checkpoint file. Returns the step of each group.
-    fn checkpoint(&mut self, py: Python<'_>, timeout: f64) -> PyResult<Vec<u64>> {
-        self.wait(py, timeout, Trainer::checkpoint)
+    fn checkpoint(&mut self, py: Python<'_>) -> PyResult<Vec<u64>> {
+        self.wait(py, Trainer::checkpoint)
     }
 
     /// Connects to an engine of the same name that replaces a lost engine. Returns whether the engine is another one, its
     /// incarnation, and for each group `(step, lost_step, last_request)`.
     fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<(bool, u64, Vec<GroupFound>)> {
-        self.check_process()?;
+        let trainer = self.trainer()?;
         logs::start(py)?;
-        let trainer = &mut self.trainer;
         let found = wait_for_engine(py, timeout, |slice| trainer.reconnect(slice))?;
         logs::flush(py)?;
         let group = |group: GroupReconnection| {
@@ -154,6 +171,11 @@ impl Connection {
         };
         Ok((found.restarted, found.incarnation, found.groups.into_iter().map(group).collect()))
     }
+
+    /// Disconnects. Arrays remain valid.
+    fn close(&mut self) {
+        self.trainer = None;
+    }
 }
 
 impl Connection {
@@ -161,12 +183,10 @@ impl Connection {
     fn wait<T: Send>(
         &mut self,
         py: Python<'_>,
-        timeout: f64,
         mut answer: impl FnMut(&mut Trainer, Duration) -> Result<T, ServiceError> + Send,
     ) -> PyResult<T> {
-        self.check_process()?;
-        let (timeout, start) = (arguments::timeout(timeout)?, Instant::now());
-        let trainer = &mut self.trainer;
+        let (timeout, start) = (arguments::timeout(self.timeout)?, Instant::now());
+        let trainer = self.trainer()?;
         loop {
             let slice = timeout.saturating_sub(start.elapsed()).min(SIGNAL_INTERVAL);
             match py.detach(|| answer(trainer, slice)) {
@@ -185,9 +205,11 @@ impl Connection {
         }
     }
 
-    fn check_process(&self) -> PyResult<()> {
+    /// The trainer, unless the connection is closed or belongs to another process.
+    fn trainer(&mut self) -> PyResult<&mut Trainer> {
+        let trainer = self.trainer.as_mut().ok_or_else(errors::closed)?;
         if self.process == std::process::id() {
-            return Ok(());
+            return Ok(trainer);
         }
         Err(PyRuntimeError::new_err(
             "this connection belongs to the process that this process was forked from; connect to another engine in the child",

@@ -82,3 +82,8 @@ pub fn service(error: ServiceError) -> PyErr {
         _ => PyRuntimeError::new_err(text),
     }
 }
+
+/// The error of every method after `close`.
+pub fn closed() -> PyErr {
+    PyRuntimeError::new_err("the environments are closed")
+}

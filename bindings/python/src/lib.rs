@@ -51,12 +51,12 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("TooManyBatchesHeld", py.get_type::<errors::TooManyBatchesHeld>())?;
     module.add_class::<experts::Experts>()?;
     module.add_class::<observer::Observer>()?;
-    module.add_class::<pool::Pool>()?;
-    module.add_class::<pool::PoolConfig>()?;
-    module.add_class::<pool::Threads>()?;
+    module.add_class::<pool::Pools>()?;
     module.add_class::<renderer::Renderer>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
+    module.add_function(wrap_pyfunction!(arguments::frame_shape, module)?)?;
+    module.add_function(wrap_pyfunction!(pool::check_pool_config, module)?)?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;
     module.add_function(wrap_pyfunction!(connection::segment_prefix, module)?)?;
     module.add_function(wrap_pyfunction!(dlpack::dlpack, module)?)?;

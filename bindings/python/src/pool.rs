@@ -1,11 +1,13 @@
-//! Many environments in this process.
+//! The groups of environments in this process.
+//!
+//! [`Pools`] has the methods of a connection to an engine, and raises the same errors for the same mistakes.
 
-use endless_gym::batch::{Block, SectionTable};
+use endless_gym::batch::Block;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
-use endless_gym::pool::{self as engine, PoolError};
+use endless_gym::pool::{Pool, PoolError, Threads};
 use endless_gym::service::ServiceError;
 use numpy::{PyArray1, PyArrayMethods};
-use pyo3::exceptions::PyRuntimeError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use serde_json::{Map, Value as Json};
@@ -14,224 +16,214 @@ use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
 use crate::{arrays, errors};
 
-/// Threads that step environments: `count` of them, or one per core for 0. Several pools may share them.
-#[pyclass(frozen, module = "endless_gym._native")]
-pub struct Threads(engine::Threads);
-
-#[pymethods]
-impl Threads {
-    #[new]
-    fn new(count: usize) -> PyResult<Self> {
-        engine::Threads::new(count).map(Threads).map_err(errors::pool)
-    }
+/// Checks the configuration of a group, from JSON text, without making environments.
+#[pyfunction]
+pub fn check_pool_config(config: &str) -> PyResult<()> {
+    arguments::pool_config(config)?.validate().map_err(errors::pool)
 }
 
-/// The checked configuration of a pool, in this process or in an engine.
-#[pyclass(frozen, module = "endless_gym._native")]
-pub struct PoolConfig(engine::PoolConfig);
-
-#[pymethods]
-impl PoolConfig {
-    #[new]
-    #[pyo3(signature = (id, num_envs, *, first_env, total_envs, options, autoreset, seed, seed_range, seed_list, frames, features, final_observation, independent_episodes=false))]
-    #[allow(clippy::too_many_arguments)]
-    fn new(
-        id: &str,
-        num_envs: usize,
-        first_env: usize,
-        total_envs: usize,
-        options: &str,
-        autoreset: &str,
-        seed: Option<u64>,
-        seed_range: Option<(u64, u64, u64)>,
-        seed_list: Option<Vec<u64>>,
-        frames: Option<(bool, bool, bool, usize)>,
-        features: bool,
-        final_observation: bool,
-        independent_episodes: bool,
-    ) -> PyResult<Self> {
-        let config = engine::PoolConfig {
-            options: arguments::pool_options(options)?,
-            autoreset: arguments::autoreset(autoreset)?,
-            seeding: arguments::seeding(seed, seed_range, seed_list),
-            frames: frames.map(arguments::frames),
-            features,
-            final_observation,
-            independent_episodes,
-            first_env,
-            total_envs,
-            ..engine::PoolConfig::new(id, num_envs)
-        };
-        config.validate().map_err(errors::pool)?;
-        Ok(PoolConfig(config))
-    }
-}
-
-/// A group of environments of one id that are stepped in lockstep, and the buffers of its batches.
+/// The environments of one group, and the buffers of its batches.
 ///
 /// A buffer is not written to while arrays of it exist. A new one is allocated if arrays of all buffers exist.
-#[pyclass(module = "endless_gym._native")]
-pub struct Pool {
-    pool: engine::Pool,
-    /// Number of the group, for messages.
-    group: usize,
+struct Group {
+    pool: Pool,
     buffers: Buffers,
-    /// The message that `receive` has not answered yet.
-    pending: Option<Message>,
-    action_shape: ActionShape,
-    /// The actions of the last `step`, or of the pending one.
+    /// The actions of the last step, or of the pending one.
     actions: Vec<i32>,
-    /// Memory for actions that are not checked yet.
-    unchecked: Vec<i32>,
-    process: u32,
 }
 
 /// What `receive` executes.
 enum Message {
-    /// A step with `Pool::actions`.
+    /// A step with the group's `actions`.
     Step,
     /// A reset.
     Reset { request: Option<Reset>, options: Option<Map<String, Json>> },
 }
 
+/// Groups of environments of one id; each group is stepped in lockstep.
+#[pyclass(module = "endless_gym._native")]
+pub struct Pools {
+    /// Empty after `close`.
+    pools: Vec<Group>,
+    /// What was sent and not received, in that order; at most one message for each group.
+    pending: Vec<(usize, Message)>,
+    action_shape: ActionShape,
+    /// Memory for actions that are not checked yet.
+    unchecked: Vec<i32>,
+    process: u32,
+}
+
 #[pymethods]
-impl Pool {
+impl Pools {
+    /// One group for each configuration, which is JSON text; at least one. All have the same id and number of environments. They
+    /// share `num_threads` threads, one per core for 0.
     #[new]
-    fn new(config: &PoolConfig, group: usize, threads: &Threads) -> PyResult<Self> {
-        let pool = engine::Pool::new(&config.0, &threads.0).map_err(errors::pool)?;
-        Ok(Pool {
-            action_shape: ActionShape::group(&pool.spec().action_space, config.0.num_envs),
-            pool,
-            group,
-            buffers: Buffers::default(),
-            pending: None,
-            actions: Vec::new(),
+    fn new(configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
+        let threads = Threads::new(num_threads).map_err(errors::pool)?;
+        let group = |config: &String| {
+            let pool = Pool::new(&arguments::pool_config(config)?, &threads).map_err(errors::pool)?;
+            Ok(Group { pool, buffers: Buffers::default(), actions: Vec::new() })
+        };
+        let pools: Vec<Group> = configs.iter().map(group).collect::<PyResult<_>>()?;
+        let first = &pools.first().ok_or_else(errors::closed)?.pool;
+        Ok(Pools {
+            action_shape: ActionShape::group(&first.spec().action_space, first.layout().num_envs()),
+            pools,
+            pending: Vec::new(),
             unchecked: Vec::new(),
             process: std::process::id(),
         })
     }
 
-    /// Names of the arrays that `reset`, `step` and `receive` return.
-    fn sections(&self) -> Vec<&'static str> {
-        self.pool.layout().sections().iter().map(|section| section.name().name()).collect()
+    /// Number of groups.
+    #[getter]
+    fn groups(&self) -> usize {
+        self.pools.len()
     }
 
-    #[pyo3(signature = (request=None, options=None))]
+    /// The layout of a batch, as JSON text.
+    fn layout(&self) -> PyResult<String> {
+        let layout = self.pools.first().ok_or_else(errors::closed)?.pool.layout();
+        serde_json::to_string(layout).map_err(|error| PyRuntimeError::new_err(error.to_string()))
+    }
+
+    /// Resets a group.
+    #[pyo3(signature = (group, request=None, options=None))]
     fn reset<'py>(
         &mut self,
         py: Python<'py>,
+        group: usize,
         request: Option<Reset>,
         options: Option<&str>,
     ) -> PyResult<Bound<'py, PyTuple>> {
         let options = options.map(arguments::options).transpose()?;
-        self.check_process()?;
-        self.check_idle()?;
-        self.write_reset(py, request.as_ref(), options.as_ref())
+        self.idle(group)?.reset(py, request.as_ref(), options.as_ref())
     }
 
+    /// Steps group 0.
     fn step<'py>(&mut self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
-        self.check_process()?;
+        self.check(0)?;
         self.action_shape.copy(actions, &mut self.unchecked)?;
-        if self.pending.is_some() {
-            self.check_message()?;
+        if self.is_pending(0) {
+            self.check_message(0)?;
         }
-        std::mem::swap(&mut self.actions, &mut self.unchecked);
-        self.write_step(py)
+        let group = &mut self.pools[0];
+        std::mem::swap(&mut group.actions, &mut self.unchecked);
+        group.step(py)
     }
 
     /// Queues a step, which `receive` executes. The actions are copied.
-    fn send(&mut self, actions: &Bound<'_, PyAny>) -> PyResult<()> {
-        self.check_process()?;
+    fn send(&mut self, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
+        self.check(group)?;
         self.action_shape.copy(actions, &mut self.unchecked)?;
-        self.check_message()?;
-        std::mem::swap(&mut self.actions, &mut self.unchecked);
-        self.pending = Some(Message::Step);
+        self.check_message(group)?;
+        std::mem::swap(&mut self.pools[group].actions, &mut self.unchecked);
+        self.pending.push((group, Message::Step));
         Ok(())
     }
 
     /// Queues a reset, which `receive` executes.
-    #[pyo3(signature = (request=None, options=None))]
-    fn send_reset(&mut self, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
+    #[pyo3(signature = (group, request=None, options=None))]
+    fn send_reset(&mut self, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
         let options = options.map(arguments::options).transpose()?;
-        self.check_process()?;
-        self.check_idle()?;
-        self.pending = Some(Message::Reset { request, options });
+        self.idle(group)?;
+        self.pending.push((group, Message::Reset { request, options }));
         Ok(())
     }
 
-    /// Executes what was sent.
-    fn receive<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
-        self.check_process()?;
-        match self.pending.take() {
-            None => Err(errors::service(ServiceError::NothingSent { group: self.group })),
-            Some(Message::Step) => self.write_step(py),
-            Some(Message::Reset { request, options }) => self.write_reset(py, request.as_ref(), options.as_ref()),
-        }
+    /// Executes what was sent to a group, or what was sent first for `None`. Returns the group's number and its arrays.
+    fn receive<'py>(&mut self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
+        self.check(group.unwrap_or(0))?;
+        let place = self.pending.iter().position(|(number, _)| group.is_none_or(|group| group == *number));
+        let Some(place) = place else {
+            return Err(errors::service(ServiceError::NothingSent { group: group.unwrap_or(0) }));
+        };
+        let (number, message) = self.pending.remove(place);
+        let group = &mut self.pools[number];
+        let arrays = match message {
+            Message::Step => group.step(py),
+            Message::Reset { request, options } => group.reset(py, request.as_ref(), options.as_ref()),
+        };
+        Ok((number, arrays?))
     }
 
-    fn snapshot<'py>(&self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyBytes>> {
-        self.check_process()?;
-        self.check_idle()?;
-        let bytes = self.pool.snapshot(env).map_err(errors::snapshot)?;
+    fn snapshot<'py>(&mut self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.idle(group)?.pool.snapshot(env).map_err(errors::snapshot)?;
         Ok(PyBytes::new(py, &bytes))
     }
 
-    fn restore(&mut self, env: usize, snapshot: &[u8]) -> PyResult<()> {
-        self.check_process()?;
-        self.check_idle()?;
-        self.pool.restore(env, snapshot).map_err(errors::snapshot)
+    fn restore(&mut self, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
+        self.idle(group)?.pool.restore(env, snapshot).map_err(errors::snapshot)
     }
 
     /// Sets the options of next episodes; see `arguments::next_options`.
-    fn set_options(&mut self, sets: &str) -> PyResult<()> {
+    fn set_options(&mut self, group: usize, sets: &str) -> PyResult<()> {
         let sets = arguments::next_options(sets)?;
-        self.check_process()?;
-        self.check_idle()?;
-        self.pool.set_options(&sets).map_err(errors::pool)
+        self.idle(group)?.pool.set_options(&sets).map_err(errors::pool)
     }
 
-    /// What the running episodes of environments follow from.
-    fn running_episodes(&self, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
-        self.check_process()?;
-        self.check_idle()?;
-        let episodes = envs.into_iter().map(|env| self.pool.running_episode(env).map(arguments::episode));
+    /// Seeds and options of the running episodes.
+    fn running_episodes(&mut self, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
+        let pool = &self.idle(group)?.pool;
+        let episodes = envs.into_iter().map(|env| pool.running_episode(env).map(arguments::episode));
         episodes.collect::<Result<_, _>>().map_err(errors::pool)
     }
 
-    /// The ground-truth view of one environment, indexed \[row\]\[column\]\[channel\].
+    /// The ground-truth view of an environment of group 0, indexed \[row\]\[column\]\[channel\].
     fn ground_truth_view<'py>(&mut self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyAny>> {
-        self.check_process()?;
+        self.check(0)?;
         let mut view = vec![0; VIEW_BYTES];
-        self.pool.ground_truth_view(env, &mut view).map_err(errors::pool)?;
+        self.pools[0].pool.ground_truth_view(env, &mut view).map_err(errors::pool)?;
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
+    }
+
+    /// Releases the environments. Arrays remain valid.
+    fn close(&mut self) {
+        self.pools.clear();
+        self.pending.clear();
     }
 }
 
-impl Pool {
-    fn check_process(&self) -> PyResult<()> {
-        if self.process == std::process::id() {
-            return Ok(());
+impl Pools {
+    /// An error if the environments are closed or belong to another process, or if there is no such group.
+    fn check(&self, group: usize) -> PyResult<()> {
+        if self.pools.is_empty() {
+            return Err(errors::closed());
         }
-        Err(PyRuntimeError::new_err(
-            "these environments belong to the process that this process was forked from; make new ones after the fork",
-        ))
+        if self.process != std::process::id() {
+            return Err(PyRuntimeError::new_err(
+                "these environments belong to the process that this process was forked from; make new ones after the fork",
+            ));
+        }
+        if group < self.pools.len() {
+            Ok(())
+        } else {
+            Err(PyValueError::new_err(format!("group must be 0 to {}, got {group}", self.pools.len() - 1)))
+        }
     }
 
-    /// An error if a message is pending: the error of an engine.
-    fn check_idle(&self) -> PyResult<()> {
-        match self.pending {
-            None => Ok(()),
-            Some(_) => Err(errors::service(ServiceError::AnswerPending { group: self.group })),
+    fn is_pending(&self, group: usize) -> bool {
+        self.pending.iter().any(|(number, _)| *number == group)
+    }
+
+    /// The group, or an error if a message to it is pending: the error of an engine.
+    fn idle(&mut self, group: usize) -> PyResult<&mut Group> {
+        self.check(group)?;
+        if self.is_pending(group) {
+            return Err(errors::service(ServiceError::AnswerPending { group }));
         }
+        Ok(&mut self.pools[group])
     }
 
     /// The checks of a step with the actions in `unchecked`, in the order in which a trainer makes them for an engine.
-    fn check_message(&self) -> PyResult<()> {
-        self.check_idle()?;
-        check_actions(&self.pool, &self.unchecked).map_err(errors::pool)
+    fn check_message(&mut self, group: usize) -> PyResult<()> {
+        self.idle(group)?;
+        check_actions(&self.pools[group].pool, &self.unchecked).map_err(errors::pool)
     }
+}
 
-    fn write_step<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+impl Group {
+    fn step<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         let actions = std::mem::take(&mut self.actions);
         let arrays = self.write(py, |pool, batch| match pool.step(&actions, batch) {
             // An engine's trainer checks the actions first.
@@ -242,7 +234,7 @@ impl Pool {
         arrays
     }
 
-    fn write_reset<'py>(
+    fn reset<'py>(
         &mut self,
         py: Python<'py>,
         request: Option<&Reset>,
@@ -255,7 +247,7 @@ impl Pool {
     fn write<'py>(
         &mut self,
         py: Python<'py>,
-        work: impl FnOnce(&mut engine::Pool, &mut [Block]) -> Result<(), PoolError> + Send,
+        work: impl FnOnce(&mut Pool, &mut [Block]) -> Result<(), PoolError> + Send,
     ) -> PyResult<Bound<'py, PyTuple>> {
         let pool = &mut self.pool;
         let (index, batch) = self.buffers.free(pool.layout());
@@ -264,6 +256,6 @@ impl Pool {
     }
 }
 
-fn check_actions(pool: &engine::Pool, actions: &[i32]) -> Result<(), PoolError> {
+fn check_actions(pool: &Pool, actions: &[i32]) -> Result<(), PoolError> {
     Ok(pool.spec().action_space.check(pool.layout().num_envs(), actions)?)
 }

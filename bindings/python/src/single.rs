@@ -3,7 +3,7 @@
 use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
 use endless_gym::envs::{ActionSpace, FRAME_BYTES, SCREEN};
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, SavedEnv, Threads};
+use endless_gym::pool::{Pool, ResetRequest, SavedEnv, Threads};
 use numpy::{Element, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -26,22 +26,10 @@ pub struct Single {
 
 #[pymethods]
 impl Single {
+    /// `config` is JSON text, with one environment.
     #[new]
-    fn new(
-        id: &str,
-        options: &str,
-        frames: Option<(bool, bool, bool, usize)>,
-        features: bool,
-        independent_episodes: bool,
-    ) -> PyResult<Self> {
-        let config = PoolConfig {
-            options: ResetOptions::Shared(arguments::options(options)?),
-            autoreset: Autoreset::Disabled,
-            frames: frames.map(arguments::frames),
-            features,
-            independent_episodes,
-            ..PoolConfig::new(id, 1)
-        };
+    fn new(config: &str) -> PyResult<Self> {
+        let config = arguments::pool_config(config)?;
         let threads = Threads::new(1).map_err(errors::pool)?;
         let pool = Pool::new(&config, &threads).map_err(errors::pool)?;
         let blocks = zeroed(pool.layout().blocks());

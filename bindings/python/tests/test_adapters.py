@@ -12,6 +12,8 @@ import pytest
 
 import endless_gym
 
+pytestmark = pytest.mark.libraries
+
 # Random agents fail after some 30 steps.
 SHORT = "Endless-MortarMayhem-v0"
 IDS = ["MortarMayhem-v0", "MortarMayhem-Grid-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"]

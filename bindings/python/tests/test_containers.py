@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
+
+yaml = pytest.importorskip("yaml")
+pytestmark = pytest.mark.libraries
 
 ROOT = Path(__file__).parents[3]
 

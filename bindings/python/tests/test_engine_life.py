@@ -38,7 +38,7 @@ def play(envs: endless_gym.EndlessVectorEnv) -> np.ndarray:
 
 
 def pid(envs: endless_gym.EndlessVectorEnv) -> int:
-    return envs._backend._engine.pid
+    return envs._engine.pid
 
 
 def test_an_engine_ends_when_its_name_is_assigned_again(no_collector: None) -> None:
@@ -46,7 +46,7 @@ def test_an_engine_ends_when_its_name_is_assigned_again(no_collector: None) -> N
     for _ in range(3):
         envs = endless_gym.serve(ID, 4)
         observations.append(play(envs))
-        assert endless_gym.running_engines() == [envs._backend._engine.service]
+        assert endless_gym.running_engines() == [envs._engine.service]
     last, process = observations[-1].copy(), pid(envs)
     del envs
     assert endless_gym.running_engines() == []
@@ -86,9 +86,7 @@ def test_an_engine_ends_with_the_adapter_around_it(library: str, name: str, auto
 
 @pytest.mark.parametrize("end", ["", "raise SystemExit(3)", "undefined_name"])
 def test_an_engine_ends_before_its_interpreter_does(end: str) -> None:
-    text = (
-        f"import endless_gym; envs = endless_gym.serve({ID!r}, 4); print(envs._backend._engine.pid, flush=True); {end}"
-    )
+    text = f"import endless_gym; envs = endless_gym.serve({ID!r}, 4); print(envs._engine.pid, flush=True); {end}"
     ended = subprocess.run([sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=60)
     assert not Path(f"/proc/{int(ended.stdout)}").exists()
     assert endless_gym.running_engines() == []
@@ -136,7 +134,7 @@ def test_close_ends_the_engine_while_a_forked_child_lives() -> None:
         signal.pause()
         os._exit(0)
     try:
-        process = envs._backend._engine._process
+        process = envs._engine._process
         envs.close()
         # Not killed after the time that an engine gets to end.
         assert process.returncode == 0

@@ -14,12 +14,12 @@ import sys
 import time
 from pathlib import Path
 
-import psutil
 import pytest
 
 import endless_gym
 
-pytestmark = pytest.mark.slow
+psutil = pytest.importorskip("psutil")
+pytestmark = [pytest.mark.slow, pytest.mark.libraries]
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SUMMARY = re.compile(r"steps=(\d+) steps_per_second=(\d+) .*mean_return=(-?\d+\.\d+|none yet)")

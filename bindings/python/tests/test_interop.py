@@ -7,10 +7,12 @@ import warnings
 
 import numpy as np
 import pytest
-import torch
 
 import endless_gym
 from endless_gym import interop
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.libraries
 
 
 @pytest.fixture

@@ -30,6 +30,7 @@ def test_its_links_lead_to_files() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.libraries
 def test_it_runs(tmp_path: Path, libraries_python: str) -> None:
     text, minute = NOTEBOOK.read_text(), '"minutes = 1.0"'
     assert text.count(minute) == 1

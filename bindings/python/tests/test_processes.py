@@ -25,7 +25,7 @@ def test_a_dead_engine_is_an_exception() -> None:
     envs = endless_gym.serve(ID, 4)
     observation, _ = envs.reset()
     kept = observation.copy()
-    os.kill(envs._backend._engine.pid, signal.SIGKILL)
+    os.kill(envs._engine.pid, signal.SIGKILL)
     with pytest.raises(endless_gym.EngineLost, match="ended"):
         for _ in range(3):
             envs.step(ACTIONS)
@@ -35,7 +35,7 @@ def test_a_dead_engine_is_an_exception() -> None:
 
 def test_the_engine_ends_with_its_environments_and_with_its_process() -> None:
     with endless_gym.serve(ID, 4) as envs:
-        service = envs._backend._engine.service
+        service = envs._engine.service
         assert service in endless_gym.running_engines()
         with pytest.raises(ConnectionError, match="already has a trainer"):
             endless_gym.connect(service, timeout=1)
@@ -58,13 +58,13 @@ import endless_gym, os, signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
 with endless_gym.serve({ID!r}, 4) as envs:
     envs.reset()
-    os.kill(envs._backend._engine.pid, signal.SIGSTOP)
+    os.kill(envs._engine.pid, signal.SIGSTOP)
     try:
         print("waiting", flush=True)
         envs.step([[0, 0]] * 4)
     except KeyboardInterrupt:
         print("interrupted", flush=True)
-    os.kill(envs._backend._engine.pid, signal.SIGCONT)
+    os.kill(envs._engine.pid, signal.SIGCONT)
 """
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "waiting\n"
@@ -79,14 +79,14 @@ def test_other_threads_run_while_one_waits() -> None:
 
     with endless_gym.serve(ID, 4) as envs:
         envs.reset()
-        os.kill(envs._backend._engine.pid, signal.SIGSTOP)
+        os.kill(envs._engine.pid, signal.SIGSTOP)
         stepping = threading.Thread(target=envs.step, args=(ACTIONS,))
         stepping.start()
         start = time.monotonic()
         assert sum(range(100_000)) > 0
         assert time.monotonic() - start < 5
         assert stepping.is_alive()
-        os.kill(envs._backend._engine.pid, signal.SIGCONT)
+        os.kill(envs._engine.pid, signal.SIGCONT)
         stepping.join(10)
         assert not stepping.is_alive()
 
@@ -161,7 +161,7 @@ def test_an_interrupted_step_is_played_once() -> None:
 
 def endless_gym_process(envs: endless_gym.EndlessVectorEnv) -> int:
     """The process id of the engine that `serve` started."""
-    return envs._backend._engine.pid
+    return envs._engine.pid
 
 
 def test_the_program_comes_along() -> None:
@@ -181,7 +181,7 @@ def test_a_killed_engine_leaves_nothing(segments: Callable[[], set[str]]) -> Non
     before = segments()
     envs = endless_gym.serve(ID, 4)
     assert segments() > before
-    os.kill(envs._backend._engine.pid, signal.SIGKILL)
+    os.kill(envs._engine.pid, signal.SIGKILL)
     envs.close()
     assert segments() <= before
 
@@ -402,7 +402,7 @@ def test_the_errors_of_an_engine_are_logged(caplog: pytest.LogCaptureFixture, tm
 
 def test_an_engine_that_is_stopped_ends_regularly() -> None:
     envs = endless_gym.serve(ID, 4)
-    process = envs._backend._engine._process
+    process = envs._engine._process
     os.kill(process.pid, signal.SIGSTOP)
     envs.close()
     assert process.returncode == 0

@@ -17,7 +17,10 @@ import pytest
 import endless_gym
 from endless_gym.program import main as program_main
 
-pytestmark = pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
+pytestmark = [
+    pytest.mark.libraries,
+    pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11"),
+]
 
 IDS = list(endless_gym.all_specs())
 

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import shared_memory_writes as writes
-import torch
 
 import endless_gym
+
+torch = pytest.importorskip("torch")
+writes = pytest.importorskip("shared_memory_writes")
+pytestmark = pytest.mark.libraries
 
 EXPORTS = [writes.imported, lambda array: torch.from_dlpack(endless_gym.DLPackView(array))]
 FRAMES = [None, endless_gym.Frames(grayscale=True, stack=2), endless_gym.Frames(channels_first=True, row_major=True)]

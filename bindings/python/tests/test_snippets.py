@@ -25,6 +25,7 @@ LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
 
 
 @pytest.mark.slow
+@pytest.mark.libraries
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in PROGRAMS])
 def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], set[str]]) -> None:
     for is_shell, part in groupby(program, lambda block: block.language in SHELL):
@@ -35,6 +36,7 @@ def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], se
 
 
 @pytest.mark.slow
+@pytest.mark.libraries
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in OF_LIBRARIES])
 def test_snippet_of_a_library(
     program: list[Block], tmp_path: Path, segments: Callable[[], set[str]], libraries_python: str, ray_folder: str

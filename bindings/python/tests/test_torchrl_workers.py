@@ -4,13 +4,15 @@ import os
 from collections.abc import Callable
 
 import numpy as np
-import psutil
 import pytest
-import torch
-from torchrl.collectors import MultiCollector
 
 import endless_gym
-from endless_gym.torchrl import EndlessEnv
+
+psutil = pytest.importorskip("psutil")
+torch = pytest.importorskip("torch")
+MultiCollector = pytest.importorskip("torchrl.collectors").MultiCollector
+EndlessEnv = pytest.importorskip("endless_gym.torchrl").EndlessEnv
+pytestmark = pytest.mark.libraries
 
 ID, ENVS, WORKERS, STEPS = "MysteryPath-Grid-v0", 6, 2, 12
 

@@ -183,7 +183,7 @@ def test_timeouts_are_checked() -> None:
             endless_gym.connect("nobody", timeout=timeout)
     with endless_gym.serve(ID, 1) as served, pytest.raises(ConnectionError, match="already has a trainer"):
         # So long a timeout overflows the clock; the engine is there, so that nothing waits.
-        endless_gym.connect(served._backend._engine.service, timeout=1e19)
+        endless_gym.connect(served._engine.service, timeout=1e19)
 
 
 @pytest.mark.parametrize("where", WHERE)

@@ -26,7 +26,7 @@ import sys, threading, endless_gym
 envs = endless_gym.serve({ID!r}, {NUM_ENVS}, groups=int(sys.argv[1]), seed=0)
 envs.action_space.seed(0)
 envs.reset(seed=0)
-print(envs._backend._engine.service, flush=True)
+print(envs._engine.service, flush=True)
 def play():
     for group in range(envs.num_groups):
         envs.send(envs.action_space.sample(), group)

@@ -1,14 +1,13 @@
 """Every wrapper of Gymnasium over single and vector environments, in this process and served, at the ends of episodes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from wrappers import SHORT, SINGLE, VECTOR, Case, Refuses, plain, recorded, same
+from wrappers import SHORT, SINGLE, VECTOR, Case, Refuses, plain, recorded, same, torch
 
 import endless_gym
 
@@ -19,9 +18,15 @@ IDS = list(endless_gym.all_specs())
 DICT_ID = "MortarMayhemB-v0"
 #: The wrappers that convert to tensors.
 TENSORS = ("ArrayConversion", "NumpyToTorch")
+#: Those that need packages beyond Gymnasium, numpy and pygame.
+LIBRARIES = (*TENSORS,)
 WHERE = {"in process": endless_gym.make_vec, "served": endless_gym.serve}
 NUM_ENVS = 3
 STEPS = 9
+
+
+def marked(names: Iterable[str]) -> list[Any]:
+    return [pytest.param(name, marks=pytest.mark.libraries) if name in LIBRARIES else name for name in names]
 
 
 def is_dict(id: str) -> bool:
@@ -35,7 +40,7 @@ def test_every_wrapper_of_gymnasium_is_listed() -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", SINGLE)
+@pytest.mark.parametrize("name", marked(SINGLE))
 @pytest.mark.parametrize("id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", DICT_ID])
 def test_single_environments(name: str, id: str, recorded: list[Any]) -> None:
     case = SINGLE[name]
@@ -97,7 +102,7 @@ def synchronous(id: str, mode: AutoresetMode) -> VectorEnv:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", VECTOR)
+@pytest.mark.parametrize("name", marked(VECTOR))
 def test_vector_environments(name: str, pair: tuple[Any, Any], recorded: list[Any]) -> None:
     case, (envs, sync) = VECTOR[name], pair
     if isinstance(case, str):

@@ -13,11 +13,15 @@ import gymnasium
 import numpy as np
 import pygame
 import pytest
-import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as vectors
 
 import endless_gym
+
+try:
+    import torch
+except ImportError:
+    torch = None  # the tests that need it are marked
 
 #: Reset parameters with which episodes end within some steps.
 SHORT: dict[str, dict[str, Any]] = {
@@ -137,7 +141,7 @@ SINGLE: dict[str, Case | Refuses | str] = {
     "ArrayConversion": Case(lambda env: w.ArrayConversion(env, env_xp=np, target_xp=torch)),
     "JaxToNumpy": NOT_JAX,
     "JaxToTorch": NOT_JAX,
-    "NumpyToTorch": Case(w.NumpyToTorch),
+    "NumpyToTorch": Case(lambda env: w.NumpyToTorch(env)),
 }
 
 v = vectors
@@ -179,7 +183,7 @@ VECTOR: dict[str, Case | Refuses | str] = {
     "ArrayConversion": Case(lambda env: v.ArrayConversion(env, env_xp=np, target_xp=torch), modes=NOT_SAME_STEP),
     "JaxToNumpy": NOT_JAX,
     "JaxToTorch": NOT_JAX,
-    "NumpyToTorch": Case(v.NumpyToTorch, modes=NOT_SAME_STEP),
+    "NumpyToTorch": Case(lambda env: v.NumpyToTorch(env), modes=NOT_SAME_STEP),
 }
 
 
@@ -214,7 +218,7 @@ def plain(value: Any) -> Any:
         return {key: plain(item) for key, item in value.items() if key != "t"}
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
         return [plain(item) for item in value]
-    if isinstance(value, torch.Tensor):
+    if torch is not None and isinstance(value, torch.Tensor):
         value = value.numpy()
     return value.copy() if isinstance(value, np.ndarray) else value
 

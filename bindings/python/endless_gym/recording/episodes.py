@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from endless_gym.create import make_vec
 from endless_gym.recording.chunks import Chunks, GrowingArrays
 from endless_gym.recording.players import Errors, Player
 from endless_gym.specs import OBSERVATIONS, Frames, ObservationName, Spec
-from endless_gym.vector import make_vec
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ import gymnasium
 
 import endless_gym
 from endless_gym.arguments import MAX_U64, integer, mapping
+from endless_gym.create import make_vec
 from endless_gym.recording.episodes import Episode, Plan, play
 from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
 from endless_gym.specs import Frames, ObservationName, Spec, contents, spec
-from endless_gym.vector import make_vec
 
 #: Steps after which episodes are truncated in environments without a step limit, in which an expert may never stop.
 DEFAULT_MAX_STEPS = 1000

@@ -62,6 +62,8 @@ pub struct EnvSpec {
     pub vector_observation: usize,
     /// Columns of the ground truth (float64 in 0..=1), none if there is none.
     pub ground_truth: &'static [Column],
+    /// Whether the ground truth of a single environment has an integer dtype in the original.
+    pub ground_truth_is_integer: bool,
     /// Columns of the final info in addition to `reward` and `length`.
     pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32), which the original does not have.

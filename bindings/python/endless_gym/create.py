@@ -1,0 +1,178 @@
+"""Makes vector environments, in this process (`make_vec`) or of a running engine (`connect`)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from endless_gym import _native
+from endless_gym.arguments import timeout as checked_timeout
+from endless_gym.backends import Backend
+from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Options, checked_arguments, options_list
+from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
+from endless_gym.rendering import VECTOR_MODES, View, checked_view
+from endless_gym.results import Results
+from endless_gym.specs import Frames, ObservationName, Spec, spec
+from endless_gym.vector import EndlessVectorEnv
+
+
+def make_vec(
+    id: str,
+    num_envs: int = 1,
+    num_threads: int | None = None,
+    *,
+    seed: int | None = None,
+    seeds: range | Sequence[int] | None = None,
+    options: Options | Sequence[Options] | None = None,
+    autoreset: AutoresetName | AutoresetMode = "next_step",
+    observation: ObservationName = "rgb",
+    frames: Frames | None = None,
+    groups: int = 1,
+    copy: bool = False,
+    independent_episodes: bool = False,
+    first_env: int = 0,
+    total_envs: int | None = None,
+    render_mode: str | None = None,
+    view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
+) -> EndlessVectorEnv:
+    """Create environments in this process.
+
+    Args:
+        id: Environment id, such as `Endless-MortarMayhem-v0`.
+        num_envs: Environments in each group.
+        num_threads: Threads that step environments; `None` or 0 for one per core.
+        seed: Environment `i`, numbered over all groups, is seeded with `seed + i` at its first reset; later episodes continue its
+            generator. `None` takes entropy from the operating system.
+        seeds: Seeds of the single episodes: a `range`, with any step, to draw from, as the training in the paper does from
+            `range(100_000)`, with draws seeded by `seed`; or a list, used in order and repeated.
+        options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each
+            environment of all groups.
+        autoreset: Gymnasium's auto-reset mode: `next_step`, `same_step` or `disabled`.
+        observation: `rgb` for frames, `features` for a vector that describes what the frame shows, without drawing it, or
+            `rgb+features` for a dict of both.
+        frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
+        groups: Groups of environments for `send` and `recv`, 1 to 64.
+        copy: Return writable copies instead of read-only views.
+        independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
+            alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
+            an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
+            the last one's background, and an episode continues the generator that the one before has drawn from.
+        first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
+            for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
+        total_envs: Environments of all of these calls together; `None` for `first_env` and those of this call.
+        render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
+        view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
+        episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between two
+            steps, before the one in which the episode may begin: with same-step auto-reset one episode ahead.
+        episode_info: Whether `info` has the seed and the options of each running episode.
+
+    Raises:
+        TypeError: A number is not an integer, or `episode_options` cannot be called.
+        ValueError: An argument is out of its range.
+    """
+    given = checked_arguments(
+        id,
+        num_envs,
+        num_threads,
+        groups,
+        seed,
+        seeds,
+        options,
+        autoreset,
+        observation,
+        frames,
+        independent_episodes,
+        first_env,
+        total_envs,
+    )
+    pools = _native.Pools([config.json() for config in given.pools], given.num_threads)
+    layout = json.loads(pools.layout())
+    return _environments(
+        pools,
+        Results(given.described, layout, given.pools[0].num_envs, given.frames, given.autoreset, copy),
+        given.described,
+        given.autoreset,
+        episode_options,
+        episode_info,
+        options=options_list(options),
+        render_mode=render_mode,
+        view=view,
+        first_env=first_env,
+    )
+
+
+def connect(
+    service: str,
+    *,
+    timeout: float = 30.0,
+    copy: bool = False,
+    render_mode: str | None = None,
+    view: View | None = None,
+    episode_options: EpisodeOptions | None = None,
+    episode_info: bool = False,
+    engine: Any = None,
+) -> EndlessVectorEnv:
+    """Connect to a running engine, started by `endless serve --service NAME` or by `serve`.
+
+    Args:
+        service: The engine's name.
+        timeout: Seconds to wait for the engine to start, and for each of its answers.
+        copy: Return writable copies instead of read-only views of shared memory.
+        render_mode: As for `make_vec`.
+        view: As for `make_vec`.
+        episode_options: As for `make_vec`. It is called in this process; options that differ from the environment's last ones
+            are sent to the engine before the next step.
+        episode_info: As for `make_vec`. Each step in which episodes begin asks the engine for them, which needs one of its
+            `batches_held`.
+        engine: Used by `serve`.
+
+    Raises:
+        ConnectionError: There is no such engine, or it already has a trainer.
+        ValueError: The timeout is negative or not finite, or there is no such render mode or view.
+    """
+    timeout = checked_timeout(timeout)
+    checked_view(render_mode, view, VECTOR_MODES)
+    connection = _native.Connection(service, timeout)
+    specification = json.loads(connection.specification())
+    described, results = specified_results(specification, copy)
+    return _environments(
+        connection,
+        results,
+        described,
+        MODES[specification["autoreset"]],
+        episode_options,
+        episode_info,
+        options=specification["options"],
+        # An earlier trainer may have changed them, or a checkpoint.
+        knows_options=False,
+        render_mode=render_mode,
+        view=view,
+        first_env=specification["first_env"],
+        engine=engine,
+    )
+
+
+def specified_results(specification: Mapping[str, Any], copy: bool) -> tuple[Spec, Results]:
+    """The specification of an engine's environment id, and the results of its batches."""
+    described, frames = spec(specification["id"]), Frames.from_specification(specification["frames"])
+    mode = MODES[specification["autoreset"]]
+    return described, Results(described, specification["batch"], specification["num_envs"], frames, mode, copy)
+
+
+def _environments(
+    backend: Backend,
+    results: Results,
+    described: Spec,
+    autoreset: AutoresetMode,
+    episode_options: EpisodeOptions | None,
+    episode_info: bool,
+    **arguments: Any,
+) -> EndlessVectorEnv:
+    if validate_episode_options(episode_options) is None and not episode_info:
+        return EndlessVectorEnv(backend, results, described, autoreset, **arguments)
+    return TrackedVectorEnv(
+        backend, results, described, autoreset, episode_options=episode_options, episode_info=episode_info, **arguments
+    )

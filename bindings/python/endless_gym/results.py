@@ -1,0 +1,112 @@
+"""What `reset` and `step` return, from the arrays of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endless_gym import _native
+from endless_gym.configuration import AutoresetMode
+from endless_gym.specs import Frames, Spec
+
+Step = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+#: The keys of an observation, by the sections of a batch.
+_OBSERVATIONS = {
+    "observation": "visual_observation",
+    "features": "features",
+    "vector_observation": "vector_observation",
+}
+
+
+class Results:
+    """Names the arrays of a batch as Gymnasium does.
+
+    Attributes:
+        num_envs: Environments of a batch.
+        observation_space: The space of one environment's observation.
+        copy: Whether all arrays are writable copies.
+        has_final_observation: Whether `info` has the last observation of an episode that ended.
+    """
+
+    def __init__(
+        self,
+        described: Spec,
+        layout: Mapping[str, Any],
+        num_envs: int,
+        frames: Frames | None,
+        autoreset: AutoresetMode,
+        copy: bool,
+    ) -> None:
+        """`layout` is the layout of a batch; with `copy`, all arrays are writable copies."""
+        self._described, self.copy, self.num_envs = described, copy, num_envs
+        self._index = {section["name"]: place for place, section in enumerate(layout["sections"])}
+        self._observed = self._places("")
+        self._final_observed = self._places("final_")
+        self.has_final_observation = bool(self._final_observed)
+        self.observation_space = described.observation_space(frames, "features" in self._index)
+        self._truth = self._index.get("ground_truth")
+        self._steps = [self._index[name] for name in ("reward", "terminated", "truncated")]
+        self._ends = [self._index[name] for name in ("episode_return", "episode_length", "info")]
+        self._integers = [is_integer for _, is_integer in described.info]
+        self._same_step = autoreset is AutoresetMode.SAME_STEP
+        self._all = np.ones(num_envs, dtype=np.bool_)
+        self._all.flags.writeable = False
+
+    def start(self, arrays: _native.Arrays) -> tuple[Any, dict[str, Any]]:
+        """What a reset returns."""
+        arrays = self._copied(arrays)
+        return self._observation(arrays), self._info(arrays)
+
+    def step(self, arrays: _native.Arrays) -> Step:
+        """What a step returns."""
+        arrays = self._copied(arrays)
+        reward, terminated, truncated = (arrays[place] for place in self._steps)
+        info = self._info(arrays)
+        self._add_ends(info, arrays, terminated)
+        return self._observation(arrays), reward, terminated, truncated, info
+
+    def _places(self, prefix: str) -> list[tuple[str, int]]:
+        sections = ((key, self._index.get(prefix + name)) for name, key in _OBSERVATIONS.items())
+        return [(key, place) for key, place in sections if place is not None]
+
+    def _copied(self, arrays: _native.Arrays) -> _native.Arrays:
+        return tuple(array.copy() for array in arrays) if self.copy else arrays
+
+    def _observation(self, arrays: _native.Arrays) -> Any:
+        if len(self._observed) == 1:
+            return arrays[self._observed[0][1]]
+        return {key: arrays[place] for key, place in self._observed}
+
+    def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
+        if self._truth is None:
+            return {}
+        return {"ground_truth": arrays[self._truth], "_ground_truth": self._all.copy() if self.copy else self._all}
+
+    def _add_ends(self, info: dict[str, Any], arrays: _native.Arrays, ended: NDArray[np.bool_]) -> None:
+        """Adds the infos of the episodes that this step ended, if it ended any."""
+        returns, lengths, infos = (arrays[place] for place in self._ends)
+        ends = _native.ended_episodes(ended, returns, lengths, infos, self._integers)
+        if ends is None:
+            return
+        ended, returns, lengths, columns = ends
+        final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
+        for (name, _), column in zip(self._described.info, columns, strict=True):
+            final[name], final[f"_{name}"] = column, ended
+        if not self._same_step:
+            info.update(final)
+            return
+        if "final_ground_truth" in self._index:
+            final["ground_truth"] = np.where(ended[:, None], arrays[self._index["final_ground_truth"]], 0.0)
+            final["_ground_truth"] = ended
+        info["final_info"], info["_final_info"] = final, ended
+        if not self.has_final_observation:
+            return
+        observations = np.full(self.num_envs, None, dtype=object)
+        for env in np.flatnonzero(ended):
+            parts = {key: arrays[place][env] for key, place in self._final_observed}
+            observations[env] = parts if len(parts) > 1 else next(iter(parts.values()))
+        info["final_obs"], info["_final_obs"] = observations, ended
