@@ -3,35 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
-if TYPE_CHECKING:
-    from endless_gym.specs import Spec
+from endless_gym.specs import Spec
 
 Documented = TypeVar("Documented", bound=Callable[..., Any])
-
-
-class Meaning(NamedTuple):
-    """What a number of an action or an entry of a vector means."""
-
-    #: Name, unique within its branch or vector.
-    name: str
-    #: Meaning and unit.
-    description: str
-
-
-class ActionBranch(NamedTuple):
-    """One branch of an action."""
-
-    #: Name, unique within the environment.
-    name: str
-    #: What each number means, from 0 on.
-    choices: tuple[Meaning, ...]
-
-
-def meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:
-    """Entries of the engine's table, with `name` and `description`."""
-    return tuple(Meaning(each["name"], each["description"]) for each in described)
 
 
 def metadata(spec: Spec) -> dict[str, Any]:

@@ -1,8 +1,5 @@
-"""The command-line program `endless`."""
+"""The command that starts the program `endless` in a new process."""
 
-import os
-import shutil
-import signal
 import sys
 
 from endless_gym import _native
@@ -28,33 +25,3 @@ sys.exit(native.endless(sys.argv[2:], executable))
 def program() -> list[str]:
     """The command that starts the program `endless`."""
     return [sys.executable, "-I", "-S", "-c", _PROGRAM, str(_native.__file__)]
-
-
-def _is_film(arguments: list[str]) -> bool:
-    """Whether these arguments of `record` ask for a film, which the program writes itself."""
-    return any(argument.partition("=")[0] == "--film" for argument in arguments)
-
-
-def _find_ffmpeg() -> None:
-    """Let the program use the ffmpeg of the package imageio-ffmpeg if the system has none."""
-    if "IMAGEIO_FFMPEG_EXE" in os.environ or shutil.which("ffmpeg"):
-        return
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        return
-    os.environ["IMAGEIO_FFMPEG_EXE"] = imageio_ffmpeg.get_ffmpeg_exe()
-
-
-def main() -> int:
-    """Run the program with this process's arguments, and return its exit status."""
-    if sys.argv[1:2] == ["record"] and not _is_film(sys.argv[2:]):
-        # It needs Python's libraries, and so the whole package.
-        from endless_gym.recording import command
-
-        return command.main(sys.argv[2:])
-    if sys.argv[1:2] == ["record"]:
-        _find_ffmpeg()
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    return _native.endless(sys.argv[1:], program())

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import integer
-from endless_gym.descriptions import ActionBranch, Meaning, meanings
 
 #: The environment id that programs use by default.
 DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
@@ -78,6 +77,24 @@ class Frames:
     def from_specification(described: dict[str, Any] | None) -> Frames | None:
         """The format of the frames in an engine's specification; `None` without frames."""
         return None if described is None else Frames(**described["format"], stack=described["stack"])
+
+
+class Meaning(NamedTuple):
+    """What a number of an action or an entry of a vector means."""
+
+    #: Name, unique within its branch or vector.
+    name: str
+    #: Meaning and unit.
+    description: str
+
+
+class ActionBranch(NamedTuple):
+    """One branch of an action."""
+
+    #: Name, unique within the environment.
+    name: str
+    #: What each number means, from 0 on.
+    choices: tuple[Meaning, ...]
 
 
 @dataclass(frozen=True)
@@ -218,14 +235,19 @@ def _spec(described: dict[str, Any]) -> Spec:
         summary=described["summary"],
         branches=tuple(choices) if multi_discrete else (choices,),
         multi_discrete=multi_discrete,
-        actions=tuple(ActionBranch(branch["name"], meanings(branch["choices"])) for branch in described["actions"]),
+        actions=tuple(ActionBranch(branch["name"], _meanings(branch["choices"])) for branch in described["actions"]),
         vector_observation=described["vector_observation"],
         ground_truth=len(described["ground_truth"]),
-        ground_truth_columns=meanings(described["ground_truth"]),
+        ground_truth_columns=_meanings(described["ground_truth"]),
         ground_truth_is_integer=described["ground_truth_is_integer"],
         info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
         features=tuple(column["name"] for column in described["features"]),
-        feature_columns=meanings(described["features"]),
+        feature_columns=_meanings(described["features"]),
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
         render_fps=described["render_fps"],
     )
+
+
+def _meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:
+    """Entries of the engine's table, with `name` and `description`."""
+    return tuple(Meaning(each["name"], each["description"]) for each in described)

@@ -165,7 +165,7 @@ def endless_gym_process(envs: endless_gym.EndlessVectorEnv) -> int:
 
 
 def test_the_program_comes_along() -> None:
-    command = [sys.executable, "-c", "import sys; from endless_gym.program import main; sys.exit(main())"]
+    command = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
     listed = subprocess.run([*command, "list", "--json"], capture_output=True, text=True, check=True)
     assert ID in listed.stdout
     with open("/dev/full", "w") as full:

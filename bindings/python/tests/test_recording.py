@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import endless_gym
-from endless_gym.program import main as program_main
+from endless_gym.cli import main as program_main
 
 pytestmark = [
     pytest.mark.libraries,

@@ -16,7 +16,7 @@ from typing import Any
 
 import gymnasium
 
-import endless_gym
+from endless_gym import _native
 from endless_gym.arguments import MAX_U64, integer, mapping
 from endless_gym.create import make_vec
 from endless_gym.recording.episodes import Episode, Plan, play
@@ -133,7 +133,7 @@ def record(
         for number in range(count)
     ]
     frames, has_features = contents(observation, frames)
-    threads = integer("num_threads", num_threads or len(os.sched_getaffinity(0)), 1, endless_gym._native.MAX_THREADS)
+    threads = integer("num_threads", num_threads or len(os.sched_getaffinity(0)), 1, _native.MAX_THREADS)
     name = dataset or f"endless-gym/{described.id}/{_short(player)}-v0"
     start = time.perf_counter()
     total = 0.0
@@ -232,8 +232,8 @@ def _metadata(
     metadata: dict[str, Any] = {
         "algorithm_name": player.name,
         "description": description or f"{described.id}: {described.summary} Played by: {player.name}.",
-        "requirements": [f"endless-gym>={endless_gym.__version__}"],
+        "requirements": [f"endless-gym>={_native.__version__}"],
         "error_rates": list(rates),
-        "endless_gym_version": endless_gym.__version__,
+        "endless_gym_version": _native.__version__,
     }
     return metadata | ({"author": {author}} if author else {})
