@@ -43,7 +43,7 @@ class TestStableBaselines3:
         self.adapt = EndlessVecEnv
 
     @pytest.mark.parametrize("env_id", IDS)
-    def test_shapes_and_dtypes(self, env_id):
+    def test_arrays_have_the_shapes_and_dtypes_of_the_spaces(self, env_id):
         venv = self.make(env_id, num_envs=5)
         venv.seed(3)
         obs = venv.reset()
@@ -124,7 +124,7 @@ class TestStableBaselines3:
                 return
         pytest.fail("no episode ended")
 
-    def test_dict_observations(self):
+    def test_dict_observations_stay_dicts(self):
         venv = self.make(DICT_ID, num_envs=3)
         obs = venv.reset()
         assert obs["visual_observation"].shape == (3, *FRAME)
@@ -157,7 +157,7 @@ class TestStableBaselines3:
         ):
             self.adapt(envs)
 
-    def test_wrappers_and_an_algorithm_accept_it(self):
+    def test_wrappers_and_ppo_accept_the_adapter(self):
         from stable_baselines3 import PPO
         from stable_baselines3.common.evaluation import evaluate_policy
         from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
@@ -219,7 +219,7 @@ for read in (lambda: obs_as_tensor(observation, "cpu"), lambda: torch.as_tensor(
 
         assert lines_of_a_step(512) == lines_of_a_step(2) > 5
 
-    def test_an_engine_in_another_process(self):
+    def test_adapter_works_over_a_served_engine(self):
         with endless_gym.serve(SHORT, num_envs=4, autoreset="same_step") as envs:
             venv = self.adapt(envs)
             venv.seed(2)
@@ -249,7 +249,7 @@ class TestTorchRL:
         self.adapt = EndlessEnv
 
     @pytest.mark.parametrize("env_id", [*IDS, SHORT, DICT_ID])
-    def test_specs(self, env_id):
+    def test_torchrls_spec_checker_passes(self, env_id):
         from torchrl.envs import check_env_specs
 
         env = self.make(env_id, num_envs=3)
@@ -336,7 +336,7 @@ class TestTorchRL:
         ):
             self.adapt(envs)
 
-    def test_an_engine_in_another_process(self):
+    def test_adapter_works_over_a_served_engine(self):
         with endless_gym.serve(SHORT, num_envs=4, autoreset="disabled") as envs:
             data = self.adapt(envs).rollout(100, break_when_any_done=False)
             assert data.batch_size == (4, 100), "a rollout keeps more observations than an engine lends"
@@ -357,7 +357,7 @@ class TestPufferLib:
         self.env = EndlessPufferEnv
 
     @pytest.mark.parametrize("env_id", IDS)
-    def test_shapes_and_dtypes(self, env_id):
+    def test_arrays_have_the_shapes_and_dtypes_of_the_spaces(self, env_id):
         env = self.env(env_id, num_envs=4)
         assert env.num_agents == 4
         assert not env.emulated
@@ -379,7 +379,7 @@ class TestPufferLib:
         env.close()
 
     @pytest.mark.parametrize("buffers", [False, True])
-    def test_steps_are_those_of_the_environments(self, buffers):
+    def test_steps_equal_those_of_the_vector_environment(self, buffers):
         num_envs, rng = 6, np.random.default_rng(4)
         envs, obs = reference(SHORT, num_envs, "same_step", seed=3 * num_envs)
         buf = None

@@ -41,20 +41,20 @@ def test_a_timeout_may_be_long() -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("given", [-1, 2**64])
 @pytest.mark.parametrize("name", ["num_envs", "num_threads", "groups", "seed"])
-def test_integers_out_of_range(where, name: str, given: int) -> None:
+def test_integers_out_of_range_raise_value_error(where, name: str, given: int) -> None:
     with pytest.raises(ValueError, match=rf"^{name} must be [01] to \d+, got {given}$"):
         where(ID, **{name: given})
 
 
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("name", ["num_envs", "num_threads", "groups", "seed"])
-def test_numbers_that_are_no_integers(where, name: str) -> None:
+def test_non_integers_raise_type_error(where, name: str) -> None:
     with pytest.raises(TypeError, match=rf"^{name} must be an integer, got 1.5$"):
         where(ID, **{name: 1.5})
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_seeds_out_of_range(where) -> None:
+def test_seeds_out_of_range_are_refused(where) -> None:
     for seeds in ([-1], [2**64], range(-1, 3), range(0, 2**64 + 1)):
         with pytest.raises(ValueError, match=r"seeds must be 0 to \d+, got "):
             where(ID, seeds=seeds)
@@ -69,14 +69,14 @@ def test_seeds_out_of_range(where) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_counts_whose_product_overflows(where) -> None:
+def test_counts_whose_product_overflows_are_refused(where) -> None:
     with pytest.raises(ValueError, match=rf"^num_envs must be 1 to \d+, got {2**63}$"):
         where(ID, 2**63, groups=4)
     with pytest.raises(ValueError, match=r"^groups must be 1 to 64, got 65$"):
         where(ID, 1, groups=65)
 
 
-def test_one_environment() -> None:
+def test_single_environment_checks_seeds_actions_and_snapshots() -> None:
     env = endless_gym.Env(ID)
     for seed in (-1, 2**64):
         with pytest.raises(ValueError, match=rf"^seed must be 0 to \d+, got {seed}$"):
@@ -151,7 +151,7 @@ def test_one_action_has_the_shape_of_the_action_space() -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_arguments_of_other_types(where) -> None:
+def test_arguments_of_other_types_are_refused(where) -> None:
     for arguments, match in (
         ({"id": 3}, "^id must be a string, got 3$"),
         ({"options": 5}, "^options must be a mapping, or a sequence of mappings, got 5$"),
@@ -205,7 +205,7 @@ def test_batches_held_are_checked() -> None:
             endless_gym.serve(ID, batches_held=given)
 
 
-def test_a_view_of_no_environment() -> None:
+def test_view_of_an_unknown_environment_is_refused() -> None:
     with endless_gym.make_vec(ID, 2) as envs:
         envs.reset()
         for env in (-1, 2, 2**64):

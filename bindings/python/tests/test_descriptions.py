@@ -30,7 +30,7 @@ def test_every_number_has_a_name_and_a_meaning(id: str) -> None:
             json.dumps([metadata[name] for name in ("actions", "ground_truth", "features")])
 
 
-def test_the_meanings_are_those_of_the_original() -> None:
+def test_names_describe_what_the_original_does() -> None:
     grid = endless_gym.Env("MortarMayhem-Grid-v0").metadata["actions"]
     assert grid == {"move": ["nothing", "left", "right", "ahead"]}
     free = endless_gym.Env("Endless-MortarMayhem-v0").metadata
@@ -40,7 +40,7 @@ def test_the_meanings_are_those_of_the_original() -> None:
 
 
 @pytest.mark.parametrize("shown", [endless_gym.Env, endless_gym.Env(IDS[0]), endless_gym.EndlessVectorEnv])
-def test_help_shows_them(shown: object) -> None:
+def test_help_shows_actions_and_ground_truth(shown: object) -> None:
     page = pydoc.plain(pydoc.render_doc(shown))
     assert "action[0], horizontal: 0 nothing, 1 left, 2 right" in page
     assert "action: 0 nothing, 1 left, 2 right, 3 ahead" in page
@@ -49,7 +49,7 @@ def test_help_shows_them(shown: object) -> None:
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=IDS)
-def test_the_program_lists_them(spec) -> None:
+def test_program_lists_actions_and_columns(spec) -> None:
     listed = subprocess.run(
         [*program(), "list", spec.id, "--picture", "never"], capture_output=True, text=True, check=True
     )

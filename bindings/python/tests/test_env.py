@@ -34,7 +34,7 @@ def plain(value: object) -> object:
 
 
 @pytest.mark.parametrize("id", IDS)
-def test_it_is_the_original_step_for_step(id: str, original_python: str, tmp_path: Path) -> None:
+def test_env_equals_the_original_step_by_step(id: str, original_python: str, tmp_path: Path) -> None:
     env = gymnasium.make(f"EndlessGym/{id}", render_mode="debug_rgb_array")
     env.action_space.seed(3)
     actions = np.array([np.atleast_1d(env.action_space.sample()) for _ in range(400)])
@@ -79,7 +79,7 @@ def test_gymnasiums_checker_passes(id: str) -> None:
         check_env(gymnasium.make(f"EndlessGym/{id}", render_mode=mode).unwrapped, skip_render_check=True)
 
 
-def test_render_modes() -> None:
+def test_rgb_array_is_the_observation_by_rows() -> None:
     env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array")
     observation, _ = env.reset(seed=1)
     np.testing.assert_array_equal(env.render(), observation.swapaxes(0, 1))
@@ -107,7 +107,7 @@ def test_a_window_shows_the_ground_truth_view(id: str, monkeypatch: pytest.Monke
     assert not pygame.display.get_init()
 
 
-def test_observations_stay_as_they_are() -> None:
+def test_observations_do_not_change() -> None:
     env = endless_gym.Env("MortarMayhem-v0")
     first, _ = env.reset(seed=1)
     kept = first.copy()
@@ -124,7 +124,7 @@ def test_options_last_for_one_episode() -> None:
     np.testing.assert_array_equal(fixed.reset(seed=1)[0], env.reset(seed=1, options={"arena_size": np.int64(2)})[0])
 
 
-def test_mistakes_are_exceptions() -> None:
+def test_wrong_arguments_and_calls_raise() -> None:
     env = endless_gym.Env("MortarMayhem-v0")
     with pytest.raises(ResetNeeded):
         env.step([0, 0])
@@ -140,7 +140,7 @@ def test_mistakes_are_exceptions() -> None:
         endless_gym.Env("Mortar")
 
 
-def test_a_snapshot_goes_on_identically() -> None:
+def test_restored_snapshot_continues_identically() -> None:
     env = endless_gym.Env("Endless-SearingSpotlights-v0")
     env.reset(seed=4)
     snapshot = env.snapshot()
@@ -152,7 +152,7 @@ def test_a_snapshot_goes_on_identically() -> None:
         assert (reward, terminated) == wanted[1:]
 
 
-def test_the_originals_ids_and_classes() -> None:
+def test_the_originals_ids_and_classes_make_equal_environments() -> None:
     import endless_gym.memory_gym as memory_gym
 
     env = gymnasium.make("MortarMayhem-Grid-v0")
@@ -171,7 +171,7 @@ COPIES = {
 
 @pytest.mark.parametrize("how", COPIES.values(), ids=COPIES)
 @pytest.mark.parametrize("id", IDS)
-def test_a_copy_goes_on_identically_and_on_its_own(how: Any, id: str) -> None:
+def test_copies_continue_identically_and_independently(how: Any, id: str) -> None:
     env = endless_gym.Env(
         id, "debug_rgb_array", {"agent_scale": 0.3}, frames=endless_gym.Frames(grayscale=True, stack=3)
     )
@@ -227,7 +227,7 @@ def test_made_environments_and_the_originals_classes_are_pickled() -> None:
 
 @pytest.mark.parametrize("where", ["EndlessGym/", ""])
 @pytest.mark.parametrize("context", ["fork", "spawn"])
-def test_gymnasiums_asynchronous_environments(where: str, context: str) -> None:
+def test_async_vector_env_plays_as_sync_vector_env(where: str, context: str) -> None:
     import endless_gym.memory_gym
 
     id = f"{where}Endless-MysteryPath-v0"
@@ -256,7 +256,7 @@ def test_an_environment_travels_to_a_spawned_worker() -> None:
         asynchronous.close()
 
 
-def test_gymnasium_makes_it_with_render_modes_of_its_own() -> None:
+def test_gymnasium_make_accepts_list_render_modes() -> None:
     env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array_list")
     env.reset(seed=1)
     env.step([1, 0])
@@ -275,7 +275,7 @@ def test_gymnasium_makes_it_with_render_modes_of_its_own() -> None:
     ],
     ids=str,
 )
-def test_observations_are_those_of_a_vector_environment(id: str, kwargs: dict[str, Any]) -> None:
+def test_observations_equal_a_vector_environments(id: str, kwargs: dict[str, Any]) -> None:
     env = gymnasium.make(f"EndlessGym/{id}", **kwargs)
     with endless_gym.make_vec(id, 1, autoreset="disabled", **kwargs) as envs:
         assert env.observation_space == envs.single_observation_space
@@ -290,7 +290,7 @@ def test_observations_are_those_of_a_vector_environment(id: str, kwargs: dict[st
             given, wanted = env.step(actions[0])[0], envs.step(actions)[0]
 
 
-def test_observations_that_cannot_be_are_refused() -> None:
+def test_impossible_observations_are_refused() -> None:
     for kwargs, error, match in (
         ({"observation": "pixels"}, ValueError, "observation must be one of rgb, features"),
         ({"observation": "features", "frames": endless_gym.Frames()}, ValueError, "has no frames"),
@@ -301,7 +301,7 @@ def test_observations_that_cannot_be_are_refused() -> None:
             endless_gym.Env("MysteryPath-v0", **kwargs)
 
 
-def test_progress_says_how_far_the_episode_is() -> None:
+def test_progress_counts_tiles_and_falls() -> None:
     env = endless_gym.Env("MysteryPath-Grid-v0")
     with pytest.raises(RuntimeError):
         env.progress()

@@ -69,7 +69,7 @@ def test_options_of_a_reset_are_those_of_its_group_and_its_environments(where: C
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_environments_with_a_mapping_each_take_options_too(where: Callable[..., Envs]) -> None:
+def test_reset_options_override_options_of_each_environment(where: Callable[..., Envs]) -> None:
     each = [{"arena_size": 4}, {"arena_size": 6}, {}, {"arena_size": 3}]
     with where(ID, 2, groups=2, seed=0, options=each) as envs:
         envs.reset(options=ONE)
@@ -232,7 +232,7 @@ def test_a_function_chooses_the_options_of_each_episode(where: Callable[..., Env
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_a_function_and_resets(where: Callable[..., Envs]) -> None:
+def test_reset_asks_the_function_for_options(where: Callable[..., Envs]) -> None:
     choices = Choices()
     with where(ID, 2, seed=0, episode_options=choices, options={"arena_size": 4}) as envs:
         envs.reset(options={"arena_size": 6})
@@ -289,7 +289,7 @@ def test_an_exception_of_the_function_loses_no_step(where: Callable[..., Envs]) 
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_info_tells_the_seeds_of_the_running_episodes(where: Callable[..., Envs]) -> None:
+def test_info_has_seeds_and_options_of_running_episodes(where: Callable[..., Envs]) -> None:
     with where(ID, 2, groups=2, seeds=[1, 2**64 - 1, 3, 4, 5], episode_info=True) as envs:
         # Episode e of environment i of all n has item e n + i.
         for group, expected in ((0, [1, 2**64 - 1]), (1, [3, 4])):
@@ -399,7 +399,7 @@ def compare(shown: list[Any], rewards: list[float], steps: Any) -> bool:
     return all(equal(one, step.observation) for one, step in zip(shown, steps, strict=True))
 
 
-def test_mistakes_of_a_replay_are_typed() -> None:
+def test_wrong_replays_raise_typed_errors() -> None:
     steps = endless_gym.replay(ID, 3, ONE, [0] * 200, render_mode="rgb_array")
     with pytest.raises(
         ValueError, match=r"^actions must not go beyond the end of the episode, which ended after \d+ actions$"

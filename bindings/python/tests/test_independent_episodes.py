@@ -48,7 +48,7 @@ def played(envs, seed: int, options: dict, steps: int) -> list[object]:
 
 
 @pytest.mark.parametrize("id", IDS)
-def test_a_used_environment_plays_what_a_new_one_does(id: str) -> None:
+def test_used_environments_play_what_new_ones_do(id: str) -> None:
     def make(independent: bool) -> gymnasium.Env:
         return gymnasium.make(f"EndlessGym/{id}", independent_episodes=independent)
 

@@ -29,13 +29,13 @@ def test_torch_shares_the_memory_without_a_warning(observation: np.ndarray) -> N
     np.testing.assert_array_equal(tensor.numpy(), observation)
 
 
-def test_torchs_own_functions_work(observation: np.ndarray) -> None:
+def test_torch_from_numpy_shares_the_memory(observation: np.ndarray) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert torch.from_numpy(observation).data_ptr() == observation.ctypes.data
 
 
-def test_every_type_and_a_part(observation: np.ndarray) -> None:
+def test_torch_view_takes_every_dtype_and_strided_parts(observation: np.ndarray) -> None:
     envs = endless_gym.make_vec("Endless-MortarMayhem-v0", 4, seed=1)
     envs.reset()
     for array in envs.step(np.zeros((4, 2), dtype=np.int64))[:4]:

@@ -14,7 +14,7 @@ import pytest
 NOTEBOOK = Path(__file__).parent.parent / "examples/quickstart.ipynb"
 
 
-def test_it_is_stored_without_outputs() -> None:
+def test_notebook_is_stored_without_outputs() -> None:
     cells = json.loads(NOTEBOOK.read_text())["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert len(code) >= 5
@@ -22,7 +22,7 @@ def test_it_is_stored_without_outputs() -> None:
     assert NOTEBOOK.stat().st_size < 500_000
 
 
-def test_its_links_lead_to_files() -> None:
+def test_notebook_links_lead_to_files() -> None:
     text = "".join("".join(cell["source"]) for cell in json.loads(NOTEBOOK.read_text())["cells"])
     links = [part.split(")")[0] for part in text.split("](")[1:]]
     assert len(links) >= 5
@@ -31,7 +31,7 @@ def test_its_links_lead_to_files() -> None:
 
 @pytest.mark.slow
 @pytest.mark.libraries
-def test_it_runs(tmp_path: Path, libraries_python: str) -> None:
+def test_notebook_runs(tmp_path: Path, libraries_python: str) -> None:
     text, minute = NOTEBOOK.read_text(), '"minutes = 1.0"'
     assert text.count(minute) == 1
     (tmp_path / "short.ipynb").write_text(text.replace(minute, '"minutes = 0.05"'))

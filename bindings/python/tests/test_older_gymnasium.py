@@ -17,7 +17,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(tmp_path), "SDL_VIDEODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
 
 
-def test_it_plays_as_the_original(original_python: str, environment: dict[str, str]) -> None:
+def test_env_plays_as_the_original_under_gymnasium_029(original_python: str, environment: dict[str, str]) -> None:
     program = Path(__file__).parent / "older_gymnasium.py"
     records = []
     for module in ("memory_gym", "endless_gym.memory_gym"):
@@ -33,7 +33,7 @@ def test_it_plays_as_the_original(original_python: str, environment: dict[str, s
             assert given == wanted, f"{id}, entry {number}"
 
 
-def test_what_needs_a_newer_one_says_so(original_python: str, environment: dict[str, str]) -> None:
+def test_vector_environments_ask_for_a_newer_gymnasium(original_python: str, environment: dict[str, str]) -> None:
     program = """
 import endless_gym, gymnasium
 print(gymnasium.__version__)

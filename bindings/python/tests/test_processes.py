@@ -164,7 +164,7 @@ def endless_gym_process(envs: endless_gym.EndlessVectorEnv) -> int:
     return envs._engine.pid
 
 
-def test_the_program_comes_along() -> None:
+def test_package_includes_the_program() -> None:
     command = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
     listed = subprocess.run([*command, "list", "--json"], capture_output=True, text=True, check=True)
     assert ID in listed.stdout

@@ -51,7 +51,7 @@ def parts(observation: Any) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("id", IDS)
-def test_an_episode_is_what_its_seed_and_actions_give(id: str) -> None:
+def test_recorded_episodes_follow_from_seed_and_actions(id: str) -> None:
     recorded = endless_gym.record(id, 3, error_rates=[0.0, 0.2], seed=40, options=short(id), max_steps=40)
     dataset = load(recorded.dataset)
     assert (dataset.total_episodes, dataset.total_steps) == (3, recorded.steps)
@@ -93,7 +93,7 @@ def test_an_episode_is_what_its_seed_and_actions_give(id: str) -> None:
 
 @pytest.mark.parametrize("id", ["MortarMayhem-Grid-v0", "MortarMayhemB-v0"])
 @pytest.mark.parametrize("observation", ["features", "rgb+features"])
-def test_other_observations_are_those_of_a_vector_environment(id: str, observation: str) -> None:
+def test_recorded_observations_equal_a_vector_environments(id: str, observation: str) -> None:
     frames = endless_gym.Frames(grayscale=True, row_major=True) if "rgb" in observation else None
     options = {"command_count": [2]}
     recorded = endless_gym.record(id, 2, observation=observation, frames=frames, options=options, seed=7)

@@ -202,7 +202,7 @@ except RuntimeError as error:
     assert "SDL_VIDEODRIVER=dummy" in ran.stdout
 
 
-def test_the_close_button_ends_it(invisible: None) -> None:
+def test_close_button_stops_the_environment_until_close(invisible: None) -> None:
     env = endless_gym.Env("MysteryPath-v0", "human")
     env.reset(seed=1)
     env.step([1, 0])

@@ -110,7 +110,7 @@ def test_episodes_depend_on_the_seed_of_the_reset_alone(seeds) -> None:
     assert all(each == played[0] for each in played)
 
 
-def test_they_are_those_of_gymnasiums_vector_environment() -> None:
+def test_seeds_of_a_reset_are_those_of_sync_vector_env() -> None:
     sync = SyncVectorEnv([lambda: endless_gym.Env(ID)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
     with endless_gym.make_vec(ID, 3, seed=0, autoreset="same_step") as envs:
         for seed in (7, [3, 1, 2]):
@@ -137,7 +137,7 @@ def test_seeds_may_be_an_array(where) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_a_range_keeps_its_step(where) -> None:
+def test_ranges_keep_their_step(where) -> None:
     wanted = {endless_gym.Env(ID).reset(seed=seed)[0].tobytes() for seed in (0, 3, 6, 9)}
     for seeds in (range(0, 10, 3), range(9, -1, -3)):
         with where(ID, 64, seeds=seeds, seed=1) as envs:
@@ -145,7 +145,7 @@ def test_a_range_keeps_its_step(where) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_many_seeds(where) -> None:
+def test_lists_longer_than_a_command_line_are_used_in_order(where) -> None:
     """More than fit one argument of a command."""
     seeds = [(number * 7_919) % 2**64 + 10**15 for number in range(100_000)]
     with where(ID, 3, seeds=seeds) as envs:

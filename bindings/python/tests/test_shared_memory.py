@@ -63,7 +63,7 @@ def test_an_exported_tensor_keeps_its_memory() -> None:
         assert (tensor == 9).all()
 
 
-def test_a_buffer_that_is_not_exported_stays_known() -> None:
+def test_reading_without_an_export_causes_no_full_redraw() -> None:
     """Reading, by all means that do not export a writable tensor, causes no full redraw: a pixel that is changed stays so."""
     with endless_gym.make_vec("MortarMayhem-Grid-v0", 1, seed=5, autoreset="disabled") as envs:
         envs.reset()
@@ -90,7 +90,7 @@ def test_no_write_to_a_served_batch_succeeds() -> None:
     assert int(ran.stdout) == 3 * len(writes.array_writes())
 
 
-def test_messages_name_the_way() -> None:
+def test_refused_exports_say_how_to_export() -> None:
     with endless_gym.serve("MortarMayhem-v0", 2) as envs:
         observation, _ = envs.reset()
         with pytest.raises(BufferError, match=r"export a copy: array.copy\(\)"):

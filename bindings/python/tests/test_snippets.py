@@ -27,7 +27,7 @@ LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
 @pytest.mark.slow
 @pytest.mark.libraries
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in PROGRAMS])
-def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], set[str]]) -> None:
+def test_snippet_runs(program: list[Block], tmp_path: Path, segments: Callable[[], set[str]]) -> None:
     for is_shell, part in groupby(program, lambda block: block.language in SHELL):
         code = "\n".join(block.code for block in part)
         shell = ["bash", "-euo", "pipefail", "-m", "-c", f"trap '{END_JOBS}' EXIT\n{code}"]
@@ -38,7 +38,7 @@ def test_snippet(program: list[Block], tmp_path: Path, segments: Callable[[], se
 @pytest.mark.slow
 @pytest.mark.libraries
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in OF_LIBRARIES])
-def test_snippet_of_a_library(
+def test_library_snippet_runs(
     program: list[Block], tmp_path: Path, segments: Callable[[], set[str]], libraries_python: str, ray_folder: str
 ) -> None:
     assert [block.language for block in program] == ["python"] * len(program)
@@ -63,7 +63,7 @@ def run(command: list[str], folder: Path, name: str) -> None:
     assert done.returncode == 0, f"{name} ended with {done.returncode}:\n{done.stdout}"
 
 
-def test_blocks_are_of_a_known_kind() -> None:
+def test_blocks_have_a_known_language() -> None:
     for page in pages():
         found = list(blocks(page))
         assert page.read_text().count("```") == 2 * len(found), f"{page} has a fence that is not recognised"
@@ -74,7 +74,7 @@ def test_blocks_are_of_a_known_kind() -> None:
                 assert block.is_included, f"{block.name}: show a file of engine/examples instead"
 
 
-def test_what_is_not_run_has_a_reason(capsys: pytest.CaptureFixture[str]) -> None:
+def test_snippets_that_do_not_run_say_why(capsys: pytest.CaptureFixture[str]) -> None:
     left = [block for page in pages() for block in blocks(page) if block.reason]
     with capsys.disabled():
         print("\ncode blocks that are not run:")

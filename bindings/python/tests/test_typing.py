@@ -24,7 +24,7 @@ def marked() -> set[int]:
 
 @pytest.mark.slow
 @pytest.mark.libraries
-def test_mypy(tmp_path: Path) -> None:
+def test_mypy_accepts_right_calls_and_reports_wrong_ones(tmp_path: Path) -> None:
     # In a folder without the package's own settings, as a user runs it. PyTorch, which is left to pyright, takes it minutes.
     (tmp_path / "mypy.ini").write_text("[mypy]\nstrict = True\n[mypy-torch.*]\nfollow_imports = skip\n")
     command = [sys.executable, "-m", "mypy", "--no-error-summary", "--cache-dir", tmp_path / "cache"]
@@ -37,7 +37,7 @@ def test_mypy(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.libraries
-def test_pyright(tmp_path: Path) -> None:
+def test_pyright_accepts_right_calls_and_reports_wrong_ones(tmp_path: Path) -> None:
     scripts = [str(path) for path in (*RIGHT, WRONG)]
     settings = {"include": scripts, "typeCheckingMode": "strict", "pythonVersion": "3.10"}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
@@ -57,7 +57,7 @@ def test_pyright(tmp_path: Path) -> None:
         for path in RIGHT
     ],
 )
-def test_the_scripts_run(path: Path) -> None:
+def test_typed_scripts_run(path: Path) -> None:
     if path.stem == "trained":
         compile(path.read_text(), path, "exec")  # the documentation's snippets run the same calls
         return
@@ -65,6 +65,6 @@ def test_the_scripts_run(path: Path) -> None:
     assert ran.returncode == 0, ran.stderr
 
 
-def test_literals_are_the_names_that_are_accepted() -> None:
+def test_literals_have_the_names_that_are_accepted() -> None:
     assert set(AutoresetName.__args__) == set(MODES)
     assert set(ObservationName.__args__) == set(OBSERVATIONS)

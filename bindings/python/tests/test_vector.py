@@ -24,7 +24,7 @@ def made(where, *args, **kwargs) -> Iterator[endless_gym.EndlessVectorEnv]:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize("id", [ID, "MortarMayhemB-Grid-v0", "Endless-SearingSpotlights-v0"])
-def test_it_does_as_gymnasiums_own_vector_environment(where, mode: AutoresetMode, id: str) -> None:
+def test_vector_env_plays_as_sync_vector_env(where, mode: AutoresetMode, id: str) -> None:
     sync = SyncVectorEnv([lambda: endless_gym.Env(id) for _ in range(4)], autoreset_mode=mode)
     with made(where, id, 4, autoreset=mode) as envs:
         assert envs.metadata["autoreset_mode"] is mode
@@ -43,7 +43,7 @@ def test_it_does_as_gymnasiums_own_vector_environment(where, mode: AutoresetMode
 
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("elsewhere", WHERE)
-def test_snapshots_go_on_identically_here_and_elsewhere(where, elsewhere) -> None:
+def test_snapshots_continue_identically_in_process_and_served(where, elsewhere) -> None:
     with made(where, ID, 3, groups=2) as envs, made(elsewhere, ID, 3, groups=2, seed=8) as others:
         envs.reset(seed=1)
         others.reset()
@@ -90,7 +90,7 @@ def compare(given: object, wanted: object, path: str = "") -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_arrays_are_views_that_stay_as_they_are(where) -> None:
+def test_arrays_are_views_that_do_not_change(where) -> None:
     with made(where, ID, 3, seed=1) as envs:
         first, _ = envs.reset()
         kept = first.copy()
@@ -122,14 +122,14 @@ def test_copies_are_the_users_own(where) -> None:
         assert envs.step(np.zeros((2, 2), dtype=np.int64))[4]["_ground_truth"].all()
 
 
-def test_memory_in_this_process_is_used_again() -> None:
+def test_buffers_in_this_process_are_reused() -> None:
     envs = endless_gym.make_vec(ID, 2, seed=1)
     envs.reset()
     places = {envs.step(np.zeros((2, 2), dtype=np.int64))[0].ctypes.data for _ in range(20)}
     assert len(places) <= 2
 
 
-def test_holding_too_many_is_an_error_that_says_what_to_do() -> None:
+def test_holding_too_many_batches_raises_and_says_what_to_do() -> None:
     with endless_gym.serve(ID, 2, batches_held=3) as envs:
         envs.reset()
         held = []
@@ -187,7 +187,7 @@ def test_timeouts_are_checked() -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_options_and_masks_at_reset(where) -> None:
+def test_reset_takes_options_and_a_mask(where) -> None:
     with made(where, "MortarMayhem-v0", 3, autoreset="disabled") as envs:
         usual, _ = envs.reset(seed=1)
         small, _ = envs.reset(seed=1, options={"arena_size": 2})
@@ -234,7 +234,7 @@ def test_options_of_single_environments_are_kept_at_reset(where) -> None:
         np.testing.assert_array_equal(envs.reset(seed=1)[0], first)
 
 
-def test_the_feature_observation() -> None:
+def test_features_come_alone_or_beside_frames() -> None:
     envs = endless_gym.make_vec(ID, 2, seed=1, observation="features")
     observation, _ = envs.reset()
     assert observation.dtype == np.float32
@@ -244,7 +244,7 @@ def test_the_feature_observation() -> None:
     assert both["visual_observation"].shape == (2, 84, 84, 3)
 
 
-def test_gymnasium_makes_it() -> None:
+def test_gymnasiums_make_vec_returns_this_class() -> None:
     envs = gymnasium.make_vec(f"EndlessGym/{ID}", num_envs=8, seed=1, num_threads=1)
     assert isinstance(envs, endless_gym.EndlessVectorEnv)
     observation, _ = envs.reset()
@@ -256,14 +256,14 @@ def test_gymnasium_makes_it() -> None:
         compare(wrapped.step(actions), plain.step(actions))
 
 
-def test_seeds_of_episodes() -> None:
+def test_seed_lists_are_used_in_order_and_ranges_drawn_from() -> None:
     one = endless_gym.make_vec(ID, 2, seeds=[3, 4, 5]).reset()[0]
     np.testing.assert_array_equal(one, endless_gym.make_vec(ID, 2, seed=3).reset()[0])
     two = endless_gym.make_vec(ID, 64, seeds=range(2), seed=1).reset()[0]
     assert len({frame.tobytes() for frame in two}) == 2
 
 
-def test_mistakes_are_exceptions() -> None:
+def test_wrong_arguments_and_calls_raise() -> None:
     with pytest.raises(ValueError, match="MortarMayhem-v0"):
         endless_gym.make_vec("Mortar", 2)
     with pytest.raises(ValueError, match="pixels"):
@@ -338,7 +338,7 @@ def test_frames_are_as_gymnasiums_wrappers_make_them(where, mode: AutoresetMode,
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_frames_that_cannot_be_are_refused(where) -> None:
+def test_impossible_frames_are_refused(where) -> None:
     with pytest.raises(ValueError, match="has no frames"):
         where(ID, 2, observation="features", frames=endless_gym.Frames(stack=2))
     with pytest.raises(ValueError, match="frame stack must be 1 to 64, got 65"):

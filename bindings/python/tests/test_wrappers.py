@@ -42,7 +42,7 @@ def test_every_wrapper_of_gymnasium_is_listed() -> None:
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", marked(SINGLE))
 @pytest.mark.parametrize("id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", DICT_ID])
-def test_single_environments(name: str, id: str, recorded: list[Any]) -> None:
+def test_wrappers_work_with_single_environments(name: str, id: str, recorded: list[Any]) -> None:
     case = SINGLE[name]
     if isinstance(case, str):
         return
@@ -103,7 +103,9 @@ def synchronous(id: str, mode: AutoresetMode) -> VectorEnv:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", marked(VECTOR))
-def test_vector_environments(name: str, pair: tuple[Any, Any], recorded: list[Any]) -> None:
+def test_wrappers_return_what_they_return_over_sync_vector_env(
+    name: str, pair: tuple[Any, Any], recorded: list[Any]
+) -> None:
     case, (envs, sync) = VECTOR[name], pair
     if isinstance(case, str):
         return
@@ -150,7 +152,7 @@ def play(case: Case, envs: VectorEnv, name: str) -> Any:
 
 @pytest.mark.parametrize("where", WHERE.values(), ids=WHERE)
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_statistics_are_those_of_the_episodes(where: Any, mode: AutoresetMode) -> None:
+def test_recorded_statistics_equal_the_final_infos(where: Any, mode: AutoresetMode) -> None:
     id = "MysteryPath-Grid-v0"
     with where(id, NUM_ENVS, autoreset=mode, options=SHORT[id], seed=1) as envs:
         wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
@@ -172,7 +174,7 @@ def test_statistics_are_those_of_the_episodes(where: Any, mode: AutoresetMode) -
 
 
 @pytest.mark.parametrize("where", WHERE.values(), ids=WHERE)
-def test_rewards_and_flags_are_the_users_own(where: Any) -> None:
+def test_rewards_and_flags_are_writable_copies(where: Any) -> None:
     with where("MortarMayhem-Grid-v0", 2, seed=1) as envs:
         envs.reset()
         kept = [envs.step(np.ones(2, np.int64)) for _ in range(3)]
