@@ -34,7 +34,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from endless_gym.interop import unchecked_torch_view
+from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
 from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
 from endless_gym_agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
@@ -71,7 +71,7 @@ class AgentMemory:
 
     def reset(self, done: Tensor | NDArray[np.bool_]) -> None:
         """Mark the next observation as the first of an episode where `done`, bool (n,), is true."""
-        done = done if isinstance(done, Tensor) else unchecked_torch_view(done)
+        done = done if isinstance(done, Tensor) else torch_view(done)
         self.reset_mask = self.reset_mask | done.to(self.reset_mask.device)
 
     def state_dict(self) -> dict[str, Any]:
@@ -378,9 +378,7 @@ class Agent(nn.Module):
         mapping = self.as_mapping(observation)
         self._check_observation(mapping)
         return {
-            key: (value if isinstance(value, Tensor) else unchecked_torch_view(value)).to(
-                self.device, non_blocking=True
-            )
+            key: (value if isinstance(value, Tensor) else torch_view(value)).to(self.device, non_blocking=True)
             for key, value in ((key, mapping[key]) for key in self.observation_shapes)
         }
 

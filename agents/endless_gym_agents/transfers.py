@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from endless_gym.interop import unchecked_torch_view
+from endless_gym.interop import torch_view
 
 
 class HostCopy:
@@ -83,7 +83,7 @@ class Upload:
         if self._on_host:
             np.copyto(target.numpy(), array)
             return
-        source = unchecked_torch_view(array)
+        source = torch_view(array)
         if self._cuda:
             if name not in self._staged:
                 self._staged[name] = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)

@@ -70,10 +70,6 @@ def torch_view(array: NDArray[Any]) -> torch.Tensor:
     return tensor
 
 
-#: The former name, for the agents.
-unchecked_torch_view = torch_view
-
-
 def pin_memory(array: NDArray[Any]) -> bool:
     """Page-lock the array's memory, so that `tensor.to("cuda", non_blocking=True)` is asynchronous.
 

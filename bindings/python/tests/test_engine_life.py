@@ -71,6 +71,7 @@ def test_an_engine_ends_with_an_exception_that_nobody_keeps(no_collector: None) 
     assert endless_gym.running_engines() == []
 
 
+@pytest.mark.libraries
 @pytest.mark.parametrize(
     ("library", "name", "autoreset"), [("sb3", "EndlessVecEnv", "same_step"), ("torchrl", "EndlessEnv", "disabled")]
 )

@@ -79,11 +79,11 @@ def test_wrappers_work_with_single_environments(name: str, id: str, recorded: li
         assert len(recorded) > 0
 
 
-#: One id of each family, with one that has a dict, in all modes, and the others in one.
-FAMILIES = (DICT_ID, "Endless-MysteryPath-v0", "SearingSpotlights-v0")
+#: Observations in a dict, and frames with two branches of actions and with one, in all modes; served, each of these in one mode.
+KINDS = (DICT_ID, "SearingSpotlights-v0", "Endless-MysteryPath-v0")
 PAIRS = [
-    *((where, mode, id) for where in WHERE for mode in AutoresetMode for id in FAMILIES),
-    *(("in process", AutoresetMode.NEXT_STEP, id) for id in IDS if id not in FAMILIES),
+    *(("in process", mode, id) for mode in AutoresetMode for id in KINDS),
+    *(("served", mode, id) for mode, id in zip(AutoresetMode, KINDS, strict=True)),
 ]
 
 
