@@ -69,6 +69,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._backend = backend
         self._engine = engine
         self._results = results
+        self._described = described
         self.num_envs = num_envs = results.num_envs
         self.num_groups = backend.groups
         self.single_observation_space = results.observation_space
