@@ -1,16 +1,15 @@
 //! Errors of engines, trainers and observers.
 
+use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use endless_gym_core::batch::{LAYOUT_VERSION, OPTIONS_BYTES, SNAPSHOT_BYTES};
 use endless_gym_core::envs::ActionError;
-use endless_gym_core::pool::PoolError;
+use endless_gym_core::pool::{PoolError, ResumeError, SnapshotError};
 use thiserror::Error;
 
-use crate::activity::EngineActivity;
-use crate::checkpoint_config::CheckpointError;
-use crate::process::LockHolder;
+use crate::namespace::process::LockHolder;
 
 /// Version of this package, for messages about versions that differ.
 pub(crate) const PACKAGE_VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -381,6 +380,175 @@ fn names(engines: &[String]) -> String {
 /// Rounded up, so that the need never appears smaller than the free space.
 fn megabytes(bytes: u64) -> u64 {
     bytes.div_ceil(1_000_000)
+}
+
+/// What an engine was doing when an answer, or a batch that is observed, did not arrive in time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EngineActivity {
+    /// Its process is running; its status cannot be read.
+    Unknown,
+    /// It is executing a request.
+    Busy {
+        /// The group of the request.
+        group: usize,
+        /// The kind of the request: `step`, `reset`, `snapshot`, `restore` or `checkpoint`.
+        kind: &'static str,
+        /// How long it has been executing it.
+        since: Duration,
+        /// Process id of the engine.
+        process: u32,
+    },
+    /// It executes nothing and has not taken the request: its process is stopped or gets no processor time.
+    NotTaken {
+        /// Process id of the engine.
+        process: u32,
+    },
+    /// It has answered the request; the answer can be received.
+    Answered,
+    /// It executes nothing, and there is no request for the group that is observed.
+    Idle {
+        /// The group.
+        group: usize,
+        /// Time since the group's last request; `None` if it had none.
+        since: Option<Duration>,
+        /// Process id of the engine.
+        process: u32,
+    },
+}
+
+impl fmt::Display for EngineActivity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            EngineActivity::Unknown => write!(f, "the engine is running, use a longer timeout"),
+            EngineActivity::Busy { group, kind, since, process } => {
+                let seconds = since.as_secs_f64();
+                write!(f, "the {kind} of group {group} has been running for {seconds:.1} s (engine process {process})")
+            }
+            EngineActivity::NotTaken { process } => write!(
+                f,
+                "the engine (process {process}) has not taken the request and executes nothing; its process may be stopped"
+            ),
+            EngineActivity::Idle { group, since: Some(since), process } => {
+                let seconds = since.as_secs_f64();
+                write!(
+                    f,
+                    "the trainer has requested nothing of group {group} for {seconds:.1} s (engine process {process})"
+                )
+            }
+            EngineActivity::Idle { group, since: None, process } => {
+                write!(f, "no trainer has requested anything of group {group} yet (engine process {process})")
+            }
+            EngineActivity::Answered => write!(f, "the engine has just answered; receive the answer"),
+        }
+    }
+}
+
+/// Version of the format of a checkpoint. It changes with every change to the content.
+pub const CHECKPOINT_VERSION: u32 = 1;
+
+/// A checkpoint that cannot be saved or used.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum CheckpointError {
+    /// The interval is zero.
+    #[error("the interval between checkpoints must be positive")]
+    Interval,
+    /// There is a file, and the engine was not asked to resume.
+    #[error(
+        "checkpoint {} exists; resume from it (`--resume`), move it away, or choose another file",
+        path.display()
+    )]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Another engine saves to the file.
+    #[error(
+        "checkpoint {} is in use by another engine{}; stop it, or choose another file",
+        path.display(),
+        process.map(|process| format!(" (process {process})")).unwrap_or_default()
+    )]
+    InUse {
+        /// The file.
+        path: PathBuf,
+        /// Process id of that engine; `None` if it cannot be read.
+        process: Option<u32>,
+    },
+    /// The file cannot be read.
+    #[error("checkpoint {} cannot be read: {reason}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The file cannot be written. An earlier checkpoint is kept.
+    #[error("checkpoint {} cannot be written: {reason}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The file does not start with `EGYC`.
+    #[error("{} is not a checkpoint of an engine", path.display())]
+    NoCheckpoint {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The checkpoint was saved by a version of this crate with another format.
+    #[error(
+        "checkpoint {} must be of version {CHECKPOINT_VERSION}, got version {given}; resume with the version of endless-gym that \
+         saved it",
+        path.display()
+    )]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// The version of the checkpoint.
+        given: u32,
+    },
+    /// The checksum differs, or the content cannot be decoded.
+    #[error("checkpoint {} is damaged: {reason}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The checkpoint is of other environments.
+    #[error("checkpoint {} was saved with {what} {saved}, and the engine has {given}", path.display())]
+    Mismatch {
+        /// The file.
+        path: PathBuf,
+        /// The property that differs.
+        what: &'static str,
+        /// Its value in the checkpoint.
+        saved: String,
+        /// Its value in the engine's configuration.
+        given: String,
+    },
+    /// The state of a group is not valid.
+    #[error("checkpoint {}, group {group}: {source}", path.display())]
+    Group {
+        /// The file.
+        path: PathBuf,
+        /// The group.
+        group: usize,
+        /// What is wrong.
+        source: ResumeError,
+    },
+    /// The state of an environment cannot be encoded.
+    #[error("the environments cannot be saved: {source}")]
+    State {
+        /// Why.
+        source: SnapshotError,
+    },
+    /// The engine has no file to save to.
+    #[error("the engine has no checkpoint file; start it with one (`--checkpoint FILE`)")]
+    NoFile,
+    /// No group was reset, so there is nothing to save.
+    #[error("there is nothing to save before the first reset")]
+    NotReset,
 }
 
 #[cfg(test)]

@@ -85,63 +85,64 @@
 //! The state of the environments ends with their engine. Whatever a dead engine executed after its last checkpoint is lost; the
 //! step number in which a resumed engine goes on says what to repeat.
 
-mod activity;
-mod blackboard;
-mod checkpoint;
-mod checkpoint_config;
-mod checkpoint_lock;
-mod checkpointer;
-mod cleanup;
-mod connect;
-mod connection;
-mod descriptors;
-mod engine;
-mod engine_config;
-mod engine_summary;
 mod error;
-mod fork_guard;
-mod group;
-mod identity;
-mod inspect;
-mod lease;
-mod lock;
-mod locked_file;
-mod members;
-mod memory;
-mod message;
-mod namespace;
-mod node;
-mod observer;
-mod observer_status;
-mod observers;
-mod pending;
-mod ports;
-mod process;
-mod reconnection;
-mod reservation;
-mod specification;
-mod status;
-mod status_file;
-mod status_record;
-mod status_writer;
-mod trainer;
-mod wait;
 
-pub use activity::EngineActivity;
-pub use blackboard::running_engines;
-pub use checkpoint_config::{CHECKPOINT_VERSION, CheckpointConfig, CheckpointError};
-pub use connect::{ConnectConfig, timeout_from_seconds};
-pub use engine::Engine;
-pub use engine_config::{EngineConfig, MAX_BATCHES_HELD, MAX_GROUPS};
-pub use engine_summary::EngineSummary;
-pub use error::{Rejection, ServiceError};
-pub use inspect::EngineProcesses;
-pub use lease::BatchLease;
-pub use namespace::{Namespace, ROOT_VARIABLE};
-pub use observer::Observer;
-pub use observers::{Observed, Observers};
-pub use process::LockHolder;
-pub use reconnection::{GroupReconnection, LastRequest, Reconnection};
-pub use specification::ServiceSpecification;
-pub use status::{EngineStatus, GroupStatus, ObserverStatus};
-pub use trainer::Trainer;
+/// What processes of one namespace share: its directory, its locks, and the removal of what dead processes left.
+mod namespace {
+    pub(crate) mod cleanup;
+    pub(crate) mod descriptors;
+    pub(crate) mod directory;
+    pub(crate) mod fork_guard;
+    pub(crate) mod identity;
+    pub(crate) mod lock;
+    pub(crate) mod locked_file;
+    pub(crate) mod members;
+    pub(crate) mod memory;
+    pub(crate) mod node;
+    pub(crate) mod process;
+}
+
+/// What an engine and its clients exchange.
+mod protocol {
+    pub(crate) mod discovery;
+    pub(crate) mod message;
+    pub(crate) mod ports;
+    pub(crate) mod specification;
+    pub(crate) mod status_file;
+    pub(crate) mod wait;
+}
+
+/// The engine.
+mod engine {
+    pub(crate) mod checkpoint;
+    pub(crate) mod config;
+    pub(crate) mod group;
+    pub(crate) mod serving;
+    pub(crate) mod status_writer;
+}
+
+/// The trainer, the observers, and the readers of an engine's status.
+mod client {
+    pub(crate) mod connect;
+    pub(crate) mod connection;
+    pub(crate) mod lease;
+    pub(crate) mod observer;
+    pub(crate) mod requests;
+    pub(crate) mod status;
+    pub(crate) mod trainer;
+}
+
+pub use client::connect::{ConnectConfig, timeout_from_seconds};
+pub use client::lease::BatchLease;
+pub use client::observer::{Observed, Observer, Observers};
+pub use client::requests::{GroupReconnection, LastRequest, Reconnection};
+pub use client::status::{EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
+pub use client::trainer::Trainer;
+pub use engine::config::{CheckpointConfig, EngineConfig, MAX_BATCHES_HELD, MAX_GROUPS};
+pub use engine::serving::Engine;
+pub use engine::status_writer::EngineSummary;
+pub use error::{CHECKPOINT_VERSION, CheckpointError, EngineActivity, Rejection, ServiceError};
+pub use namespace::directory::{Namespace, ROOT_VARIABLE};
+pub use namespace::process::LockHolder;
+pub use protocol::discovery::running_engines;
+pub use protocol::specification::ServiceSpecification;

@@ -1,0 +1,412 @@
+//! The observer: reads a group's batches in addition to the trainer.
+
+use std::fs::File;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::MetadataExt;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use endless_gym_core::batch::BLOCK_BYTES;
+use iceoryx2::prelude::{CallbackProgression, PortFactory, SemanticString};
+use rustix::fs::FallocateFlags;
+use rustix::io::Errno;
+
+use crate::client::connect::{ConnectConfig, connect_to_engine};
+use crate::client::lease::{BatchLease, Response, ResponsePort, ResponseService};
+use crate::client::status;
+use crate::error::ServiceError;
+use crate::namespace::node::NamespaceNode;
+use crate::namespace::{descriptors, memory};
+use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
+use crate::protocol::specification::ServiceSpecification;
+use crate::protocol::status_file::{self, ObserverRecord, StatusFile, StatusReader, now};
+use crate::protocol::wait::LIVENESS_INTERVAL;
+
+/// The files of the engine's status and of the observer's own.
+const STATUS_DESCRIPTORS: usize = 2;
+
+/// How often a waiting observer polls.
+const POLL_INTERVAL: Duration = Duration::from_millis(1);
+
+/// Reads the batches of one group while a trainer steps it.
+///
+/// The engine does not wait for observers. An observer sees the newest batch and misses those before it that it did not receive
+/// in time. Before it connects, the shared memory for the batches that it may hold is reserved, so that what it holds is never
+/// missing to the engine.
+///
+/// ```no_run
+/// use std::time::Duration;
+///
+/// use endless_gym_service::{ConnectConfig, Observer};
+///
+/// let mut observer = Observer::connect(&ConnectConfig::new("endless"), 0)?;
+/// loop {
+///     let lease = observer.next(Duration::from_secs(10))?;
+///     println!("step {}: rewards {:?}", lease.step(), lease.batch().reward());
+/// }
+/// # #[allow(unreachable_code)]
+/// # Ok::<(), endless_gym_service::ServiceError>(())
+/// ```
+pub struct Observer {
+    /// `None` while this observer is paused.
+    port: Option<Arc<ResponsePort>>,
+    /// The last port, which exists until the last lease that was received through it is dropped.
+    last_port: Weak<ResponsePort>,
+    service: ResponseService,
+    group: usize,
+    /// The number of the last batch that was received.
+    last_step: Option<u64>,
+    /// The engine's status; `None` if it cannot be read.
+    engine: Option<StatusReader>,
+    status: Option<ObserverStatusWriter>,
+    specification: Arc<ServiceSpecification>,
+    node: Arc<NamespaceNode>,
+}
+
+impl Observer {
+    /// Connects to a group of an engine.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::UnknownEngine`] if no engine of that name appears within the timeout, [`ServiceError::NoSuchGroup`] if it
+    /// has no such group, [`ServiceError::TooManyObservers`] if the group has as many observers as it accepts,
+    /// [`ServiceError::SharedMemoryTooSmall`] if there is no room for the batches that the observer may hold,
+    /// [`ServiceError::EngineRestarted`] if the engine ended while this process connected, [`ServiceError::Version`],
+    /// [`ServiceError::IncompatibleTypes`] or [`ServiceError::Specification`] for an engine of another version,
+    /// [`ServiceError::InvalidName`] or [`ServiceError::Root`] for an invalid configuration, [`ServiceError::NamespaceLocked`] if
+    /// another process holds the namespace's lock for too long, and [`ServiceError::Middleware`] for other errors of iceoryx2.
+    pub fn connect(config: &ConnectConfig, group: usize) -> Result<Self, ServiceError> {
+        let (node, (port, service), specification) = connect_to_engine(config, |node, specification| {
+            let (service, groups) = (specification.service.clone(), specification.groups);
+            if group >= groups {
+                return Err(ServiceError::NoSuchGroup { service, given: group, groups });
+            }
+            let names = ServiceNames::new(&service, specification.incarnation);
+            let services = EngineServices { node, names, mode: OpenMode::Open };
+            descriptors::reserve(descriptors::of_trainer(1) + STATUS_DESCRIPTORS)?;
+            // One observer at a time, so that each counts those before it.
+            let _lock = node.lock()?;
+            reserve_for_observer(&services, group, specification)?;
+            let service = ResponseService::open(&services, node, group, specification)?;
+            Ok((service.port(specification, false)?, service))
+        })?;
+        let status = status_file::path(node.prefix(), &specification.service, specification.incarnation);
+        let port = Arc::new(port);
+        Ok(Observer {
+            last_port: Arc::downgrade(&port),
+            port: Some(port),
+            service,
+            group,
+            last_step: None,
+            engine: StatusReader::open(&status),
+            status: ObserverStatusWriter::create(&node, &specification, group),
+            specification: Arc::new(specification),
+            node,
+        })
+    }
+
+    /// The engine's specification.
+    pub fn specification(&self) -> &ServiceSpecification {
+        &self.specification
+    }
+
+    /// The newest batch, or `None` if there has been none since the last call.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held, and
+    /// [`ServiceError::IncompatibleTypes`] for a malformed message. After a [pause](Observer::pause) also
+    /// [`ServiceError::SharedMemoryTooSmall`], [`ServiceError::RootRemoved`] and [`ServiceError::Middleware`], if this observer cannot
+    /// receive again.
+    pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
+        let Some(port) = self.connected()? else { return Ok(None) };
+        let batch = port.receive(&self.specification)?.and_then(Response::into_batch);
+        // The engine repeats a batch for an observer that has resumed.
+        let batch = batch.filter(|batch| self.last_step != Some(batch.step()));
+        self.last_step = batch.as_ref().map(BatchLease::step).or(self.last_step);
+        if let (Some(status), Some(_)) = (&mut self.status, &batch) {
+            // Each lease holds the port, and so do this observer and this call.
+            status.received(Arc::strong_count(&port) - 2);
+        }
+        Ok(batch)
+    }
+
+    /// The port, made anew after a pause; `None` if it cannot be made yet.
+    fn connected(&mut self) -> Result<Option<Arc<ResponsePort>>, ServiceError> {
+        let port = match self.port.take().or_else(|| self.last_port.upgrade()) {
+            Some(port) => port,
+            None => {
+                let creating = self.node.creating()?;
+                memory::check_free(memory::MARGIN)?;
+                match self.service.port(&self.specification, true) {
+                    Ok(port) => Arc::new(port),
+                    // The place of this observer is taken by what a dead process has left.
+                    Err(ServiceError::TooManyObservers { .. }) => {
+                        drop(creating);
+                        self.node.remove_dead_nodes();
+                        return Ok(None);
+                    }
+                    Err(e) => return Err(e),
+                }
+            }
+        };
+        self.last_port = Arc::downgrade(&port);
+        self.port = Some(Arc::clone(&port));
+        Ok(Some(port))
+    }
+
+    /// Receives nothing until the next call of [`newest`](Observer::newest) or [`next`](Observer::next), which ask for the next batch
+    /// that the engine writes. If the trainer pauses, the engine sends the last one again within two tenths of a second. The
+    /// place of the observer and the memory that is reserved for it remain.
+    ///
+    /// The queue of an observer that is not paused always holds the newest batch, so that the engine cannot write the next one to
+    /// the same memory, which is in its cache. A paused observer costs the engine nothing. A lease that is held remains valid, and
+    /// the pause begins when it is dropped.
+    pub fn pause(&mut self) {
+        // A paused observer is counted by its status. Without memory for a new port, it keeps the one that it has.
+        if self.status.is_some() && memory::check_free(memory::MARGIN).is_ok() {
+            self.port = None;
+        }
+    }
+
+    /// Whether this observer is paused.
+    pub fn is_paused(&self) -> bool {
+        self.port.is_none() && self.last_port.strong_count() == 0
+    }
+
+    /// Number of batches that the group has returned, as [`BatchLease::step`] of the newest one, from the engine's status; `None` if
+    /// that cannot be read. Costs the engine nothing, also while this observer is paused.
+    pub fn step(&self) -> Option<u64> {
+        self.engine.as_ref().and_then(|engine| engine.group(self.group)).map(|group| group.step)
+    }
+
+    /// Whether [`newest`](Observer::newest) would return a batch: whether the engine has written one since the last call. Nothing
+    /// is received. False while this observer is [paused](Observer::pause).
+    pub fn has_newer(&self) -> bool {
+        self.port.as_ref().is_some_and(|port| port.has_response())
+    }
+
+    /// Checks that the engine runs.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::EngineLost`] if its process has ended, and [`ServiceError::RootRemoved`] if the namespace's directory was
+    /// removed.
+    pub fn check_alive(&self) -> Result<(), ServiceError> {
+        if self.node.is_alive(self.service.engine()) {
+            return Ok(());
+        }
+        self.node.check_root()?;
+        let (service, pid) = (self.specification.service.clone(), self.specification.engine_pid);
+        Err(ServiceError::EngineLost { service, pid })
+    }
+
+    /// The next batch. Waits for it up to `timeout`.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::TimedOut`] if there was no batch in time, which says what the engine was doing, [`ServiceError::EngineLost`]
+    /// within half a second after the engine's process has ended, [`ServiceError::RootRemoved`] if the namespace's directory was
+    /// removed, and the errors of [`newest`](Observer::newest).
+    pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
+        let start = Instant::now();
+        let mut last_check = start;
+        loop {
+            let is_over = start.elapsed() >= timeout;
+            let is_due = is_over || last_check.elapsed() >= LIVENESS_INTERVAL;
+            // Before the poll, which then also finds the last batch of an engine that has ended.
+            let alive = if is_due { self.check_alive() } else { Ok(()) };
+            if let Some(lease) = self.newest()? {
+                return Ok(lease);
+            }
+            alive?;
+            if is_over {
+                let activity = status::observed_activity(self.engine.as_ref(), self.group);
+                let service = self.specification.service.clone();
+                return Err(ServiceError::TimedOut { service, waited: timeout, activity });
+            }
+            if is_due {
+                last_check = Instant::now();
+            }
+            std::thread::sleep(POLL_INTERVAL.min(timeout));
+        }
+    }
+}
+
+/// How long one group is waited for before the others are looked at again.
+const TURN: Duration = Duration::from_millis(5);
+
+/// Reads the batches of all groups of an engine, or of one of them, while a trainer steps it, and counts the batches that it missed.
+///
+/// ```no_run
+/// use std::time::Duration;
+///
+/// use endless_gym_service::{ConnectConfig, Observers};
+///
+/// let mut observers = Observers::connect(&ConnectConfig::new("endless"), None)?;
+/// loop {
+///     let observed = observers.next(Duration::from_secs(10))?;
+///     println!("group {} step {}, {} missed", observed.lease.group(), observed.lease.step(), observed.missed);
+/// }
+/// # #[allow(unreachable_code)]
+/// # Ok::<(), endless_gym_service::ServiceError>(())
+/// ```
+pub struct Observers {
+    observers: Vec<Observer>,
+    /// The step of the last batch of each observer.
+    steps: Vec<Option<u64>>,
+    /// The observer that is looked at first, so that a fast group does not hide the others.
+    turn: usize,
+}
+
+/// A batch that was observed.
+#[derive(Debug)]
+pub struct Observed {
+    /// The batch.
+    pub lease: BatchLease,
+    /// Batches of its group between the one that was observed before and this one; 0 for the first.
+    pub missed: u64,
+}
+
+impl Observers {
+    /// Connects to one group of an engine, or to all for `None`. `config.timeout` applies to each group.
+    ///
+    /// # Errors
+    ///
+    /// As [`Observer::connect`].
+    pub fn connect(config: &ConnectConfig, group: Option<usize>) -> Result<Self, ServiceError> {
+        let mut observers = vec![Observer::connect(config, group.unwrap_or(0))?];
+        if group.is_none() {
+            for group in 1..observers[0].specification().groups {
+                let observer = Observer::connect(config, group)?;
+                if observer.specification().incarnation != observers[0].specification().incarnation {
+                    return Err(ServiceError::EngineRestarted { service: config.service.clone() });
+                }
+                observers.push(observer);
+            }
+        }
+        Ok(Observers { steps: vec![None; observers.len()], observers, turn: 0 })
+    }
+
+    /// The engine's specification.
+    pub fn specification(&self) -> &ServiceSpecification {
+        self.observers[0].specification()
+    }
+
+    /// The next batch of any of the groups. Waits for it up to `timeout`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Observer::next`].
+    pub fn next(&mut self, timeout: Duration) -> Result<Observed, ServiceError> {
+        let (start, count) = (Instant::now(), self.observers.len());
+        loop {
+            for place in (0..count).map(|i| (self.turn + i) % count) {
+                if let Some(lease) = self.observers[place].newest()? {
+                    return Ok(self.observed(place, lease));
+                }
+            }
+            let left = timeout.saturating_sub(start.elapsed());
+            let (place, is_last) = (self.turn, count == 1 || left <= TURN);
+            match self.observers[place].next(if is_last { left } else { TURN }) {
+                Ok(lease) => return Ok(self.observed(place, lease)),
+                Err(ServiceError::TimedOut { .. }) if !is_last => self.turn = (place + 1) % count,
+                Err(ServiceError::TimedOut { service, activity, .. }) => {
+                    return Err(ServiceError::TimedOut { service, waited: timeout, activity });
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    fn observed(&mut self, place: usize, lease: BatchLease) -> Observed {
+        self.turn = (place + 1) % self.observers.len();
+        let before = self.steps[place].replace(lease.step());
+        let missed = before.map_or(0, |before| lease.step().saturating_sub(before.saturating_add(1)));
+        Observed { lease, missed }
+    }
+}
+
+/// Publishes what an observer holds.
+#[derive(Debug)]
+pub(crate) struct ObserverStatusWriter {
+    file: StatusFile,
+    record: ObserverRecord,
+}
+
+impl ObserverStatusWriter {
+    /// `None` if there is no memory or descriptor for it: an observer works without.
+    pub(crate) fn create(node: &NamespaceNode, specification: &ServiceSpecification, group: usize) -> Option<Self> {
+        // A file that another process finds empty is removed, unless this process is creating something.
+        let _creating = node.creating().ok()?;
+        let record = ObserverRecord { process: std::process::id(), group: group as u32, ..ObserverRecord::default() };
+        let path = status_file::observer_path(node.prefix(), specification.incarnation, rand::random());
+        let created = StatusFile::create_observer(path, &record);
+        let created = created.inspect_err(|e| tracing::debug!(error = %e, "cannot publish what this observer holds"));
+        created.ok().map(|file| ObserverStatusWriter { file, record })
+    }
+
+    /// A batch was received; with it, `held` are held.
+    pub(crate) fn received(&mut self, held: usize) {
+        let ObserverRecord { batches, .. } = self.record;
+        self.record = ObserverRecord { batches: batches + 1, last_batch: now(), held: held as u32, ..self.record };
+        self.file.write_observer(&self.record);
+    }
+}
+
+/// Allocates the memory of the batches that one more observer of a group may hold. The caller holds the namespace's lock, so that
+/// no other observer connects meanwhile.
+pub(crate) fn reserve_for_observer(
+    services: &EngineServices<'_>,
+    group: usize,
+    specification: &ServiceSpecification,
+) -> Result<(), ServiceError> {
+    let limits = specification.lease_limits();
+    let responses = services.responses(group, limits)?;
+    let trainer = services.requests(group).ok().and_then(|requests| ports::publisher_node(&requests));
+    let mut ports = 0;
+    responses.dynamic_config().list_subscribers(|subscriber| {
+        ports += usize::from(Some(subscriber.node_id) != trainer);
+        CallbackProgression::Continue
+    });
+    // An observer that is paused has a status and no port. A dead one may have a port, and one without a status has one, too.
+    let statuses = status_file::running_observers(services.node.prefix(), specification.incarnation);
+    let statuses = statuses.iter().filter(|observer| observer.group as usize == group).count();
+    let observers = 1 + statuses.max(ports);
+    if observers > specification.observers {
+        let (service, limit) = (specification.service.clone(), specification.observers);
+        return Err(ServiceError::TooManyObservers { service, limit });
+    }
+    let mut publisher = None;
+    responses.dynamic_config().list_publishers(|details| {
+        publisher = Some(details.publisher_id.value());
+        CallbackProgression::Stop
+    });
+    let restarted = || ServiceError::EngineRestarted { service: specification.service.clone() };
+    let Some(segment) = publisher.and_then(|publisher| segment(services, publisher)) else { return Err(restarted()) };
+
+    let unused = limits.observer_chunks() * (specification.observers - observers);
+    let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
+    let failed = |e: std::io::Error| ServiceError::middleware("cannot reserve shared memory")(e.to_string());
+    let bytes = segment.metadata().map_err(failed)?.len().saturating_sub(chunk * unused as u64).max(1);
+    // What is allocated already, in the file system's blocks of 512 bytes. The observer's own port needs memory, too.
+    let allocated = segment.metadata().map_err(failed)?.blocks().saturating_mul(512);
+    memory::check_free(bytes.saturating_sub(allocated).saturating_add(memory::MARGIN))?;
+    match rustix::fs::fallocate(&segment, FallocateFlags::KEEP_SIZE, 0, bytes) {
+        Ok(()) => Ok(()),
+        Err(Errno::NOSPC | Errno::NOMEM) => Err(memory::too_small(chunk * limits.observer_chunks() as u64)),
+        // The file system cannot allocate in advance.
+        Err(Errno::OPNOTSUPP | Errno::NOSYS) => memory::check_free(chunk * limits.observer_chunks() as u64),
+        Err(e) => Err(failed(e.into())),
+    }
+}
+
+/// The data segment of the engine's publisher. Its name ends with the publisher's id.
+fn segment(services: &EngineServices<'_>, publisher: u128) -> Option<File> {
+    let global = &services.node.config().global;
+    let suffix = format!("_{publisher}{}", global.service.data_segment_suffix);
+    let is_segment = |name: &[u8]| name.starts_with(global.prefix.as_bytes()) && name.ends_with(suffix.as_bytes());
+    let found =
+        std::fs::read_dir(memory::PATH).ok()?.flatten().find(|entry| is_segment(entry.file_name().as_bytes()))?;
+    File::options().read(true).write(true).open(found.path()).ok()
+}

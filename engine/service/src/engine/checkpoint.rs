@@ -1,0 +1,512 @@
+//! The file from which an engine continues the environments of an earlier one.
+//!
+//! A checkpoint is `EGYC`, the format's version (u32), the CRC-32 of what follows (u32), both little-endian, and then the content
+//! in [postcard](https://postcard.jamesmunns.com)'s encoding: what the environments are, as JSON text, and for each group its step and
+//! its environments' states.
+
+use std::fs::{self, File, TryLockError};
+use std::io::{ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+use std::thread::JoinHandle;
+use std::time::Instant;
+
+use endless_gym_core::batch::Frames;
+use endless_gym_core::pool::{SavedEnv, Seeding};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value as Json};
+
+use crate::engine::config::{CheckpointConfig, EngineConfig};
+use crate::engine::group::Group;
+use crate::engine::status_writer::StatusWriter;
+use crate::error::{CHECKPOINT_VERSION, CheckpointError, PACKAGE_VERSION};
+use crate::namespace::locked_file;
+use crate::protocol::specification::ServiceSpecification;
+use crate::protocol::status_file::now;
+
+const MAGIC: [u8; 4] = *b"EGYC";
+const PREAMBLE: usize = 12;
+
+/// What must be the same in the engine that saves and in the one that resumes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct CheckpointHead {
+    package: String,
+    id: String,
+    num_envs: usize,
+    groups: usize,
+    autoreset: String,
+    frames: Option<Frames>,
+    features: bool,
+    /// The source of the seeds, without the seed that it started from: its state is part of the environments' states.
+    seeding: String,
+    options: Vec<Map<String, Json>>,
+}
+
+impl CheckpointHead {
+    pub(crate) fn new(config: &EngineConfig, specification: &ServiceSpecification) -> Self {
+        let seeding = match &config.pool.seeding {
+            Seeding::Continue { .. } if config.pool.independent_episodes => "a drawn seed for each episode".to_owned(),
+            Seeding::Continue { .. } => "continued generators".to_owned(),
+            Seeding::Range { start, end, step, .. } => format!("seeds drawn from {start}..{end}:{step}"),
+            Seeding::List(seeds) => {
+                format!(
+                    "a list of {} seeds with checksum {:08x}",
+                    seeds.len(),
+                    crc32fast::hash(bytemuck::cast_slice(seeds))
+                )
+            }
+        };
+        // Part of the text, so that the format is that of earlier checkpoints.
+        let independent = if config.pool.independent_episodes { ", independent episodes" } else { "" };
+        CheckpointHead {
+            package: PACKAGE_VERSION.to_owned(),
+            id: specification.id.clone(),
+            num_envs: specification.num_envs,
+            groups: specification.groups,
+            autoreset: specification.autoreset.name().to_owned(),
+            frames: specification.frames,
+            features: config.pool.features,
+            seeding: seeding + independent,
+            options: specification.options.clone(),
+        }
+    }
+
+    /// The first property that differs, its value in `self` and in `other`.
+    fn difference(&self, other: &Self) -> Option<(&'static str, String, String)> {
+        let text = |head: &Self| {
+            [
+                ("the environment", head.id.clone()),
+                ("num_envs", head.num_envs.to_string()),
+                ("groups", head.groups.to_string()),
+                ("autoreset", head.autoreset.clone()),
+                ("frames", format!("{:?}", head.frames)),
+                ("features", head.features.to_string()),
+                ("the seeding", head.seeding.clone()),
+                ("the reset parameters", Json::from_iter(head.options.iter().cloned().map(Json::from)).to_string()),
+            ]
+        };
+        let mut pairs = text(self).into_iter().zip(text(other));
+        pairs.find(|(own, others)| own != others).map(|((what, own), (_, others))| (what, own, others))
+    }
+}
+
+/// The saved state of one group.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct SavedGroup {
+    /// Batches that the group has returned.
+    pub step: u64,
+    /// `None` before its first reset.
+    pub envs: Option<Vec<SavedEnv>>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Content {
+    head: String,
+    groups: Vec<SavedGroup>,
+}
+
+/// Writes a checkpoint and replaces an earlier one when it is complete and on the disk.
+pub(crate) fn write(path: &Path, head: &CheckpointHead, groups: Vec<SavedGroup>) -> Result<(), CheckpointError> {
+    let failed = |reason: String| CheckpointError::Write { path: path.to_owned(), reason };
+    let head = serde_json::to_string(head).map_err(|e| failed(e.to_string()))?;
+    let mut bytes = vec![0; PREAMBLE];
+    bytes = postcard::to_extend(&Content { head, groups }, bytes).map_err(|e| failed(e.to_string()))?;
+    let checksum = crc32fast::hash(&bytes[PREAMBLE..]);
+    bytes[..4].copy_from_slice(&MAGIC);
+    bytes[4..8].copy_from_slice(&CHECKPOINT_VERSION.to_le_bytes());
+    bytes[8..PREAMBLE].copy_from_slice(&checksum.to_le_bytes());
+    let new = new_path(path);
+    let written = File::create(&new).and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()));
+    let replaced = written.and_then(|()| fs::rename(&new, path));
+    replaced.and_then(|()| File::open(directory(path))?.sync_all()).map_err(|e| {
+        let _ = fs::remove_file(&new);
+        failed(e.to_string())
+    })
+}
+
+/// Checks that a checkpoint can be written, so that this is not found out at the first one.
+pub(crate) fn check_writable(path: &Path) -> Result<(), CheckpointError> {
+    let new = new_path(path);
+    let created = if path.is_dir() { Err(ErrorKind::IsADirectory.into()) } else { File::create(&new).map(drop) };
+    created
+        .and_then(|()| fs::remove_file(&new))
+        .map_err(|e| CheckpointError::Write { path: path.to_owned(), reason: e.to_string() })
+}
+
+/// Reads the groups of a checkpoint that was saved with this head; `None` if there is no file.
+pub(crate) fn read(path: &Path, head: &CheckpointHead) -> Result<Option<Vec<SavedGroup>>, CheckpointError> {
+    let bytes = match fs::read(path) {
+        Ok(bytes) => bytes,
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(CheckpointError::Read { path: path.to_owned(), reason: e.to_string() }),
+    };
+    decode(path, &bytes, head).map(Some)
+}
+
+fn decode(path: &Path, bytes: &[u8], head: &CheckpointHead) -> Result<Vec<SavedGroup>, CheckpointError> {
+    let path = || path.to_owned();
+    let damaged = |reason: &dyn ToString| CheckpointError::Damaged { path: path(), reason: reason.to_string() };
+    let (preamble, content) =
+        bytes.split_at_checked(PREAMBLE).ok_or_else(|| CheckpointError::NoCheckpoint { path: path() })?;
+    let number = |at: usize| u32::from_le_bytes([preamble[at], preamble[at + 1], preamble[at + 2], preamble[at + 3]]);
+    if preamble[..4] != MAGIC {
+        return Err(CheckpointError::NoCheckpoint { path: path() });
+    }
+    if number(4) != CHECKPOINT_VERSION {
+        return Err(CheckpointError::Version { path: path(), given: number(4) });
+    }
+    if number(8) != crc32fast::hash(content) {
+        return Err(damaged(&"its checksum differs"));
+    }
+    let (content, rest) = postcard::take_from_bytes::<Content>(content).map_err(|e| damaged(&e))?;
+    if !rest.is_empty() {
+        return Err(damaged(&"it has bytes after its end"));
+    }
+    let saved: CheckpointHead = serde_json::from_str(&content.head).map_err(|e| damaged(&e))?;
+    if let Some((what, saved, given)) = saved.difference(head) {
+        return Err(CheckpointError::Mismatch { path: path(), what, saved, given });
+    }
+    if content.groups.len() != head.groups {
+        return Err(damaged(&"the number of its groups differs from its head"));
+    }
+    Ok(content.groups)
+}
+
+fn new_path(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".new");
+    name.into()
+}
+
+fn directory(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// Saves the environments of an engine. A periodic checkpoint stalls the engine only while their states are copied: another thread
+/// encodes and writes them.
+#[derive(Debug)]
+pub(crate) struct Checkpointer {
+    config: CheckpointConfig,
+    head: CheckpointHead,
+    last: Instant,
+    /// Whether a request was executed since the last checkpoint.
+    changed: bool,
+    writing: Option<JoinHandle<Result<(), CheckpointError>>>,
+    // Released when nothing is written any more.
+    _lock: CheckpointLock,
+}
+
+impl Checkpointer {
+    pub(crate) fn new(config: &CheckpointConfig, head: CheckpointHead) -> Result<Self, CheckpointError> {
+        if config.every.is_some_and(|every| every.is_zero()) {
+            return Err(CheckpointError::Interval);
+        }
+        // First: another engine may be about to create the file.
+        let lock = CheckpointLock::acquire(&config.path)?;
+        if !config.resume && config.path.exists() {
+            return Err(CheckpointError::Exists { path: config.path.clone() });
+        }
+        check_writable(&config.path)?;
+        Ok(Checkpointer {
+            config: config.clone(),
+            head,
+            last: Instant::now(),
+            changed: false,
+            writing: None,
+            _lock: lock,
+        })
+    }
+
+    /// Continues from the file, if the configuration asks for it and the file exists.
+    pub(crate) fn resume(&self, groups: &mut [Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
+        let path = &self.config.path;
+        let Some(saved) = self.config.resume.then(|| read(path, &self.head)).transpose()?.flatten() else {
+            return Ok(());
+        };
+        for (number, (group, SavedGroup { step, envs })) in groups.iter_mut().zip(saved).enumerate() {
+            if let Some(envs) = envs {
+                group.resume(&envs).map_err(|source| CheckpointError::Group {
+                    path: path.clone(),
+                    group: number,
+                    source,
+                })?;
+            }
+            status.update_group(number, |group| group.step = step);
+        }
+        tracing::info!(path = %path.display(), "resumed from a checkpoint");
+        Ok(())
+    }
+
+    /// A request was executed.
+    pub(crate) fn mark_changed(&mut self) {
+        self.changed = true;
+    }
+
+    /// Saves in the background if it is time to.
+    pub(crate) fn poll(&mut self, groups: &[Group], status: &mut StatusWriter) {
+        if self.writing.as_ref().is_some_and(JoinHandle::is_finished)
+            && let Err(e) = self.finish(status)
+        {
+            tracing::error!(error = %e, "cannot save a checkpoint");
+        }
+        let is_due = self.config.every.is_some_and(|every| self.last.elapsed() >= every);
+        if !is_due || !self.changed || self.writing.is_some() {
+            return;
+        }
+        (self.last, self.changed) = (Instant::now(), false);
+        let saved = match save(groups, status) {
+            Ok(saved) => saved,
+            // No group was reset.
+            Err(CheckpointError::NotReset) => return,
+            Err(e) => return tracing::error!(error = %e, "cannot save a checkpoint"),
+        };
+        let (path, head) = (self.config.path.clone(), self.head.clone());
+        let thread = std::thread::Builder::new().name("checkpoint".to_owned());
+        match thread.spawn(move || write(&path, &head, saved)) {
+            Ok(writing) => self.writing = Some(writing),
+            Err(e) => tracing::error!(error = %e, "cannot start a thread to save a checkpoint"),
+        }
+    }
+
+    /// Saves now, and returns when the checkpoint is on the disk.
+    pub(crate) fn save(&mut self, groups: &[Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
+        if let Err(e) = self.finish(status) {
+            tracing::warn!(error = %e, "cannot save a checkpoint");
+        }
+        let saved = save(groups, status)?;
+        write(&self.config.path, &self.head, saved)?;
+        (self.last, self.changed) = (Instant::now(), false);
+        self.saved(status);
+        Ok(())
+    }
+
+    /// Saves what has changed since the last checkpoint, when the engine stops.
+    pub(crate) fn stop(&mut self, groups: &[Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
+        let unfinished = self.finish(status);
+        if self.changed || unfinished.is_err() { self.save(groups, status) } else { Ok(()) }
+    }
+
+    /// Waits for the thread that writes.
+    fn finish(&mut self, status: &mut StatusWriter) -> Result<(), CheckpointError> {
+        let Some(writing) = self.writing.take() else { return Ok(()) };
+        let failed = |_| CheckpointError::Write { path: self.config.path.clone(), reason: "it panicked".to_owned() };
+        let written = writing.join().map_err(failed).and_then(|written| written);
+        match written {
+            Ok(()) => self.saved(status),
+            Err(_) => self.changed = true,
+        }
+        written
+    }
+
+    fn saved(&self, status: &mut StatusWriter) {
+        tracing::info!(path = %self.config.path.display(), "saved a checkpoint");
+        status.update_engine(|engine| (engine.checkpoints, engine.last_checkpoint) = (engine.checkpoints + 1, now()));
+    }
+}
+
+impl Drop for Checkpointer {
+    fn drop(&mut self) {
+        // Otherwise the end of the process would interrupt the thread.
+        if let Some(writing) = self.writing.take() {
+            let _ = writing.join();
+        }
+    }
+}
+
+/// The states of all groups.
+fn save(groups: &[Group], status: &StatusWriter) -> Result<Vec<SavedGroup>, CheckpointError> {
+    let saved: Result<Vec<_>, _> = groups
+        .iter()
+        .enumerate()
+        .map(|(number, group)| group.save().map(|envs| SavedGroup { step: status.step(number), envs }))
+        .collect();
+    let saved = saved.map_err(|source| CheckpointError::State { source })?;
+    if saved.iter().all(|group| group.envs.is_none()) { Err(CheckpointError::NotReset) } else { Ok(saved) }
+}
+
+/// An engine's right to save to a checkpoint file: an `flock` on `FILE.lock`, since `FILE` itself is replaced by every save. The kernel
+/// releases it when the process dies; the file that then stays is taken over by the next engine.
+#[derive(Debug)]
+pub(crate) struct CheckpointLock {
+    file: File,
+    path: PathBuf,
+    process: u32,
+}
+
+impl CheckpointLock {
+    /// Takes the lock of the checkpoint file `checkpoint`.
+    pub(crate) fn acquire(checkpoint: &Path) -> Result<Self, CheckpointError> {
+        let mut path = checkpoint.as_os_str().to_owned();
+        path.push(".lock");
+        let path = PathBuf::from(path);
+        let failed = |e: std::io::Error| CheckpointError::Write {
+            path: checkpoint.to_owned(),
+            reason: format!("{}: {e}", path.display()),
+        };
+        loop {
+            let mut file = locked_file::open(&path, true).map_err(failed)?;
+            match file.try_lock() {
+                Ok(()) => {}
+                Err(TryLockError::Error(e)) => return Err(failed(e)),
+                Err(TryLockError::WouldBlock) => {
+                    let mut text = String::new();
+                    let process = file.read_to_string(&mut text).ok().and_then(|_| text.trim().parse().ok());
+                    return Err(CheckpointError::InUse { path: checkpoint.to_owned(), process });
+                }
+            }
+            // Otherwise an engine that ended has removed it in the meantime.
+            if locked_file::is_same(&file, &path) {
+                let process = std::process::id();
+                file.set_len(0).and_then(|()| writeln!(file, "{process}")).map_err(failed)?;
+                return Ok(CheckpointLock { file, path, process });
+            }
+        }
+    }
+}
+
+impl Drop for CheckpointLock {
+    fn drop(&mut self) {
+        // In a forked process, the lock is the parent's.
+        if self.process == std::process::id() {
+            let _ = fs::remove_file(&self.path);
+            // Closing the file is not enough: a forked child shares the lock.
+            let _ = self.file.unlock();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::batch::zeroed;
+    use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A head and the file of a checkpoint of two groups, one of which was not reset.
+    fn checkpoint(name: &str) -> (CheckpointHead, Vec<u8>) {
+        let path = std::env::temp_dir().join(format!("endless-checkpoint-{name}-{}", std::process::id()));
+        let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
+        pool.reset(ResetRequest::Seed(1), &mut zeroed(pool.layout().blocks())).unwrap();
+        let groups = vec![SavedGroup { step: 7, envs: pool.save().unwrap() }, SavedGroup { step: 0, envs: None }];
+        let head = CheckpointHead {
+            package: PACKAGE_VERSION.to_owned(),
+            id: "MysteryPath-Grid-v0".to_owned(),
+            num_envs: 2,
+            groups: 2,
+            autoreset: "next_step".to_owned(),
+            frames: None,
+            features: false,
+            seeding: "continued generators".to_owned(),
+            options: vec![Map::new()],
+        };
+        write(&path, &head, groups.clone()).unwrap();
+        assert_eq!(read(&path, &head).unwrap(), Some(groups));
+        assert!(!new_path(&path).exists());
+        let bytes = fs::read(&path).unwrap();
+        fs::remove_file(&path).unwrap();
+        assert_eq!(read(&path, &head).unwrap(), None);
+        (head, bytes)
+    }
+
+    #[test]
+    fn every_truncation_is_an_error() {
+        let (head, bytes) = checkpoint("short");
+        for length in 0..bytes.len() {
+            decode(Path::new("file"), &bytes[..length], &head).unwrap_err();
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+
+        #[test]
+        fn an_altered_checkpoint_is_never_accepted(
+            changes in prop::collection::vec((any::<prop::sample::Index>(), 1..=255u8), 1..4),
+        ) {
+            let (head, original) = checkpoint("altered");
+            let mut bytes = original.clone();
+            for (at, change) in changes {
+                *at.get_mut(&mut bytes) ^= change;
+            }
+            prop_assume!(bytes != original);
+            prop_assert!(decode(Path::new("file"), &bytes, &head).is_err());
+        }
+
+        /// With a checksum that matches, so that the decoder sees the content.
+        #[test]
+        fn a_forged_checkpoint_is_no_panic(
+            changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..9),
+            length in any::<prop::sample::Index>(),
+            cut: bool,
+        ) {
+            let (head, mut bytes) = checkpoint("forged");
+            for (at, value) in changes {
+                *at.get_mut(&mut bytes[PREAMBLE..]) = value;
+            }
+            if cut {
+                bytes.truncate(PREAMBLE + length.index(bytes.len() - PREAMBLE));
+            }
+            let checksum = crc32fast::hash(&bytes[PREAMBLE..]);
+            bytes[8..PREAMBLE].copy_from_slice(&checksum.to_le_bytes());
+            if let Ok(groups) = decode(Path::new("file"), &bytes, &head) {
+                let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
+                for group in groups {
+                    let _ = group.envs.map(|envs| pool.resume(&envs));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn foreign_files_and_other_environments_are_named() {
+        let (head, bytes) = checkpoint("foreign");
+        let message =
+            |bytes: &[u8], head: &CheckpointHead| decode(Path::new("/a/b"), bytes, head).unwrap_err().to_string();
+        assert_eq!(message(b"PK\x03\x04 something else", &head), "/a/b is not a checkpoint of an engine");
+        let mut newer = bytes.clone();
+        newer[4] = 9;
+        assert!(message(&newer, &head).contains("must be of version 1, got version 9"));
+        let mut damaged = bytes.clone();
+        *damaged.last_mut().unwrap() ^= 1;
+        assert_eq!(message(&damaged, &head), "checkpoint /a/b is damaged: its checksum differs");
+        let other = CheckpointHead { num_envs: 5, ..head.clone() };
+        assert_eq!(message(&bytes, &other), "checkpoint /a/b was saved with num_envs 2, and the engine has 5");
+        let newer_package = CheckpointHead { package: "99.0.0".to_owned(), ..head };
+        decode(Path::new("file"), &bytes, &newer_package).unwrap();
+    }
+
+    #[test]
+    fn a_place_that_cannot_be_written_is_found_out_at_once() {
+        for (path, part) in [("/nowhere/file", "No such file"), ("/dev", "directory")] {
+            let text = check_writable(Path::new(path)).unwrap_err().to_string();
+            assert!(text.contains(path) && text.contains(part), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_checkpoint_has_one_engine_at_a_time() {
+        let folder = std::env::temp_dir().join(format!("endless-checkpoint-lock-{}", std::process::id()));
+        fs::create_dir(&folder).unwrap();
+        let path = folder.join("run.ckpt");
+        let lock = CheckpointLock::acquire(&path).unwrap();
+        let refused = CheckpointLock::acquire(&path).unwrap_err();
+        assert_eq!(refused, CheckpointError::InUse { path: path.clone(), process: Some(std::process::id()) });
+        let text = format!(
+            "checkpoint {} is in use by another engine (process {}); stop it, or choose another file",
+            path.display(),
+            std::process::id()
+        );
+        assert_eq!(refused.to_string(), text);
+        CheckpointLock::acquire(&folder.join("other.ckpt")).unwrap();
+        drop(lock);
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+
+        // What a dead engine left, which may be longer than what is written.
+        fs::write(folder.join("run.ckpt.lock"), "4294967295000\n").unwrap();
+        drop(CheckpointLock::acquire(&path).unwrap());
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+        let missing = CheckpointLock::acquire(&folder.join("missing/run.ckpt")).unwrap_err();
+        assert!(matches!(missing, CheckpointError::Write { .. }), "{missing}");
+        fs::remove_dir(&folder).unwrap();
+    }
+}

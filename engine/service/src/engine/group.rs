@@ -1,0 +1,397 @@
+//! One group of an engine: its pool, its ports, and how it executes requests.
+
+use endless_gym_core::batch::{ActionLayout, ActionSection, Batch, Block, LAYOUT_VERSION, SNAPSHOT_BYTES};
+use endless_gym_core::pool::{NextOptions, Pool, PoolError, ResetRequest, ResumeError, SavedEnv, SnapshotError};
+use iceoryx2::port::{ReceiveError, SendError};
+use iceoryx2::prelude::{CallbackProgression, PortFactory};
+use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
+use serde_json::{Map, Value as Json};
+
+use crate::error::{Rejection, ServiceError};
+use crate::namespace::directory::Ipc;
+use crate::namespace::memory::PrefaultedChunks;
+use crate::protocol::message::{PayloadBlock, RequestHeader, RequestKind, ResponseHeader, write_text};
+use crate::protocol::ports::{self, BlockService, EngineServices, LeaseLimits, RequestSubscriber, ResponsePublisher};
+
+/// A request in shared memory.
+pub(crate) type RequestSample = Sample<Ipc, [PayloadBlock], RequestHeader>;
+
+/// A response that is being written.
+pub(crate) type ResponseLoan = SampleMut<Ipc, [PayloadBlock], ResponseHeader>;
+
+/// Why a request is rejected, and an explanation.
+pub(crate) type Rejected = (Rejection, String);
+
+/// What the response to a request holds.
+pub(crate) enum Outcome {
+    Batch { env_steps: usize, episodes: usize },
+    Snapshot { bytes: usize },
+}
+
+/// A batch that was sent, and is still where it was written.
+#[derive(Clone, Copy)]
+struct SentBatch {
+    header: ResponseHeader,
+    /// Exposed address of its first block.
+    address: usize,
+}
+
+/// One group of an engine.
+pub(crate) struct Group {
+    pool: Pool,
+    requests: RequestSubscriber,
+    responses: ResponsePublisher,
+    memory: PrefaultedChunks,
+    response_service: BlockService<ResponseHeader>,
+    /// The batch that was sent last, until the next chunk is written.
+    last: Option<SentBatch>,
+    /// The ports of observers that had resumed when the engine was last idle.
+    resumed: Vec<u128>,
+    request: RequestData,
+    /// The trainer that last reset all environments.
+    trainer: Option<u64>,
+}
+
+impl Group {
+    pub(crate) fn new(
+        services: &EngineServices<'_>,
+        number: usize,
+        pool: Pool,
+        limits: LeaseLimits,
+    ) -> Result<Self, ServiceError> {
+        let requests = services
+            .requests(number)?
+            .subscriber_builder()
+            .create()
+            .map_err(|e| ServiceError::middleware("cannot create a subscriber")(e.to_string()))?;
+        let service = services.responses(number, limits)?;
+        // An observer reserves its chunks when it connects.
+        let publisher = ports::publisher(&service, ports::chunk_blocks(pool.layout()), limits.trainer_chunks());
+        let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
+        let (last, resumed, request) = (None, Vec::new(), RequestData::default());
+        Ok(Group {
+            pool,
+            requests,
+            responses,
+            memory,
+            response_service: service,
+            last,
+            resumed,
+            request,
+            trainer: None,
+        })
+    }
+
+    /// A chunk for a response, with unspecified content.
+    pub(crate) fn loan(&mut self) -> Result<ResponseLoan, ServiceError> {
+        let mut chunk = self
+            .responses
+            .loan_slice_uninit(ports::chunk_blocks(self.pool.layout()))
+            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
+        self.memory.prefault(chunk.payload_mut())?;
+        self.last = None;
+        // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
+        // memory, and a recycled chunk holds an earlier response.
+        Ok(unsafe { chunk.assume_init() })
+    }
+
+    /// Sends a batch, and returns how many processes receive it.
+    pub(crate) fn send_batch(&mut self, batch: ResponseLoan) -> Result<usize, SendError> {
+        self.last =
+            Some(SentBatch { header: *batch.user_header(), address: batch.payload().as_ptr().expose_provenance() });
+        batch.send()
+    }
+
+    /// Sends the last batch again if an observer has resumed since: while the trainer pauses, there is no other for it. All who have
+    /// it ignore it by its numbers.
+    pub(crate) fn repeat_batch(&mut self) {
+        let mut resumed = Vec::new();
+        self.response_service.dynamic_config().list_subscribers(|subscriber| {
+            if subscriber.subscriber_name.as_str() == ports::RESUMED {
+                resumed.push(subscriber.subscriber_id.value());
+            }
+            CallbackProgression::Continue
+        });
+        let has_new = resumed.iter().any(|port| !self.resumed.contains(port));
+        self.resumed = resumed;
+        let Some(last) = self.last.filter(|_| has_new) else { return };
+        let mut batch = match self.loan() {
+            Ok(batch) => batch,
+            Err(error) => return tracing::warn!(%error, "cannot send a batch again"),
+        };
+        *batch.user_header_mut() = last.header;
+        let payload: &mut [Block] = bytemuck::cast_slice_mut(batch.payload_mut());
+        // Usually it is the same chunk, unless the trainer holds it.
+        if payload.as_ptr().addr() != last.address {
+            // SAFETY: the address is that of a chunk of the publisher's segment, which has this size and stays mapped. Only `loan`
+            // gives access for writing; it has given another chunk, and none since that one was sent. Every byte pattern is a
+            // valid block.
+            let written = unsafe {
+                std::slice::from_raw_parts(std::ptr::with_exposed_provenance::<Block>(last.address), payload.len())
+            };
+            payload.copy_from_slice(written);
+        }
+        if let Err(e) = self.send_batch(batch) {
+            tracing::warn!(error = %e, "cannot deliver a batch again");
+        }
+    }
+
+    /// The next request, if there is one.
+    pub(crate) fn poll(&self) -> Result<Option<RequestSample>, ServiceError> {
+        match self.requests.receive() {
+            // The trainer died while it connected.
+            Err(ReceiveError::ConnectionFailure(e)) => {
+                tracing::warn!(error = %e, "cannot receive from a trainer");
+                Ok(None)
+            }
+            received => received.map_err(|e| ServiceError::middleware("cannot receive a request")(e.to_string())),
+        }
+    }
+
+    /// Checks a request and copies its payload. `header` is a copy as well.
+    pub(crate) fn read(
+        &mut self,
+        layout: &ActionLayout,
+        header: &RequestHeader,
+        payload: &[Block],
+    ) -> Result<RequestKind, Rejected> {
+        let kind = self.request.read(layout, header, payload)?;
+        // A new trainer must not step the episodes of another one by mistake. It may adopt them, by a reset of no environment.
+        let is_allowed = match kind {
+            RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore | RequestKind::Episodes => false,
+            RequestKind::ResetEach => {
+                let count = self.request.reset.iter().filter(|flag| **flag != 0).count();
+                count == 0 || count == self.request.reset.len()
+            }
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Checkpoint | RequestKind::SetOptions => true,
+        };
+        if !is_allowed && self.trainer != Some(header.trainer) {
+            let text = "this trainer must reset all environments of the group first, or none to adopt their episodes";
+            return Err((Rejection::NotReset, text.to_owned()));
+        }
+        Ok(kind)
+    }
+
+    /// Executes the request that was read last and writes the response into `payload`.
+    pub(crate) fn execute(
+        &mut self,
+        kind: RequestKind,
+        header: &RequestHeader,
+        payload: &mut [Block],
+    ) -> Result<Outcome, Rejected> {
+        let RequestData { action, reset, seed, snapshot, options, next_options, .. } = &self.request;
+        let (options, env) = (options.as_ref(), usize::try_from(header.env).unwrap_or(usize::MAX));
+        let batch_blocks = self.pool.layout().blocks();
+        let batch = &mut payload[..batch_blocks];
+        let done = match kind {
+            RequestKind::Step => self.pool.step(action, batch),
+            RequestKind::Snapshot => return self.write_snapshot(env, payload),
+            RequestKind::Restore => {
+                let done = self.pool.restore(env, snapshot).map(|()| Outcome::Snapshot { bytes: 0 });
+                return done.map_err(|e| (Rejection::Snapshot, e.to_string()));
+            }
+            RequestKind::ResetAll => self.pool.reset_with(ResetRequest::All, options, batch),
+            RequestKind::ResetSeed => self.pool.reset_with(ResetRequest::Seed(header.seed), options, batch),
+            RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each { reset, seed }, options, batch),
+            RequestKind::SetOptions => self.pool.set_options(next_options),
+            RequestKind::Episodes => return self.write_episodes(payload),
+            // The engine executes it.
+            RequestKind::Checkpoint => return Ok(Outcome::Snapshot { bytes: 0 }),
+        };
+        done.map_err(|e| match e {
+            PoolError::NotReset => (Rejection::NotReset, e.to_string()),
+            e => (Rejection::Pool, e.to_string()),
+        })?;
+        if kind == RequestKind::SetOptions {
+            return Ok(Outcome::Snapshot { bytes: 0 });
+        }
+        self.trainer = Some(header.trainer);
+        let (env_steps, episodes) = match kind {
+            RequestKind::Step => {
+                let terminated = Batch::new(self.pool.layout(), batch).terminated();
+                (terminated.len(), terminated.iter().map(|flag| usize::from(*flag)).sum())
+            }
+            _ => (0, 0),
+        };
+        Ok(Outcome::Batch { env_steps, episodes })
+    }
+
+    /// The states of the environments; `None` before the first reset.
+    pub(crate) fn save(&self) -> Result<Option<Vec<SavedEnv>>, SnapshotError> {
+        self.pool.save()
+    }
+
+    /// Continues from these states.
+    pub(crate) fn resume(&mut self, saved: &[SavedEnv]) -> Result<(), ResumeError> {
+        self.pool.resume(saved)
+    }
+
+    /// Prepares `payload` for other content than a batch.
+    pub(crate) fn forget_frames(&self, payload: &mut [Block]) {
+        self.pool.layout().forget_frames(payload);
+    }
+
+    /// Writes the explanation of a rejection over the batch in `payload`, and returns its length in bytes.
+    pub(crate) fn write_rejection(&self, payload: &mut [Block], text: &str) -> usize {
+        self.forget_frames(payload);
+        write_text(payload, text)
+    }
+
+    /// Writes what the running episodes of the requested environments follow from over the batch in `payload`, as JSON text: those
+    /// of as many environments as fit, at least one.
+    fn write_episodes(&self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
+        self.forget_frames(payload);
+        let text: &mut [u8] = bytemuck::cast_slice_mut(payload);
+        let mut end = 0;
+        for env in (0..self.request.reset.len()).filter(|env| self.request.reset[*env] != 0) {
+            let episode = self.pool.running_episode(env).map_err(|e| (Rejection::NotReset, e.to_string()))?;
+            let item = serde_json::to_vec(&episode).map_err(|e| (Rejection::Pool, e.to_string()))?;
+            // A separator before it, and a bracket behind the last.
+            if end + item.len() + 2 > text.len() {
+                break;
+            }
+            text[end] = if end == 0 { b'[' } else { b',' };
+            text[end + 1..][..item.len()].copy_from_slice(&item);
+            end += 1 + item.len();
+        }
+        if end == 0 {
+            text[0] = b'[';
+            end = 1;
+        }
+        text[end] = b']';
+        Ok(Outcome::Snapshot { bytes: end + 1 })
+    }
+
+    /// Writes a snapshot of an environment over the batch in `payload`.
+    fn write_snapshot(&self, env: usize, payload: &mut [Block]) -> Result<Outcome, Rejected> {
+        let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
+        if snapshot.len() > SNAPSHOT_BYTES {
+            let text = format!(
+                "snapshot must have at most {SNAPSHOT_BYTES} bytes, got {}; use reset parameters with shorter lists",
+                snapshot.len()
+            );
+            return Err((Rejection::Snapshot, text));
+        }
+        self.pool.layout().forget_frames(payload);
+        bytemuck::cast_slice_mut(payload)[..snapshot.len()].copy_from_slice(&snapshot);
+        Ok(Outcome::Snapshot { bytes: snapshot.len() })
+    }
+}
+
+/// The payload of the current request, copied out of shared memory: the trainer cannot change it after the check. The buffers are
+/// reused, so that a step does not allocate.
+#[derive(Debug, Default)]
+struct RequestData {
+    action: Vec<i32>,
+    reset: Vec<u8>,
+    seed: Vec<u64>,
+    snapshot: Vec<u8>,
+    options_text: Vec<u8>,
+    options: Option<Map<String, Json>>,
+    next_options: Vec<NextOptions>,
+}
+
+impl RequestData {
+    fn read(
+        &mut self,
+        layout: &ActionLayout,
+        header: &RequestHeader,
+        payload: &[Block],
+    ) -> Result<RequestKind, Rejected> {
+        if header.layout_version != LAYOUT_VERSION {
+            let text = format!("layout version must be {LAYOUT_VERSION}, got {}", header.layout_version);
+            return Err((Rejection::Version, text));
+        }
+        let Some(kind) = RequestKind::from_code(header.kind) else {
+            let text = format!("request kind must be 1 to {}, got {}", RequestKind::ALL.len(), header.kind);
+            return Err((Rejection::Kind, text));
+        };
+        if payload.len() < layout.blocks() {
+            let text = format!("payload must have {} blocks of 64 bytes, got {}", layout.blocks(), payload.len());
+            return Err((Rejection::Payload, text));
+        }
+        match kind {
+            RequestKind::Step => copy(&mut self.action, layout.read(payload, ActionSection::Action)),
+            RequestKind::ResetEach => {
+                copy(&mut self.reset, layout.read(payload, ActionSection::Reset));
+                copy(&mut self.seed, layout.read(payload, ActionSection::Seed));
+            }
+            RequestKind::Episodes => copy(&mut self.reset, layout.read(payload, ActionSection::Reset)),
+            RequestKind::Restore | RequestKind::SetOptions => {
+                copy(&mut self.snapshot, prefix(layout.read(payload, ActionSection::Snapshot), header.bytes));
+            }
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::Snapshot | RequestKind::Checkpoint => {}
+        }
+        if kind == RequestKind::SetOptions {
+            let sets = serde_json::from_slice(&self.snapshot);
+            let wrong = |e| (Rejection::Options, format!("options of next episodes must be a JSON list: {e}"));
+            self.next_options = sets.map_err(wrong)?;
+        }
+        self.options = match kind {
+            RequestKind::ResetAll | RequestKind::ResetSeed | RequestKind::ResetEach if header.bytes > 0 => {
+                copy(&mut self.options_text, prefix(layout.read(payload, ActionSection::Options), header.bytes));
+                let options = serde_json::from_slice(&self.options_text);
+                Some(
+                    options
+                        .map_err(|e| (Rejection::Options, format!("reset parameters must be a JSON object: {e}")))?,
+                )
+            }
+            _ => None,
+        };
+        Ok(kind)
+    }
+}
+
+/// The first `length` elements, or an empty slice if there are fewer.
+fn prefix<T>(elements: &[T], length: u64) -> &[T] {
+    usize::try_from(length).ok().and_then(|length| elements.get(..length)).unwrap_or_default()
+}
+
+fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {
+    to.clear();
+    to.extend_from_slice(from);
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::batch::{action_layout, zeroed};
+    use endless_gym_core::envs;
+
+    use super::*;
+
+    #[test]
+    fn a_request_that_changes_after_it_was_read_has_no_effect() {
+        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1).unwrap();
+        let mut payload = zeroed(layout.blocks());
+        let mut data = RequestData::default();
+        let header = |kind: RequestKind, bytes| RequestHeader {
+            layout_version: LAYOUT_VERSION,
+            kind: kind.code(),
+            bytes,
+            ..RequestHeader::default()
+        };
+
+        let text = br#"{"arena_size": 3}"#;
+        layout.write::<u8>(&mut payload, ActionSection::Options)[..text.len()].copy_from_slice(text);
+        data.read(&layout, &header(RequestKind::ResetAll, text.len() as u64), &payload).unwrap();
+        layout.write::<u8>(&mut payload, ActionSection::Options).fill(b'x');
+        assert_eq!(data.options.as_ref().unwrap()["arena_size"], 3);
+        assert_eq!(data.options_text, text);
+
+        layout.write::<u8>(&mut payload, ActionSection::Snapshot).fill(1);
+        data.read(&layout, &header(RequestKind::Restore, 9), &payload).unwrap();
+        layout.write::<u8>(&mut payload, ActionSection::Snapshot).fill(2);
+        assert_eq!((&data.snapshot[..], &data.options), (&[1; 9][..], &None));
+    }
+
+    #[test]
+    fn a_length_beyond_the_payload_reads_nothing() {
+        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1).unwrap();
+        let payload = zeroed(layout.blocks());
+        let header =
+            RequestHeader { layout_version: LAYOUT_VERSION, kind: 2, bytes: u64::MAX, ..RequestHeader::default() };
+        let (reason, _) = RequestData::default().read(&layout, &header, &payload).unwrap_err();
+        assert_eq!(reason, Rejection::Options);
+    }
+}

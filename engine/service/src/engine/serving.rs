@@ -1,0 +1,421 @@
+//! The engine: receives requests, steps the pools, and sends the batches that they write into shared memory.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use endless_gym_core::batch::{Block, LAYOUT_VERSION, action_layout};
+use endless_gym_core::pool::{Pool, PoolError, ResetOptions};
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+
+use crate::engine::checkpoint::{CheckpointHead, Checkpointer};
+use crate::engine::config::EngineConfig;
+use crate::engine::group::{Group, Outcome, Rejected, RequestSample};
+use crate::engine::status_writer::{EngineSummary, StatusWriter};
+use crate::error::{CheckpointError, PACKAGE_VERSION, Rejection, ServiceError};
+use crate::namespace::descriptors;
+use crate::namespace::directory::Ipc;
+use crate::namespace::lock::NamespaceLock;
+use crate::namespace::memory::PrefaultedChunks;
+use crate::namespace::node::NamespaceNode;
+use crate::protocol::discovery::{self, PublishedSpecification};
+use crate::protocol::message::{RequestKind, ResponseHeader, copied};
+use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
+use crate::protocol::specification::ServiceSpecification;
+use crate::protocol::wait::wait;
+
+/// How long an idle engine parks at most, which is also how long it takes to notice its stop flag.
+const IDLE_TIMEOUT: Duration = Duration::from_millis(100);
+
+/// How often an idle engine looks for dead processes.
+const CLEANUP_INTERVAL: Duration = Duration::from_millis(500);
+
+/// How long an engine that stops looks whether its trainer ends, too.
+const LAST_CLEANUP: Duration = Duration::from_millis(100);
+
+/// How often an engine checks that it can still be found.
+const CHECK_INTERVAL: Duration = Duration::from_millis(500);
+
+/// How often an engine refreshes the times of the namespace's files.
+const REFRESH_INTERVAL: Duration = Duration::from_secs(3600);
+
+/// How long an engine that starts waits for the namespace's lock.
+const START_PATIENCE: Duration = Duration::from_secs(30);
+
+/// How often an engine tries to start whose files are removed meanwhile.
+const START_ATTEMPTS: usize = 3;
+
+/// Serves groups of environments to a trainer and to observers in other processes.
+///
+/// ```
+/// use std::sync::atomic::{AtomicBool, Ordering};
+/// use std::time::Duration;
+///
+/// use endless_gym_core::pool::{PoolConfig, ResetRequest, Threads};
+/// use endless_gym_service::{ConnectConfig, Engine, EngineConfig, Namespace, Trainer};
+///
+/// # let root = format!("/tmp/endless-doc-{}", std::process::id());
+/// # let namespace = Namespace::at(&root);
+/// # /*
+/// let namespace = Namespace::default();
+/// # */
+/// let pool = PoolConfig::new("MortarMayhem-Grid-v0", 4);
+/// let config = EngineConfig { namespace: namespace.clone(), ..EngineConfig::new("example", pool, Threads::new(1)?) };
+/// let mut engine = Engine::new(&config)?;
+/// let stop = AtomicBool::new(false);
+///
+/// std::thread::scope(|scope| {
+///     let running = scope.spawn(|| engine.run(&stop));
+///     // Usually in another process:
+///     let timeout = Duration::from_secs(10);
+///     let mut trainer = Trainer::connect(&ConnectConfig { namespace, timeout, ..ConnectConfig::new("example") })?;
+///     trainer.reset(0, ResetRequest::Seed(1))?;
+///     let first = trainer.receive(0, timeout)?;
+///     assert_eq!(first.batch().observation().len(), 4 * 84 * 84 * 3);
+///     trainer.send_with(0, |actions| actions.fill(0))?;
+///     let second = trainer.receive(0, timeout)?;
+///     assert_eq!(second.batch().episode_length(), [1; 4]);
+///     stop.store(true, Ordering::Relaxed);
+///     let summary = running.join().expect("the engine does not panic")?;
+///     assert_eq!((summary.batches, summary.env_steps), (2, 4));
+///     Ok::<(), endless_gym_service::ServiceError>(())
+/// })?;
+/// # drop(engine);
+/// # std::fs::remove_dir_all(root).ok();
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Engine {
+    // Dropped first: a process that finds the specification expects all other services.
+    _published: PublishedSpecification,
+    // Ports must be dropped before the node.
+    groups: Vec<Group>,
+    to_trainer: Notifier<Ipc>,
+    to_engine: Listener<Ipc>,
+    specification: ServiceSpecification,
+    status: StatusWriter,
+    checkpointer: Option<Checkpointer>,
+    node: NamespaceNode,
+}
+
+impl Engine {
+    /// Creates the environments and takes the engine's name. Trainers can connect, and are answered while [`run`](Engine::run)
+    /// runs.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::InvalidName`], [`ServiceError::OutOfRange`] or [`ServiceError::Pool`] for an invalid configuration,
+    /// [`ServiceError::Root`] for a namespace that cannot be used, [`ServiceError::EngineExists`] if an engine of that name is
+    /// running, [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] if there is not enough shared memory or
+    /// there are too few file descriptors, [`ServiceError::Version`] if an engine of another version has the name,
+    /// [`ServiceError::ForeignSegment`] if another user has taken the namespace's segments, [`ServiceError::EngineUnreachable`] if
+    /// the engine's files are removed while it starts, [`ServiceError::NamespaceLocked`] if another process holds the namespace's
+    /// lock for too long, [`ServiceError::Checkpoint`] for a checkpoint that exists, cannot be written, or cannot be resumed from,
+    /// and [`ServiceError::Middleware`] for other errors of iceoryx2.
+    pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
+        config.check()?;
+        let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
+        discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
+        let pools = config.pools()?;
+        let pools = || pools.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<Vec<_>, _>>();
+        let mut attempt = 1;
+        loop {
+            match Self::start(config, node, pools()?) {
+                // Something has removed the engine's files.
+                Err(ServiceError::EngineUnreachable { .. } | ServiceError::EngineRestarted { .. })
+                    if attempt < START_ATTEMPTS => {}
+                Err(ServiceError::EngineRestarted { service }) => {
+                    return Err(ServiceError::EngineUnreachable { service });
+                }
+                started => return started,
+            }
+            attempt += 1;
+            tracing::warn!(engine = config.service, "the engine cannot be found; starting it again");
+            node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
+        }
+    }
+
+    /// Creates the engine's services and publishes them.
+    fn start(config: &EngineConfig, node: NamespaceNode, pools: Vec<Pool>) -> Result<Self, ServiceError> {
+        let specification = specify(config, &pools[0])?;
+        let head = CheckpointHead::new(config, &specification);
+        let checkpointer = config.checkpoint.as_ref().map(|config| Checkpointer::new(config, head)).transpose()?;
+        let limits = specification.lease_limits();
+        let blocks = chunk_blocks(&specification.batch);
+        PrefaultedChunks::check_available(blocks, limits.trainer_chunks() * config.groups)?;
+        descriptors::reserve(descriptors::of_engine(config.groups, config.observers))?;
+        let names = ServiceNames::new(&config.service, specification.incarnation);
+        let services = EngineServices { node: &node, names, mode: OpenMode::Create };
+        let creating = node.creating()?;
+        let to_engine = ports::listener(&services.events("to_engine", config.groups)?);
+        let to_engine = to_engine.map_err(|e| e.unexpected("a listener"))?;
+        let to_trainer = ports::notifier(&services.events("to_trainer", config.groups)?);
+        let to_trainer = to_trainer.map_err(|e| e.unexpected("a notifier"))?;
+        let mut groups: Vec<_> = pools
+            .into_iter()
+            .enumerate()
+            .map(|(group, pool)| Group::new(&services, group, pool, limits))
+            .collect::<Result<_, _>>()?;
+        let mut status = StatusWriter::create(node.prefix(), &specification)?;
+        drop(creating);
+        if let Some(checkpointer) = &checkpointer {
+            checkpointer.resume(&mut groups, &mut status)?;
+        }
+        // Last: a process that finds the specification expects all other services.
+        let (lock, published) = discovery::publish(&node, &specification)?;
+        let found = Self::check_published(&node, &specification, &lock);
+        drop(lock);
+        found?;
+        let (service, process) = (&*specification.service, specification.engine_pid);
+        tracing::info!(service, process, id = &*specification.id, groups = specification.groups, "engine started");
+        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, _published: published, node })
+    }
+
+    /// Fails unless a trainer could find the engine and all of its services.
+    fn check_published(
+        node: &NamespaceNode,
+        specification: &ServiceSpecification,
+        lock: &NamespaceLock,
+    ) -> Result<(), ServiceError> {
+        let ServiceSpecification { service, incarnation, groups, .. } = specification;
+        let found = discovery::read_locked(node, service, lock)?;
+        if found.is_none_or(|found| found.incarnation != *incarnation) {
+            return Err(ServiceError::EngineUnreachable { service: service.clone() });
+        }
+        let services = EngineServices { node, names: ServiceNames::new(service, *incarnation), mode: OpenMode::Open };
+        services.events("to_engine", *groups)?;
+        services.events("to_trainer", *groups)?;
+        for group in 0..*groups {
+            services.requests(group)?;
+            services.responses(group, specification.lease_limits())?;
+        }
+        Ok(())
+    }
+
+    /// The specification that trainers and observers read.
+    pub fn specification(&self) -> &ServiceSpecification {
+        &self.specification
+    }
+
+    /// Batches that each group has returned, counted on from the checkpoint that the engine resumed from.
+    pub fn steps(&self) -> Vec<u64> {
+        (0..self.groups.len()).map(|group| self.status.step(group)).collect()
+    }
+
+    /// Serves requests until `stop` is set. Returns within two tenths of a second after that, or when the last checkpoint is saved.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, so that no trainer finds the engine
+    /// any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
+    /// are no errors: its requests are rejected. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; an earlier
+    /// one that cannot is logged, and tried again later.
+    pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
+        let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
+        let (mut last_check, mut last_refresh) = (Instant::now(), Instant::now());
+        let mut next = 0;
+        while !stop.load(Ordering::Relaxed) {
+            if last_check.elapsed() >= CHECK_INTERVAL {
+                self.node.check_root()?;
+                last_check = Instant::now();
+                if last_refresh.elapsed() >= REFRESH_INTERVAL {
+                    self.node.refresh_files();
+                    last_refresh = last_check;
+                }
+            }
+            let Engine { groups, to_engine, .. } = self;
+            // Round robin: the group after the last one is polled first, so that no group starves.
+            let request = wait(to_engine, IDLE_TIMEOUT, last_request, || {
+                let (first, last) = groups.split_at(next);
+                let in_turn = last.iter().zip(next..).chain(first.iter().zip(0..));
+                for (group, number) in in_turn {
+                    if let Some(sample) = group.poll()? {
+                        return Ok(Some((number, sample)));
+                    }
+                }
+                Ok(None)
+            })?;
+            let is_idle = request.is_none();
+            match request {
+                Some((group, sample)) => {
+                    next = (group + 1) % self.groups.len();
+                    self.answer(group, sample)?;
+                    last_request = Instant::now();
+                }
+                None if last_cleanup.elapsed() >= CLEANUP_INTERVAL => {
+                    let removed = self.node.remove_dead_nodes() as u64;
+                    if removed > 0 {
+                        self.status.update_engine(|engine| engine.recoveries += removed);
+                    }
+                    last_cleanup = Instant::now();
+                }
+                None => {}
+            }
+            if is_idle {
+                self.groups.iter_mut().for_each(Group::repeat_batch);
+            }
+            if let Some(checkpointer) = &mut self.checkpointer {
+                checkpointer.poll(&self.groups, &mut self.status);
+            }
+        }
+        if let Some(checkpointer) = &mut self.checkpointer {
+            checkpointer.stop(&self.groups, &mut self.status)?;
+        }
+        self.remove_ending_trainer();
+        let summary = self.status.summary();
+        tracing::info!(service = &*self.specification.service, batches = summary.batches, "engine stopped");
+        Ok(summary)
+    }
+
+    /// Executes a request and sends the response.
+    fn answer(&mut self, number: usize, sample: RequestSample) -> Result<(), ServiceError> {
+        let request = copied(sample.user_header());
+        if request.layout_version == LAYOUT_VERSION && request.incarnation != self.specification.incarnation {
+            tracing::debug!(group = number, "dropped a request for an earlier incarnation");
+            self.status.update_engine(|engine| engine.dropped += 1);
+            return Ok(());
+        }
+        if self.status.begin(number, &request) {
+            tracing::info!(group = number, process = request.process, "a trainer sends its first request");
+        }
+        let group = &mut self.groups[number];
+        let read = group.read(&self.specification.action, &request, bytemuck::cast_slice(sample.payload()));
+        // The chunk returns to the trainer before the step.
+        drop(sample);
+        let mut batch = group.loan()?;
+        let read_kind = read.as_ref().ok().copied();
+        let outcome =
+            read.and_then(|kind| group.execute(kind, &request, bytemuck::cast_slice_mut(batch.payload_mut())));
+        let outcome = match read_kind {
+            Some(RequestKind::Checkpoint) => {
+                outcome.and_then(|_| self.save(bytemuck::cast_slice_mut(batch.payload_mut())))
+            }
+            _ => outcome,
+        };
+        if let (Ok(_), Some(checkpointer)) = (&outcome, &mut self.checkpointer)
+            && !read_kind.is_some_and(RequestKind::changes_nothing)
+        {
+            checkpointer.mark_changed();
+        }
+        let step = self.status.step(number) + u64::from(matches!(outcome, Ok(Outcome::Batch { .. })));
+        let text = match &outcome {
+            Err((_, message)) => {
+                self.groups[number].write_rejection(bytemuck::cast_slice_mut(batch.payload_mut()), message)
+            }
+            Ok(_) => 0,
+        };
+        let header = batch.user_header_mut();
+        *header = ResponseHeader::answering(&request, number, self.specification.incarnation, step);
+        match &outcome {
+            Ok(Outcome::Batch { .. }) => {}
+            Ok(Outcome::Snapshot { bytes }) => header.set_snapshot(*bytes),
+            Err((reason, _)) => header.set_rejection(*reason, text),
+        }
+        // Before the response, so that a trainer that has received it reads a status that includes it.
+        self.status.end(number, step, outcome.as_ref().ok());
+        // A trainer that dies at this moment must not end the engine.
+        let sent = match outcome {
+            Ok(Outcome::Batch { .. }) => self.groups[number].send_batch(batch),
+            _ => batch.send(),
+        };
+        let receivers = sent.unwrap_or_else(|e| {
+            tracing::warn!(error = %e, group = number, "cannot deliver a response");
+            0
+        });
+        ports::notify(&self.to_trainer, number);
+        if receivers == 0 && matches!(outcome, Ok(Outcome::Batch { .. })) {
+            self.status.update_group(number, |group| group.undelivered += 1);
+        }
+        Ok(())
+    }
+}
+
+impl Engine {
+    /// Saves a checkpoint and writes the steps of the groups into the payload of the response.
+    fn save(&mut self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
+        let rejected = |e: CheckpointError| match e {
+            CheckpointError::NotReset => (Rejection::NotReset, e.to_string()),
+            e => (Rejection::Checkpoint, e.to_string()),
+        };
+        let checkpointer = self.checkpointer.as_mut().ok_or_else(|| rejected(CheckpointError::NoFile))?;
+        checkpointer.save(&self.groups, &mut self.status).map_err(rejected)?;
+        let steps = self.steps();
+        self.groups[0].forget_frames(payload);
+        bytemuck::cast_slice_mut(payload)[..steps.len()].copy_from_slice(&steps);
+        Ok(Outcome::Snapshot { bytes: size_of_val(&*steps) })
+    }
+}
+
+impl Engine {
+    /// Removes the resources of a trainer that ends together with the engine: often the engine stops since its trainer was killed,
+    /// and no process remains that would find what that has left.
+    fn remove_ending_trainer(&self) {
+        let ServiceSpecification { service, incarnation, groups, .. } = &self.specification;
+        let names = ServiceNames::new(service, *incarnation);
+        let services = EngineServices { node: &self.node, names, mode: OpenMode::Open };
+        let has_trainer = |group| services.requests(group).is_ok_and(|port| ports::publisher_node(&port).is_some());
+        let start = Instant::now();
+        while start.elapsed() < LAST_CLEANUP && (0..*groups).any(has_trainer) {
+            self.node.remove_dead_nodes();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, PoolError> {
+    let spec = pool.spec();
+    let features: &[_] = if config.pool.features { spec.features } else { &[] };
+    Ok(ServiceSpecification {
+        service: config.service.clone(),
+        layout_version: LAYOUT_VERSION,
+        engine_version: PACKAGE_VERSION.to_owned(),
+        engine_pid: std::process::id(),
+        incarnation: rand::random(),
+        id: spec.id.to_owned(),
+        groups: config.groups,
+        num_envs: config.pool.num_envs,
+        first_env: config.pool.first_env,
+        batch: pool.layout().clone(),
+        action: action_layout(spec, config.pool.num_envs)?,
+        frames: config.pool.frames,
+        action_space: spec.action_space.clone(),
+        info: spec.info.iter().map(|column| column.name.to_owned()).collect(),
+        features: features.iter().map(|column| column.name.to_owned()).collect(),
+        options: match &config.pool.options {
+            ResetOptions::Shared(options) => vec![options.clone()],
+            ResetOptions::Each(each) => each.clone(),
+        },
+        independent_episodes: config.pool.independent_episodes,
+        autoreset: config.pool.autoreset,
+        render_fps: spec.render_fps,
+        batches_held: config.batches_held,
+        observers: config.observers,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use endless_gym_core::pool::{PoolConfig, Threads};
+
+    use super::*;
+    use crate::namespace::directory::Namespace;
+
+    #[test]
+    fn an_engine_that_cannot_be_found_is_noticed() {
+        let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
+        let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
+        let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+        let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
+        let check = || {
+            let lock = engine.node.lock().unwrap();
+            Engine::check_published(&engine.node, engine.specification(), &lock)
+        };
+        check().unwrap();
+        let services = namespace.root().join("services");
+        std::fs::rename(&services, namespace.root().join("elsewhere")).unwrap();
+        assert!(matches!(check(), Err(ServiceError::EngineUnreachable { .. })));
+        std::fs::rename(namespace.root().join("elsewhere"), &services).unwrap();
+        check().unwrap();
+        drop(engine);
+        std::fs::remove_dir_all(namespace.root()).unwrap();
+    }
+}

@@ -1,0 +1,122 @@
+//! The status of an engine as it serves requests.
+
+use crate::engine::group::Outcome;
+use crate::error::ServiceError;
+use crate::protocol::message::RequestHeader;
+use crate::protocol::specification::ServiceSpecification;
+use crate::protocol::status_file::{self, EngineRecord, GroupRecord, MAGIC, StatusFile, now, padded};
+
+/// Keeps the records of an engine and publishes every change. Publishing takes some dozens of nanoseconds.
+#[derive(Debug)]
+pub(crate) struct StatusWriter {
+    file: StatusFile,
+    engine: EngineRecord,
+    groups: Vec<GroupRecord>,
+}
+
+impl StatusWriter {
+    /// Publishes the status of an engine that starts. `prefix` is that of the files of its namespace.
+    pub(crate) fn create(prefix: &str, specification: &ServiceSpecification) -> Result<Self, ServiceError> {
+        let (service, incarnation) = (&specification.service, specification.incarnation);
+        let engine = EngineRecord {
+            magic: MAGIC,
+            layout_version: specification.layout_version,
+            process: specification.engine_pid,
+            incarnation,
+            started: now(),
+            groups: specification.groups as u32,
+            num_envs: specification.num_envs as u32,
+            dropped: 0,
+            recoveries: 0,
+            checkpoints: 0,
+            last_checkpoint: 0,
+            id: padded(&specification.id),
+            service: padded(service),
+        };
+        let path = status_file::path(prefix, service, incarnation);
+        let file = StatusFile::create(path, &engine, specification.groups)?;
+        Ok(StatusWriter { file, engine, groups: vec![GroupRecord::default(); specification.groups] })
+    }
+
+    /// Changes the engine's record.
+    pub(crate) fn update_engine(&mut self, change: impl FnOnce(&mut EngineRecord)) {
+        change(&mut self.engine);
+        self.file.write_engine(&self.engine);
+    }
+
+    /// Changes a group's record.
+    pub(crate) fn update_group(&mut self, group: usize, change: impl FnOnce(&mut GroupRecord)) {
+        let record = &mut self.groups[group];
+        change(record);
+        self.file.write_group(group, record);
+    }
+
+    /// A request was taken. Returns whether it is the first of its trainer.
+    pub(crate) fn begin(&mut self, group: usize, request: &RequestHeader) -> bool {
+        let is_new = self.groups[group].trainer != request.trainer;
+        self.update_group(group, |record| {
+            if is_new {
+                (record.trainers, record.answered, record.executed) = (record.trainers + 1, 0, 0);
+            }
+            (record.trainer, record.trainer_process) = (request.trainer, request.process);
+            (record.taken, record.kind, record.held) = (request.request, request.kind, request.held);
+            record.busy_since = now();
+            record.last_request = record.busy_since;
+        });
+        is_new
+    }
+
+    /// The request was executed and is about to be answered: `outcome` is what the response holds, `None` for a rejection.
+    pub(crate) fn end(&mut self, group: usize, step: u64, outcome: Option<&Outcome>) {
+        self.update_group(group, |record| {
+            (record.step, record.answered, record.busy_since) = (step, record.taken, 0);
+            match outcome {
+                Some(_) => record.executed = record.taken,
+                None => record.rejected += 1,
+            }
+            if let Some(Outcome::Batch { env_steps, episodes }) = outcome {
+                record.batches += 1;
+                record.env_steps += *env_steps as u64;
+                record.episodes += *episodes as u64;
+            }
+        });
+    }
+
+    /// The number of the current step of a group.
+    pub(crate) fn step(&self, group: usize) -> u64 {
+        self.groups[group].step
+    }
+
+    /// Totals over the groups.
+    pub(crate) fn summary(&self) -> EngineSummary {
+        let sum = |field: fn(&GroupRecord) -> u64| self.groups.iter().map(field).sum();
+        EngineSummary {
+            batches: sum(|group| group.batches),
+            env_steps: sum(|group| group.env_steps),
+            episodes: sum(|group| group.episodes),
+            rejected: sum(|group| group.rejected),
+            undelivered: sum(|group| group.undelivered),
+            dropped: self.engine.dropped,
+            recoveries: self.engine.recoveries,
+        }
+    }
+}
+
+/// What an engine has done.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct EngineSummary {
+    /// Batches sent, including those of resets.
+    pub batches: u64,
+    /// Steps, summed over the environments.
+    pub env_steps: u64,
+    /// Episodes that have ended.
+    pub episodes: u64,
+    /// Requests that were rejected.
+    pub rejected: u64,
+    /// Requests for an earlier incarnation, which were ignored.
+    pub dropped: u64,
+    /// Batches that no process received.
+    pub undelivered: u64,
+    /// Dead processes whose resources the engine removed.
+    pub recoveries: u64,
+}

@@ -1,0 +1,263 @@
+//! Removes resources that iceoryx2 cannot remove: those of processes that died while they joined or left a namespace.
+//!
+//! iceoryx2 removes the resources of a dead process by the records that the process kept. A process that is killed between two
+//! steps of its start or end leaves resources that iceoryx2 ignores or waits for forever:
+//!
+//! - **unsized segments**: created, but not resized yet. iceoryx2 waits without a timeout for the size, so they are removed
+//!   first;
+//! - **incomplete nodes and services**: a node without details, or a service whose static configuration is not finished;
+//! - **orphans**: segments and sockets that no record names. They are recognised once a namespace has no nodes;
+//! - **the node counter**: a segment that iceoryx2 needs while it creates a node, and leaves behind.
+//!
+//! A living process may be in the same state for any time, for it may be stopped. Nodes are created under the namespace's lock,
+//! services and ports under the creation lock ([`crate::namespace::identity`]); the functions take the locks that prove that no process which
+//! lives is creating what they remove.
+
+use std::collections::HashSet;
+use std::ffi::OsStr;
+use std::fs::{self, Metadata};
+use std::io::ErrorKind;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use iceoryx2::node::NodeView;
+use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, SemanticString};
+use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
+
+use crate::error::ServiceError;
+use crate::namespace::directory::Ipc;
+use crate::namespace::identity::ExclusiveCreation;
+use crate::namespace::lock::NamespaceLock;
+
+const SEGMENTS: &str = "/dev/shm";
+
+/// Whether the namespace has an unsized segment.
+pub(crate) fn has_unsized_segments(config: &Config) -> bool {
+    unsized_segments(config).next().is_some()
+}
+
+/// Removes unsized segments.
+pub(crate) fn remove_unsized_segments(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) {
+    unsized_segments(config).for_each(|segment| remove(&segment));
+}
+
+fn unsized_segments(config: &Config) -> impl Iterator<Item = PathBuf> {
+    segments(config).filter(|path| metadata(path).is_some_and(|data| data.len() == 0))
+}
+
+fn segments(config: &Config) -> impl Iterator<Item = PathBuf> {
+    let prefix = config.global.prefix;
+    entries(Path::new(SEGMENTS)).into_iter().filter(move |path| is_named(path, prefix.as_bytes()))
+}
+
+/// A segment of the namespace that belongs to another user, and that user.
+pub(crate) fn foreign_segment(config: &Config) -> Option<(PathBuf, u32)> {
+    let user = rustix::process::getuid().as_raw();
+    segments(config).find_map(|path| {
+        let owner = metadata(&path)?.uid();
+        (owner != user).then_some((path, owner))
+    })
+}
+
+/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and creates a new one each time: a node's id also
+/// contains its process id and its start time. All users may write to the counter, and one that a process left which died in
+/// between is unusable, so it exists only while a node is created.
+pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(), ServiceError> {
+    for path in segments(config).filter(|path| path.as_os_str().as_bytes().ends_with(b".global_mgmt")) {
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != ErrorKind::NotFound => {
+                let failed = ServiceError::middleware("cannot remove the counter of nodes");
+                return Err(failed(format!("{}: {e}", path.display())));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Removes incomplete services, which block their names.
+pub(crate) fn remove_incomplete_services(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) {
+    for path in entries(&directory(&config.global.service_dir())) {
+        // iceoryx2 makes a static configuration read-only when it is finished.
+        if metadata(&path).is_some_and(|data| data.permissions().mode() & 0o200 != 0) {
+            remove(&path);
+        }
+    }
+}
+
+/// Removes incomplete nodes.
+pub(crate) fn remove_incomplete_nodes(config: &Config, _lock: &NamespaceLock) {
+    let mut complete = HashSet::new();
+    let listed = Node::<Ipc>::list(config, |state| {
+        let is_complete = match &state {
+            NodeState::Dead(view) => view.details().is_some(),
+            NodeState::Undefined(_) => false,
+            NodeState::Alive(_) | NodeState::Inaccessible(_) => true,
+        };
+        if is_complete {
+            complete.insert(state.node_id().value().to_string());
+        }
+        CallbackProgression::Continue
+    });
+    if listed.is_err() {
+        return;
+    }
+    for path in entries(&directory(&config.global.node_dir())) {
+        let number = node_number(&path, config.global.prefix.as_bytes());
+        if number.is_some_and(|number| !complete.contains(&number)) {
+            remove(&path);
+        }
+    }
+}
+
+/// Removes everything if the namespace has no nodes, neither running nor dead. Returns whether it had none.
+pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock, _all: &ExclusiveCreation) -> bool {
+    let mut is_empty = true;
+    let listed = Node::<Ipc>::list(config, |_| {
+        is_empty = false;
+        CallbackProgression::Stop
+    });
+    if listed.is_err() || !is_empty {
+        return false;
+    }
+    remove_files(config);
+    // They stay if they are not empty.
+    let _ =
+        (fs::remove_dir(directory(&config.global.service_dir())), fs::remove_dir(directory(&config.global.node_dir())));
+    true
+}
+
+/// Removes everything. The caller knows that no process uses the namespace.
+pub(crate) fn remove_all(config: &Config, _lock: &NamespaceLock) {
+    remove_files(config);
+    for directory in [directory(&config.global.service_dir()), directory(&config.global.node_dir())] {
+        if directory.exists() {
+            remove(&directory);
+        }
+    }
+}
+
+/// Removes the segments, the sockets and the services.
+fn remove_files(config: &Config) {
+    let (root, services) = (directory(config.global.root_path()), directory(&config.global.service_dir()));
+    let prefix = config.global.prefix.as_bytes();
+    let files = [&root, &services].into_iter().flat_map(|directory| entries(directory));
+    files.filter(|path| is_named(path, prefix)).chain(segments(config)).for_each(|path| remove(&path));
+}
+
+/// Sets the times of all files in the namespace's directory to now.
+pub(crate) fn refresh(config: &Config) {
+    let now = Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
+    let now = Timestamps { last_access: now, last_modification: now };
+    let (services, nodes) = (directory(&config.global.service_dir()), directory(&config.global.node_dir()));
+    let of_nodes = entries(&nodes).into_iter().flat_map(|path| entries(&path));
+    let all =
+        [directory(config.global.root_path()), services, nodes.clone()].into_iter().flat_map(|path| entries(&path));
+    for path in all.chain(of_nodes) {
+        if let Err(e) = utimensat(CWD, &path, &now, AtFlags::SYMLINK_NOFOLLOW) {
+            tracing::debug!(error = %e, path = %path.display(), "cannot set the times of a file");
+        }
+    }
+}
+
+/// The number of the node that a file or directory belongs to: `NUMBER`, or `PREFIX NUMBER .node_monitor...`.
+fn node_number(path: &Path, prefix: &[u8]) -> Option<String> {
+    let name = path.file_name()?.as_bytes();
+    let name = std::str::from_utf8(name.strip_prefix(prefix).unwrap_or(name)).ok()?;
+    let number = name.split('.').next()?;
+    (!number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit())).then(|| number.to_owned())
+}
+
+fn directory(path: &iceoryx2::prelude::Path) -> PathBuf {
+    PathBuf::from(OsStr::from_bytes(path.as_bytes()))
+}
+
+fn entries(directory: &Path) -> Vec<PathBuf> {
+    fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path()).collect()
+}
+
+fn is_named(path: &Path, prefix: &[u8]) -> bool {
+    path.file_name().is_some_and(|name| name.as_bytes().starts_with(prefix))
+}
+
+fn metadata(path: &Path) -> Option<Metadata> {
+    fs::symlink_metadata(path).ok()
+}
+
+fn remove(path: &Path) {
+    tracing::debug!(path = %path.display(), "removing a resource of a dead process");
+    // An error means that another process has removed it.
+    let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{File, Permissions};
+    use std::time::SystemTime;
+
+    use super::*;
+    use crate::namespace::directory::Namespace;
+    use crate::namespace::identity::Identity;
+
+    /// A namespace in a directory of its own, without nodes.
+    fn empty_namespace(name: &str) -> (Namespace, Config, Identity, NamespaceLock) {
+        let namespace = Namespace::at(format!("/tmp/endless-sweep-{name}-{}", std::process::id()));
+        namespace.prepare().unwrap();
+        let lock = NamespaceLock::acquire(namespace.root()).unwrap();
+        let identity = Identity::read_or_create(&namespace, &lock).unwrap();
+        let config = namespace.config(identity.prefix()).unwrap();
+        fs::create_dir(namespace.root().join("services")).unwrap();
+        fs::create_dir(namespace.root().join("nodes")).unwrap();
+        (namespace, config, identity, lock)
+    }
+
+    fn file(directory: &Path, config: &Config, name: &str, mode: u32) -> PathBuf {
+        let path = directory.join(format!("{}{name}", config.global.prefix));
+        File::create(&path).unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
+        path
+    }
+
+    #[test]
+    fn files_of_nodes_are_recognised() {
+        let number = |name: &str| node_number(&Path::new("/tmp").join(name), b"e1_");
+        assert_eq!(number("123").as_deref(), Some("123"));
+        assert_eq!(number("e1_123.node_monitor_owner_lock").as_deref(), Some("123"));
+        assert_eq!(number("e2_123.node_monitor"), None);
+        assert_eq!(number("e1_.node_monitor"), None);
+        assert_eq!(number("notes.txt"), None);
+    }
+
+    /// Files of age zero: what is removed does not depend on the clock.
+    #[test]
+    fn incomplete_resources_are_removed_under_the_locks_that_prove_it() {
+        let (namespace, config, identity, lock) = empty_namespace("stub");
+        let [services, nodes] = ["services", "nodes"].map(|name| namespace.root().join(name));
+        let [finished, begun] = [("a", 0o400), ("b", 0o600)].map(|(name, mode)| file(&services, &config, name, mode));
+        let node = file(&nodes, &config, "1.node_monitor_context", 0o200);
+        fs::create_dir(nodes.join("1")).unwrap();
+        let segments = Path::new(SEGMENTS);
+        let [empty, sized, counter] =
+            ["empty", "sized", ".global_mgmt"].map(|name| file(segments, &config, name, 0o200));
+        fs::write(&sized, "x").unwrap();
+
+        let creating = identity.creating().unwrap();
+        assert!(identity.try_exclusive(&lock).is_none() && has_unsized_segments(&config));
+        drop(creating);
+        let all = identity.try_exclusive(&lock).unwrap();
+        File::options().write(true).open(&begun).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        refresh(&config);
+        assert!(metadata(&begun).unwrap().modified().unwrap() > SystemTime::UNIX_EPOCH);
+        remove_counter(&config, &lock).unwrap();
+        assert!(empty.exists() && !counter.exists());
+        remove_unsized_segments(&config, &lock, &all);
+        assert!(!empty.exists() && sized.exists());
+        remove_incomplete_services(&config, &lock, &all);
+        remove_incomplete_nodes(&config, &lock);
+        assert!(finished.exists() && !begun.exists() && !node.exists() && !nodes.join("1").exists());
+        assert!(remove_orphans(&config, &lock, &all));
+        assert!(!finished.exists() && !sized.exists() && !services.exists() && !nodes.exists());
+        fs::remove_dir_all(namespace.root()).unwrap();
+    }
+}

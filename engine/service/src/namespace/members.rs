@@ -1,0 +1,116 @@
+//! The processes that use a prefix of segments: each holds a shared lock on a file of that prefix in `/dev/shm`.
+//!
+//! The namespace's directory says which processes use it, but it may have been removed, or be in another container. A process that gets
+//! the lock of a prefix exclusively knows that no process uses it any more, and may remove its segments.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use crate::error::ServiceError;
+use crate::namespace::directory::{MAX_PREFIX, Namespace};
+use crate::namespace::lock::NamespaceLock;
+use crate::namespace::locked_file::{is_same, open};
+
+const SEGMENTS: &str = "/dev/shm";
+
+/// What follows the prefix in the name of the file.
+const SUFFIX: &str = ".members";
+
+/// A process's use of a prefix. Forked children share it.
+#[derive(Debug)]
+pub(crate) struct Membership(#[expect(dead_code, reason = "held until it is dropped")] File);
+
+impl Membership {
+    /// Joins the processes that use the prefix. The namespace's lock keeps others from taking the new file for an unsized segment.
+    pub(crate) fn join(prefix: &str, _lock: &NamespaceLock) -> Result<Self, ServiceError> {
+        let path = file_of(prefix);
+        let failed = |e: std::io::Error| {
+            ServiceError::middleware("cannot register this process")(format!("{}: {e}", path.display()))
+        };
+        loop {
+            let mut file = open(&path, true).map_err(failed)?;
+            file.lock_shared().map_err(failed)?;
+            if file.metadata().map_err(failed)?.len() == 0 {
+                // A file of zero bytes is removed as an unsized segment.
+                file.write_all(b"\n").map_err(failed)?;
+            }
+            // Otherwise another process has removed it in the meantime.
+            if is_same(&file, &path) {
+                return Ok(Membership(file));
+            }
+        }
+    }
+}
+
+/// Removes the segments of all prefixes of a namespace's path that no process uses, except for the prefix `own`.
+pub(crate) fn remove_abandoned(namespace: &Namespace, own: Option<&str>) {
+    let names =
+        fs::read_dir(SEGMENTS).into_iter().flatten().flatten().filter_map(|entry| entry.file_name().into_string().ok());
+    for name in names.filter(|name| name.starts_with(namespace.prefix())) {
+        let Some(prefix) = name.strip_suffix(SUFFIX).filter(|prefix| prefix.len() == MAX_PREFIX) else { continue };
+        if Some(prefix) != own {
+            remove_if_unused(prefix);
+        }
+    }
+}
+
+/// Removes the segments of a prefix if no process uses it. Returns whether it did.
+pub(crate) fn remove_if_unused(prefix: &str) -> bool {
+    let path = file_of(prefix);
+    let Ok(file) = open(&path, false) else { return false };
+    if file.try_lock().is_err() || !is_same(&file, &path) {
+        return false;
+    }
+    for entry in fs::read_dir(SEGMENTS).into_iter().flatten().flatten() {
+        let segment = entry.path();
+        if entry.file_name().to_str().is_some_and(|name| name.starts_with(prefix)) && segment != path {
+            tracing::debug!(path = %segment.display(), "removing a segment that no process uses");
+            let _ = fs::remove_file(segment);
+        }
+    }
+    // Last: as long as it is there, another process can continue what this one leaves.
+    fs::remove_file(path).is_ok()
+}
+
+/// Whether a process uses the prefix.
+pub(crate) fn is_used(prefix: &str) -> bool {
+    open(&file_of(prefix), false).is_ok_and(|file| file.try_lock().is_err())
+}
+
+fn file_of(prefix: &str) -> PathBuf {
+    Path::new(SEGMENTS).join(format!("{prefix}{SUFFIX}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn segments_are_removed_when_the_last_process_has_left() {
+        let root = std::env::temp_dir().join(format!("endless-members-{}", std::process::id()));
+        fs::create_dir_all(&root).unwrap();
+        let namespace = Namespace::at(&root);
+        let lock = NamespaceLock::acquire(&root).unwrap();
+        let prefix = |last: char| {
+            format!("{}{}", namespace.prefix(), last.to_string().repeat(MAX_PREFIX - namespace.prefix().len()))
+        };
+        let (own, other) = (prefix('a'), prefix('b'));
+        let segment = Path::new(SEGMENTS).join(format!("{other}.data"));
+        fs::write(&segment, "x").unwrap();
+
+        let membership = Membership::join(&own, &lock).unwrap();
+        let [first, second] = [(); 2].map(|()| Membership::join(&other, &lock).unwrap());
+        drop(first);
+        remove_abandoned(&namespace, Some(&own));
+        assert!(segment.exists(), "a process uses it");
+        drop(second);
+        remove_abandoned(&namespace, Some(&other));
+        assert!(segment.exists() && file_of(&own).exists());
+        remove_abandoned(&namespace, Some(&own));
+        assert!(!segment.exists() && !file_of(&other).exists() && file_of(&own).exists());
+        drop(membership);
+        assert!(remove_if_unused(&own) && !file_of(&own).exists());
+        fs::remove_dir(&root).unwrap();
+    }
+}

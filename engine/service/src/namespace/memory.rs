@@ -1,0 +1,137 @@
+//! Prefaulting of shared memory: making sure that it is available before it is written to.
+//!
+//! A segment in `/dev/shm` may be larger than the space that is left there. The process is then killed by SIGBUS when it first
+//! writes to a page for which there is no memory, possibly hours after its start. Each chunk is therefore prefaulted before its
+//! first use, and missing memory is an error.
+
+use std::mem::MaybeUninit;
+
+use rustix::io::Errno;
+use rustix::mm::Advice;
+
+use endless_gym_core::batch::BLOCK_BYTES;
+
+use crate::error::ServiceError;
+use crate::protocol::message::PayloadBlock;
+
+pub(crate) const PATH: &str = "/dev/shm";
+
+/// Bytes reserved for iceoryx2's own segments and for headers.
+pub(crate) const MARGIN: u64 = 1 << 20;
+
+/// Bytes that must be free for a process to join a namespace.
+pub(crate) const NODE_BYTES: u64 = 64 << 10;
+
+/// Fails if `/dev/shm` has fewer than `needed` bytes free. iceoryx2 writes to a new segment without allocating it first, which
+/// raises SIGBUS if there is no memory.
+pub(crate) fn check_free(needed: u64) -> Result<(), ServiceError> {
+    available().map_or(Ok(()), |available| check(needed, available))
+}
+
+/// The addresses of the chunks that have been prefaulted.
+#[derive(Debug, Default)]
+pub(crate) struct PrefaultedChunks(Vec<usize>);
+
+impl PrefaultedChunks {
+    /// Fails if `/dev/shm` has no room for `chunks` chunks of `blocks` blocks.
+    pub(crate) fn check_available(blocks: usize, chunks: usize) -> Result<(), ServiceError> {
+        check_free(needed(blocks, chunks))
+    }
+
+    /// Prefaults a chunk unless it has been prefaulted before.
+    pub(crate) fn prefault(&mut self, chunk: &mut [MaybeUninit<PayloadBlock>]) -> Result<(), ServiceError> {
+        let address = chunk.as_ptr().addr();
+        if self.0.contains(&address) {
+            return Ok(());
+        }
+        match populate(chunk) {
+            // Linux before 5.14 does not support the advice; `check_available` must suffice.
+            Ok(()) | Err(Errno::INVAL) => {
+                self.0.push(address);
+                Ok(())
+            }
+            Err(_) => Err(too_small(needed(chunk.len(), 1))),
+        }
+    }
+}
+
+/// The error if `needed` bytes cannot be had.
+pub(crate) fn too_small(needed: u64) -> ServiceError {
+    ServiceError::SharedMemoryTooSmall { needed, available: available().unwrap_or(0), path: PATH }
+}
+
+fn needed(blocks: usize, chunks: usize) -> u64 {
+    (blocks as u64).saturating_mul(BLOCK_BYTES as u64).saturating_mul(chunks as u64).saturating_add(MARGIN)
+}
+
+fn check(needed: u64, available: u64) -> Result<(), ServiceError> {
+    if needed <= available { Ok(()) } else { Err(ServiceError::SharedMemoryTooSmall { needed, available, path: PATH }) }
+}
+
+/// Free bytes; `None` if the file system does not report them or has no limit.
+fn available() -> Option<u64> {
+    let file_system = rustix::fs::statvfs(PATH).ok()?;
+    (file_system.f_blocks > 0).then(|| file_system.f_bavail.saturating_mul(file_system.f_frsize))
+}
+
+/// Possible page sizes of the operating system.
+const PAGE_SIZES: [usize; 3] = [4 << 10, 16 << 10, 64 << 10];
+
+/// Allocates the pages of `chunk` without changing their content.
+fn populate(chunk: &mut [MaybeUninit<PayloadBlock>]) -> rustix::io::Result<()> {
+    let start = chunk.as_mut_ptr();
+    let mut pages = PAGE_SIZES.into_iter();
+    let mut page = pages.next().unwrap_or(1);
+    loop {
+        let above = start.addr() % page;
+        let (first, length) = (start.wrapping_byte_sub(above), above + size_of_val(chunk));
+        // SAFETY: the range covers the pages of `chunk`, which is mapped for writing. If `page` is not the page size, the call
+        // fails without an effect. The advice allocates pages and changes neither their content nor the mapping.
+        match unsafe { rustix::mm::madvise(first.cast(), length, Advice::LinuxPopulateWrite) } {
+            Err(Errno::INTR | Errno::AGAIN) => {}
+            Err(Errno::INVAL) => match pages.next() {
+                Some(next) => page = next,
+                None => return Err(Errno::INVAL),
+            },
+            result => return result,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+
+    use rustix::mm::{MapFlags, ProtFlags, mmap};
+
+    use super::*;
+
+    #[test]
+    fn too_little_memory_is_refused_with_both_numbers() {
+        check(needed(1000, 5), 10_000_000).unwrap();
+        let text = check(needed(1_000_000, 5), 64_000_000).unwrap_err().to_string();
+        assert!(text.contains("322 MB") && text.contains("64 MB") && text.contains("/dev/shm"), "{text}");
+        check(needed(usize::MAX, usize::MAX), u64::MAX - 1).unwrap_err();
+    }
+
+    #[test]
+    fn missing_pages_are_an_error_and_not_a_signal() {
+        // The second page of the mapping is beyond the end of the file: writing to it raises SIGBUS, as in a full /dev/shm.
+        let page = PAGE_SIZES[2];
+        let path = std::env::temp_dir().join(format!("endless-prefault-{}", std::process::id()));
+        let file = File::options().read(true).write(true).create(true).truncate(true).open(&path).unwrap();
+        std::fs::remove_file(&path).unwrap();
+        file.set_len(page as u64).unwrap();
+        // SAFETY: a new mapping at an address that the system chooses, which lasts until the process ends.
+        let start = unsafe {
+            mmap(std::ptr::null_mut(), 2 * page, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0)
+        };
+        let start = start.unwrap().cast::<MaybeUninit<PayloadBlock>>();
+        let blocks = page / BLOCK_BYTES;
+        // SAFETY: both pages are mapped for writing and not used elsewhere; the second is never accessed.
+        let (present, missing) = unsafe { std::slice::from_raw_parts_mut(start, 2 * blocks) }.split_at_mut(blocks);
+        let mut chunks = PrefaultedChunks::default();
+        chunks.prefault(&mut present[1..]).unwrap();
+        assert!(matches!(chunks.prefault(missing), Err(ServiceError::SharedMemoryTooSmall { .. })));
+    }
+}

@@ -1,0 +1,348 @@
+//! The iceoryx2 services and ports of an engine.
+
+use endless_gym_core::batch::{Layout, SNAPSHOT_BYTES, blocks_for};
+use iceoryx2::identifiers::UniqueNodeId;
+use iceoryx2::port::listener::{Listener, ListenerCreateError};
+use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::{
+    AllocationStrategy, BackpressureStrategy, CallbackProgression, EventId, PortFactory, ServiceName, ZeroCopySend,
+};
+use iceoryx2::service::builder::event::EventOpenError;
+use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
+use iceoryx2::service::port_factory::{event, publish_subscribe};
+
+use crate::error::ServiceError;
+use crate::namespace::directory::Ipc;
+use crate::namespace::memory::PrefaultedChunks;
+use crate::namespace::node::NamespaceNode;
+use crate::protocol::message::{PayloadBlock, RequestHeader, ResponseHeader};
+
+pub(crate) type BlockService<H> = publish_subscribe::PortFactory<Ipc, [PayloadBlock], H>;
+pub(crate) type BlockPublisher<H> = Publisher<Ipc, [PayloadBlock], H>;
+pub(crate) type RequestPublisher = BlockPublisher<RequestHeader>;
+pub(crate) type RequestSubscriber = Subscriber<Ipc, [PayloadBlock], RequestHeader>;
+pub(crate) type ResponsePublisher = BlockPublisher<ResponseHeader>;
+pub(crate) type ResponseSubscriber = Subscriber<Ipc, [PayloadBlock], ResponseHeader>;
+
+/// Nodes that may open a service at a time: the engine, its trainer, observers, and processes that are about to be refused.
+const MAX_NODES: usize = 64;
+
+/// Names of one engine's services. All names except the specification's contain the incarnation, so that a restarted engine
+/// shares nothing with the services that a dead one left.
+#[derive(Clone, Debug)]
+pub(crate) struct ServiceNames {
+    service: String,
+    incarnation: u64,
+}
+
+/// Name of the port of an observer that has paused. Others have none.
+pub(crate) const RESUMED: &str = "resumed";
+
+/// Prefix of the names of all specification services.
+pub(crate) const SPECIFICATION_PREFIX: &str = "endless-gym/";
+
+impl ServiceNames {
+    pub(crate) fn new(service: &str, incarnation: u64) -> Self {
+        ServiceNames { service: service.to_owned(), incarnation }
+    }
+
+    pub(crate) fn specification(service: &str) -> Result<ServiceName, ServiceError> {
+        Self::name(format!("{SPECIFICATION_PREFIX}{service}"))
+    }
+
+    fn of_incarnation(&self, what: &str) -> Result<ServiceName, ServiceError> {
+        Self::name(format!("{SPECIFICATION_PREFIX}{}/{:016x}/{what}", self.service, self.incarnation))
+    }
+
+    fn name(text: String) -> Result<ServiceName, ServiceError> {
+        ServiceName::new(&text).map_err(|e| ServiceError::middleware("cannot create a service name")(e.to_string()))
+    }
+}
+
+/// How many batches of a group its trainer and observers may hold. This determines the number of chunks in shared memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LeaseLimits {
+    pub batches_held: usize,
+    pub observers: usize,
+}
+
+impl LeaseLimits {
+    /// Chunks in use without observers: those that the trainer holds, one in its queue and one being written.
+    pub(crate) fn trainer_chunks(self) -> usize {
+        self.batches_held + 2
+    }
+
+    /// Chunks in use by one observer: those that it holds, and one in its queue.
+    pub(crate) fn observer_chunks(self) -> usize {
+        self.batches_held + 1
+    }
+}
+
+/// Blocks of a chunk that can hold a batch or a snapshot.
+pub(crate) fn chunk_blocks(batch: &Layout) -> usize {
+    batch.blocks().max(blocks_for(SNAPSHOT_BYTES))
+}
+
+/// Whether services are created or opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum OpenMode {
+    Create,
+    Open,
+}
+
+/// Creates or opens the services of one engine.
+pub(crate) struct EngineServices<'a> {
+    pub node: &'a NamespaceNode,
+    pub names: ServiceNames,
+    pub mode: OpenMode,
+}
+
+impl EngineServices<'_> {
+    /// The service of one group's requests: from one trainer to one engine.
+    pub(crate) fn requests(&self, group: usize) -> Result<BlockService<RequestHeader>, ServiceError> {
+        self.block_service(&format!("act/{group}"), 1, 1)
+    }
+
+    /// The service of one group's responses: from one engine to its trainer and observers.
+    pub(crate) fn responses(
+        &self,
+        group: usize,
+        limits: LeaseLimits,
+    ) -> Result<BlockService<ResponseHeader>, ServiceError> {
+        self.block_service(&format!("obs/{group}"), limits.batches_held, 1 + limits.observers)
+    }
+
+    /// A service with one publisher and `subscribers` subscribers, each of which may borrow `borrowed` samples.
+    fn block_service<H: Default + std::fmt::Debug + ZeroCopySend>(
+        &self,
+        name: &str,
+        borrowed: usize,
+        subscribers: usize,
+    ) -> Result<BlockService<H>, ServiceError> {
+        let builder = self
+            .node
+            .service_builder(&self.names.of_incarnation(name)?)
+            .publish_subscribe::<[PayloadBlock]>()
+            .user_header::<H>()
+            .enable_safe_overflow(true)
+            .history_size(0)
+            .subscriber_max_buffer_size(1)
+            .subscriber_max_borrowed_samples(borrowed)
+            .max_publishers(1)
+            .max_subscribers(subscribers)
+            .max_nodes(MAX_NODES);
+        match self.mode {
+            OpenMode::Create => builder.create().map_err(create_error),
+            OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
+        }
+    }
+
+    /// The events of one direction. The id of an event is the number of a group; `groups` is the number of groups.
+    pub(crate) fn events(&self, to: &str, groups: usize) -> Result<event::PortFactory<Ipc>, ServiceError> {
+        let builder = self
+            .node
+            .service_builder(&self.names.of_incarnation(to)?)
+            .event()
+            .event_id_max_value(groups)
+            .max_listeners(1)
+            .max_notifiers(1)
+            .max_nodes(MAX_NODES);
+        match self.mode {
+            OpenMode::Create => builder.create().map_err(create_error),
+            OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
+        }
+    }
+
+    fn open_error(&self, failure: OpenFailure) -> ServiceError {
+        let service = self.names.service.clone();
+        match failure {
+            OpenFailure::Missing => ServiceError::EngineRestarted { service },
+            OpenFailure::OtherType => ServiceError::IncompatibleTypes { service },
+            OpenFailure::OtherVersion => ServiceError::other_iceoryx2(&service),
+            OpenFailure::Other(reason) => ServiceError::middleware("cannot open a service")(reason),
+        }
+    }
+}
+
+fn create_error(error: impl std::fmt::Display) -> ServiceError {
+    ServiceError::middleware("cannot create a service")(error.to_string())
+}
+
+/// Why a service could not be opened.
+#[derive(Debug, PartialEq, Eq)]
+enum OpenFailure {
+    /// It does not exist, or it is being removed.
+    Missing,
+    /// Its messages have another type.
+    OtherType,
+    /// It was created by another version of iceoryx2.
+    OtherVersion,
+    Other(String),
+}
+
+impl From<PublishSubscribeOpenError> for OpenFailure {
+    fn from(error: PublishSubscribeOpenError) -> Self {
+        use PublishSubscribeOpenError as E;
+        match error {
+            E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
+                OpenFailure::Missing
+            }
+            E::IncompatibleTypes | E::IncompatibleMessagingPattern => OpenFailure::OtherType,
+            E::VersionMismatch => OpenFailure::OtherVersion,
+            e => OpenFailure::Other(e.to_string()),
+        }
+    }
+}
+
+impl From<EventOpenError> for OpenFailure {
+    fn from(error: EventOpenError) -> Self {
+        use EventOpenError as E;
+        match error {
+            E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
+                OpenFailure::Missing
+            }
+            E::IncompatibleMessagingPattern => OpenFailure::OtherType,
+            E::VersionMismatch => OpenFailure::OtherVersion,
+            e => OpenFailure::Other(e.to_string()),
+        }
+    }
+}
+
+/// A publisher of messages of `blocks` blocks. Prefaults `prefaulted` chunks, so that missing memory is an error here and not a
+/// SIGBUS later.
+pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
+    service: &BlockService<H>,
+    blocks: usize,
+    prefaulted: usize,
+) -> Result<(BlockPublisher<H>, PrefaultedChunks), PortError> {
+    PrefaultedChunks::check_available(blocks, prefaulted)?;
+    let publisher = service
+        .publisher_builder()
+        .initial_max_slice_len(blocks)
+        .allocation_strategy(AllocationStrategy::Static)
+        .backpressure_strategy(BackpressureStrategy::DiscardData)
+        // Loans beyond one serve only to prefault the chunks below; they need no chunks of their own.
+        .max_loaned_samples(prefaulted)
+        .override_sample_preallocation(move |chunks| chunks - (prefaulted - 1))
+        .create()?;
+    let mut memory = PrefaultedChunks::default();
+    let mut loans = Vec::with_capacity(prefaulted);
+    for _ in 0..prefaulted {
+        PrefaultedChunks::check_available(blocks, 1)?;
+        let mut loan = publisher
+            .loan_slice_uninit(blocks)
+            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
+        memory.prefault(loan.payload_mut())?;
+        loans.push(loan);
+    }
+    // The list of free chunks is a stack; after this the first chunk is on top again.
+    while loans.pop().is_some() {}
+    Ok((publisher, memory))
+}
+
+/// Why a port could not be created.
+#[derive(Debug)]
+pub(crate) enum PortError {
+    /// The service already has its maximum number of such ports.
+    LimitReached,
+    Other(ServiceError),
+}
+
+impl From<ServiceError> for PortError {
+    fn from(error: ServiceError) -> Self {
+        PortError::Other(error)
+    }
+}
+
+impl From<PublisherCreateError> for PortError {
+    fn from(error: PublisherCreateError) -> Self {
+        match error {
+            PublisherCreateError::ExceedsMaxSupportedPublishers => PortError::LimitReached,
+            e => PortError::Other(ServiceError::middleware("cannot create a publisher")(e.to_string())),
+        }
+    }
+}
+
+impl From<NotifierCreateError> for PortError {
+    fn from(error: NotifierCreateError) -> Self {
+        match error {
+            NotifierCreateError::ExceedsMaxSupportedNotifiers => PortError::LimitReached,
+            e => PortError::Other(ServiceError::middleware("cannot create a notifier")(e.to_string())),
+        }
+    }
+}
+
+impl From<ListenerCreateError> for PortError {
+    fn from(error: ListenerCreateError) -> Self {
+        match error {
+            ListenerCreateError::ExceedsMaxSupportedListeners => PortError::LimitReached,
+            e => PortError::Other(ServiceError::middleware("cannot create a listener")(e.to_string())),
+        }
+    }
+}
+
+impl PortError {
+    /// The error where no other process can have such a port.
+    pub(crate) fn unexpected(self, port: &str) -> ServiceError {
+        match self {
+            PortError::Other(e) => e,
+            PortError::LimitReached => {
+                ServiceError::middleware("cannot create a port")(format!("{port} exists already"))
+            }
+        }
+    }
+}
+
+/// The port that wakes the waiter of the other process.
+pub(crate) fn notifier(events: &event::PortFactory<Ipc>) -> Result<Notifier<Ipc>, PortError> {
+    Ok(events.notifier_builder().create()?)
+}
+
+/// The port that this process parks on.
+pub(crate) fn listener(events: &event::PortFactory<Ipc>) -> Result<Listener<Ipc>, PortError> {
+    Ok(events.listener_builder().create()?)
+}
+
+/// Wakes the waiter of the other process. A failure is not an error: a waiter also polls after a timeout.
+pub(crate) fn notify(notifier: &Notifier<Ipc>, group: usize) {
+    if let Err(e) = notifier.notify_with_custom_event_id(EventId::new(group)) {
+        tracing::debug!(error = %e, group, "cannot notify the other process");
+    }
+}
+
+/// The first node that `list` reports.
+pub(crate) fn first_node(list: impl FnOnce(&mut dyn FnMut(UniqueNodeId))) -> Option<UniqueNodeId> {
+    let mut first = None;
+    list(&mut |node| {
+        first.get_or_insert(node);
+    });
+    first
+}
+
+/// The node that publishes on a service.
+pub(crate) fn publisher_node<H: std::fmt::Debug + ZeroCopySend>(service: &BlockService<H>) -> Option<UniqueNodeId> {
+    first_node(|found| {
+        service.dynamic_config().list_publishers(|details| {
+            found(details.node_id);
+            CallbackProgression::Continue
+        });
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn open_errors_are_told_apart_by_their_variant() {
+        use PublishSubscribeOpenError as E;
+        assert_eq!(OpenFailure::from(E::IncompatibleTypes), OpenFailure::OtherType);
+        assert_eq!(OpenFailure::from(E::VersionMismatch), OpenFailure::OtherVersion);
+        assert_eq!(OpenFailure::from(E::HangsInCreation), OpenFailure::Missing);
+        assert!(matches!(OpenFailure::from(E::ExceedsMaxNumberOfNodes), OpenFailure::Other(_)));
+        assert_eq!(OpenFailure::from(EventOpenError::IncompatibleMessagingPattern), OpenFailure::OtherType);
+        assert_eq!(OpenFailure::from(EventOpenError::VersionMismatch), OpenFailure::OtherVersion);
+    }
+}

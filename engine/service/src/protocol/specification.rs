@@ -1,0 +1,117 @@
+//! The specification of an engine: what trainers and observers must know before they connect.
+
+use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, Section, action_layout};
+use endless_gym_core::envs::{self, ActionSpace};
+use endless_gym_core::pool::{Autoreset, MAX_ENVS};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value as Json};
+
+use crate::engine::config::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
+use crate::protocol::ports::LeaseLimits;
+
+/// Describes an engine and its environments. The engine publishes it as JSON under its name.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ServiceSpecification {
+    /// The engine's name.
+    pub service: String,
+    /// The engine's [`LAYOUT_VERSION`](endless_gym_core::batch::LAYOUT_VERSION).
+    pub layout_version: u32,
+    /// Version of the engine's package.
+    pub engine_version: String,
+    /// Process id of the engine.
+    pub engine_pid: u32,
+    /// Random number that identifies this run of the engine.
+    pub incarnation: u64,
+    /// Environment id.
+    pub id: String,
+    /// Number of groups, which are stepped independently of each other.
+    pub groups: usize,
+    /// Environments in each group.
+    pub num_envs: usize,
+    /// Number of the first group's first environment among those of all engines, for seeds.
+    #[serde(default)]
+    pub first_env: usize,
+    /// Layout of a group's batch.
+    pub batch: Layout,
+    /// Layout of a request to step or reset a group.
+    pub action: ActionLayout,
+    /// Format of the frames in a batch; `None` if batches have no frames.
+    pub frames: Option<Frames>,
+    /// The action space of one environment.
+    pub action_space: ActionSpace,
+    /// Names of the columns of the batch's section `info`.
+    pub info: Vec<String>,
+    /// Names of the columns of the batch's section `features`.
+    pub features: Vec<String>,
+    /// The reset parameters that were given: one map for all environments, or one for each environment of all groups.
+    pub options: Vec<Map<String, Json>>,
+    /// [`PoolConfig::independent_episodes`](endless_gym_core::pool::PoolConfig::independent_episodes).
+    #[serde(default)]
+    pub independent_episodes: bool,
+    /// When a new episode starts after the end of one.
+    pub autoreset: Autoreset,
+    /// Nominal rendering rate in frames per second (`metadata["render_fps"]`).
+    pub render_fps: u32,
+    /// Batches of a group that a trainer or an observer may hold at a time.
+    pub batches_held: usize,
+    /// Observers of a group that may be connected at a time.
+    pub observers: usize,
+}
+
+impl ServiceSpecification {
+    pub(crate) fn lease_limits(&self) -> LeaseLimits {
+        LeaseLimits { batches_held: self.batches_held, observers: self.observers }
+    }
+
+    /// Checks what a malformed specification could break in a trainer of the engine `service`. Returns the reason if it is
+    /// invalid.
+    pub(crate) fn check(&self, service: &str) -> Result<(), String> {
+        if self.service != service {
+            return Err(format!("service must be `{service}`, got `{}`", self.service));
+        }
+        let ranges = [
+            ("groups", self.groups, 1, MAX_GROUPS),
+            ("num_envs", self.num_envs, 1, MAX_ENVS),
+            ("batches_held", self.batches_held, 1, MAX_BATCHES_HELD),
+            ("observers", self.observers, 0, MAX_OBSERVERS),
+        ];
+        for (name, given, lowest, highest) in ranges {
+            if !(lowest..=highest).contains(&given) {
+                return Err(format!("{name} must be {lowest} to {highest}, got {given}"));
+            }
+        }
+        let spec = envs::spec(&self.id).map_err(|e| e.to_string())?;
+        let action = action_layout(spec, self.num_envs).map_err(|e| e.to_string())?;
+        if self.action != action || self.action_space != spec.action_space {
+            return Err(format!("action layout or action space is not that of {}", self.id));
+        }
+        if self.batch.num_envs() != self.num_envs {
+            return Err(format!("batch must have {} environments, got {}", self.num_envs, self.batch.num_envs()));
+        }
+        let columns = [("info", &self.info, BatchSection::Info), ("features", &self.features, BatchSection::Features)];
+        for (name, columns, section) in columns {
+            let (given, width) = (columns.len(), self.batch.section(section).map_or(0, Section::width));
+            if given != width {
+                return Err(format!("{name} must name {width} columns, those of the batch's section, got {given}"));
+            }
+        }
+        Ok(())
+    }
+
+    /// The first property in which `other` differs such that a trainer of this engine cannot continue with that one.
+    pub(crate) fn difference(&self, other: &ServiceSpecification) -> Option<&'static str> {
+        let same = [
+            ("environment", self.id == other.id),
+            ("number of groups", self.groups == other.groups),
+            ("number of environments", self.num_envs == other.num_envs),
+            ("number of the first environment", self.first_env == other.first_env),
+            ("batch layout", self.batch == other.batch && self.action == other.action && self.frames == other.frames),
+            ("action space", self.action_space == other.action_space),
+            ("set of columns", self.info == other.info && self.features == other.features),
+            ("set of options", self.options == other.options),
+            ("independence of episodes", self.independent_episodes == other.independent_episodes),
+            ("auto-reset mode", self.autoreset == other.autoreset),
+        ];
+        same.into_iter().find(|(_, same)| !same).map(|(what, _)| what)
+    }
+}

@@ -1,0 +1,450 @@
+//! The files in shared memory that hold the status of an engine and of its observers.
+//!
+//! The engine or the observer maps its file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a
+//! writer does can harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence
+//! lock).
+//!
+//! The writer holds an `flock` on the file from before it has its name until its process ends. A file without that lock belongs to
+//! a dead process and may be removed, independent of process ids, which another container would not see.
+//!
+//! A process that truncated the file would end its writer by SIGBUS, as with every segment of shared memory. The file is read-only,
+//! so that this does not happen by mistake; root, and a process of the same user that changes the mode first, still can.
+
+use std::fs::{self, File};
+use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicU64, Ordering, fence};
+
+use bytemuck::{Pod, Zeroable};
+use endless_gym_core::batch::LAYOUT_VERSION;
+use rustix::fs::{FallocateFlags, FlockOperation, OFlags, fallocate, flock};
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+use rustix::time::{ClockId, clock_gettime};
+
+use crate::engine::config::MAX_GROUPS;
+use crate::error::ServiceError;
+use crate::protocol::message::RequestKind;
+
+const DIRECTORY: &str = "/dev/shm";
+
+/// End of the names of the files of engines, and of observers.
+const SUFFIX: &str = ".status";
+const OBSERVER_SUFFIX: &str = ".observer";
+
+const WORD: usize = size_of::<u64>();
+
+/// Words from one record to the next, with its sequence number: whole cache lines.
+const ENGINE_WORDS: usize = 32;
+const GROUP_WORDS: usize = 24;
+const OBSERVER_WORDS: usize = 8;
+const _: () = assert!(size_of::<EngineRecord>() / WORD < ENGINE_WORDS && size_of::<GroupRecord>() / WORD < GROUP_WORDS);
+const _: () = assert!(size_of::<ObserverRecord>() / WORD < OBSERVER_WORDS);
+
+/// How often a reader tries to read a record that is being written.
+const READ_ATTEMPTS: usize = 100;
+
+/// The file of an engine's status.
+pub(crate) fn path(prefix: &str, service: &str, incarnation: u64) -> PathBuf {
+    Path::new(DIRECTORY).join(format!("{prefix}{service}.{incarnation:016x}{SUFFIX}"))
+}
+
+/// The file of an observer of an engine, with a random number.
+pub(crate) fn observer_path(prefix: &str, incarnation: u64, number: u64) -> PathBuf {
+    Path::new(DIRECTORY).join(format!("{prefix}{incarnation:016x}.{number:016x}{OBSERVER_SUFFIX}"))
+}
+
+/// The status files of a namespace's engines.
+pub(crate) fn paths(prefix: &str) -> Vec<PathBuf> {
+    paths_with(prefix, SUFFIX)
+}
+
+/// The records of an engine's observers that are running.
+pub(crate) fn running_observers(prefix: &str, incarnation: u64) -> Vec<ObserverRecord> {
+    observer_paths(prefix, incarnation).iter().filter_map(|path| StatusReader::running_observer(path)).collect()
+}
+
+/// The files of an engine's observers.
+fn observer_paths(prefix: &str, incarnation: u64) -> Vec<PathBuf> {
+    paths_with(&format!("{prefix}{incarnation:016x}."), OBSERVER_SUFFIX)
+}
+
+fn paths_with(prefix: &str, suffix: &str) -> Vec<PathBuf> {
+    let is_status = |name: &str| name.starts_with(prefix) && name.ends_with(suffix);
+    let entries = fs::read_dir(DIRECTORY).into_iter().flatten().flatten();
+    let named = entries.filter(|entry| entry.file_name().to_str().is_some_and(is_status));
+    named.map(|entry| entry.path()).collect()
+}
+
+/// Removes the files of dead engines and observers.
+pub(crate) fn remove_abandoned(prefix: &str) {
+    for path in paths(prefix).into_iter().chain(paths_with(prefix, OBSERVER_SUFFIX)) {
+        let Some(file) = open(&path) else { continue };
+        if flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok() {
+            tracing::debug!(path = %path.display(), "removing the status of a dead process");
+            // An error means that another process has removed it.
+            let _ = fs::remove_file(&path);
+        }
+    }
+}
+
+/// Opens a status file of this user for reading.
+fn open(path: &Path) -> Option<File> {
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
+    let file = File::options().read(true).custom_flags(flags.cast_signed()).open(path).ok()?;
+    let metadata = file.metadata().ok()?;
+    (metadata.is_file() && metadata.uid() == rustix::process::getuid().as_raw()).then_some(file)
+}
+
+/// The number of words of a file with that many groups.
+fn words(groups: usize) -> usize {
+    ENGINE_WORDS + groups * GROUP_WORDS
+}
+
+/// The status file of an engine or an observer in this process. It is removed when this is dropped.
+#[derive(Debug)]
+pub(crate) struct StatusFile {
+    start: NonNull<AtomicU64>,
+    words: usize,
+    path: PathBuf,
+    process: u32,
+    /// Holds the lock.
+    _file: File,
+}
+
+// SAFETY: the mapping belongs to this value alone, and its words are atomic.
+unsafe impl Send for StatusFile {}
+// SAFETY: as above; `&self` gives access to atomic words.
+unsafe impl Sync for StatusFile {}
+
+impl StatusFile {
+    /// Creates the file of an engine with these records. It appears under its name complete and locked.
+    pub(crate) fn create(path: PathBuf, engine: &EngineRecord, groups: usize) -> Result<Self, ServiceError> {
+        Self::with_record(path, words(groups), bytemuck::cast_slice(std::slice::from_ref(engine)))
+    }
+
+    /// Creates the file of an observer.
+    pub(crate) fn create_observer(path: PathBuf, record: &ObserverRecord) -> Result<Self, ServiceError> {
+        Self::with_record(path, OBSERVER_WORDS, bytemuck::cast_slice(std::slice::from_ref(record)))
+    }
+
+    fn with_record(path: PathBuf, words: usize, record: &[u64]) -> Result<Self, ServiceError> {
+        let failed = |e: &dyn std::fmt::Display| ServiceError::middleware("cannot create the status")(e.to_string());
+        let unnamed = path.with_extension("new");
+        let file = File::options()
+            .read(true)
+            .write(true)
+            .create_new(true)
+            .mode(0o400)
+            .open(&unnamed)
+            .map_err(|e| failed(&format_args!("{}: {e}", unnamed.display())))?;
+        let prepared = flock(&file, FlockOperation::NonBlockingLockExclusive)
+            // Without allocation, writing to the mapping of a file for which there is no memory raises SIGBUS.
+            .and_then(|()| fallocate(&file, FallocateFlags::empty(), 0, (words * WORD) as u64))
+            .and_then(|()| {
+                // SAFETY: a new mapping at an address that the system chooses.
+                unsafe {
+                    let protection = ProtFlags::READ | ProtFlags::WRITE;
+                    mmap(std::ptr::null_mut(), words * WORD, protection, MapFlags::SHARED, &file, 0)
+                }
+            });
+        let start = prepared.map_err(|e| {
+            let _ = fs::remove_file(&unnamed);
+            failed(&e)
+        })?;
+        let start = NonNull::new(start.cast()).ok_or_else(|| failed(&"the mapping has no address"))?;
+        let status = StatusFile { start, words, path, process: std::process::id(), _file: file };
+        status.write(0, record);
+        fs::rename(&unnamed, &status.path).map_err(|e| {
+            let _ = fs::remove_file(&unnamed);
+            failed(&e)
+        })?;
+        Ok(status)
+    }
+
+    pub(crate) fn write_engine(&self, record: &EngineRecord) {
+        self.write(0, bytemuck::cast_slice(std::slice::from_ref(record)));
+    }
+
+    pub(crate) fn write_observer(&self, record: &ObserverRecord) {
+        self.write(0, bytemuck::cast_slice(std::slice::from_ref(record)));
+    }
+
+    pub(crate) fn write_group(&self, group: usize, record: &GroupRecord) {
+        self.write(words(group), bytemuck::cast_slice(std::slice::from_ref(record)));
+    }
+
+    fn write(&self, at: usize, record: &[u64]) {
+        // SAFETY: the mapping has that many words, is aligned to a page, and lasts until this value is dropped. All access to it
+        // in this process is atomic.
+        let memory = unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.words) };
+        let sequence = memory[at].load(Ordering::Relaxed);
+        memory[at].store(sequence.wrapping_add(1), Ordering::Relaxed);
+        fence(Ordering::Release);
+        for (to, from) in memory[at + 1..].iter().zip(record) {
+            to.store(*from, Ordering::Relaxed);
+        }
+        memory[at].store(sequence.wrapping_add(2), Ordering::Release);
+    }
+}
+
+impl Drop for StatusFile {
+    fn drop(&mut self) {
+        // In a forked process, the file is the parent's.
+        if self.process == std::process::id() {
+            let _ = fs::remove_file(&self.path);
+        }
+        // SAFETY: the mapping was made with this address and length, and nothing else refers to it.
+        let _ = unsafe { munmap(self.start.as_ptr().cast(), self.words * WORD) };
+    }
+}
+
+/// Reads the status of an engine or an observer in another process, also after its end.
+#[derive(Debug)]
+pub(crate) struct StatusReader {
+    file: File,
+}
+
+impl StatusReader {
+    /// Opens an engine's file; `None` if it is missing, or not of this version.
+    pub(crate) fn open(path: &Path) -> Option<Self> {
+        let reader = StatusReader { file: open(path)? };
+        reader.engine().map(|_| reader)
+    }
+
+    /// The record of an observer that is running; `None` if it cannot be read.
+    fn running_observer(path: &Path) -> Option<ObserverRecord> {
+        let reader = StatusReader { file: open(path)? };
+        if reader.is_alive() { reader.read(0) } else { None }
+    }
+
+    /// Whether the process that writes the file is running.
+    pub(crate) fn is_alive(&self) -> bool {
+        match flock(&self.file, FlockOperation::NonBlockingLockShared) {
+            Ok(()) => {
+                let _ = flock(&self.file, FlockOperation::Unlock);
+                false
+            }
+            Err(_) => true,
+        }
+    }
+
+    /// The record of the engine; `None` if it cannot be read.
+    pub(crate) fn engine(&self) -> Option<EngineRecord> {
+        self.read::<EngineRecord>(0).filter(EngineRecord::is_valid)
+    }
+
+    /// The record of a group; `None` if it cannot be read.
+    pub(crate) fn group(&self, group: usize) -> Option<GroupRecord> {
+        self.read(words(group))
+    }
+
+    fn read<R: Pod>(&self, at: usize) -> Option<R> {
+        let offset = (at * WORD) as u64;
+        let sequence = || {
+            let mut word = [0; WORD];
+            self.file.read_exact_at(&mut word, offset).ok().map(|()| u64::from_ne_bytes(word))
+        };
+        for _ in 0..READ_ATTEMPTS {
+            let before = sequence()?;
+            let mut record = R::zeroed();
+            self.file.read_exact_at(bytemuck::bytes_of_mut(&mut record), offset + WORD as u64).ok()?;
+            if before.is_multiple_of(2) && sequence()? == before {
+                return Some(record);
+            }
+            std::thread::yield_now();
+        }
+        None
+    }
+}
+
+/// First word of a status file.
+pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"EGYMSTAT");
+
+/// What concerns the whole engine. Times are in nanoseconds of CLOCK_MONOTONIC, 0 for none.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct EngineRecord {
+    pub magic: u64,
+    pub layout_version: u32,
+    pub process: u32,
+    pub incarnation: u64,
+    pub started: u64,
+    pub groups: u32,
+    pub num_envs: u32,
+    /// Requests for an earlier incarnation, which were ignored.
+    pub dropped: u64,
+    /// Dead processes whose resources the engine removed.
+    pub recoveries: u64,
+    /// Checkpoints saved, and when the last one was.
+    pub checkpoints: u64,
+    pub last_checkpoint: u64,
+    /// Environment id and engine name, padded with zeros.
+    pub id: [u8; 64],
+    pub service: [u8; 64],
+}
+
+impl EngineRecord {
+    /// Whether a reader of this version can use the record.
+    pub(crate) fn is_valid(&self) -> bool {
+        let groups = usize::try_from(self.groups).unwrap_or(usize::MAX);
+        self.magic == MAGIC && self.layout_version == LAYOUT_VERSION && (1..=MAX_GROUPS).contains(&groups)
+    }
+}
+
+/// What concerns one group. Times are as in [`EngineRecord`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct GroupRecord {
+    /// Batches returned, as in the header of a response.
+    pub step: u64,
+    /// The trainer of the last request, and how many trainers there were.
+    pub trainer: u64,
+    pub trainers: u64,
+    /// Numbers of that trainer's requests: the last one that was taken, answered, and executed rather than rejected.
+    pub taken: u64,
+    pub answered: u64,
+    pub executed: u64,
+    /// When the current request was taken; 0 if there is none.
+    pub busy_since: u64,
+    /// When the last request was taken.
+    pub last_request: u64,
+    pub batches: u64,
+    pub env_steps: u64,
+    pub episodes: u64,
+    pub rejected: u64,
+    pub undelivered: u64,
+    /// Code of the last request's [`RequestKind`].
+    pub kind: u32,
+    /// Process id of the trainer, as it gave it.
+    pub trainer_process: u32,
+    /// Batches that the trainer held when it sent the last request.
+    pub held: u32,
+    pub padding: u32,
+}
+
+impl GroupRecord {
+    /// The kind of the last request in a word.
+    pub(crate) fn kind(&self) -> &'static str {
+        RequestKind::from_code(self.kind).map_or("request", RequestKind::name)
+    }
+}
+
+/// What concerns one observer. Times are as in [`EngineRecord`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct ObserverRecord {
+    /// Process id, as the observer gives it.
+    pub process: u32,
+    pub group: u32,
+    /// Batches received.
+    pub batches: u64,
+    /// When it received the last one.
+    pub last_batch: u64,
+    /// Batches that it held then, including that one.
+    pub held: u32,
+    pub padding: u32,
+}
+
+/// Nanoseconds of CLOCK_MONOTONIC, which is the same in all processes of a host; at least 1.
+pub(crate) fn now() -> u64 {
+    let time = clock_gettime(ClockId::Monotonic);
+    let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
+    seconds.saturating_mul(1_000_000_000).saturating_add(u64::try_from(time.tv_nsec).unwrap_or(0)).max(1)
+}
+
+/// Text as a field that is padded with zeros.
+pub(crate) fn padded<const N: usize>(text: &str) -> [u8; N] {
+    let mut bytes = [0; N];
+    bytes.iter_mut().zip(text.bytes()).for_each(|(to, from)| *to = from);
+    bytes
+}
+
+/// The text of a field that is padded with zeros.
+pub(crate) fn unpadded(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).trim_end_matches('\0').chars().filter(|c| !c.is_control()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use bytemuck::Zeroable;
+    use endless_gym_core::batch::LAYOUT_VERSION;
+
+    use super::*;
+    use crate::protocol::status_file::{MAGIC, padded};
+
+    fn record() -> EngineRecord {
+        let (id, service) = (padded("MortarMayhem-v0"), padded("gym"));
+        let (magic, layout_version) = (MAGIC, LAYOUT_VERSION);
+        EngineRecord { magic, layout_version, groups: 2, num_envs: 3, id, service, ..EngineRecord::zeroed() }
+    }
+
+    fn place(name: &str) -> PathBuf {
+        path(&format!("endless-status-{}_", std::process::id()), name, 1)
+    }
+
+    #[test]
+    fn records_are_read_as_they_were_written() {
+        let path = place("read");
+        let file = StatusFile::create(path.clone(), &record(), 2).unwrap();
+        let reader = StatusReader::open(&path).unwrap();
+        assert_eq!(reader.engine(), Some(record()));
+        let mode = fs::metadata(&path).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o400, "no other process truncates it by mistake");
+        let group = GroupRecord { step: 7, taken: 9, held: 2, ..GroupRecord::default() };
+        file.write_group(1, &group);
+        assert_eq!((reader.group(0), reader.group(1)), (Some(GroupRecord::default()), Some(group)));
+        assert_eq!(reader.group(2), None);
+        assert!(reader.is_alive());
+        drop(file);
+        assert!(!path.exists() && !reader.is_alive());
+        assert_eq!(reader.group(1), Some(group), "the last status remains readable");
+    }
+
+    #[test]
+    fn a_record_is_never_read_half_written() {
+        let path = place("torn");
+        let file = StatusFile::create(path.clone(), &record(), 1).unwrap();
+        let reader = StatusReader::open(&path).unwrap();
+        let same = |n: u64| GroupRecord { step: n, taken: n, answered: n, undelivered: n, ..GroupRecord::default() };
+        std::thread::scope(|scope| {
+            let writer = scope.spawn(|| (0..300_000).for_each(|n| file.write_group(0, &same(n))));
+            while !writer.is_finished() {
+                if let Some(read) = reader.group(0) {
+                    assert_eq!(read, same(read.step));
+                }
+            }
+        });
+        assert_eq!(reader.group(0), Some(same(299_999)));
+    }
+
+    #[test]
+    fn what_is_no_status_of_a_running_engine_is_refused_or_removed() {
+        let prefix = format!("endless-status-odd-{}_", std::process::id());
+        let running = path(&prefix, "running", 1);
+        let file = StatusFile::create(running.clone(), &record(), 1).unwrap();
+        let [other, short, dead] = ["other", "short", "dead"].map(|name| path(&prefix, name, 1));
+        fs::write(&other, [7; 4096]).unwrap();
+        fs::write(&short, [0; 9]).unwrap();
+        fs::copy(&running, &dead).unwrap();
+        assert!(StatusReader::open(&other).is_none() && StatusReader::open(&short).is_none());
+        assert!(StatusReader::open(&path(&prefix, "missing", 1)).is_none());
+        assert!(!StatusReader::open(&dead).unwrap().is_alive());
+        assert_eq!(paths(&prefix).len(), 4);
+        let [observer, gone] = [1, 2].map(|number| observer_path(&prefix, 9, number));
+        let seen = ObserverRecord { group: 1, held: 2, ..ObserverRecord::default() };
+        let file_of_observer = StatusFile::create_observer(observer.clone(), &seen).unwrap();
+        fs::copy(&observer, &gone).unwrap();
+        assert_eq!(StatusReader::running_observer(&observer), Some(seen));
+        assert_eq!(StatusReader::running_observer(&gone), None);
+        remove_abandoned(&prefix);
+        assert_eq!(observer_paths(&prefix, 9), [observer]);
+        drop(file_of_observer);
+        assert!(observer_paths(&prefix, 9).is_empty());
+        assert_eq!(paths(&prefix), [running]);
+        drop(file);
+        assert!(paths(&prefix).is_empty());
+    }
+}
