@@ -12,19 +12,16 @@ import pytest
 pytestmark = pytest.mark.slow
 
 SMALL = (
-    "--preset quick --environment.num-envs 2 --ppo.steps 16 --ppo.updates 1 --ppo.epochs 1 "
+    "--preset quick --environment.num-envs 2 --ppo.steps 8 --ppo.updates 1 --ppo.epochs 1 "
     "--ppo.minibatches 2 --threads 1 --environment.num-threads 1 --recurrence.hidden-size 16 --transformer.width 16 "
-    "--transformer.window 8 --transformer.sequence-length 8"
+    "--transformer.window 6 --transformer.sequence-length 4"
 )
 HEADS = "--environment.observation rgb --ppo.reconstruction-coefficient 0.1 --ppo.ground-truth-coefficient 0.1"
 FLAGS = {
     "gru": f"--env Endless-MortarMayhem-v0 --agent gru {HEADS}",
-    "trxl": "--env Endless-MysteryPath-v0 --agent trxl --ppo.ground-truth-coefficient 0.1",
-    "lstm": "--env MortarMayhemB-Grid-v0 --agent lstm --recurrence.layers 2",
-    "none": "--env MortarMayhemB-Grid-v0 --agent none --ppo.advantage-normalisation minibatch",
-    "gtrxl": "--env MortarMayhemB-Grid-v0 --agent gtrxl --transformer.positional-encoding relative",
-    "previous": "--env MortarMayhemB-v0 --agent trxl --transformer.query-previous",
-    "learned": "--env MortarMayhemB-v0 --agent trxl --transformer.positional-encoding learned --transformer.query-encoding",
+    "lstm": "--env MortarMayhemB-Grid-v0 --agent lstm --recurrence.layers 2 --ppo.advantage-normalisation minibatch",
+    "trxl": "--env Endless-MysteryPath-v0 --agent trxl --transformer.positional-encoding learned --transformer.query-encoding",
+    "gtrxl": "--env MortarMayhemB-Grid-v0 --agent gtrxl --transformer.positional-encoding relative --transformer.query-previous",
     "stack": "--env MortarMayhemB-Grid-v0 --agent stack --environment.observation rgb --model.stack 2",
     "position": "--env MortarMayhemB-Grid-v0 --agent position --ppo.advantage-normalisation batch",
 }

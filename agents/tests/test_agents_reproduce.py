@@ -296,15 +296,23 @@ def test_errors_of_ray(
     assert re.match(f"endless-reproduce: {message}", capsys.readouterr().err)
 
 
+@pytest.fixture(scope="module")
+def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an undisturbed run, in its folder `through`."""
+    folder = tmp_path_factory.mktemp("reproduced")
+    own(folder)
+    process = start(folder, "through")
+    text, _ = process.communicate(timeout=280)
+    assert process.returncode == 0, text
+    assert (folder / "through" / "mine" / "README.md").exists()
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["kill", "interrupt"])
-def test_stopped_run_equals_an_uninterrupted_one(how: str, tmp_path: Path) -> None:
+def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_path: Path) -> None:
     """A run that is killed, or stopped by Ctrl-C, continues; then everything is done, and nothing runs again."""
     own(tmp_path)
-    through = start(tmp_path, "through")
-    text, _ = through.communicate(timeout=280)
-    assert through.returncode == 0, text
-    assert (tmp_path / "through" / "mine" / "README.md").exists()
     begun = start(tmp_path, "stopped")
     wait_for_updates(run_folder(tmp_path, "stopped"), 3)
     if how == "kill":
@@ -320,12 +328,13 @@ def test_stopped_run_equals_an_uninterrupted_one(how: str, tmp_path: Path) -> No
     text, _ = again.communicate(timeout=280)
     assert again.returncode == 0, text
     assert "resumed at update" in text
-    (rows, model), (expected_rows, expected) = (outcome(run_folder(tmp_path, out)) for out in ("stopped", "through"))
+    rows, model = outcome(run_folder(tmp_path, "stopped"))
+    expected_rows, expected = outcome(run_folder(through, "through"))
     assert len(rows) == 6
     assert rows == expected_rows
     assert all(torch.equal(model[name], expected[name]) for name in expected)
-    tables = [(tmp_path / out / "mine" / "table.csv").read_text() for out in ("stopped", "through")]
-    assert tables[0] == tables[1]
+    tables = [folder / "mine" / "table.csv" for folder in (tmp_path / "stopped", through / "through")]
+    assert tables[0].read_text() == tables[1].read_text()
     before = os.stat(run_folder(tmp_path, "stopped") / "progress.jsonl").st_mtime_ns
     skipped = start(tmp_path, "stopped")
     text, _ = skipped.communicate(timeout=280)
@@ -337,8 +346,8 @@ def test_stopped_run_equals_an_uninterrupted_one(how: str, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_the_smallest_version_of_an_experiment(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", list({definitions.load(name).kind: name for name in NAMES}.values()))
+def test_the_smallest_version_of_each_kind_of_experiment(name: str, tmp_path: Path) -> None:
     """One run with one update, through evaluation and report."""
     file = tmp_path / f"{name}.json"
     experiment = definitions.load(name)

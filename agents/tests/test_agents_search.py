@@ -28,8 +28,6 @@ from endless_gym_agents.search_study import SearchArguments, Trials
 from endless_gym_agents.settings import PRESETS, Settings
 from endless_gym_agents.train import train
 
-pytestmark = pytest.mark.slow
-
 QUIET = Console(quiet=True)
 
 
@@ -77,6 +75,7 @@ def test_single_changes_differ_in_one_parameter() -> None:
     assert (value(lstm, "agent"), lstm.ppo.epochs, lstm.ppo.gamma) == ("lstm", 4, base.ppo.gamma)
 
 
+@pytest.mark.slow
 def test_search_from_start_to_end(tmp_path: Path) -> None:
     """Single changes, then a combination; restarting a complete search runs no trial."""
     first = Trials(small(tmp_path, stage="single"), QUIET)
@@ -154,6 +153,7 @@ def test_a_failed_trial_is_resumed_by_the_next_call_only(tmp_path: Path) -> None
     assert states(trials) == ["FAIL", "FAIL", "COMPLETE"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_checkpoint", [True, False])
 def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that is interrupted after the first update has the results of an uninterrupted search."""
@@ -245,6 +245,7 @@ def killed_once(trials: Trials, share: search_workers.Share | None) -> None:
     search.run_trials(trials, share)
 
 
+@pytest.mark.slow
 def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -> None:
     def given(name: str) -> SearchArguments:
         given = small(tmp_path / name, stage="single", workers=2)
@@ -280,12 +281,14 @@ def killed_and_replaced(trials: Trials, share: search_workers.Share | None) -> N
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_the_time_limit_of_a_replaced_worker_is_that_of_the_search(tmp_path: Path) -> None:
     trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
     search_workers.run_workers(trials, killed_and_replaced)
     assert (tmp_path / "ends").read_text() == f"{trials.end!r}\n" * 2
 
 
+@pytest.mark.slow
 def test_a_worker_is_not_replaced_after_the_time_limit(tmp_path: Path) -> None:
     trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
     trials.end = time.monotonic()
@@ -309,6 +312,7 @@ def interrupted_or_late(trials: Trials, share: search_workers.Share | None) -> N
     (trials.folder / "late").touch()
 
 
+@pytest.mark.slow
 def test_a_signal_while_workers_are_started_stops_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     process = multiprocessing.get_context("spawn").Process
     start, started = process.start, []
@@ -325,6 +329,7 @@ def test_a_signal_while_workers_are_started_stops_them(tmp_path: Path, monkeypat
     assert not (tmp_path / "late").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) -> None:
     """Also if it is killed: they stop after their update, with checkpoints, as if they had been interrupted."""
