@@ -167,6 +167,7 @@ def test_unknown_render_modes_are_errors(make: Any) -> None:
             make("MysteryPath-v0", render_mode="human")
 
 
+@pytest.mark.libraries
 @pytest.mark.parametrize("view", ["agent", "ground_truth"])
 def test_stable_baselines3_records_videos(view: str, recorded: list[Any]) -> None:
     from stable_baselines3.common.vec_env import VecVideoRecorder
