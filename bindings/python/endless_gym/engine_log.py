@@ -15,12 +15,12 @@ _logger = logging.getLogger("endless_gym.engine")
 _LINE = re.compile(r"\S+Z +(ERROR|WARN|INFO|DEBUG|TRACE) (.*)")
 _LEVELS = {"ERROR": 40, "WARN": 30, "INFO": 20, "DEBUG": 10, "TRACE": 5}
 
-#: Lines that are kept of what is no log.
+#: Number of the latest lines that are kept if they are not log lines.
 _KEPT = 100
 
 
 def level() -> list[str]:
-    """The arguments by which the program logs what `endless_gym.engine` shows now, unless `ENDLESS_GYM_LOG` says it."""
+    """Arguments that give the program the current level of the logger, unless `ENDLESS_GYM_LOG` sets one."""
     if os.environ.get("ENDLESS_GYM_LOG"):
         return []
     effective = _logger.getEffectiveLevel()
@@ -29,7 +29,7 @@ def level() -> list[str]:
 
 
 class EngineLog:
-    """Reads the standard error of an engine to its end, in a thread: the engine must not wait for a reader."""
+    """Reads the standard error of an engine in a thread until it ends: the engine must not wait for a reader."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
@@ -49,13 +49,13 @@ class EngineLog:
                 self._other.append(line)
 
     def message(self) -> str:
-        """What the engine, which has ended, gave as its reason; empty if it gave none."""
+        """The reason that the engine, which has ended, gave; empty if it gave none."""
         self._thread.join(10)
         text = "\n" + "\n".join(self._other)
         return text.rpartition("\nendless: ")[2].strip()
 
     def close(self) -> None:
-        """Log the reason of an engine, which has ended, with an error status."""
+        """Log why the engine, which has ended, failed, if its status is an error."""
         if self._process.returncode and (message := self.message()):
             _logger.error("engine %d: %s", self._process.pid, message)
         self._thread.join(10)

@@ -29,11 +29,11 @@ class Env(gymnasium.Env[Any, Any]):
 
     `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
 
-    As in the original, an episode shows what the one before has left: the first frames of Endless-MortarMayhem show the last
-    episode's character until the agent may move, so that `reset(seed=...)` alone does not decide them. An episode depends on its
-    seed and its options alone with `independent_episodes`.
-    `copy.deepcopy` and `pickle` make an independent environment that goes on identically, with the state of the episode and of
-    the generator; a window is not part of it.
+    As in the original, an episode can show traces of the one before: the first frames of Endless-MortarMayhem show the last
+    episode's character until the agent may move, so `reset(seed=...)` alone does not determine them. With
+    `independent_episodes`, an episode depends on its seed and its options alone.
+    `copy.deepcopy` and `pickle` make an independent environment that continues identically: they copy the state of the episode
+    and of the generator, but no window.
 
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
@@ -99,10 +99,10 @@ class Env(gymnasium.Env[Any, Any]):
         return self._spec.max_episode_steps(self.reset_params)
 
     def progress(self) -> dict[str, tuple[float, float | None]]:
-        """How far the episode is, such as `{"tiles": (2.0, 9.0), "falls": (1.0, None)}`.
+        """The progress of the episode, such as `{"tiles": (2.0, 9.0), "falls": (1.0, None)}`.
 
         Returns:
-            By name the number now, and the number at which nothing is missing; `None` if there is none.
+            By name, the current number and the number at which the task is complete; `None` if there is no such number.
 
         Raises:
             RuntimeError: The environment has not been reset.

@@ -1,4 +1,4 @@
-"""Who chooses the options of each episode, and what `info` says about the running ones."""
+"""Options chosen episode by episode, and the seeds and options of running episodes in `info`."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def validate_episode_options(given: Any) -> EpisodeOptions | None:
 
 
 class EpisodeTracker:
-    """Follows the beginnings and ends of the episodes of one group.
+    """Tracks where the episodes of one group begin and end.
 
-    It lets `choose` choose their options, and if `has_info` adds to `info` what the running ones follow from.
+    `choose` chooses their options; with `has_info`, `info` has the seeds and options of the running ones.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class EpisodeTracker:
         self._same_step = autoreset is AutoresetMode.SAME_STEP
         # For each environment, the number of its next episode.
         self._numbers = [0] * num_envs
-        # The environments whose next episode may begin in the next step, and has no options.
+        # The environments whose next episode may begin in the next step and has no options yet.
         self._due: set[int] = set()
         # What `choose` returned for the next episode, and for the running one.
         self._next: dict[int, Options] = {}
@@ -149,7 +149,7 @@ class EpisodeTracker:
         for env in envs:
             given = self._choose(self._first + env, self._numbers[env], self._final.get(env))
             chosen[env] = mapping("the result of episode_options", given)
-        # After all calls, so that the same ones are called again if one raises.
+        # After all calls: if one raises, the next attempt repeats all of them.
         self._options.set(self._group, chosen)
         self._next.update(chosen)
         for env in envs:
@@ -188,7 +188,7 @@ class EpisodeTracker:
 
 
 class TrackedVectorEnv(EndlessVectorEnv):
-    """Environments whose episodes are followed, for `episode_options` and `episode_info`."""
+    """Environments whose episodes are tracked, for `episode_options` and `episode_info`."""
 
     def __init__(
         self,
@@ -213,7 +213,7 @@ class TrackedVectorEnv(EndlessVectorEnv):
 
     def step(self, actions: Any) -> Step:
         self._trackers[0].before_step()
-        return self._followed(0, super().step(actions))
+        return self._tracked(0, super().step(actions))
 
     def send(self, actions: Any, group: int = 0) -> None:
         self._trackers[self._group(group)].before_step()
@@ -221,7 +221,7 @@ class TrackedVectorEnv(EndlessVectorEnv):
 
     def recv(self, group: int | None = None) -> Step:
         step = super().recv(group)
-        return self._followed(step[4]["group"], step)
+        return self._tracked(step[4]["group"], step)
 
     def set_options(
         self,
@@ -254,6 +254,6 @@ class TrackedVectorEnv(EndlessVectorEnv):
         super()._sent_reset(group, envs, given, text)
         self._trackers[group].sent_reset(envs)
 
-    def _followed(self, group: int, step: Step) -> Step:
+    def _tracked(self, group: int, step: Step) -> Step:
         self._trackers[group].after_step(step[2], step[4])
         return step

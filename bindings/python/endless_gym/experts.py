@@ -14,7 +14,7 @@ from endless_gym.specs import Spec, spec
 
 
 class Experts:
-    """One scripted expert for each of n environments: it reads the features, and remembers what an agent must remember.
+    """One scripted expert for each of n environments: it reads the features and remembers what an agent must remember.
 
     ```python
     import endless_gym

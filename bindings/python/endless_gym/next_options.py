@@ -37,8 +37,8 @@ def running_episodes(backend: Backend, group: int, envs: Iterable[int]) -> dict[
 class NextOptions:
     """The options of each environment's next episode.
 
-    Those given at creation are overridden by those of `set`, and these by those of the last reset. It knows what the backend's
-    environments have, so that only what differs is sent.
+    Those given at creation are overridden by those of `set`, and these by those of the last reset. It remembers the
+    options of the backend's environments, and sends only changes.
     """
 
     def __init__(self, backend: Backend, num_envs: int, created: Sequence[Options], is_known: bool) -> None:
@@ -60,7 +60,7 @@ class NextOptions:
                 self.forget(group, range(num_envs))
 
     def forget(self, group: int, envs: Iterable[int]) -> None:
-        """The environments may have other options than these, until their next reset."""
+        """Treat the options of these environments as unknown until their next reset."""
         self._sent[group].update(dict.fromkeys(envs, _UNKNOWN))
 
     def set_all(self, groups: Sequence[int], envs: Sequence[int], options: Any) -> None:
@@ -131,7 +131,7 @@ class NextOptions:
             self._note(group, envs, text)
 
     def _note(self, group: int, envs: Iterable[int], text: str) -> None:
-        """The backend's environments have the options of that text."""
+        """Remember that the backend's environments have these options."""
         sent = self._sent[group]
         for env in envs:
             if text == self._texts[self._number(group, env)]:

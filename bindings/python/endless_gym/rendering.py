@@ -45,7 +45,7 @@ def checked_view(render_mode: Any, view: Any, modes: dict[str, tuple[View, ...]]
 
 
 class SnapshotRenderer:
-    """Draws environments from their snapshots, in this process, and so leaves them as they are."""
+    """Draws environments from their snapshots, in this process, without changing the environments."""
 
     def __init__(self, id: str, view: View) -> None:
         self._native = _native.Renderer(id)

@@ -1,4 +1,4 @@
-"""Episodes that are shown again, from what they follow from."""
+"""Replays of episodes from their seeds, options and actions."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def replay(
     Args:
         id: Environment id.
         seed: The seed that the episode started with. Or a snapshot, taken at the start of the episode or later, from which it is
-            continued: the way for an episode that has no seed of its own, since it continues the generator of the one before.
+            continued. An episode that continues the generator of the one before has no seed, so it needs a snapshot.
         options: The reset parameters of the episode; `None` for the defaults, and with a snapshot, which contains its own.
         actions: The actions in the order of the steps, each an element of the action space. They must not go beyond the end.
         render_mode: As for `endless_gym.Env`; its pictures are `ReplayStep.frame`.
 
     Returns:
-        An iterator over the steps, which plays each when it is asked for: the start and one item for each action.
+        An iterator that plays each step on request: the reset, then one item for each action.
 
     Raises:
         TypeError: The seed is neither an integer nor a snapshot.

@@ -34,7 +34,7 @@ OBSERVATIONS: dict[ObservationName, tuple[bool, bool]] = {
 class Frames:
     """The format of the frames of an observation. The default is the original's: uint8 (84, 84, 3), indexed `[x][y][channel]`.
 
-    The engine writes this format directly, and only the pixels that change. There is no conversion.
+    The engine writes this format directly, without a conversion, and only the pixels that change.
     """
 
     #: Grayscale without a channel axis, as Gymnasium's `GrayscaleObservation`.

@@ -279,8 +279,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
 
         With `rgb_array` the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
-        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process, from a snapshot, so
-        that the environments stay as they are. With same-step auto-reset, it shows the new episode, as everywhere in Gymnasium.
+        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process from a
+        snapshot, which does not change the environments. With same-step auto-reset, it shows the new episode, as Gymnasium does.
 
         Raises:
             ValueError: There is no such group.
@@ -305,7 +305,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def adopt(self, group: int = 0) -> tuple[Any, dict[str, Any]]:
         """The current observations and info of a group, without starting an episode.
 
-        The episodes of an engine that resumed from a checkpoint, or that another trainer left, go on from there.
+        It continues the episodes of an engine that resumed from a checkpoint, or that another trainer left.
 
         Raises:
             ValueError: There is no such group.

@@ -1,4 +1,4 @@
-"""Watches the batches of an engine that another process trains with."""
+"""An observer of the batches of an engine that another process trains with."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Watch:
         """Called by `watch`."""
         self._timeout = None if timeout is None else checked_timeout(timeout)
         group = None if group is None else integer("group", group)
-        # As for a timeout of iceoryx2's calls, a year counts as no limit.
+        # A year stands for no limit.
         observer = _native.Observer(service, group, 3e7 if self._timeout is None else self._timeout)
         specification = json.loads(observer.specification())
         self._observer: _native.Observer | None = observer

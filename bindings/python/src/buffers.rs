@@ -14,7 +14,7 @@ pub struct Buffer {
     blocks: BatchBuffer,
     /// The address of `blocks`, which arrays and tensors use.
     address: *mut Block,
-    /// A writable tensor of this memory was exported since the pool last wrote to it.
+    /// Whether a writable tensor of this memory was exported since the pool last wrote to it.
     exported: AtomicBool,
 }
 

@@ -20,7 +20,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 /// Levels of `logging`, with the level of `tracing` that each stands for.
 const LEVELS: [(u8, Level); 4] = [(40, Level::ERROR), (30, Level::WARN), (20, Level::INFO), (10, Level::DEBUG)];
 
-/// Events that are kept at most. Python takes them often, and newer ones are dropped.
+/// Most events that are kept. Python takes them often; beyond this number, newer ones are dropped.
 const CAPACITY: usize = 1000;
 
 /// The level of Python's logger when it was last asked. Events below it cost one comparison.

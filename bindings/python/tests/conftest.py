@@ -1,4 +1,4 @@
-"""What the tests share."""
+"""Fixtures and markers of all tests."""
 
 import os
 import shutil

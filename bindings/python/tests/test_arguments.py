@@ -1,4 +1,4 @@
-"""Arguments that cannot be: exceptions that name the argument, what was given and what is allowed, and never a panic."""
+"""Invalid arguments raise exceptions that name the argument, what was given and what is allowed, and never panic."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Engines that `serve` started and no call closed: they end when nothing refers to them, and with their process."""
+"""Engines that `serve` started and no call closed end when nothing refers to them, and with their process."""
 
 import gc
 import importlib

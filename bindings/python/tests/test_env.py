@@ -1,4 +1,4 @@
-"""One environment: the original's, byte for byte, and Gymnasium's own checks."""
+"""One environment equals the original byte for byte and passes Gymnasium's own checks."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""Options and seeds of episodes: chosen for the next ones, told of the running ones, and played again."""
+"""Options of next episodes, seeds and options of running ones, and replays."""
 
 from __future__ import annotations
 
@@ -385,7 +385,7 @@ def row(observation: Any, env: int) -> Any:
 
 
 def compare(shown: list[Any], rewards: list[float], steps: Any) -> bool:
-    """Whether the observations are the same. Rewards and the end must be."""
+    """Whether the observations are equal. Asserts that rewards and the end are."""
     steps = list(steps)
     assert [step.reward for step in steps[1:]] == rewards
     assert [step.terminated for step in steps] == [False] * (len(steps) - 1) + [True]

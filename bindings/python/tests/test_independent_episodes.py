@@ -1,4 +1,4 @@
-"""`independent_episodes`: an episode depends on its seed and options alone, in a new environment and in one that was used."""
+"""With `independent_episodes`, an episode depends on its seed and options alone, in new and in used environments."""
 
 import subprocess
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""`send`, `recv` and which calls they refuse in between: the same in this process and in an engine process."""
+"""`send` and `recv`, and the calls that are refused between them, behave equally in this process and in an engine process."""
 
 import contextlib
 from collections.abc import Callable, Iterator

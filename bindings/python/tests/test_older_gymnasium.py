@@ -1,4 +1,4 @@
-"""Programs that are held to Gymnasium 0.29 and numpy 1, as the original is, run with the package in its place."""
+"""Programs that need Gymnasium 0.29 and numpy 1, as the original does, run with the package in its place."""
 
 import json
 import os

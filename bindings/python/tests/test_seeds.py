@@ -1,4 +1,4 @@
-"""Which seeds the episodes have: in this process and in an engine process, and in the original under Gymnasium."""
+"""Episodes have the same seeds in this process, in an engine process, and in the original under Gymnasium."""
 
 import json
 import os
@@ -146,7 +146,7 @@ def test_ranges_keep_their_step(where) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_lists_longer_than_a_command_line_are_used_in_order(where) -> None:
-    """More than fit one argument of a command."""
+    """The list is longer than an argument of a command may be."""
     seeds = [(number * 7_919) % 2**64 + 10**15 for number in range(100_000)]
     with where(ID, 3, seeds=seeds) as envs:
         for episode in range(2):

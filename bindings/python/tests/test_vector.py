@@ -1,4 +1,4 @@
-"""Many environments, in this process and in an engine process: the same class with the same results."""
+"""Vector environments in this process and in an engine process have the same class and the same results."""
 
 import contextlib
 import gc

@@ -89,8 +89,8 @@ PAIRS = [
 
 @pytest.fixture(scope="module", params=PAIRS, ids=lambda each: f"{each[0]}, {each[1].name}, {each[2]}")
 def pair(request: pytest.FixtureRequest) -> Iterator[tuple[VectorEnv, VectorEnv]]:
-    """Our environments and Gymnasium's of the same id, which play the same, so that the frames that an episode takes over from an
-    earlier one are the same, too."""
+    """Our environments and Gymnasium's of the same id. Both always play the same, so the frames that an episode takes over from
+    an earlier one are the same, too."""
     where, mode, id = request.param
     with WHERE[where](id, NUM_ENVS, autoreset=mode, options=SHORT[id], render_mode="rgb_array") as envs:
         yield envs, synchronous(id, mode)

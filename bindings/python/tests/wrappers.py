@@ -213,7 +213,7 @@ def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[l
 
 
 def plain(value: Any) -> Any:
-    """A value that can be compared: without times, with tensors as arrays, and copied, since an engine lends few batches."""
+    """A comparable copy of a value, without times and with arrays instead of tensors: engines lend few batches."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items() if key != "t"}
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):

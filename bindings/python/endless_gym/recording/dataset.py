@@ -1,7 +1,7 @@
 """Writes episodes as a Minari data set, in the format HDF5.
 
 Minari's own writer stores frames as JPEG, which changes them, or without compression. This one compresses them without
-loss, in chunks that were compressed while the episodes were played. Minari reads both alike.
+loss, in chunks compressed while the episodes are played. Minari reads both formats.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def check_id(dataset: str) -> str:
 
 
 class DatasetWriter:
-    """Writes a data set. It appears under its id when the `with` block ends without an exception, and else leaves nothing.
+    """Writes a data set. It appears under its id when the `with` block ends without an exception; otherwise nothing remains.
 
     Args:
         dataset: Id of the data set.

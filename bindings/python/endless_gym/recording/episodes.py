@@ -18,7 +18,7 @@ from endless_gym.specs import OBSERVATIONS, Frames, ObservationName, Spec
 
 @dataclass(frozen=True)
 class Plan:
-    """What decides an episode, beside the policy.
+    """What determines an episode, besides the policy.
 
     Attributes:
         number: Number of the episode in the data set.
@@ -40,7 +40,7 @@ class Episode:
     """A played episode of T steps.
 
     Attributes:
-        plan: What decided it.
+        plan: What determined it.
         observations: T + 1 observations by their keys.
         arrays: `actions` int64, `rewards` float64, `terminations` and `truncations` bool, with T rows.
         ground_truth: T + 1 rows of `info["ground_truth"]`, float64; `None` if the environment has none.
@@ -92,7 +92,7 @@ def play(
     errors = Errors(spec, action_seed, range(plans[0].number, plans[0].number + num_envs), rates)
     actor = player.actor(num_envs, plans[0].number)
     shown = _union(observation, player.observation)
-    # New environments for every episode: some of the original's show traces of the episode before.
+    # New environments for every episode, since some show traces of the episode before, as in the original.
     with make_vec(
         spec.id,
         num_envs,

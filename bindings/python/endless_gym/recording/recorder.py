@@ -26,7 +26,7 @@ from endless_gym.specs import Frames, ObservationName, Spec, contents, spec
 #: Steps after which episodes are truncated in environments without a step limit, in which an expert may never stop.
 DEFAULT_MAX_STEPS = 1000
 
-#: Episodes that a thread plays at the same time. It does not depend on the number of threads, nor do an agent's actions then.
+#: Episodes that a thread plays at the same time. A fixed number, so that an agent's actions do not depend on that of threads.
 EPISODES_AT_A_TIME = 32
 
 
@@ -42,7 +42,7 @@ class Recording:
         mean_return: Mean of the episodes' sums of rewards.
         mean_length: Mean of their lengths.
         megabytes: Size of its files in MB.
-        seconds: Time that it took.
+        seconds: Duration of the recording.
     """
 
     dataset: str
@@ -77,9 +77,9 @@ def record(
 ) -> Recording:
     """Play episodes and write them as a Minari data set, which `minari.load_dataset` reads.
 
-    Each episode follows from its seed, its options and the policy alone, also from `action_seed` and its number if it has random
-    actions: neither from the episodes before it nor from the number of threads. Its metadata has `seed`, `options`, `error_rate`,
-    `return` and, unless it was truncated, `final_info` with the original's final infos.
+    An episode depends on its seed, its options and the policy alone, and on `action_seed` and its number if it has random
+    actions; it depends neither on earlier episodes nor on the number of threads. Its metadata has `seed`, `options`,
+    `error_rate`, `return` and, unless it was truncated, `final_info` with the original's final infos.
 
     Args:
         id: Environment id, such as `MortarMayhem-v0`.
@@ -167,7 +167,7 @@ def record(
 def _waves(
     plans: Sequence[Plan], threads: int, work: Callable[[Sequence[Plan], threading.Event], list[Episode]]
 ) -> Iterator[Iterator[list[Episode]]]:
-    """Episodes in their order, some of which are played ahead."""
+    """Episodes in order; some are played ahead."""
     size = EPISODES_AT_A_TIME
     parts = iter([plans[at : at + size] for at in range(0, len(plans), size)])
     stop, pending = threading.Event(), deque[Future[list[Episode]]]()
