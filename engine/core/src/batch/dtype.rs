@@ -5,8 +5,6 @@ use std::fmt;
 use bytemuck::Pod;
 use serde::{Deserialize, Serialize};
 
-use super::sealed::Sealed;
-
 /// Number type of a section. In JSON it is written as [`name`](Dtype::name).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -50,6 +48,24 @@ impl fmt::Display for Dtype {
         f.write_str(self.name())
     }
 }
+
+/// A supertrait that other crates cannot name, so that they cannot implement [`Element`] or
+/// [`SectionTable`](super::SectionTable). A number type with the [`Dtype`] of another type would make the views of a batch panic:
+///
+/// ```compile_fail,E0277
+/// use endless_gym_core::batch::{Dtype, Element};
+///
+/// #[derive(Clone, Copy)]
+/// #[repr(transparent)]
+/// struct Half(u16);
+/// unsafe impl bytemuck::Zeroable for Half {}
+/// unsafe impl bytemuck::Pod for Half {}
+///
+/// impl Element for Half {
+///     const DTYPE: Dtype = Dtype::Uint8;
+/// }
+/// ```
+pub trait Sealed {}
 
 /// A Rust number type that has a [`Dtype`].
 ///

@@ -18,9 +18,7 @@ mod dtype;
 mod forged_tests;
 mod frames;
 mod layout;
-mod layout_error;
 pub(crate) mod limits;
-mod sealed;
 mod sections;
 mod stamp;
 mod view;
@@ -29,8 +27,7 @@ pub use block::{BLOCK_BYTES, Block, blocks_for, zeroed};
 pub use buffer::BatchBuffer;
 pub use dtype::{Dtype, Element};
 pub use frames::{Frames, MAX_STACK};
-pub use layout::{ActionLayout, Layout, MAX_DIMENSIONS, Section, action_layout, batch_layout};
-pub use layout_error::LayoutError;
+pub use layout::{ActionLayout, Layout, LayoutError, MAX_DIMENSIONS, Section, action_layout, batch_layout};
 pub use sections::{ActionSection, BatchSection, Contents, OPTIONS_BYTES, RowShape, SNAPSHOT_BYTES, SectionTable};
 pub(crate) use stamp::Stamp;
 pub use view::Batch;
@@ -41,5 +38,5 @@ pub(crate) use view::BatchMut;
 /// Version 4: the specification's key `epoch` became `incarnation`, the message headers have new type names, and a reset with a
 /// seed counts the environments of all groups.
 ///
-/// Version 6: the requests that set the options of next episodes, and that ask what the running episodes follow from.
+/// Version 6: requests that set the options of next episodes, and that ask for seed and options of the running ones.
 pub const LAYOUT_VERSION: u32 = 6;

@@ -2,9 +2,8 @@
 
 use std::fmt;
 
-use super::dtype::{Dtype, Element};
+use super::dtype::{Dtype, Element, Sealed};
 use super::frames::Frames;
-use super::sealed::Sealed;
 use crate::envs::EnvSpec;
 
 /// Maximum length of a message's reset parameters, in bytes of JSON text.
@@ -236,7 +235,7 @@ section_table! {
     Action action: i32, Vector, required,
         "for a step, one number for each branch of the action space";
     Reset reset: u8, Scalar, required,
-        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`; for a question about running episodes: 0 leaves the environment out";
+        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`; for a question about running episodes: 0 omits the environment";
     Seed seed: u64, Scalar, required,
         "for a reset of some environments: the seed where `reset` is 2";
     Options options: u8, Bytes(OPTIONS_BYTES), required,

@@ -13,11 +13,11 @@ pub(crate) struct RowsMut<'a, T> {
 }
 
 impl<'a, T> RowsMut<'a, T> {
-    /// The row of one environment; empty where the batch lacks the section.
+    /// The row of one environment; empty if the batch lacks the section.
     ///
     /// # Panics
     ///
-    /// If there are not so many environments.
+    /// If `env` is out of range.
     pub fn row(&mut self, env: usize) -> &mut [T] {
         &mut self.numbers[env * self.width..(env + 1) * self.width]
     }
@@ -26,7 +26,7 @@ impl<'a, T> RowsMut<'a, T> {
     ///
     /// # Panics
     ///
-    /// If there are not so many numbers.
+    /// If `env` is out of range.
     pub fn set(&mut self, env: usize, number: T) {
         self.numbers[env] = number;
     }
@@ -75,7 +75,7 @@ macro_rules! batch_view {
             ///
             /// # Panics
             ///
-            /// If there are not so many environments.
+            /// If `env` is out of range.
             pub fn split_at(self, env: usize) -> (Self, Self) {
                 $(let $field = self.$field.split_at(env);)*
                 (BatchMut { $($field: $field.0),* }, BatchMut { $($field: $field.1),* })

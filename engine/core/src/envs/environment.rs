@@ -52,8 +52,7 @@ pub trait Environment: Send + Sync {
     /// Paints every pixel of a scene within the canvas' clip, independent of what the canvas showed before.
     fn paint(assets: &Self::Assets, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
-    /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ. On a canvas
-    /// [without pixels](Canvas::without_pixels), that is only marked as dirty.
+    /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ.
     fn repaint(assets: &Self::Assets, shown: &Self::Scene, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
     /// Draws the observation in full. `frame` has [`FRAME_BYTES`](super::FRAME_BYTES) bytes, indexed
@@ -70,7 +69,7 @@ pub trait Environment: Send + Sync {
     /// The state changes where the original advances an animation with every view.
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
-    /// Sets these animations to where they are when the view was drawn once after the reset and after each step before this one.
+    /// Sets these animations as if the view had been drawn once after the reset and after each step before this one.
     fn align_ground_truth(&mut self) {}
 
     /// Writes the vector observation; an environment without one writes nothing.
@@ -92,7 +91,7 @@ pub trait Environment: Send + Sync {
     /// [`InvalidState`] if a number of the state is out of its range. The environment is then unchanged.
     fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
 
-    /// How far the episode is, at any time, for a person who watches.
+    /// Progress of the episode, at any time, for a human viewer.
     fn progress(&self) -> Vec<Progress>;
 
     /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended

@@ -15,7 +15,6 @@ mod registry;
 mod screen;
 pub mod searing_spotlights;
 mod spec;
-mod steering;
 mod vector;
 pub mod view;
 

@@ -1,4 +1,4 @@
-//! How far an episode is, for a person who watches.
+//! Progress of an episode, for a human viewer.
 
 use serde::Serialize;
 
@@ -9,12 +9,12 @@ pub struct Progress {
     pub name: &'static str,
     /// The current number.
     pub value: f64,
-    /// The number at which nothing is missing, if there is one.
+    /// The total, if there is one.
     pub of: Option<f64>,
 }
 
 impl Progress {
-    /// A number without an end.
+    /// A count without a total.
     pub fn count(name: &'static str, value: impl Into<f64>) -> Self {
         Progress { name, value: value.into(), of: None }
     }

@@ -1,4 +1,4 @@
-//! The buffers that a pool has written into, with a generation counter: which of them still hold the pool's last write.
+//! The buffers that a pool has written into, and which of them still hold the pool's last write.
 //!
 //! A buffer is recognised by the generation stamp in its memory and not by its address. Memory that was recycled, copied, mapped
 //! again or written to by another pool has another stamp than the pool's record says, or none, and is drawn in full. As with buffer

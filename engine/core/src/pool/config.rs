@@ -89,11 +89,11 @@ pub struct PoolConfig {
     /// Source of the episodes' seeds.
     #[serde(default)]
     pub seeding: Seeding,
-    /// Whether an episode depends on its seed and its reset parameters alone. Otherwise, as in the original, some environments show
-    /// what an earlier episode left (the character of Endless Mortar Mayhem, the lit circles and the background of Searing
-    /// Spotlights), and with [`Seeding::Continue`] an episode continues the generator that the one before has drawn from. With this,
-    /// every episode starts as in a new environment, and [`Seeding::Continue`] draws a seed for each later episode: from
-    /// `SeedSequence(seed, spawn_key=(0,))`, where `seed` is the one that the environment was last given. Resets allocate memory.
+    /// Whether an episode depends only on its seed and its reset parameters. If not, as in the original, some environments show what
+    /// an earlier episode left (the character of Endless Mortar Mayhem, the lit circles and the background of Searing Spotlights),
+    /// and with [`Seeding::Continue`] an episode continues the generator of the one before. If so, every episode starts as in a new
+    /// environment, [`Seeding::Continue`] draws a seed for each later episode from `SeedSequence(seed, spawn_key=(0,))`, where `seed`
+    /// is the one that the environment was last given, and resets allocate memory.
     #[serde(default)]
     pub independent_episodes: bool,
     /// Format of the frames; `None` omits them, and nothing is drawn.
@@ -119,7 +119,7 @@ fn default_frames() -> Option<Frames> {
     Some(Frames::default())
 }
 
-// The derived functions, with the default that depends on other fields.
+// The derived functions, and the one default that depends on other fields.
 impl<'de> Deserialize<'de> for PoolConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let mut config = PoolConfig::deserialize(deserializer)?;

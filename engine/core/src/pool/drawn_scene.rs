@@ -28,8 +28,8 @@ impl<E: Environment> DrawnScene<E> {
         DrawnScene(None)
     }
 
-    /// Updates `frame` to `scene`: repaints the differences to the drawn scene, or draws in full where the frame's content is not
-    /// known or was drawn with other assets.
+    /// Updates `frame` to `scene`: repaints what differs from the drawn scene, or draws in full if the frame's content is unknown or
+    /// was drawn with other assets.
     pub fn update(
         &mut self,
         assets: &Arc<E::Assets>,
@@ -109,8 +109,8 @@ fn compare<E: Environment>(
     }
 }
 
-/// A frame that was updated differs from the same frame drawn in full: a mistake in this crate, or the frame was changed without
-/// a call of [`Layout::forget_frames`](crate::batch::Layout::forget_frames).
+/// An updated frame differs from the same frame drawn in full: a mistake in this crate, or the frame was changed without a call of
+/// [`Layout::forget_frames`](crate::batch::Layout::forget_frames).
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error(
     "the frame of environment {env} is wrong at pixel {pixel:?}: expected {expected}, found {found}; its scene was {before}, and \

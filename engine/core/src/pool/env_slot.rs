@@ -12,17 +12,17 @@ use crate::envs::Environment;
 use crate::random::Generator;
 use crate::raster::PixelFormat;
 
-/// An environment with its generator, its seeds, and what is counted of its episode.
+/// An environment with its generator, its seeds, and the sums of its episode.
 pub(super) struct EnvSlot<E: Environment> {
     pub env: E,
-    /// The assets for the next episode, unless there is `next`.
+    /// The assets for the next episode, unless `next` replaces them.
     pub assets: Arc<E::Assets>,
     pub random: Generator,
     pub seeds: Seeds,
     pub episode_return: f64,
     pub episode_length: i32,
     pub frame_stack: FrameStack<E::Scene>,
-    /// Whether the last step ended the episode, so that in next-step autoreset the next one starts another.
+    /// Whether the last step ended the episode. With next-step autoreset, the next step then starts another.
     pub ended: bool,
     /// Whether an episode starts as in a new environment.
     independent_episodes: bool,

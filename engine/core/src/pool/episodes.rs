@@ -1,4 +1,4 @@
-//! Reset parameters for the next episodes of single environments, and what the running episodes follow from.
+//! Reset parameters of next episodes, and the seeds and reset parameters of running ones.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +13,7 @@ pub struct NextOptions {
     pub envs: Vec<usize>,
 }
 
-/// What the running episode of an environment follows from.
+/// The seed and the reset parameters of an environment's running episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunningEpisode {
     /// Number of the environment in its pool.
@@ -23,6 +23,6 @@ pub struct RunningEpisode {
     pub seed: Option<u64>,
     /// The reset parameters that were given for the episode; the rest have their defaults.
     pub options: OptionMap,
-    /// Whether the last step ended it, so that in next-step autoreset the next step starts another.
+    /// Whether the last step ended the episode. With next-step autoreset, the next step then starts another.
     pub ended: bool,
 }

@@ -12,7 +12,7 @@ use crate::random::EntropyError;
 
 /// A pool that cannot be made, or a call that it cannot carry out.
 ///
-/// The call has changed no environment and no batch, except for [`PoolError::WrongFrame`].
+/// Except for [`PoolError::WrongFrame`], an error changes no environment and no batch.
 #[derive(Debug, Error)]
 pub enum PoolError {
     /// No environment has that id.
@@ -127,8 +127,8 @@ pub enum PoolError {
     },
     /// With [`check_drawing`](super::PoolConfig::check_drawing) only: a frame differs from one that is drawn in full.
     ///
-    /// All or some of the environments have advanced then, and the batch is incomplete. Its generation stamp is removed, so the
-    /// next write into it draws in full.
+    /// All or some of the environments have advanced, and the batch is incomplete. It has no generation stamp, so the next write into
+    /// it draws in full.
     #[error(transparent)]
     WrongFrame(#[from] WrongFrame),
     /// The memory for a batch is too small.

@@ -33,7 +33,7 @@ pub struct Experts {
 }
 
 impl Experts {
-    /// Experts for `num_envs` environments that are reset in that mode.
+    /// Experts for `num_envs` environments with that autoreset mode.
     pub fn new(spec: &EnvSpec, num_envs: usize, autoreset: Autoreset) -> Self {
         Experts {
             experts: (0..num_envs).map(|_| expert(spec)).collect(),
@@ -44,14 +44,13 @@ impl Experts {
         }
     }
 
-    /// Chooses the action of every environment for its observation in `batch`, and writes it to `actions`: one row for each
-    /// environment, one number for each branch of the action space. It must be called once for each batch from an episode's first
-    /// observation on: the experts remember what they saw.
+    /// Chooses an action for every observation in `batch`, and writes it to `actions`: one row for each environment, one number for
+    /// each branch of the action space. It must be called once for each batch, since the experts remember what they saw.
     ///
     /// # Errors
     ///
     /// [`ExpertsError`] if the batch has no features or is of another number of environments, or if `actions` has a wrong length.
-    /// No expert has acted then.
+    /// On an error, no expert acts.
     pub fn act(&mut self, batch: &Batch<'_>, actions: &mut [i32]) -> Result<(), ExpertsError> {
         let (features, vectors) = (batch.features(), batch.vector_observation());
         let (lengths, terminated, truncated) = (batch.episode_length(), batch.terminated(), batch.truncated());
@@ -67,7 +66,7 @@ impl Experts {
         }
         let rows = self.experts.iter_mut().zip(actions.chunks_exact_mut(self.branches));
         for (env, (expert, action)) in rows.enumerate() {
-            // With same-step auto-reset, the row of an episode's end has the next one's first observation.
+            // With same-step autoreset, the row in which an episode ends has the first observation of the next one.
             let ended = terminated[env] == 1 || truncated[env] == 1;
             if lengths[env] == 0 || ended && self.autoreset == Autoreset::SameStep {
                 expert.reset();
@@ -120,7 +119,7 @@ mod tests {
         PoolConfig { features: true, frames: None, autoreset, seeding, ..PoolConfig::new(id, NUM_ENVS) }
     }
 
-    /// Plays until every environment has ended that number of episodes.
+    /// Plays until every environment has ended [`EPISODES`] episodes.
     fn play(id: &str, autoreset: Autoreset) -> Episodes {
         let mut pool = Pool::new(&config(id, autoreset), &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());

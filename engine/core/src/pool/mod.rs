@@ -12,7 +12,6 @@ mod env_slot;
 mod episodes;
 mod error;
 mod experts;
-mod family_slots;
 mod frame_stack;
 #[expect(clippy::module_inception, reason = "the file of the type `Pool`")]
 mod pool;
@@ -20,6 +19,7 @@ mod seeding;
 mod snapshot;
 mod sync;
 mod threads;
+mod typed_envs;
 
 pub use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 pub use autoreset::{Autoreset, UnknownAutoreset};

@@ -6,10 +6,10 @@ use super::config::{OptionMap, PoolConfig, ResetRequest};
 use super::drawn_scene::{DrawSettings, WrongFrame};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
-use super::family_slots::{EnvSlots, WriteContext, family_slots};
-use super::seeding::Unseeded;
+use super::seeding::PoolEntropy;
 use super::snapshot::{ResumeError, SavedEnv, SnapshotError};
 use super::threads::Threads;
+use super::typed_envs::{AnyEnvs, WriteContext, typed_envs};
 use crate::batch::{BatchMut, Block, Layout, batch_layout};
 use crate::envs::mortar_mayhem::MortarMayhem;
 use crate::envs::mystery_path::MysteryPath;
@@ -43,7 +43,7 @@ use crate::raster::PixelFormat;
 pub struct Pool {
     spec: &'static EnvSpec,
     layout: Layout,
-    slots: Box<dyn EnvSlots>,
+    envs: Box<dyn AnyEnvs>,
     buffers: Buffers,
     format: PixelFormat,
     check_drawing: bool,
@@ -63,19 +63,19 @@ impl Pool {
         let spec = envs::spec(&config.id)?;
         config.check()?;
         let layout = batch_layout(spec, config.num_envs, config.contents())?;
-        let unseeded = Unseeded::draw(&config.seeding)?;
-        let slots: Box<dyn EnvSlots> = match spec.family {
-            Family::MortarMayhem(variant) => Box::new(family_slots::<MortarMayhem>(spec, variant, config, unseeded)?),
-            Family::MysteryPath(variant) => Box::new(family_slots::<MysteryPath>(spec, variant, config, unseeded)?),
+        let entropy = PoolEntropy::draw(&config.seeding)?;
+        let envs: Box<dyn AnyEnvs> = match spec.family {
+            Family::MortarMayhem(variant) => Box::new(typed_envs::<MortarMayhem>(spec, variant, config, entropy)?),
+            Family::MysteryPath(variant) => Box::new(typed_envs::<MysteryPath>(spec, variant, config, entropy)?),
             Family::SearingSpotlights(variant) => {
-                Box::new(family_slots::<SearingSpotlights>(spec, variant, config, unseeded)?)
+                Box::new(typed_envs::<SearingSpotlights>(spec, variant, config, entropy)?)
             }
         };
         Ok(Pool {
             spec,
             layout,
-            slots,
-            buffers: Buffers::new(unseeded.identity()),
+            envs,
+            buffers: Buffers::new(entropy.identity()),
             format: config.frames.unwrap_or_default().format,
             check_drawing: config.check_drawing,
             autoreset: config.autoreset,
@@ -110,8 +110,7 @@ impl Pool {
     /// # Errors
     ///
     /// [`PoolError`] if `request` has a wrong number of flags or seeds, if the first reset leaves environments out, if an option
-    /// is not valid, or if `batch` is too short. No environment has changed then. [`PoolError::WrongFrame`] is an exception, see
-    /// there.
+    /// is not valid, or if `batch` is too short. Except for [`PoolError::WrongFrame`], an error changes no environment.
     pub fn reset_with(
         &mut self,
         request: ResetRequest<'_>,
@@ -135,9 +134,9 @@ impl Pool {
         self.check_batch(batch)?;
         if let Some(options) = options {
             // After all other checks, so that an error changes no environment.
-            self.slots.set_options_of(request, options)?;
+            self.envs.set_options_of(request, options)?;
         }
-        self.write(batch, |slots, context, out| slots.reset(context, request, out))?;
+        self.write(batch, |envs, context, out| envs.reset(context, request, out))?;
         self.was_reset = true;
         Ok(())
     }
@@ -147,17 +146,17 @@ impl Pool {
     /// # Errors
     ///
     /// [`PoolError`] if the environments were not reset yet, if `actions` has a wrong length or a number out of range, or if
-    /// `batch` is too short. No environment has advanced then. [`PoolError::WrongFrame`] is an exception, see there.
+    /// `batch` is too short. Except for [`PoolError::WrongFrame`], an error advances no environment.
     pub fn step(&mut self, actions: &[i32], batch: &mut [Block]) -> Result<(), PoolError> {
         if !self.was_reset {
             return Err(PoolError::NotReset);
         }
         self.spec.action_space.check(self.layout.num_envs(), actions)?;
         let autoreset = self.autoreset;
-        self.write(batch, |slots, context, out| slots.step(context, autoreset, actions, out))
+        self.write(batch, |envs, context, out| envs.step(context, autoreset, actions, out))
     }
 
-    /// The error of a batch that is too short.
+    /// Refuses a batch that is too short.
     fn check_batch(&self, batch: &[Block]) -> Result<(), PoolError> {
         let (given, needed) = (batch.len(), self.layout.blocks());
         if given < needed { Err(PoolError::BatchTooShort { given, needed }) } else { Ok(()) }
@@ -167,7 +166,7 @@ impl Pool {
     fn write(
         &mut self,
         batch: &mut [Block],
-        write: impl FnOnce(&mut dyn EnvSlots, WriteContext<'_>, BatchMut<'_>) -> Result<(), WrongFrame>,
+        write: impl FnOnce(&mut dyn AnyEnvs, WriteContext<'_>, BatchMut<'_>) -> Result<(), WrongFrame>,
     ) -> Result<(), PoolError> {
         self.check_batch(batch)?;
         let buffer = self.buffers.begin(&self.layout, batch);
@@ -175,7 +174,7 @@ impl Pool {
         let context = WriteContext { threads: &self.threads, buffer: buffer.index, draw };
         let (given, needed) = (batch.len(), self.layout.blocks());
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
-        write(&mut *self.slots, context, out)?;
+        write(&mut *self.envs, context, out)?;
         self.buffers.finish(buffer, &self.layout, batch);
         Ok(())
     }
@@ -185,7 +184,7 @@ impl Pool {
     ///
     /// # Errors
     ///
-    /// [`PoolError::NoSuchEnv`], or [`PoolError::Parameters`] if an option is not valid. No environment has changed then.
+    /// [`PoolError::NoSuchEnv`], or [`PoolError::Parameters`] if an option is not valid. An error changes no environment.
     ///
     /// ```
     /// use endless_gym_core::batch::zeroed;
@@ -206,17 +205,17 @@ impl Pool {
         if let Some(given) = sets.iter().flat_map(|set| &set.envs).find(|env| **env >= num_envs) {
             return Err(PoolError::NoSuchEnv { given: *given, num_envs });
         }
-        Ok(self.slots.set_options(sets)?)
+        Ok(self.envs.set_options(sets)?)
     }
 
-    /// What the running episode of an environment follows from.
+    /// Seed and reset parameters of the running episode of an environment.
     ///
     /// # Errors
     ///
     /// [`PoolError::NoSuchEnv`] or [`PoolError::NotReset`].
     pub fn running_episode(&self, env: usize) -> Result<RunningEpisode, PoolError> {
         self.check_running(env)?;
-        Ok(self.slots.running_episode(env))
+        Ok(self.envs.running_episode(env))
     }
 
     /// Writes every environment's row without starting an episode: the current observation, a reward of 0, no flag.
@@ -254,7 +253,7 @@ impl Pool {
     /// ```
     pub fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
         self.check_env(env)?;
-        if self.was_reset { self.slots.snapshot(env) } else { Err(SnapshotError::NotReset) }
+        if self.was_reset { self.envs.snapshot(env) } else { Err(SnapshotError::NotReset) }
     }
 
     /// Puts an environment into the state of a snapshot of the same environment id, which may come from another pool with other
@@ -266,10 +265,10 @@ impl Pool {
     /// # Errors
     ///
     /// [`SnapshotError`] if there is no such environment, if the environments were not reset yet, or if `snapshot` is not a valid
-    /// one of this environment id. The environment has not changed then.
+    /// one of this environment id. An error does not change the environment.
     pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
         self.check_env(env)?;
-        if self.was_reset { self.slots.restore(env, snapshot) } else { Err(SnapshotError::NotReset) }
+        if self.was_reset { self.envs.restore(env, snapshot) } else { Err(SnapshotError::NotReset) }
     }
 
     /// The state of all environments, from which [`resume`](Pool::resume) continues identically; `None` before their first reset.
@@ -297,8 +296,8 @@ impl Pool {
             return Ok(None);
         }
         let save = |env| {
-            let snapshot = self.slots.snapshot(env)?;
-            Ok(SavedEnv { snapshot, earlier_frames: self.slots.earlier_frames(env, self.format, self.frame_bytes()) })
+            let snapshot = self.envs.snapshot(env)?;
+            Ok(SavedEnv { snapshot, earlier_frames: self.envs.earlier_frames(env, self.format, self.frame_bytes()) })
         };
         (0..self.layout.num_envs()).map(save).collect::<Result<_, _>>().map(Some)
     }
@@ -307,7 +306,7 @@ impl Pool {
     ///
     /// # Errors
     ///
-    /// [`ResumeError`] if the number of environments differs, or if a state is not valid. Environments before it have changed then.
+    /// [`ResumeError`] if the number of environments differs, or if a state is not valid; the environments before it have changed.
     pub fn resume(&mut self, saved: &[SavedEnv]) -> Result<(), ResumeError> {
         let num_envs = self.layout.num_envs();
         if saved.len() != num_envs {
@@ -316,8 +315,8 @@ impl Pool {
         let frame_bytes = self.frame_bytes();
         for (env, SavedEnv { snapshot, earlier_frames }) in saved.iter().enumerate() {
             let failed = |source| ResumeError::Environment { env, source };
-            self.slots.restore(env, snapshot).map_err(failed)?;
-            self.slots.restore_earlier_frames(env, earlier_frames, frame_bytes).map_err(failed)?;
+            self.envs.restore(env, snapshot).map_err(failed)?;
+            self.envs.restore_earlier_frames(env, earlier_frames, frame_bytes).map_err(failed)?;
         }
         self.was_reset = true;
         Ok(())
@@ -342,14 +341,14 @@ impl Pool {
         if env < num_envs { Ok(()) } else { Err(SnapshotError::NoSuchEnv { given: env, num_envs }) }
     }
 
-    /// How far the episode of one environment is, for a person who watches: commands, tiles, coins, health.
+    /// Progress of one environment's episode, for a human viewer: commands, tiles, coins, health.
     ///
     /// # Errors
     ///
     /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
     pub fn progress(&self, env: usize) -> Result<Vec<Progress>, PoolError> {
         self.check_running(env)?;
-        Ok(self.slots.progress(env))
+        Ok(self.envs.progress(env))
     }
 
     /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,
@@ -363,20 +362,20 @@ impl Pool {
         if out.len() != VIEW_BYTES {
             return Err(PoolError::ViewSize { given: out.len() });
         }
-        self.slots.ground_truth_view(env, out);
+        self.envs.ground_truth_view(env, out);
         Ok(())
     }
 
-    /// Sets the animations of an environment's ground-truth view to where they are when [`ground_truth_view`](Self::ground_truth_view)
-    /// was called once for each observation of the episode before the current one. The next view is then the current step's,
-    /// whatever was viewed before. Observations do not depend on it.
+    /// Sets the animations of an environment's ground-truth view as if [`ground_truth_view`](Self::ground_truth_view) had been called
+    /// once for each earlier observation of the episode, so that the next view shows the current step. Observations do not depend on
+    /// it.
     ///
     /// # Errors
     ///
     /// [`PoolError::NotReset`] or [`PoolError::NoSuchEnv`].
     pub fn align_ground_truth_view(&mut self, env: usize) -> Result<(), PoolError> {
         self.check_running(env)?;
-        self.slots.align_ground_truth_view(env);
+        self.envs.align_ground_truth_view(env);
         Ok(())
     }
 }

@@ -65,19 +65,19 @@ impl Seeding {
     }
 }
 
-/// Entropy for unseeded pools. One draw of the system's entropy serves all environments: each gets its own
-/// stream by a spawn key, as with numpy's `SeedSequence.spawn`.
+/// The entropy of a pool. One draw from the operating system serves all environments: each has a stream of its own by a spawn key, as
+/// with numpy's `SeedSequence.spawn`.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Unseeded(SeedSequence);
+pub(super) struct PoolEntropy(SeedSequence);
 
-impl Unseeded {
-    /// Draws entropy. Without a source of it, only pools whose episodes all are seeded can be made.
+impl PoolEntropy {
+    /// Draws entropy. Without a source of entropy, a pool needs [`Seeding`] that seeds every episode.
     pub(super) fn draw(seeding: &Seeding) -> Result<Self, EntropyError> {
         let bits = match entropy() {
             Err(error) if !seeding.is_seeded() => return Err(error),
             bits => bits.unwrap_or(0),
         };
-        Ok(Unseeded(SeedSequence::from_u128(bits)))
+        Ok(PoolEntropy(SeedSequence::from_u128(bits)))
     }
 
     /// The generator that environment number `env` starts with.
@@ -132,7 +132,7 @@ impl Seeds {
         list: &std::sync::Arc<[u64]>,
         env: usize,
         total: usize,
-        unseeded: Unseeded,
+        unseeded: PoolEntropy,
     ) -> Self {
         match seeding {
             Seeding::Continue { seed } => Seeds::Continue { first: seed.map(|seed| seed.wrapping_add(env as u64)) },
@@ -155,7 +155,7 @@ impl Seeds {
     }
 
     /// The seeds of environment number `env` if no episode may continue the generator of the one before.
-    pub(super) fn independent(self, env: usize, unseeded: Unseeded) -> Self {
+    pub(super) fn independent(self, env: usize, unseeded: PoolEntropy) -> Self {
         match self {
             Seeds::Continue { first } => {
                 let draws = first.map_or_else(|| unseeded.seeds(env), later_seeds);

@@ -22,7 +22,7 @@ pub fn entropy() -> Result<u128, EntropyError> {
     Err(EntropyError("this build has no source of entropy (feature `entropy`)".to_owned()))
 }
 
-/// There is no entropy for an unseeded generator.
+/// An unseeded generator needs entropy, and there is none.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("cannot draw a seed: {0}; pass a seed")]
 pub struct EntropyError(String);

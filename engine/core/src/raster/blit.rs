@@ -1,8 +1,7 @@
 //! Painting one surface onto another: copied, with a colour key, and translucent.
 
 use super::canvas::Canvas;
-use super::color::Rgb;
-use super::runs::clip;
+use super::runs::{Rgb, clip};
 use super::surface::Surface;
 
 /// Blends a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26

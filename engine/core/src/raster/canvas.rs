@@ -2,9 +2,8 @@
 
 use std::ops::Range;
 
-use super::color::Rgb;
 use super::rect::Rect;
-use super::runs::{clip, copy_run, fill_run};
+use super::runs::{Rgb, clip, copy_run, fill_run};
 
 /// Borrowed pixels with a width and a height: the target of all drawing.
 ///

@@ -6,8 +6,7 @@
 use std::ops::Range;
 
 use super::canvas::Canvas;
-use super::color::Rgb;
-use super::runs::{clip, fill_run};
+use super::runs::{Rgb, clip, fill_run};
 
 /// Maximum radius; larger ones are drawn with it, to bound the time.
 const MAX_RADIUS: i64 = 1 << 16;

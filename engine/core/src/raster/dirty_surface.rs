@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::canvas::Canvas;
-use super::color::Rgb;
+use super::runs::Rgb;
 
 /// Pixels with a dirty mask, of which only the painted ones are copied elsewhere.
 ///

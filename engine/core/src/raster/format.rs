@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::color::Rgb;
 use super::dirty_surface::DirtySurface;
+use super::runs::Rgb;
 
 /// Order and kind of the numbers in a frame. The default is the order of a [`Canvas`](super::Canvas) and of the original's
 /// observations: \[x\]\[y\]\[channel\].

@@ -1,7 +1,7 @@
 //! Straight lines, thin and wide.
 
 use super::canvas::Canvas;
-use super::color::Rgb;
+use super::runs::Rgb;
 
 /// A point in whole pixels.
 type Point = (i64, i64);

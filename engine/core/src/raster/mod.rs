@@ -21,18 +21,16 @@
 mod blit;
 mod canvas;
 mod circle;
-mod color;
 mod damage;
 mod dirty_surface;
 mod format;
 mod line;
 mod rect;
 mod rectangle;
-mod rotate;
 mod runs;
-mod scale;
 mod sprite;
 mod surface;
+mod transform;
 
 #[cfg(test)]
 mod tests;
@@ -41,11 +39,11 @@ pub(crate) use blit::blend_keyed;
 pub use canvas::Canvas;
 pub(crate) use circle::circle_outline;
 pub use circle::{Disc, DiscColumn};
-pub use color::Rgb;
 pub use damage::Damage;
 pub use dirty_surface::DirtySurface;
 pub use format::PixelFormat;
 pub use rect::{CornerRadii, Rect};
+pub use runs::Rgb;
 pub(crate) use runs::copy_run;
 pub use sprite::Sprite;
 pub use surface::Surface;

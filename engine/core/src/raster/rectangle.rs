@@ -2,8 +2,8 @@
 
 use super::canvas::Canvas;
 use super::circle::{Octant, falls};
-use super::color::Rgb;
 use super::rect::{CornerRadii, Rect};
+use super::runs::Rgb;
 
 /// Maximum coordinate of a rounded rectangle; larger ones are drawn as this, to bound the time.
 const MAX_COORDINATE: i64 = 1 << 16;

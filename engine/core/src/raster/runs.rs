@@ -1,8 +1,9 @@
-//! Runs: consecutive pixels of a column, which are contiguous in memory.
+//! Pixels, and runs of them: consecutive pixels of a column, which are contiguous in memory.
 
 use std::ops::Range;
 
-use super::color::Rgb;
+/// A colour: red, green, blue.
+pub type Rgb = [u8; 3];
 
 /// Sets all pixels of a run to one colour.
 pub(super) fn fill_run(run: &mut [u8], color: Rgb) {

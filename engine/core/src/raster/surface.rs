@@ -1,8 +1,8 @@
 //! A picture with the colour key and the alpha of a pygame surface.
 
 use super::canvas::Canvas;
-use super::color::Rgb;
 use super::rect::{CornerRadii, Rect};
+use super::runs::Rgb;
 
 /// An RGB picture, as a `pygame.Surface` of the display's format: 32 bits, no alpha per pixel.
 #[derive(Clone, Debug, PartialEq, Eq)]

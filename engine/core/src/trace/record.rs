@@ -57,7 +57,7 @@ impl Recorder {
         });
     }
 
-    /// Adds a step to the last episode, which is what `blocks` have. Without an episode nothing is recorded.
+    /// Adds the step in `blocks` to the last episode. Without an episode nothing is recorded.
     pub fn step(&mut self, action: &[i32], pool: &Pool, blocks: &[Block]) {
         let Some(episode) = self.trace.episodes.last_mut() else { return };
         let batch = Batch::new(pool.layout(), blocks);

@@ -86,7 +86,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
         options: ResetOptions::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
         check_drawing: true,
-        // Only for a first episode without a seed, whose own is unknown. Not every platform has a source of entropy.
+        // Used only by a first episode without a seed, since not every platform has a source of entropy.
         seeding: Seeding::Continue { seed: Some(0) },
         ..PoolConfig::new(&trace.env, 1)
     };

@@ -1,19 +1,25 @@
-//! The pictures of Mortar Mayhem, and how they are composed into a frame.
+//! What a frame of Mortar Mayhem shows, its pictures, and how they are composed.
 
 use std::sync::Arc;
 
-use super::command_sprites::{COMMAND_SIDE, command_sprites};
 use super::commands::{COMMANDS, Command};
 use super::config::{Config, TILE};
 use super::parameters::{Parameters, Variant};
-use super::scene::Scene;
 use super::state::{DisplayedCharacter, State};
+use crate::envs::character::Character;
 use crate::envs::character_sprites::CharacterSprites;
 use crate::envs::screen::SCREEN;
 use crate::raster::{Canvas, Damage, Rect, Rgb, Sprite, Surface};
 
 const TILE_BORDER: i32 = 1;
 
+/// Scale of the command pictures relative to the original's 336 pixel screen.
+const COMMAND_SCALE: f64 = 0.25;
+const WHITE: Rgb = [255, 255, 255];
+const BLACK: Rgb = [0, 0, 0];
+
+/// Side of an unrotated command picture in pixels.
+const COMMAND_SIDE: i32 = (88.0 * COMMAND_SCALE) as i32;
 /// Top left corner of the command pictures.
 const COMMAND_CORNER: (i32, i32) = ((SCREEN as i32 - COMMAND_SIDE) / 2, (SCREEN as i32 - COMMAND_SIDE) / 2);
 
@@ -118,7 +124,36 @@ fn draw_arena(config: &Config, (fill, border): TileColours) -> Vec<u8> {
     screen.into_pixels()
 }
 
+/// What a frame shows.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Scene {
+    /// The one tile that does not burn, while the others do.
+    pub(super) safe_tile: Option<(i32, i32)>,
+    pub(super) character: Character,
+    /// The character's pictures, if they are an earlier episode's and differ from the current ones.
+    pub(super) earlier_sprites: Option<Arc<CharacterSprites>>,
+    pub(super) command: Option<Command>,
+}
+
 impl Scene {
+    /// What a state looks like. `sprites` are the current episode's, `earlier_sprites` those of an earlier episode's
+    /// character.
+    pub(super) fn new(
+        state: &State,
+        config: &Config,
+        sprites: &Arc<CharacterSprites>,
+        earlier_sprites: &Arc<CharacterSprites>,
+    ) -> Self {
+        let shows_earlier = !state.first_frame && matches!(state.displayed, DisplayedCharacter::Earlier { .. });
+        let differs = shows_earlier && !Arc::ptr_eq(sprites, earlier_sprites);
+        Scene {
+            safe_tile: state.visible_fire(&config.parameters),
+            character: *state.visible_character(),
+            earlier_sprites: differs.then(|| Arc::clone(earlier_sprites)),
+            command: state.shown_command,
+        }
+    }
+
     /// Paints the frame.
     pub(super) fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
         assets.paint_arena(self.safe_tile, canvas);
@@ -128,14 +163,14 @@ impl Scene {
         }
     }
 
-    /// The rectangles in which this scene's frame differs from `shown`'s. Unless they are `noted` for readers, they may be larger
+    /// The rectangles in which this scene's frame differs from `shown`'s. Unless painted pixels are `tracked`, they may be larger
     /// where that is faster to paint.
-    pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets, noted: bool) -> Damage {
+    pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets, tracked: bool) -> Damage {
         let mut damage = Damage::new(SCREEN, SCREEN);
         if self.safe_tile != shown.safe_tile {
             let (left, top, right, bottom) = assets.config.arena;
             // Whole columns are copied as one run.
-            let (top, bottom) = if noted { (top, bottom) } else { (0, SCREEN as i32) };
+            let (top, bottom) = if tracked { (top, bottom) } else { (0, SCREEN as i32) };
             damage.add(Rect::new(left, top, right - left, bottom - top));
         }
         if self.command != shown.command {
@@ -151,4 +186,31 @@ impl Scene {
     fn sprites<'a>(&'a self, assets: &'a Assets) -> &'a CharacterSprites {
         self.earlier_sprites.as_ref().unwrap_or(&assets.character)
     }
+}
+
+/// The pictures of all commands, by number.
+fn command_sprites() -> [Sprite; COMMANDS] {
+    let pixels = |length: f64| (length * COMMAND_SCALE) as i32;
+    std::array::from_fn(|index| {
+        let mut surface = Surface::new(COMMAND_SIDE as usize, COMMAND_SIDE as usize);
+        surface.fill(BLACK);
+        surface.set_color_key(Some(BLACK));
+        let width = pixels(8.0);
+        match Command::from_index(index).angle() {
+            None => {
+                let radius = COMMAND_SIDE / 2 - pixels(4.0);
+                let (x, y) = (COMMAND_SIDE - pixels(12.0), COMMAND_SIDE / 2 - pixels(8.0));
+                surface.draw_circle(WHITE, (radius, radius), radius, width);
+                surface.draw_line(WHITE, (0, y), (x, y), width);
+            }
+            Some(angle) => {
+                let (tail, tip, middle) = (pixels(2.0), pixels(80.0), pixels(40.0));
+                surface.draw_line(WHITE, (tail, middle), (tip, middle), width);
+                surface.draw_line(WHITE, (tip, middle), (middle, 0), width);
+                surface.draw_line(WHITE, (tip, middle), (middle, tip), width);
+                surface = surface.rotate(angle);
+            }
+        }
+        Sprite::new(&surface)
+    })
 }

@@ -4,9 +4,8 @@ use super::commands::{COMMANDS, Command};
 use super::config::TILE;
 use super::features::{AGENT, ARENA_SIZE, BURNING, COMMAND, HEADING, LARGEST_ARENA};
 use super::parameters::{Locomotion, Variant};
-use crate::envs::expert::Expert;
+use crate::envs::expert::{Expert, turn_or_walk};
 use crate::envs::screen::SCREEN;
-use crate::envs::steering::turn_or_walk;
 
 /// Distance in pixels from a tile's centre within which the agent stops.
 const DEAD_ZONE: i32 = 2;

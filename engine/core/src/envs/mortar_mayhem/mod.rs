@@ -1,6 +1,5 @@
 //! Mortar Mayhem: memorise a sequence of commands, then execute it on an arena whose other tiles burn.
 
-mod command_sprites;
 mod commands;
 mod config;
 mod display_schedule;
@@ -10,17 +9,15 @@ mod features;
 mod parameters;
 mod registry;
 mod rules;
-mod scene;
 mod state;
 
 use std::sync::Arc;
 
 pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
 pub use config::Config;
-pub use drawing::Assets;
+pub use drawing::{Assets, Scene};
 pub use parameters::{Locomotion, Parameters, Variant};
 pub use registry::SPECS;
-pub use scene::Scene;
 pub use state::State;
 
 use super::character_sprites::CharacterSprites;

@@ -24,7 +24,7 @@ pub struct Parameters {
     pub agent_speed: f64,
     /// Tiles along a side of the arena, 2 to 6.
     pub arena_size: i32,
-    /// The first this many [commands](super::Command) may occur, 4 to 9.
+    /// Number of [commands](super::Command) that may occur, counted from the first; 4 to 9.
     pub allowed_commands: usize,
     /// Number of commands of an episode, to draw from; empty for the endless id.
     pub command_count: Vec<i64>,

@@ -8,9 +8,8 @@ use super::features::{AGENT, FALLEN, HEADING};
 use super::parameters::Variant;
 use super::path::{GRID, Tile};
 use super::route::SEGMENT;
-use crate::envs::expert::Expert;
+use crate::envs::expert::{Expert, turn_or_walk};
 use crate::envs::screen::SCREEN;
-use crate::envs::steering::turn_or_walk;
 
 /// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so that the frames do not show it.
 const ENDLESS_SPEED: i32 = 3;

@@ -1,4 +1,4 @@
-//! The environments of a pool, which are all of one family.
+//! The environments of a pool, all of one family.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -13,14 +13,14 @@ use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame};
 use super::env_slot::{EnvSlot, OptionSet};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
-use super::seeding::{Seeding, Seeds, Unseeded};
+use super::seeding::{PoolEntropy, Seeding, Seeds};
 use super::snapshot::{Saved, SnapshotError};
 use super::threads::Threads;
 use crate::batch::BatchMut;
 use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters, view};
 use crate::raster::PixelFormat;
 
-/// The means for writing a batch.
+/// What a write of a batch needs besides the environments.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct WriteContext<'a> {
     pub threads: &'a Threads,
@@ -29,8 +29,8 @@ pub(super) struct WriteContext<'a> {
     pub draw: DrawSettings,
 }
 
-/// The environments of a pool, of any family: one virtual call for a whole batch.
-pub(super) trait EnvSlots: Send + Sync {
+/// The environments of a pool, of any family. One virtual call serves a whole batch.
+pub(super) trait AnyEnvs: Send + Sync {
     /// Steps all environments.
     fn step(
         &mut self,
@@ -54,7 +54,7 @@ pub(super) trait EnvSlots: Send + Sync {
     /// As [`set_options`](Self::set_options), for the environments that `request` resets.
     fn set_options_of(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError>;
 
-    /// What an environment's running episode follows from.
+    /// Seed and reset parameters of an environment's running episode.
     fn running_episode(&self, env: usize) -> RunningEpisode;
 
     /// The whole state of one environment.
@@ -70,7 +70,7 @@ pub(super) trait EnvSlots: Send + Sync {
     /// Replaces these frames.
     fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError>;
 
-    /// How far one environment's episode is.
+    /// Progress of one environment's episode.
     fn progress(&self, env: usize) -> Vec<Progress>;
 
     /// Draws one environment's ground-truth view.
@@ -81,7 +81,7 @@ pub(super) trait EnvSlots: Send + Sync {
 }
 
 /// The environments of a pool, all of one family.
-pub(super) struct FamilySlots<E: Environment> {
+pub(super) struct TypedEnvs<E: Environment> {
     slots: Vec<EnvSlot<E>>,
     /// For each buffer, the scenes that were last drawn into its frames.
     drawn: Vec<Vec<DrawnScene<E>>>,
@@ -92,12 +92,12 @@ pub(super) struct FamilySlots<E: Environment> {
 }
 
 /// Makes the environments of one family; those with the same options share their assets.
-pub(super) fn family_slots<E: Environment>(
+pub(super) fn typed_envs<E: Environment>(
     spec: &'static EnvSpec,
     variant: E::Variant,
     config: &PoolConfig,
-    unseeded: Unseeded,
-) -> Result<FamilySlots<E>, PoolError> {
+    entropy: PoolEntropy,
+) -> Result<TypedEnvs<E>, PoolError> {
     // The options of an environment, and what is made from them.
     let make = |given: &OptionMap| -> Result<(Arc<OptionMap>, Arc<E::Assets>), ParameterError> {
         let parameters = ResetParameters::new(spec.id, spec.parameters, given)?;
@@ -125,18 +125,17 @@ pub(super) fn family_slots<E: Environment>(
     let stack = config.frames.unwrap_or_default().stack;
     let slots = made.into_iter().enumerate().map(|(env, (options, assets))| {
         let number = config.first_env + env;
-        let mut seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, unseeded);
+        let mut seeds = Seeds::new(&config.seeding, &list, number, config.total_envs, entropy);
         if config.independent_episodes {
-            seeds = seeds.independent(number, unseeded);
+            seeds = seeds.independent(number, entropy);
         }
-        EnvSlot::new(assets, options, seeds, unseeded.environment(number), stack, config.independent_episodes)
+        EnvSlot::new(assets, options, seeds, entropy.environment(number), stack, config.independent_episodes)
     });
-    Ok(FamilySlots { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
+    Ok(TypedEnvs { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
 }
 
-impl<E: Environment> FamilySlots<E> {
-    /// Writes all rows. `play` gets an environment's number, the environment, and the rows that its own is number `row` of, and
-    /// writes everything but the frames.
+impl<E: Environment> TypedEnvs<E> {
+    /// Writes all rows. `play(env, slot, out, row)` plays environment `env` and writes row `row` of `out`, except its frames.
     fn write(
         &mut self,
         context: WriteContext<'_>,
@@ -163,7 +162,7 @@ impl<E: Environment> FamilySlots<E> {
         })
     }
 
-    /// The assets for these options: those of an environment that has the same, or new ones.
+    /// The assets for these options: shared with an environment that has the same options, or new.
     fn with_options(&self, options: &OptionMap) -> Result<OptionSet<E>, ParameterError> {
         for slot in &self.slots {
             if *slot.options == *options {
@@ -178,7 +177,7 @@ impl<E: Environment> FamilySlots<E> {
     }
 }
 
-impl<E: Environment> EnvSlots for FamilySlots<E> {
+impl<E: Environment> AnyEnvs for TypedEnvs<E> {
     fn step(
         &mut self,
         context: WriteContext<'_>,
@@ -213,7 +212,7 @@ impl<E: Environment> EnvSlots for FamilySlots<E> {
     }
 
     fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError> {
-        // All of them are made before the first is set, so that an error changes no environment.
+        // All are made before the first is set, so that an error changes no environment.
         let made: Vec<_> = sets.iter().map(|set| self.with_options(&set.options)).collect::<Result<_, _>>()?;
         for (set, (assets, options)) in sets.iter().zip(made) {
             for env in &set.envs {

@@ -1,4 +1,0 @@
-//! Colours.
-
-/// A colour: red, green, blue.
-pub type Rgb = [u8; 3];
