@@ -122,36 +122,6 @@ mod tests {
     }
 
     #[test]
-    fn a_buffer_whose_write_was_not_finished_is_not_current() {
-        let (mut buffers, layout) = (Buffers::new(1), layout());
-        let mut batch = zeroed(layout.blocks());
-        write(&mut buffers, &layout, &mut batch);
-        assert!(buffers.begin(&layout, &mut batch).current);
-        assert!(!write(&mut buffers, &layout, &mut batch).current);
-    }
-
-    #[test]
-    fn a_copy_of_a_buffer_whose_write_was_not_finished_is_not_current() {
-        let (mut buffers, layout) = (Buffers::new(1), layout());
-        let mut batch = zeroed(layout.blocks());
-        write(&mut buffers, &layout, &mut batch);
-        let mut copy = batch.clone();
-        assert!(buffers.begin(&layout, &mut batch).current);
-        assert!(!write(&mut buffers, &layout, &mut copy).current);
-    }
-
-    #[test]
-    fn a_buffer_whose_record_was_taken_by_an_unfinished_write_is_not_current() {
-        let (mut buffers, layout) = (Buffers::new(1), layout());
-        let mut batches = vec![zeroed(layout.blocks()); MAX_BUFFERS + 1];
-        let (taker, recorded) = batches.split_last_mut().unwrap();
-        recorded.iter_mut().for_each(|batch| assert!(!write(&mut buffers, &layout, batch).current));
-        assert_eq!(buffers.begin(&layout, taker), Buffer { index: 0, current: false });
-        assert_eq!(write(&mut buffers, &layout, &mut recorded[0]), Buffer { index: 0, current: false });
-        assert!(write(&mut buffers, &layout, &mut recorded[1]).current);
-    }
-
-    #[test]
     fn the_least_recently_written_record_is_replaced() {
         let (mut buffers, layout) = (Buffers::new(1), layout());
         let mut batches = vec![zeroed(layout.blocks()); MAX_BUFFERS + 1];

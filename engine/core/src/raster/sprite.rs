@@ -2,8 +2,7 @@
 
 use std::ops::Range;
 
-use super::blit::blend_keyed;
-use super::blit::opaque_runs;
+use super::blit::{blend_keyed, opaque_runs};
 use super::canvas::Canvas;
 use super::circle::Disc;
 use super::rect::Rect;
@@ -74,7 +73,6 @@ impl Sprite {
         let (first, end) = (columns.start as i64, columns.end as i64);
         let (highest, lowest) = (rows.start as i64, rows.end as i64);
         if left >= first && top >= highest && right <= end && bottom <= lowest && !canvas.tracks_dirty() {
-            canvas.mark_dirty(left as usize..right as usize, &(top as usize..bottom as usize));
             // Negative where the sprite's empty margin reaches beyond the canvas; the blocks do not.
             let corner = i64::from(x) * canvas.height() as i64 + i64::from(y);
             self.blocks.copy(corner, canvas);

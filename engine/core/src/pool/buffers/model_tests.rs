@@ -1,5 +1,4 @@
-//! A pool takes a buffer for current only if it shows the scenes of the buffer's record: all short sequences of what can happen
-//! to buffers, and long random ones.
+//! A buffer is current only if it shows the scenes of its record: after every short sequence of events, and after long random ones.
 
 use proptest::prelude::*;
 
@@ -13,15 +12,15 @@ use crate::property_cases::property_cases;
 enum Event {
     /// A pool writes into a buffer.
     Write { pool: usize, buffer: usize },
-    /// A write ends early, by an error or a panic: some pixels and scenes are those of before, some are new.
+    /// A write ends early, by an error or a panic: some pixels and scenes are old, some are new.
     Interrupted { pool: usize, buffer: usize },
     /// The memory of a buffer is copied over another's.
     Copy { from: usize, to: usize },
-    /// The frames are changed by somebody else, who says so.
+    /// The frames are changed from outside, and the pool is told.
     Forget { buffer: usize },
 }
 
-/// Buffers whose first number stands for their pixels, and pools whose drawn scenes are the same kind of number.
+/// Buffers whose first number stands for their pixels, and pools whose drawn scenes are such numbers.
 struct Model {
     layout: Layout,
     pools: [(Buffers, Vec<u64>); 2],
@@ -79,7 +78,7 @@ fn layout() -> Layout {
 }
 
 #[test]
-fn all_short_sequences() {
+fn no_short_sequence_makes_a_buffer_with_other_pixels_current() {
     const LENGTH: u32 = 5;
     let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
     let events: Vec<Event> = pairs
@@ -110,9 +109,8 @@ fn event() -> impl Strategy<Value = Event> {
 proptest! {
     #![proptest_config(property_cases(200))]
 
-    /// With more buffers than records.
     #[test]
-    fn long_sequences(events in prop::collection::vec(event(), 1..400)) {
+    fn no_sequence_with_more_buffers_than_records_makes_a_buffer_with_other_pixels_current(events in prop::collection::vec(event(), 1..400)) {
         let mut model = Model::new(&layout(), MAX_BUFFERS + 4);
         events.into_iter().for_each(|event| model.happens(event));
     }
