@@ -296,7 +296,7 @@ mod tests {
     use crate::envs;
 
     #[test]
-    fn names_are_unique_and_found_again() {
+    fn a_name_finds_its_section() {
         fn check<S: SectionTable>() {
             for section in S::ALL {
                 assert_eq!(S::from_name(section.name()), Some(*section));

@@ -36,7 +36,7 @@ mod tests {
     use super::{distance, lerp, rotate};
 
     #[test]
-    fn interpolation_and_distance() {
+    fn points_between_and_distances_equal_pygames() {
         assert_eq!(lerp([2.0, -4.0], [10.0, 4.0], 0.25), [4.0, -2.0]);
         assert_eq!(lerp([0.1, 0.2], [0.7, 0.3], 0.0), [0.1, 0.2]);
         assert_eq!(distance([1.0, 2.0], [4.0, -2.0]), 5.0);

@@ -13,7 +13,7 @@ const MAX_RADIUS: i64 = 1 << 16;
 
 /// Whether the midpoint that follows the point `(x, y)` of an outline lies outside of the circle,
 /// in which case the outline moves one pixel towards the centre.
-pub(super) fn falls(radius: i64, x: i64, y: i64) -> bool {
+pub(super) fn midpoint_is_outside(radius: i64, x: i64, y: i64) -> bool {
     (x + 1) * (x + 1) + y * (y - 1) >= radius * radius
 }
 
@@ -39,7 +39,7 @@ impl Iterator for Octant {
         if self.x >= self.y {
             return None;
         }
-        self.y -= i64::from(falls(self.radius, self.x, self.y));
+        self.y -= i64::from(midpoint_is_outside(self.radius, self.x, self.y));
         self.x += 1;
         Some((self.x, self.y))
     }
@@ -70,7 +70,7 @@ impl Disc {
             // pygame swaps the ends of a run that end before they start: none is empty.
             half_heights[x as usize - 1] = y.max(1) as i32;
             // Of the points with the same `y`, the last is the farthest out.
-            if y > 0 && falls(radius, x, y) {
+            if y > 0 && midpoint_is_outside(radius, x, y) {
                 let half_height = &mut half_heights[y as usize - 1];
                 *half_height = (*half_height).max(x as i32);
             }

@@ -1,7 +1,7 @@
 //! Drawing rectangles: filled or with a border, with square or rounded corners.
 
 use super::canvas::Canvas;
-use super::circle::{Octant, falls};
+use super::circle::{Octant, midpoint_is_outside};
 use super::rect::{CornerRadii, Rect};
 use super::runs::Rgb;
 
@@ -267,7 +267,7 @@ impl Canvas<'_> {
         let mut inner = inner_radius;
         let mut thickness = width;
         for (near, far) in Octant::new(radius) {
-            inner -= i64::from(falls(inner_radius, near - 1, inner));
+            inner -= i64::from(midpoint_is_outside(inner_radius, near - 1, inner));
             if thickness > 1 {
                 thickness = far - inner;
             }

@@ -38,7 +38,7 @@ impl Model {
         &mut bytemuck::cast_slice_mut(&mut self.buffers[buffer])[0]
     }
 
-    fn happens(&mut self, event: Event) {
+    fn apply(&mut self, event: Event) {
         self.drawings += 1;
         let new = self.drawings;
         match event {
@@ -91,7 +91,7 @@ fn no_short_sequence_makes_a_buffer_with_other_pixels_current() {
     for sequence in 0..events.len().pow(LENGTH) {
         let mut model = Model::new(&layout, 2);
         for position in 0..LENGTH {
-            model.happens(events[sequence / events.len().pow(position) % events.len()]);
+            model.apply(events[sequence / events.len().pow(position) % events.len()]);
         }
     }
 }
@@ -112,6 +112,6 @@ proptest! {
     #[test]
     fn no_sequence_with_more_buffers_than_records_makes_a_buffer_with_other_pixels_current(events in prop::collection::vec(event(), 1..400)) {
         let mut model = Model::new(&layout(), MAX_BUFFERS + 4);
-        events.into_iter().for_each(|event| model.happens(event));
+        events.into_iter().for_each(|event| model.apply(event));
     }
 }
