@@ -61,7 +61,7 @@ def test_episodes_after_a_reset_are_the_originals(id: str, original_python: str,
         assert ends >= 2 * GROUPS * NUM_ENVS
 
 
-def episodes(envs: endless_gym.EndlessVectorEnv, group: int = 0, number: int = 4) -> list[list[bytes]]:
+def episodes(envs: endless_gym.EndlessVectorEnv, group: int = 0, number: int = 3) -> list[list[bytes]]:
     """The first frames of the next episodes of each environment of a group, which start in the same step as others end."""
     firsts: list[list[bytes]] = [[] for _ in range(envs.num_envs)]
     while min(map(len, firsts)) < number:
