@@ -53,7 +53,7 @@ RawObservation: TypeAlias = Array | Mapping[str, Array]
 
 @dataclass
 class AgentMemory:
-    """What the agent keeps of n environments between two steps.
+    """The agent's memory of n environments between two steps.
 
     Attributes:
         reset_mask: Whether the next observation is the first of an episode, bool (n,).

@@ -43,8 +43,8 @@ class StepResult:
 class Environments:
     """Groups of environments: `send` a group's actions, `receive` the result later.
 
-    An engine process steps from `send` on. Environments in this process are stepped in `receive`, by their threads: a step takes
-    microseconds, less than a Python thread takes to begin one.
+    An engine process starts a step at `send`. Environments in this process step in `receive`, on their threads: a step takes
+    microseconds, less than starting it from a Python thread.
 
     The seed of each episode is drawn from 0 to 99,999, as in the paper's training.
 
@@ -143,7 +143,7 @@ class Environments:
 
     @property
     def failure(self) -> str | None:
-        """Why the engine was given up, and the environments continue in this process; None otherwise."""
+        """Reason for giving up the engine, after which the environments run in this process; None while there is one."""
         return None if self._engine is None else self._engine.failure
 
     def snapshots(self) -> list[list[bytes]]:

@@ -13,7 +13,7 @@ SHARE = 0.9
 
 
 def learnt(spec: Spec, options: Mapping[str, Any], means: Mapping[str, float]) -> str | None:
-    """Why the task counts as learnt, for a message; `None` if it does not, and always in an endless environment.
+    """The reason why the task counts as learnt, for a message; `None` if it does not, as always in an endless environment.
 
     Args:
         spec: Specification of the environment.

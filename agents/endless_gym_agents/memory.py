@@ -38,7 +38,7 @@ class Minibatch:
 
 
 class MemoryState(ABC):
-    """What a memory keeps of n environments between two steps."""
+    """The state of n environments between two steps."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ class RecoverableEngine:
 
     Attributes:
         report: Called with a line of text for each failure and each recovery.
-        failure: Why the engine was given up, and the environments continue in this process; None while there is an engine.
+        failure: Reason for giving up the engine, after which the environments run in this process; None while there is one.
     """
 
     def __init__(

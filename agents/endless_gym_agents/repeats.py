@@ -1,6 +1,6 @@
 """Equal frames are encoded once, which saves most of the encoder's work where observations repeat.
 
-In Mortar Mayhem and Mystery Path, an agent that stands still, or that is where another one was, sees the same frame again. The
+In Mortar Mayhem and Mystery Path, an agent that stands still, or that returns to a place, sees the same frame again. The
 encoder and the layer after it have no memory, so equal frames have equal outputs: while acting, a frame is encoded where it
 occurs first in a segment; while learning, a minibatch encodes each of its different frames once (`Segment.distinct`), and the
 gradients of equal frames are added before the encoder.

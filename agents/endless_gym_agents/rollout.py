@@ -3,9 +3,9 @@
 The environments are divided into groups. While the agent computes the actions of one group, the other groups are stepped. A
 segment continues the episodes of the previous one.
 
-Between an observation and the actions is only what the actions need: the observation is copied to its place in the segment, the
-network reads it there, and the copy of the actions is the only operation that waits for the device. The memory is updated while
-the environments step; log-probabilities and values are computed from the stored outputs at the end of the segment.
+Only what the actions need is computed between an observation and the actions: the observation is copied to its place in the
+segment, the network reads it there, and the copy of the actions is the only operation that waits for the device. The memory is
+updated while the environments step; log-probabilities and values are computed from the stored outputs at the end of the segment.
 """
 
 from __future__ import annotations

@@ -69,8 +69,8 @@ class SearchArguments:
     """trials that run at a time on this machine, each in a process of its own; 0 for one, in this process. With --ray the limit
     for all machines; 0 for as many as the resources permit"""
     max_failures: int = 3
-    """how often the search replaces a worker whose process was killed; with --ray, how often it resumes a failed trial. One that
-    failed more often is resumed when the command is repeated"""
+    """largest number of killed workers that the search replaces; with --ray, of times that it resumes a failed trial. A trial
+    that failed more often is resumed when the command is repeated"""
     ray: str = ""
     """run the trials on Ray Tune. The flag alone starts Ray on this machine; with an address the trials run on that cluster,
     whose machines must share the folder of the search"""

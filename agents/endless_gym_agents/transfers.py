@@ -1,6 +1,6 @@
-"""Copies between the host and the agent's device, of which only one waits: that of the actions.
+"""Copies between the host and the agent's device; only the copy of the actions waits.
 
-On the CPU the copies are those of NumPy, which take less time to begin, and nothing waits. On CUDA they go through page-locked
+On the CPU, NumPy copies, since its calls cost less, and nothing waits. On CUDA they go through page-locked
 memory and are asynchronous.
 """
 

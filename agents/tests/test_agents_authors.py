@@ -75,7 +75,7 @@ def assert_gradients(memory: AnyMemory, output: Tensor, factor: Tensor, recorded
 
 
 @pytest.mark.parametrize("name", [name for name in RECORDED if "gru" in name or "lstm" in name])
-def test_recurrent_layers(name: str) -> None:
+def test_recurrent_layers_equal_those_of_the_authors(name: str) -> None:
     recorded = RECORDED[name]
     x, hidden, factor = (tensors(recorded[key]) for key in ("x", "hidden", "factor"))
     hidden = hidden.transpose(1, 2)  # (parts, layers, sequences, hidden size)
@@ -99,7 +99,7 @@ def test_recurrent_layers(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in RECORDED if "trxl" in name])
-def test_transformer(name: str) -> None:
+def test_transformer_equals_that_of_the_authors(name: str) -> None:
     recorded = RECORDED[name]
     x, memories, steps, factor = (tensors(recorded[key]) for key in ("x", "memories", "steps", "factor"))
     kind = name.split(", ")[1]
@@ -136,7 +136,7 @@ def test_transformer(name: str) -> None:
     assert_gradients(memory, output, factor[minibatch.indices], recorded)
 
 
-def test_relative_attention() -> None:
+def test_relative_attention_equals_that_of_the_authors() -> None:
     """The authors divide scores by the root of a head's size, and project distances with one matrix for all heads."""
     recorded = RECORDED["attention, relative"]
     query, tokens, mask, factor = (tensors(recorded[key]) for key in ("query", "tokens", "mask", "factor"))

@@ -16,7 +16,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_the_parts_that_need_no_gpu(tmp_path: Path) -> None:
+def test_parts_that_need_no_gpu_run_on_the_cpu(tmp_path: Path) -> None:
     files = ("--json", str(tmp_path / "cuda.json"), "--markdown", str(tmp_path / "cuda.md"))
     done = run("--device", "cpu", "--updates", "1", *files)
     assert done.returncode == 0, done.stderr

@@ -65,14 +65,14 @@ def small(*paths: Path, **changes: object) -> EvalArguments:
         ("Endless-MysteryPath-v0", {}, {"reward": 0.4, "tiles_visited": 4}, 0, None),
     ],
 )
-def test_task_progress(
+def test_task_progress_follows_from_infos_and_reward(
     env: str, options: dict[str, object], final: dict[str, float], path: int, expected: float | None
 ) -> None:
     progress = task_progress(spec(env), options, final, path)
     assert progress == (expected if expected is None else pytest.approx(expected))
 
 
-def test_metrics_of_the_paper() -> None:
+def test_each_environment_has_the_metric_of_the_paper() -> None:
     assert metric("Endless-MortarMayhem-v0") == ("commands_completed", "Commands")
     assert metric("Endless-MysteryPath-v0") == ("tiles_visited", "Tiles")
     assert metric("Endless-SearingSpotlights-v0") == ("coins_collected", "Coins")
@@ -120,7 +120,7 @@ def test_labels_match_the_published_results(flags: str, expected: str) -> None:
     assert any(expected.replace("_learned", "_lr_learned") in curves for curves in published["curves"].values())
 
 
-def test_label_without_published_results() -> None:
+def test_label_names_variations_without_published_results() -> None:
     assert label(parse(["--agent", "trxl", "--transformer.query-previous"])) == "trxl_qprev"
     assert label(parse(["--agent", "gru", "--transformer.query-previous"])) == "gru"
 

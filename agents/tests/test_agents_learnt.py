@@ -32,7 +32,9 @@ GRID = "MortarMayhem-Grid-v0"
         (GRID, {}, {}, False),
     ],
 )
-def test_learnt(id: str, options: dict[str, object], means: dict[str, float], is_learnt: bool) -> None:
+def test_task_is_learnt_at_nine_tenths_of_its_best_result(
+    id: str, options: dict[str, object], means: dict[str, float], is_learnt: bool
+) -> None:
     given = {f"episode/{name}": value for name, value in means.items()}
     assert (learnt(spec(id), options, given) is not None) is is_learnt
 

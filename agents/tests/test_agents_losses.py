@@ -68,7 +68,7 @@ def test_advantages_of_long_segments_take_few_operations() -> None:
         (0.5, -2.0, 1.8),  # clipped to 0.9
     ],
 )
-def test_policy_loss_of_one_branch(ratio: float, advantage: float, expected: float) -> None:
+def test_policy_loss_clips_the_ratio_of_one_branch(ratio: float, advantage: float, expected: float) -> None:
     new, old = torch.tensor([[math.log(0.4 * ratio)]]), torch.tensor([[math.log(0.4)]])
     assert float(losses.policy_loss(new, old, torch.tensor([advantage]), 0.1)) == pytest.approx(expected, abs=1e-6)
 
@@ -88,7 +88,7 @@ def test_policy_loss_clips_each_branch_and_takes_the_mean() -> None:
         (1.05, 1.0, 0.0, 1.05**2),  # within the range
     ],
 )
-def test_value_loss(value: float, old: float, target: float, expected: float) -> None:
+def test_value_loss_takes_the_larger_of_both_errors(value: float, old: float, target: float, expected: float) -> None:
     loss = losses.value_loss(torch.tensor([value]), torch.tensor([old]), torch.tensor([target]), 0.1)
     assert float(loss) == pytest.approx(expected, abs=1e-5)
 
@@ -131,12 +131,12 @@ def test_reconstruction_loss_is_binary_cross_entropy() -> None:
     assert total > 100
 
 
-def test_normalisation() -> None:
+def test_normalised_advantages_have_mean_0_and_deviation_1() -> None:
     advantages = losses.normalised(torch.tensor([1.0, 2.0, 3.0]))
     torch.testing.assert_close(advantages, torch.tensor([-1.0, 0.0, 1.0]))
 
 
-def test_explained_variance() -> None:
+def test_explained_variance_is_1_for_equal_values_and_nan_without_variance() -> None:
     returns = torch.tensor([0.0, 2.0, 4.0])
     assert losses.explained_variance(returns.clone(), returns) == 1.0
     assert losses.explained_variance(torch.zeros(3), returns) == 0.0
@@ -144,7 +144,7 @@ def test_explained_variance() -> None:
     assert math.isnan(losses.explained_variance(returns, torch.ones(3)))
 
 
-def test_decay() -> None:
+def test_coefficients_decay_linearly_to_their_final_value() -> None:
     assert linear_decay(2.75e-4, 1e-5, 0, 10_000) == 2.75e-4
     assert linear_decay(2.75e-4, 1e-5, 5_000, 10_000) == pytest.approx((2.75e-4 + 1e-5) / 2)
     assert linear_decay(2.75e-4, 1e-5, 10_000, 10_000) == 1e-5

@@ -96,7 +96,7 @@ def test_epochs_follow_one_another(agent: Agent) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
-def test_minibatches_without_a_step_of_the_rank(name: str) -> None:
+def test_rank_may_have_no_step_of_a_minibatch(name: str) -> None:
     """A rank with one of three environments: its steps are in some of the minibatches, and the others can be made, too."""
     kind, changes = KINDS[name]
     agent = make(kind, **changes)
@@ -171,7 +171,7 @@ def test_forward_does_not_leak(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
-def test_band_mask_of_cached_tokens(name: str) -> None:
+def test_cached_token_influences_the_next_window_of_its_episode(name: str) -> None:
     """A cached token influences exactly the next `window - 1` steps of its own episode."""
     kind, changes = KINDS[name]
     agent = make(kind, **changes)
@@ -324,7 +324,7 @@ def test_bootstrap_value_does_not_change_the_memory() -> None:
         assert_close(agent.act({"features": observed[3]}, memory).value, once)
 
 
-def test_state_dict_of_the_memory() -> None:
+def test_memory_resumes_from_its_state_dict() -> None:
     for kind, changes in KINDS.values():
         agent, observed, done = make(kind, **changes), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
         memory, other = agent.initial_memory(ENVS), agent.initial_memory(ENVS)
@@ -358,7 +358,7 @@ def test_compiled_agent_has_the_same_outputs() -> None:
     assert agent.state_dict().keys() == parameters
 
 
-def test_balanced_split() -> None:
+def test_balanced_split_makes_parts_of_similar_size() -> None:
     sizes = [1, 30, 5, 5, 9, 2, 2, 2, 8, 8, 8, 20]
     parts = balanced_split(sizes, 4, torch.Generator().manual_seed(1))
     assert sorted(torch.cat(parts).tolist()) == list(range(len(sizes)))
@@ -366,7 +366,7 @@ def test_balanced_split() -> None:
     assert len(balanced_split([1], 4, torch.Generator())) == 1
 
 
-def test_stack_of_grey_frames() -> None:
+def test_stack_holds_the_last_grey_frames_of_an_episode() -> None:
     agent = Agent(PRESETS["paper"].__class__(agent="stack"), {"visual_observation": (84, 84, 3)}, BRANCHES)
     memory = agent.initial_memory(2)
     colours = torch.tensor([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [10, 20, 30]], dtype=torch.uint8)

@@ -39,7 +39,7 @@ PAPER = PRESETS["paper"]
         ("none", {}, 4_049_575 - 1_606_144 - 1_575_936 + (3136 - 512) * 512),
     ],
 )
-def test_numbers_of_parameters(agent: str, changes: dict, count: int) -> None:
+def test_number_of_parameters_is_as_computed_by_hand(agent: str, changes: dict, count: int) -> None:
     made = Agent(replace(PAPER, agent=agent, **changes), {"visual_observation": (84, 84, 3)}, (3, 3))
     assert made.num_parameters == count
 
@@ -356,7 +356,7 @@ def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
     ("kind", "bound"),
     [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))],
 )
-def test_uniform_initialisations(kind: str, bound: float) -> None:
+def test_uniform_weights_are_within_their_bound_and_close_to_it(kind: str, bound: float) -> None:
     """The weights of a block are within the bound and close to it; T-Fixup scales the output projection."""
     block = Block(Transformer(layers=3, width=64, heads=4, shared_heads=False, initialisation=kind))
     for name, weight in block.named_parameters():
@@ -366,13 +366,13 @@ def test_uniform_initialisations(kind: str, bound: float) -> None:
         assert 0.98 * bound * factor < float(weight.abs().max()) <= bound * factor, name
 
 
-def test_orthogonal_initialisation() -> None:
+def test_orthogonal_initialisation_gives_orthogonal_weights() -> None:
     block = Block(Transformer(width=64, heads=4, shared_heads=False, initialisation="orthogonal"))
     for weight in (block.fc.weight, block.attention.queries.weight):
         torch.testing.assert_close(weight @ weight.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
 
 
-def test_initialisation_of_gates_and_relative_biases() -> None:
+def test_gates_start_orthogonal_and_relative_biases_at_0() -> None:
     """The matrices of the gates have the initialisation of the block, each on its own; the biases of the encoding are 0."""
     changes = {"shared_heads": False, "gating": True, "positional_encoding": "relative"}
     block = Block(Transformer(width=64, heads=4, initialisation="orthogonal", gate_bias=2.0, **changes))
@@ -384,7 +384,7 @@ def test_initialisation_of_gates_and_relative_biases() -> None:
 
 
 @pytest.mark.parametrize("bias", [0.0, 2.0])
-def test_gate_with_zero_weights(bias: float) -> None:
+def test_gate_with_zero_weights_scales_by_its_bias(bias: float) -> None:
     """With zero weights the candidate is 0 and x is scaled by 1 - sigmoid(-bias), which is closer to 1 for a bias of 2."""
     gate, x = Gate(8, bias), torch.randn(5, 8)
     for layer in (gate.from_x, gate.from_y, gate.from_reset):
@@ -392,7 +392,7 @@ def test_gate_with_zero_weights(bias: float) -> None:
     torch.testing.assert_close(gate(x, torch.randn(5, 8)), x * (1 - 1 / (1 + math.exp(bias))))
 
 
-def test_table_of_the_absolute_encoding() -> None:
+def test_absolute_encoding_counts_from_the_end_of_its_table() -> None:
     """Row p is the encoding of `positions - 1 - p`: the sines of all frequencies, then the cosines."""
     agent = make("trxl", **transformer(positions=10))
     table = agent.memory.table

@@ -24,7 +24,7 @@ def made(
 
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
-def test_outputs_and_gradients_are_those_of_pytorch(kind: type[nn.GRU] | type[nn.LSTM], layers: int) -> None:
+def test_outputs_and_gradients_equal_those_of_pytorch(kind: type[nn.GRU] | type[nn.LSTM], layers: int) -> None:
     recurrent, x, hidden = made(kind, layers, torch.float32)
     output = packed_layers(x, recurrent.all_weights, hidden, SIZES)
     expected, _ = recurrent(PackedSequence(x, torch.tensor(SIZES)), hidden[0] if kind is nn.GRU else tuple(hidden))

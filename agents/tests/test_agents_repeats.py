@@ -98,7 +98,7 @@ def test_frames_are_embedded_where_they_occur_first(monkeypatch: pytest.MonkeyPa
         assert embedded.first.tolist() == first_occurrences(frames) == [0, 1, 0, 0, 4, 1, 0, 7]
 
 
-def test_another_segment_begins_without_embeddings() -> None:
+def test_next_segment_starts_without_embeddings() -> None:
     frames = frames_of([5, 6])
     embedded = EmbeddedFrames(frames)
     embedded.embed(range(2), embeddings)
@@ -109,7 +109,7 @@ def test_another_segment_begins_without_embeddings() -> None:
 
 
 @pytest.mark.parametrize("agent", ["none", "gru", "lstm", "trxl"])
-def test_a_segment_is_what_encoding_each_frame_gives(agent: str) -> None:
+def test_segment_equals_one_whose_frames_are_all_encoded(agent: str) -> None:
     made, segment, states, encoded = collected(small(agent), segments=2)
     flat = segment.flat()
     frames = flat.observation[FRAME]
@@ -130,7 +130,7 @@ def test_a_segment_is_what_encoding_each_frame_gives(agent: str) -> None:
 
 
 @pytest.mark.parametrize("agent", ["none", "gru", "lstm", "trxl"])
-def test_losses_and_gradients_are_those_of_encoding_each_frame(agent: str) -> None:
+def test_losses_and_gradients_equal_those_of_encoding_each_frame(agent: str) -> None:
     given = small(agent, reconstruction_coefficient=0.1)
     made, segment, states, _ = collected(given)
     flat, returns = segment.flat(), torch.randn(STEPS * ENVS)
@@ -153,7 +153,7 @@ def test_losses_and_gradients_are_those_of_encoding_each_frame(agent: str) -> No
                 torch.testing.assert_close(gradients[name], gradient, rtol=1e-4, atol=1e-5)
 
 
-def test_steps_are_found_by_their_rows() -> None:
+def test_distinct_frames_and_rows_give_the_frames_of_steps() -> None:
     _, segment, _, _ = collected(small())
     flat, indices = segment.flat(), torch.tensor([7, 3, 3, 40, 0])
     observation, rows = flat.distinct(indices)

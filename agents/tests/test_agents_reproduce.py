@@ -90,7 +90,7 @@ def log_of(job: planning.Job, updates: int, seconds: float) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_flags_are_those_of_the_programs(name: str) -> None:
+def test_flags_of_an_experiment_give_its_settings(name: str) -> None:
     """The settings of a run are those that its command line gives, also at a small scale."""
     experiment = definitions.load(name)
     for one in (experiment, planning.scaled(experiment, planning.TINY)):
@@ -142,7 +142,7 @@ def test_runs_of_one_name_are_the_same_run() -> None:
         ({"runs": 2 * [{"name": "a", "env": "MortarMayhem-v0"}]}, "names of runs in an environment must differ"),
     ],
 )
-def test_mistakes_in_a_file(changes: dict[str, Any], message: str) -> None:
+def test_mistakes_in_an_experiment_file_are_named(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         definitions.parse("mine", json.dumps(OWN | changes))
 
@@ -242,7 +242,7 @@ def test_each_job_gets_a_gpu() -> None:
     assert running.Machine(2).environment(0) == {"OMP_NUM_THREADS": "1"}
 
 
-def test_numbers_of_the_ablation_table() -> None:
+def test_ablation_table_takes_the_best_update() -> None:
     """The best update is that with the highest mean over the runs; updates before the first end of an episode do not count."""
     nan = float("nan")
     found = report.ablation_numbers([[nan, 0.2, 0.8, 0.1], [nan, 0.4, 0.4, 0.3]], [[1, 2, 3, 99], [1, 2, 3, 99]])
@@ -288,7 +288,7 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
         ("--ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
     ],
 )
-def test_errors_of_ray(
+def test_errors_of_the_flag_ray_are_one_line(
     arguments: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["endless-reproduce", "endless", *arguments.split()])

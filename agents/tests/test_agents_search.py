@@ -101,7 +101,7 @@ def test_search_from_start_to_end(tmp_path: Path) -> None:
 
 
 def test_the_best_settings_are_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who has the old file open reads it to its end."""
+    """A reader that has the old file open reads it to its end."""
 
     def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
         watch(given.ppo.updates, {"episode/reward": float(given.ppo.epochs)})
@@ -204,7 +204,7 @@ def test_trials_are_pruned_after_the_warm_up(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(("pruner", "updates"), [("asha", {3: 10, 2: 2, 4: 10}), ("none", {3: 10, 2: 10, 4: 10})])
-def test_other_pruners(
+def test_asha_prunes_from_the_first_trial_on_and_none_never(
     pruner: Literal["asha", "none"], updates: dict[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """ASHA keeps the best of the trials that have reached an update, from the first trial on."""

@@ -15,7 +15,7 @@ from endless_gym_agents.statistics import interquartile_mean, stratified_bootstr
         ([[0, 10], [0, 10]], 5.0),  # over runs and tasks
     ],
 )
-def test_interquartile_mean(scores: list[float], expected: float) -> None:
+def test_interquartile_mean_is_the_mean_of_the_middle_half(scores: list[float], expected: float) -> None:
     assert interquartile_mean(scores) == expected
 
 

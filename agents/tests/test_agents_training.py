@@ -127,7 +127,7 @@ def test_resumed_run_with_frames_and_all_heads(tmp_path: Path) -> None:
         "--env Endless-MysteryPath-v0 --agent position",
     ],
 )
-def test_all_kinds_of_observations_and_actions(flags: str, tmp_path: Path) -> None:
+def test_update_changes_every_weight_with_each_kind_of_observation_and_action(flags: str, tmp_path: Path) -> None:
     """Frames, features and vectors, with one and two action branches; an update changes every weight."""
     small_run = "--preset quick --environment.num-envs 4 --ppo.steps 32 --ppo.updates 1 --threads 1"
     given = parse([*flags.split(), *small_run.split(), "--run", str(tmp_path / "run"), "--ppo.learning-rate", "0.01"])
@@ -407,7 +407,7 @@ def test_weights_and_biases_logs_contain_the_metrics_under_one_id(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
-def test_bf16_runs(agent: str, tmp_path: Path) -> None:
+def test_bf16_changes_results_slightly_and_keeps_float32_weights(agent: str, tmp_path: Path) -> None:
     """bfloat16 changes the numbers slightly; weights stay float32."""
     plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
     one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
@@ -434,7 +434,7 @@ def one_command(agent: str, run: Path, **changes: Any) -> Settings:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("agent", ["gru", "trxl"])
-def test_memory_matters(agent: str, tmp_path: Path) -> None:
+def test_agent_with_memory_learns_a_command_that_is_shown_and_hidden(agent: str, tmp_path: Path) -> None:
     """One command that is shown and then hidden: an agent with memory learns to execute it."""
     trained = checkpoint.load(train(one_command(agent, tmp_path / agent)))
     assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085

@@ -36,7 +36,7 @@ def results() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("env", "name", "metric", "suffix"), METRICS)
-def test_curves_are_the_published_ones(env: str, name: str, metric: str, suffix: str) -> None:
+def test_published_curves_are_read_unchanged(env: str, name: str, metric: str, suffix: str) -> None:
     published = {
         key.removeprefix(f"{name}/").removesuffix("_2") + suffix: value["metrics"][metric]
         for key, value in results().items()

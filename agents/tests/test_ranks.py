@@ -259,7 +259,7 @@ def test_numbers_of_environments_are_checked() -> None:
         endless_gym.serve("MysteryPath-v0", 2, first_env=-1)
 
 
-def test_a_rank_of_another_program_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rank_of_another_program_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RANK", "3")
     ranks = Ranks()
     assert (ranks.rank, ranks.size, ranks.threads) == (0, 1, None)
