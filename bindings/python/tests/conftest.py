@@ -28,10 +28,10 @@ def original_python() -> str:
 
 @pytest.fixture(scope="session")
 def libraries_python() -> str:
-    """A Python that has Ray, JAX and Jupyter's kernel, and what this one has."""
+    """A Python with the dependency group `rllib`: Ray, JAX and Jupyter's kernel, and with the agents."""
     python = os.environ.get("ENDLESS_LIBRARIES_PYTHON")
     if not python:
-        pytest.fail("ENDLESS_LIBRARIES_PYTHON names no Python with requirements-libraries.txt; run `cargo xtask test`")
+        pytest.fail("ENDLESS_LIBRARIES_PYTHON names no Python with the group `rllib`; run `cargo xtask test --all`")
     return python
 
 

@@ -53,7 +53,8 @@ def test_every_example_has_a_test():
 
 @pytest.mark.parametrize("script", ["cleanrl_ppo.py", "torchrl_rollout.py", "rllib_ppo.py"])
 def test_dict_observations_are_refused_with_a_message(script, tmp_path, libraries_python):
-    command = [libraries_python, EXAMPLES / script, "--env-id", "MortarMayhemB-v0"]
+    python = libraries_python if script == "rllib_ppo.py" else sys.executable
+    command = [python, EXAMPLES / script, "--env-id", "MortarMayhemB-v0"]
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert ran.returncode
     assert "MortarMayhemB-v0 has dict observations" in ran.stderr
