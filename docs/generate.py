@@ -1,101 +1,237 @@
-"""MkDocs hook: the parts of the documentation that follow from the sources.
+"""Write what follows from the sources into the pages: the tables of the environments, and the messages of errors.
 
-Pages have comments, `<!-- generated: PART -->`, in the places where their parts are inserted. `cargo xtask docs` writes the
-engine's table of environments and the messages of its errors as JSON into the folder that ENDLESS_DOCS_DATA names.
+    endless list --json | python docs/generate.py            # writes into the pages
+    endless list --json | python docs/generate.py --check    # fails if a page is stale
+
+A page names its parts by comments, `<!-- generated: PART ARGUMENT -->`; what follows, up to `<!-- end -->`, is replaced.
 """
 
-import os
+import json
 import re
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-import messages
-import tables
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.exceptions import PluginError
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.nav import Navigation
-from mkdocs.structure.pages import Page
+import tomllib
 
+Spec = dict[str, Any]
 ROOT = Path(__file__).parent.parent
-DATA = Path(os.environ["ENDLESS_DOCS_DATA"])
-#: Whether the site has the page that plays the environments.
-PAGE = bool(os.environ.get("ENDLESS_DOCS_PAGE"))
-ENVIRONMENTS = tables.read(DATA / "environments.json")
-MESSAGES = messages.Messages(ROOT, DATA / "errors.json")
+SPECS: list[Spec] = []
 
-#: Documents of the repository that are pages of the site, too.
-PAGES = {
-    "design/comparison.md": "benches/comparison.md",
-    "reference/changes.md": "CHANGELOG.md",
-    "train/learning.md": "agents/benches/learning/README.md",
-}
+#: Infos of all environments, which are not in their tables.
+COMMON_INFOS = [
+    {"name": "reward", "description": "sum of the rewards of the episode"},
+    {"name": "length", "description": "steps of the episode"},
+]
 
-#: What a page must not have: scripts, pictures and style sheets from other hosts.
-EXTERNAL = re.compile(
-    r"""<(?:script|img|iframe|source)\b[^>]*\ssrc=["']?(?:https?:)?//"""
-    r"""|<link\b[^>]*rel=["']?(?:stylesheet|preconnect|icon)[^>]*href=["']?(?:https?:)?//"""
+
+def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
+
+
+def family(name: str) -> list[Spec]:
+    """The environments whose ids contain a name."""
+    return [spec for spec in SPECS if name in spec["id"]]
+
+
+def merged(specs: list[Spec], rows: Callable[[Spec], Iterable[tuple[str, ...]]]) -> list[tuple[str, ...]]:
+    """The rows of all environments, each once, with a first column of the ids that have it."""
+    ids: dict[tuple[str, ...], list[str]] = {}
+    for spec in specs:
+        for row in rows(spec):
+            ids.setdefault(row, []).append(short(spec))
+    return [("all" if len(names) == len(specs) else ", ".join(names), *row) for row, names in ids.items()]
+
+
+def short(spec: Spec) -> str:
+    """An id without its version."""
+    return spec["id"].removesuffix("-v0")
+
+
+def overview(name: str) -> str:
+    """Environments with links to their sections."""
+    page = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
+    rows = []
+    for spec in family(name):
+        ((kind, choices),) = spec["action_space"].items()
+        link = f"[`{spec['id']}`]({page}.md#{spec['id'].lower()})"
+        rows.append((link, f"`{kind}({choices})`".replace(" ", "\N{NO-BREAK SPACE}"), spec["render_fps"], spec["summary"]))
+    return table(["id", "actions", "frames per second", "task"], rows)
+
+
+def actions(_: str) -> str:
+    """What the numbers of an action mean."""
+
+    def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
+        for branch, described in enumerate(spec["actions"]):
+            place = f"`action[{branch}]`" if len(spec["actions"]) > 1 else "`action`"
+            for value, choice in enumerate(described["choices"]):
+                yield place, str(value), choice["name"], choice["description"]
+
+    found = merged(SPECS, rows)
+    most = max((row[0] for row in found), key=len)
+    return table(["ids", "branch", "number", "name", "meaning"], (("all others", *row[1:]) if row[0] == most else row for row in found))
+
+
+def parameters(name: str) -> str:
+    """Reset parameters with limits, the default of each id, and meaning."""
+    specs = family(name)
+    found: dict[tuple[str, str, str], dict[str, str]] = {}
+    for spec in specs:
+        for each in spec["parameters"]:
+            key = (f"`{each['name']}`", allowed(each), each["description"])
+            found.setdefault(key, {})[short(spec)] = f"`{json.dumps(each['default'])}`"
+    rows = [
+        (parameter, limits, *(defaults.get(short(spec), "") for spec in specs), meaning)
+        for (parameter, limits, meaning), defaults in found.items()
+    ]
+    return table(["reset parameter", "allowed", *map(short, specs), "meaning"], rows)
+
+
+def allowed(parameter: dict[str, Any]) -> str:
+    """The values of a reset parameter, in words."""
+    kind, limits = parameter["type"], (parameter.get("min"), parameter.get("max"))
+    if kind == "bool":
+        return "true or false"
+    noun = {"int": "integer", "float": "number", "int_list": "list of integers"}[kind]
+    if limits == (-(2**63), 2**63 - 1):
+        return noun
+    return f"{noun}, {' to '.join(f'{int(limit):,}' if limit == int(limit) else str(limit) for limit in limits)}"
+
+
+def infos(name: str) -> str:
+    """Infos of an episode's last step."""
+    rows = merged(
+        family(name), lambda spec: [(f"`{each['name']}`", each["description"]) for each in COMMON_INFOS + spec["info"]]
+    )
+    return table(["ids", "info", "meaning"], rows)
+
+
+def ground_truth(name: str) -> str:
+    """The numbers of `info["ground_truth"]`, which the endless id of a family has."""
+    columns = next(spec["ground_truth"] for spec in family(name) if spec["ground_truth"])
+    return table(
+        ["index", "name", "meaning"],
+        ((place, f"`{each['name']}`", each["description"]) for place, each in enumerate(columns)),
+    )
+
+
+def features(name: str) -> str:
+    """Columns of the feature observation; those that differ only in numbers, such as the places of a grid, share a row."""
+
+    def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
+        names: dict[tuple[str, str], list[str]] = {}
+        for each in spec["features"]:
+            names.setdefault((re.sub(r"\d+", "{}", each["name"]), each["description"]), []).append(each["name"])
+        return [(f"`{ranges(template, same)}`", meaning) for (template, meaning), same in names.items()]
+
+    return table(["ids", "feature", "meaning"], merged(family(name), rows))
+
+
+def ranges(template: str, names: Sequence[str]) -> str:
+    """`coin_{0..7}_x` for `coin_0_x` to `coin_7_x`."""
+    if len(names) == 1:
+        return names[0]
+    places = zip(*(map(int, re.findall(r"\d+", name)) for name in names), strict=True)
+    return template.format(*(f"{{{min(place)}..{max(place)}}}" for place in places))
+
+
+#: A type that derives `thiserror::Error`: documentation, kind, name, and the rest up to the line that closes it.
+ERROR_TYPE = re.compile(
+    r"((?:^///[^\n]*\n)*)^#\[derive\([^)]*\bError\b[^)]*\)\]\n((?:^#\[.*?\]\n)*)^pub (enum|struct) (\w+)(.*?(?:^\}|;$))",
+    re.M | re.S,
+)
+#: The arguments of an error attribute: the format string and the rest.
+FORMAT = re.compile(r'#\[error\(\s*"((?:[^"\\]|\\.)*)"(.*?)\)\]\n', re.S)
+#: Documentation, attribute, name and fields of a variant.
+VARIANT = re.compile(
+    r"((?:^    ///[^\n]*\n)+)(?:^    #\[(?!error)[^\n]*\n)*^    (#\[error\(.*?\)\]\n)(?:^    #\[[^\n]*\n)*^    (\w+)"
+    r"( \{.*?^    \},$|[^\n]*$)",
+    re.M | re.S,
 )
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are written elsewhere in the repository, with their pictures."""
-    for page, source in PAGES.items():
-        files.append(File.generated(config, page, content=(ROOT / source).read_text()))
-        for picture in (ROOT / source).parent.glob("*.png"):
-            files.append(File.generated(config, f"{Path(page).parent}/{picture.name}", abs_src_path=str(picture)))
-    return files
+def errors(name: str) -> str:
+    """The messages of an error type, each with its cause and the help of `error_help.toml`."""
+    variants, help = error_types().get(name, {}), HELP.get(name, {})
+    if differing := variants.keys() ^ help.keys():
+        raise SystemExit(f"docs/error_help.toml, [{name}]: not both an error and a help: {', '.join(sorted(differing))}")
+    return "\n".join(f"- `` {text} ``: {reason} *Help:* {help[variant]}" for variant, (text, reason) in variants.items())
 
 
-def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> None:
-    """Check that every environment has a page, and every error a cure."""
-    missing = [id for id in ENVIRONMENTS if files.get_file_from_path(f"environments/{id}.md") is None]
-    if missing:
-        raise PluginError(f"there is no page docs/environments/ID.md for {', '.join(missing)}")
-    MESSAGES.check()
+def error_types() -> dict[str, dict[str, tuple[str, str]]]:
+    """Message and cause by error type and variant. Errors that show another error's message are left out."""
+    types = {}
+    for file in sorted((ROOT / "engine").glob("*/src/**/*.rs")):
+        for doc, attributes, kind, name, body in ERROR_TYPE.findall(file.read_text()):
+            described = [(doc, attributes, "self", body)] if kind == "struct" else VARIANT.findall(body)
+            types[name] = {
+                variant: (message(*found.groups(), fields), cause(doc))
+                for doc, attribute, variant, fields in described
+                if (found := FORMAT.search(attribute))
+            }
+    return types
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Replace the comments by the parts that they name."""
-    path = Path(page.file.src_uri)
-
-    def part(found: re.Match[str]) -> str:
-        kind, _, name = found[1].partition(" ")
-        if kind == "environments":
-            return tables.overview(spec for id, spec in ENVIRONMENTS.items() if name in id)
-        if kind == "errors":
-            return MESSAGES.of_type(name)
-        if kind == "play":
-            return play(ENVIRONMENTS, ".")
-        if kind == "python":
-            return MESSAGES.of_python()
-        if path.stem not in ENVIRONMENTS:
-            raise PluginError(f"docs/{path} describes no environment; there are {', '.join(ENVIRONMENTS)}")
-        if kind == "picture":
-            return picture(path.stem, files) + "\n\n" + play([path.stem], "..")
-        return tables.PARTS[found[1]](ENVIRONMENTS[path.stem])
-
-    return re.sub(r"<!-- generated: (.+?) -->", part, markdown)
+def cause(doc: str) -> str:
+    """The text of documentation comments, without the links of Rust's documentation, which lead nowhere here."""
+    text = " ".join(re.findall(r"/// ?(.*)", doc))
+    return " ".join(re.sub(r"\[(`.+?`)\](\(.+?\))?", r"\1", text).split())
 
 
-def on_post_build(config: MkDocsConfig) -> None:
-    """Check that no page loads anything from elsewhere when it is viewed."""
-    for file in Path(config.site_dir).rglob("*.html"):
-        if found := EXTERNAL.search(file.read_text()):
-            raise PluginError(f"{file} loads something from elsewhere: {found[0]}")
+def message(text: str, arguments: str, fields: str) -> str:
+    """The text of a format string, with names in angle brackets in place of values."""
+    names = set(re.findall(r"(\w+):", fields))
+    # Commas inside of parentheses do not separate arguments.
+    values = iter(part for part in re.split(r",(?![^(]*\))", arguments) if part.strip())
+
+    def placeholder(found: re.Match[str]) -> str:
+        if name := found[1].split(":")[0]:
+            return f"<{name}>"
+        value = next(values, "").strip()
+        word = next((word for word in re.findall(r"\w+", value) if word in names and " - " not in value), "...")
+        return f" (process <{word}>)" if value.startswith("in_process") else f"<{word}>"
+
+    text = re.sub(r"\\\n\s*", "", text).replace('\\"', '"')
+    return re.sub(r"\{([^}]*)\}", placeholder, text)
 
 
-def play(ids: Iterable[str], root: str) -> str:
-    """Links to the page that plays environments, where it is part of the site; MkDocs does not know its files."""
-    if not PAGE:
-        return "This copy of the documentation was built without the page that plays environments in the browser."
-    links = (f'<a href="{root}/play/index.html#env={id}&amp;seed=1">Play {id}</a>' for id in ids)
-    return '<p class="play">' + "\n".join(links) + "</p>"
+HELP = tomllib.loads((ROOT / "docs/error_help.toml").read_text())
+PARTS = {
+    "environments": overview,
+    "actions": actions,
+    "parameters": parameters,
+    "infos": infos,
+    "ground-truth": ground_truth,
+    "features": features,
+    "errors": errors,
+}
 
 
-def picture(id: str, files: Files) -> str:
-    """The animation of an environment, where `cargo xtask pictures` has made it."""
-    name = f"images/environments/{id}.webp"
-    if files.get_file_from_path(name) is None:
-        return ""
-    return f"![An episode of {id}](../{name}){{ .environment }}"
+def main() -> None:
+    """Write or check all pages."""
+    SPECS.extend(json.load(sys.stdin))
+    pages = {file: file.read_text() for file in sorted((ROOT / "docs").rglob("*.md"))}
+    described = " ".join(pages.values())
+    missing = [spec["id"] for spec in SPECS if f"## {spec['id']}\n" not in described]
+    missing += [name for name, found in error_types().items() if found and f"generated: errors {name} -->" not in described]
+    if missing or (missing := list(HELP.keys() - error_types().keys())):
+        raise SystemExit(f"docs/ does not describe, or describes in vain: {', '.join(missing)}")
+    stale = []
+    for file, text in pages.items():
+        part = re.compile(r"(<!-- generated: ([\w-]+) ?(\w*) -->\n).*?(<!-- end -->)", re.S)
+        new = part.sub(lambda found: f"{found[1]}\n{PARTS[found[2]](found[3])}\n\n{found[4]}", text)
+        if new != text:
+            stale.append(str(file.relative_to(ROOT)))
+            if "--check" not in sys.argv:
+                file.write_text(new)
+    if stale:
+        print("stale, run `cargo xtask docs --write`:" if "--check" in sys.argv else "written:", ", ".join(stale))
+        sys.exit("--check" in sys.argv)
+
+
+if __name__ == "__main__":
+    main()

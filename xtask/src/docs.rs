@@ -8,16 +8,20 @@ use std::time::Instant;
 use crate::requirements::Requirement;
 use crate::venv::{Install, execute, target, venv, workspace};
 use crate::wasm::Toolchain;
-use crate::{error_messages, interpreters, web};
+use crate::{interpreters, web};
 
-/// Builds the site. A warning, a link to a missing page or anchor, and an error message without a cure are errors.
-pub fn build() -> Result<(), String> {
+/// Checks the generated parts of the pages, or writes them, and builds the site. A warning, a link to a missing page or anchor, and an
+/// error message without help are errors.
+pub fn build(write: bool) -> Result<(), String> {
     println!("==> documentation");
     let start = Instant::now();
-    let data = target()?.join("docs");
-    fs::create_dir_all(&data).map_err(|error| format!("{}: {error}", data.display()))?;
-    write(&data.join("environments.json"), &environments()?)?;
-    write(&data.join("errors.json"), &error_messages::as_json()?)?;
+    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
+    let folder = venv("docs", &base, &[Install::of_file("requirements-docs.txt")?])?;
+    let mut generate = Command::new(folder.join("bin/python"));
+    generate.arg("docs/generate.py").args((!write).then_some("--check")).current_dir(workspace());
+    let list = target()?.join("environments.json");
+    fs::write(&list, environments()?).map_err(|error| format!("{}: {error}", list.display()))?;
+    execute(generate.stdin(fs::File::open(&list).map_err(|error| format!("{}: {error}", list.display()))?))?;
 
     let page = Toolchain::find().is_some();
     if page {
@@ -25,14 +29,12 @@ pub fn build() -> Result<(), String> {
     } else {
         println!("    without the page: {}", Toolchain::missing());
     }
-    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    let folder = venv("docs", &base, &[Install::of_file("requirements-docs.txt")?])?;
     let site = target()?.join("site");
     let mut mkdocs = Command::new(folder.join("bin/mkdocs"));
     // Not `--quiet`: with it, warnings are not errors.
     mkdocs.args(["build", "--strict", "--site-dir"]).arg(&site).current_dir(workspace());
-    // The second variable silences an announcement of Material for MkDocs.
-    mkdocs.env("ENDLESS_DOCS_DATA", &data).env("NO_MKDOCS_2_WARNING", "1");
+    // Silences an announcement of Material for MkDocs.
+    mkdocs.env("NO_MKDOCS_2_WARNING", "1");
     if page {
         mkdocs.env("ENDLESS_DOCS_PAGE", "1");
     }
@@ -79,10 +81,6 @@ fn cargo(arguments: &[&str]) -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.args(arguments).current_dir(workspace());
     command
-}
-
-fn write(path: &Path, text: &str) -> Result<(), String> {
-    fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))
 }
 
 /// Copies a folder with everything in it.

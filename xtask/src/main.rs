@@ -3,7 +3,6 @@
 mod cargo;
 mod dist;
 mod docs;
-mod error_messages;
 mod faults;
 mod files;
 mod instructions;
@@ -58,8 +57,12 @@ enum Task {
     },
     /// Check that the files of a crate do not import each other in cycles.
     Modules,
-    /// Build the documentation, with its links checked, into target/site.
-    Docs,
+    /// Build the documentation, with its links and generated tables checked, into target/site.
+    Docs {
+        /// Write the generated tables into the pages instead of checking them.
+        #[arg(long)]
+        write: bool,
+    },
     /// Check the files that no compiler reads: workflows, forms, scripts, versions, licences.
     Files,
     /// Build what a release consists of into target/dist: wheel, source distribution, crates.
@@ -133,7 +136,7 @@ impl Task {
             Task::Python => test::run(Selection::Python, false),
             Task::Stage { name } => (stages::find(name)?.run)(),
             Task::Modules => modules::check(),
-            Task::Docs => docs::build(),
+            Task::Docs { write } => docs::build(*write),
             Task::Files => files::check(),
             Task::Dist => dist::build(),
             Task::Packages => packages::test(),

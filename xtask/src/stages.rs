@@ -123,7 +123,7 @@ pub const STAGES: &[Stage] = &[
     },
     Stage {
         name: "documentation",
-        run: docs::build,
+        run: || docs::build(false),
         after: &["rust build"],
         needs: &[Linker, Python, Disk],
         compiles: true,
