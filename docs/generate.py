@@ -58,7 +58,9 @@ def overview(name: str) -> str:
     for spec in family(name):
         ((kind, choices),) = spec["action_space"].items()
         link = f"[`{spec['id']}`]({page}.md#{spec['id'].lower()})"
-        rows.append((link, f"`{kind}({choices})`".replace(" ", "\N{NO-BREAK SPACE}"), spec["render_fps"], spec["summary"]))
+        rows.append(
+            (link, f"`{kind}({choices})`".replace(" ", "\N{NO-BREAK SPACE}"), spec["render_fps"], spec["summary"])
+        )
     return table(["id", "actions", "frames per second", "task"], rows)
 
 
@@ -73,7 +75,10 @@ def actions(_: str) -> str:
 
     found = merged(SPECS, rows)
     most = max((row[0] for row in found), key=len)
-    return table(["ids", "branch", "number", "name", "meaning"], (("all others", *row[1:]) if row[0] == most else row for row in found))
+    return table(
+        ["ids", "branch", "number", "name", "meaning"],
+        (("all others", *row[1:]) if row[0] == most else row for row in found),
+    )
 
 
 def parameters(name: str) -> str:
@@ -158,8 +163,12 @@ def errors(name: str) -> str:
     """The messages of an error type, each with its cause and the help of `error_help.toml`."""
     variants, help = error_types().get(name, {}), HELP.get(name, {})
     if differing := variants.keys() ^ help.keys():
-        raise SystemExit(f"docs/error_help.toml, [{name}]: not both an error and a help: {', '.join(sorted(differing))}")
-    return "\n".join(f"- `` {text} ``: {reason} *Help:* {help[variant]}" for variant, (text, reason) in variants.items())
+        raise SystemExit(
+            f"docs/error_help.toml, [{name}]: not both an error and a help: {', '.join(sorted(differing))}"
+        )
+    return "\n".join(
+        f"- `` {text} ``: {reason} *Help:* {help[variant]}" for variant, (text, reason) in variants.items()
+    )
 
 
 def error_types() -> dict[str, dict[str, tuple[str, str]]]:
@@ -217,7 +226,9 @@ def main() -> None:
     pages = {file: file.read_text() for file in sorted((ROOT / "docs").rglob("*.md"))}
     described = " ".join(pages.values())
     missing = [spec["id"] for spec in SPECS if f"## {spec['id']}\n" not in described]
-    missing += [name for name, found in error_types().items() if found and f"generated: errors {name} -->" not in described]
+    missing += [
+        name for name, found in error_types().items() if found and f"generated: errors {name} -->" not in described
+    ]
     if missing or (missing := list(HELP.keys() - error_types().keys())):
         raise SystemExit(f"docs/ does not describe, or describes in vain: {', '.join(missing)}")
     stale = []
