@@ -17,7 +17,7 @@ from endless_gym_agents.settings import to_dict
 
 ID = "MortarMayhem-Grid-v0"
 WEB = Path(__file__).resolve().parents[2] / "bindings" / "web"
-FILE = WEB / "page" / "files" / f"{ID}.agent.bin"
+FILE = WEB.parents[1] / "engine" / "view" / "page" / "files" / f"{ID}.agent.bin"
 
 
 def trained(tmp_path: Path, **changes: object) -> Path:

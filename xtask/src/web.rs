@@ -1,5 +1,5 @@
 //! The page that plays the environments in a browser, in target/web: the core as WebAssembly, and the files of
-//! `bindings/web/page/files`.
+//! `engine/view/page/files`.
 
 use std::fs;
 use std::io::Write;
@@ -33,7 +33,7 @@ pub fn build() -> Result<(), String> {
     let toolchain = Toolchain::find().ok_or_else(Toolchain::missing)?;
     execute(toolchain.build()?.args(["--release", "--package", "endless-gym-web"]))?;
     let mut files = vec![("engine.wasm".to_owned(), read(&toolchain.output()?.join("release/endless_gym_web.wasm"))?)];
-    let page = workspace().join("bindings/web/page/files");
+    let page = workspace().join("engine/view/page/files");
     let entries = fs::read_dir(&page).map_err(|error| describe(&page, &error))?;
     for entry in entries {
         let path = entry.map_err(|error| describe(&page, &error))?.path();
@@ -43,7 +43,7 @@ pub fn build() -> Result<(), String> {
     complete_worker(&mut files)?;
     write(&folder()?, &files)?;
     // From where the program embeds it. Unchanged files are left alone, so that it need not be compiled again.
-    let embedded = workspace().join("bindings/web/page/built");
+    let embedded = workspace().join("engine/view/page/built");
     if files.iter().any(|(name, bytes)| fs::read(embedded.join(name)).ok().as_ref() != Some(bytes)) {
         write(&embedded, &files)?;
     }

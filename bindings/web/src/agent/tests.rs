@@ -5,7 +5,7 @@ use serde::Deserialize;
 
 use super::*;
 
-const AGENT: &[u8] = include_bytes!("../../page/files/MortarMayhem-Grid-v0.agent.bin");
+const AGENT: &[u8] = include_bytes!("../../../../engine/view/page/files/MortarMayhem-Grid-v0.agent.bin");
 
 /// Recorded by `python -m endless_gym_agents.export --vectors`.
 #[derive(Deserialize)]
