@@ -10,21 +10,6 @@ import pytest
 from endless_gym import _native
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if "libraries_python" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.libraries)
-
-
-@pytest.fixture(scope="session")
-def libraries_python() -> str:
-    """A Python that has Ray and what this one has."""
-    python = os.environ.get("ENDLESS_LIBRARIES_PYTHON")
-    if not python:
-        pytest.fail("ENDLESS_LIBRARIES_PYTHON names no Python with Ray; run `cargo xtask test`")
-    return python
-
-
 @pytest.fixture
 def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A folder for Ray's logs and sockets, whose paths must be short; Ray writes and sends nothing elsewhere."""

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,22 +21,21 @@ from endless_gym_agents.search_study import Trials
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.train import train
 
+pytest.importorskip("ray")
 pytestmark = pytest.mark.slow
 
 SCRIPT = Path(__file__).parent / "ray_search.py"
 
 
-def test_search_on_ray(
-    tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
-) -> None:
+def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]) -> None:
     """The worst trial is pruned, and the one whose process is killed resumes from its checkpoint.
 
     The path of the interpreter has a space.
     """
     spaced = tmp_path / "with a space"
-    folder_of_environments = Path(libraries_python).parents[2]
+    folder_of_environments = Path(sys.executable).parents[2]
     spaced.symlink_to(folder_of_environments)
-    python = spaced / Path(libraries_python).relative_to(folder_of_environments)
+    python = spaced / Path(sys.executable).relative_to(folder_of_environments)
     environments = ["--environment.num-envs", "4", "--environment.engine", "process", "--agent", "gru"]
     sizes = ["--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "6", "--checkpoint-interval", "1"]
     sizes += ["--recurrence.hidden-size", "16"]
@@ -85,7 +85,6 @@ def test_search_on_ray(
 def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
     tmp_path: Path,
     ray_folder: str,
-    libraries_python: str,
     segments: Callable[[], set[str]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -106,7 +105,7 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
     runs = [tmp_path / "search" / f"trial-000{number}" for number in (0, 1)]
     with (tmp_path / "output").open("w") as output:
         started = subprocess.Popen(
-            [libraries_python, "-m", "endless_gym_agents.search", *given, "--ray", "--workers", "2"],
+            [sys.executable, "-m", "endless_gym_agents.search", *given, "--ray", "--workers", "2"],
             cwd=tmp_path,
             env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
             stdout=output,
@@ -170,12 +169,12 @@ EXPERIMENT: dict[str, Any] = {
 
 
 def test_an_experiment_on_ray_is_stopped_and_resumed(
-    tmp_path: Path, ray_folder: str, libraries_python: str, segments: Callable[[], set[str]]
+    tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]
 ) -> None:
     """Ctrl-C stops its run after an update, with a checkpoint; the same command completes it, and then has nothing to do."""
     (tmp_path / "mine.json").write_text(json.dumps(EXPERIMENT))
     run = tmp_path / "out" / "runs" / "MortarMayhem-Grid-v0" / "gru" / "seed-1"
-    program = [libraries_python, "-m", "endless_gym_agents.reproduce", "mine.json", "--out", "out", "--device", "cpu"]
+    program = [sys.executable, "-m", "endless_gym_agents.reproduce", "mine.json", "--out", "out", "--device", "cpu"]
 
     def reproduced(is_interrupted: bool) -> str:
         with (tmp_path / "output").open("w") as output:

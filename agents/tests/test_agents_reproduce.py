@@ -1,5 +1,6 @@
 """The experiments of the paper as data: files, scales, plans, and runs that are stopped and resumed."""
 
+import importlib.util
 import json
 import os
 import re
@@ -291,6 +292,7 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
 def test_errors_of_the_flag_ray_are_one_line(
     arguments: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)  # of Ray
     monkeypatch.setattr(sys, "argv", ["endless-reproduce", "endless", *arguments.split()])
     assert reproduce.main() == 1
     assert re.match(f"endless-reproduce: {message}", capsys.readouterr().err)

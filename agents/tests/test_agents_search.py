@@ -1,5 +1,6 @@
 """The hyperparameter search: search space, order of the trials, pruning, and resumption."""
 
+import importlib.util
 import json
 import multiprocessing
 import os
@@ -378,6 +379,7 @@ def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) 
 def test_errors_are_one_line(
     arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)  # of Ray
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["endless-search", *arguments.split()])
     assert search.main() == 1
