@@ -250,14 +250,6 @@ fn the_number_of_threads_is_limited() {
 }
 
 #[test]
-fn a_seeded_reset_resets_all() {
-    let mut player = Player::new(&config(2), 1);
-    player.step_at_random();
-    player.pool.reset(ResetRequest::Seed(50), &mut player.blocks).unwrap();
-    assert_eq!((player.frame(0), player.frame(1)), (first_frame(50), first_frame(51)));
-}
-
-#[test]
 fn each_environment_may_have_its_own_options() {
     let each = vec![options(json!({})), options(json!({"agent_scale": 0.4})), options(json!({}))];
     let seeding = Seeding::List(vec![8]);

@@ -110,7 +110,9 @@ proptest! {
     #![proptest_config(property_cases(200))]
 
     #[test]
-    fn no_sequence_with_more_buffers_than_records_makes_a_buffer_with_other_pixels_current(events in prop::collection::vec(event(), 1..400)) {
+    fn no_sequence_with_more_buffers_than_records_makes_a_buffer_with_other_pixels_current(
+        events in prop::collection::vec(event(), 1..400),
+    ) {
         let mut model = Model::new(&layout(), MAX_BUFFERS + 4);
         events.into_iter().for_each(|event| model.apply(event));
     }
