@@ -159,16 +159,15 @@ VARIANT = re.compile(
 )
 
 
-def errors(name: str) -> str:
-    """The messages of an error type, each with its cause and the help of `error_help.toml`."""
-    variants, help = error_types().get(name, {}), HELP.get(name, {})
-    if differing := variants.keys() ^ help.keys():
-        raise SystemExit(
-            f"docs/error_help.toml, [{name}]: not both an error and a help: {', '.join(sorted(differing))}"
-        )
-    return "\n".join(
-        f"- `` {text} ``: {reason} *Help:* {help[variant]}" for variant, (text, reason) in variants.items()
-    )
+def errors(names: str) -> str:
+    """The messages of error types, each with its cause and the help of `error_help.toml`."""
+    lines = []
+    for name in names.split():
+        variants, help = error_types().get(name, {}), HELP.get(name, {})
+        if differing := variants.keys() ^ help.keys():
+            raise SystemExit(f"docs/error_help.toml, [{name}]: not both an error and a help: {', '.join(differing)}")
+        lines += [f"- `` {text} ``: {reason} *Help:* {help[key]}" for key, (text, reason) in variants.items()]
+    return "\n".join(lines)
 
 
 def error_types() -> dict[str, dict[str, tuple[str, str]]]:
@@ -226,14 +225,13 @@ def main() -> None:
     pages = {file: file.read_text() for file in sorted((ROOT / "docs").rglob("*.md"))}
     described = " ".join(pages.values())
     missing = [spec["id"] for spec in SPECS if f"## {spec['id']}\n" not in described]
-    missing += [
-        name for name, found in error_types().items() if found and f"generated: errors {name} -->" not in described
-    ]
+    listed = set(" ".join(re.findall(r"<!-- generated: errors ([\w ]+) -->", described)).split())
+    missing += [name for name, found in error_types().items() if found and name not in listed]
     if missing or (missing := list(HELP.keys() - error_types().keys())):
         raise SystemExit(f"docs/ does not describe, or describes in vain: {', '.join(missing)}")
     stale = []
     for file, text in pages.items():
-        part = re.compile(r"(<!-- generated: ([\w-]+) ?(\w*) -->\n).*?(<!-- end -->)", re.S)
+        part = re.compile(r"(<!-- generated: ([\w-]+) ?([\w ]*?) -->\n).*?(<!-- end -->)", re.S)
         new = part.sub(lambda found: f"{found[1]}\n{PARTS[found[2]](found[3])}\n\n{found[4]}", text)
         if new != text:
             stale.append(str(file.relative_to(ROOT)))

@@ -35,7 +35,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links that leave `docs/` to the site's copy of a page, or replace them by their text; link the page that plays."""
+    """Point links that leave `docs/` to the site's copy of a page, or show their text; link the page that plays."""
     folder = (ROOT / "docs" / page.file.src_uri).parent
     here = Path(page.file.src_uri).parent
     if page.file.src_uri in PAGES:
@@ -53,6 +53,11 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return f"[{text}]({os.path.relpath(file, ROOT / 'docs' / here)}{anchor or ''})"
         return found[0] if file.suffix == ".png" else text
 
+    def contents(found: re.Match[str]) -> str:
+        return f"```{Path(found[1]).suffix[1:]}\n{(ROOT / found[1]).read_text()}```"
+
+    # A link that is a paragraph of its own shows the file.
+    markdown = re.sub(r"^\[([\w/.-]+\.(?:rs|yaml|sh))\]\([^)]*\)$", contents, markdown, flags=re.M)
     markdown = re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)", link, markdown)
     if os.environ.get("ENDLESS_DOCS_PAGE"):
         markdown = markdown.replace("<!-- play -->", '<a href="play/index.html">Play in the browser</a>')
