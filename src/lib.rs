@@ -54,8 +54,3 @@ pub mod service {
 pub mod trace {
     pub use endless_gym_core::trace::{Difference, Episode, Recorder, Replay, Step, Trace, TraceError, replay};
 }
-
-/// The examples of the README, as tests.
-#[cfg(doctest)]
-#[doc = include_str!("../README.md")]
-struct Readme;

@@ -40,11 +40,6 @@ class Block:
     def name(self) -> str:
         return f"{self.file.relative_to(ROOT)}:{self.line}"
 
-    @property
-    def is_included(self) -> bool:
-        """Whether the block shows a file of the repository."""
-        return self.code.lstrip().startswith("--8<--")
-
 
 def pages() -> list[Path]:
     """Every page for users."""
@@ -66,7 +61,7 @@ def programs(file: Path) -> list[list[Block]]:
     """The blocks that run, each with those that continue it."""
     runs: list[list[Block]] = []
     for block in blocks(file):
-        if block.reason or block.language not in ("python", *SHELL) or block.is_included:
+        if block.reason or block.language not in ("python", *SHELL):
             continue
         if block.continues:
             runs[-1].append(block)

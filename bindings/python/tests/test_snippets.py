@@ -19,8 +19,6 @@ END_JOBS = "kill -TERM $(jobs -p) 2>/dev/null || true; wait"
 ALL_PROGRAMS = [program for page in pages() for program in programs(page)]
 PROGRAMS = [program for program in ALL_PROGRAMS if not program[0].libraries]
 OF_LIBRARIES = [program for program in ALL_PROGRAMS if program[0].libraries]
-#: Rust in the README is a test of the crate's documentation (`src/lib.rs`).
-DOCTESTS = ROOT / "README.md"
 LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
 
 
@@ -69,9 +67,8 @@ def test_blocks_have_a_known_language() -> None:
         assert page.read_text().count("```") == 2 * len(found), f"{page} has a fence that is not recognised"
         for block in found:
             assert block.language in LANGUAGES, block.name
-            if block.language == "rust" and page != DOCTESTS:
-                # The examples are tested by tests/examples.rs.
-                assert block.is_included, f"{block.name}: show a file of engine/examples instead"
+            # The integration tests run the examples.
+            assert block.language != "rust", f"{block.name}: link a file of engine/examples instead"
 
 
 def test_snippets_that_do_not_run_say_why(capsys: pytest.CaptureFixture[str]) -> None:
