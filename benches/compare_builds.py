@@ -1,7 +1,7 @@
 """Compares the time of a step between two builds: `python benches/compare_builds.py OLD NEW [--env ID ...] [--num-envs N ...]`.
 
-OLD and NEW are programs that `cargo bench --bench step_profile --no-run` built, copied away in between. Both keep running and take
-turns of some milliseconds of processor time, so that the load of the machine falls on both alike.
+OLD and NEW are programs that `cargo bench --bench step_profile --no-run` built, copied away in between. Both keep running and
+take turns of some milliseconds of processor time, so that the load of the machine falls on both alike.
 """
 
 from __future__ import annotations

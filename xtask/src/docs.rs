@@ -3,31 +3,25 @@
 use std::fs;
 use std::path::Path;
 use std::process::Command;
-use std::time::Instant;
 
-use crate::requirements::Requirement;
-use crate::venv::{Install, execute, target, venv, workspace};
-use crate::wasm::Toolchain;
-use crate::{interpreters, web};
+use crate::shell::{cargo, describe, output, run, target, workspace};
+use crate::{python, web};
 
 /// Checks the generated parts of the pages, or writes them, and builds the site. A warning, a link to a missing page or anchor, and an
 /// error message without help are errors.
 pub fn build(write: bool) -> Result<(), String> {
-    println!("==> documentation");
-    let start = Instant::now();
-    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    let folder = venv("docs", &base, &[Install::of_file("requirements-docs.txt")?])?;
+    let folder = python::docs()?;
     let mut generate = Command::new(folder.join("bin/python"));
     generate.arg("docs/generate.py").args((!write).then_some("--check")).current_dir(workspace());
     let list = target()?.join("environments.json");
-    fs::write(&list, environments()?).map_err(|error| format!("{}: {error}", list.display()))?;
-    execute(generate.stdin(fs::File::open(&list).map_err(|error| format!("{}: {error}", list.display()))?))?;
+    fs::write(&list, environments()?).map_err(describe(&list))?;
+    run(generate.stdin(fs::File::open(&list).map_err(describe(&list))?))?;
 
-    let page = Toolchain::find().is_some();
+    let page = web::Toolchain::find().is_some();
     if page {
         web::build()?;
     } else {
-        println!("    without the page: {}", Toolchain::missing());
+        println!("without the page; missing: {}", web::MISSING);
     }
     let site = target()?.join("site");
     let mut mkdocs = Command::new(folder.join("bin/mkdocs"));
@@ -38,25 +32,22 @@ pub fn build(write: bool) -> Result<(), String> {
     if page {
         mkdocs.env("ENDLESS_DOCS_PAGE", "1");
     }
-    let output = mkdocs.output().map_err(|error| format!("{mkdocs:?} cannot be run: {error}"))?;
-    if !output.status.success() {
-        return Err(format!("the documentation cannot be built:\n{}", String::from_utf8_lossy(&output.stderr)));
-    }
+    output(&mut mkdocs)?;
 
     if page {
         copy(&web::folder()?, &site.join("play"))?;
     }
 
-    execute(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
+    run(cargo(&["doc", "--workspace", "--no-deps", "--locked", "--quiet"]).env("RUSTDOCFLAGS", "--deny warnings"))?;
     copy(&target()?.join("doc"), &site.join("rust"))?;
     check_links(&site.join("reference/rust.html"))?;
-    println!("    {:.1} s, {}", start.elapsed().as_secs_f64(), site.join("index.html").display());
+    println!("{}", site.join("index.html").display());
     Ok(())
 }
 
 /// Fails if a page's link to rustdoc's reference leads nowhere. MkDocs does not know that reference.
 fn check_links(page: &Path) -> Result<(), String> {
-    let text = fs::read_to_string(page).map_err(|error| format!("{}: {error}", page.display()))?;
+    let text = fs::read_to_string(page).map_err(describe(page))?;
     let links: Vec<&str> = text.split("href=\"").skip(1).filter_map(|link| link.split('"').next()).collect();
     let links: Vec<&str> = links.into_iter().filter(|link| link.starts_with("../rust/")).collect();
     let folder = page.parent().unwrap_or(page);
@@ -69,18 +60,7 @@ fn check_links(page: &Path) -> Result<(), String> {
 
 /// The table of environments, as `endless list --json` prints it.
 fn environments() -> Result<String, String> {
-    let mut list = cargo(&["run", "--quiet", "--locked", "--bin", "endless", "--", "list", "--json"]);
-    let output = list.output().map_err(|error| format!("{list:?} cannot be run: {error}"))?;
-    if !output.status.success() {
-        return Err(format!("{list:?} failed: {}", String::from_utf8_lossy(&output.stderr)));
-    }
-    String::from_utf8(output.stdout).map_err(|error| error.to_string())
-}
-
-fn cargo(arguments: &[&str]) -> Command {
-    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    command.args(arguments).current_dir(workspace());
-    command
+    output(&mut cargo(&["run", "--quiet", "--locked", "--bin", "endless", "--", "list", "--json"]))
 }
 
 /// Copies a folder with everything in it.

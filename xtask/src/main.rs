@@ -1,31 +1,17 @@
 //! Development tasks: `cargo xtask test` runs all tests.
 
-mod cargo;
-mod dist;
 mod docs;
-mod faults;
 mod files;
-mod instructions;
-mod interpreters;
-mod modules;
-mod original;
-mod packages;
-mod paths;
-mod pictures;
 mod python;
-mod requirements;
-mod runner;
-mod stages;
-mod test;
-mod venv;
-mod wasm;
+mod release;
+mod rust;
+mod shell;
+mod steps;
 mod web;
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-
-use crate::test::Selection;
 
 /// Development tasks of Endless Gym.
 #[derive(Parser)]
@@ -37,42 +23,31 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Task {
-    /// Check formatting, lint, and run all tests, Rust's and Python's, in stages side by side.
-    ///
-    /// Prints first what the machine lacks; the stages that require it are not run. The output of a stage is in target/test-logs.
+    /// Check formatting, lint, and run the tests that need only Rust, a linker and CPython.
     Test {
-        /// The stages of every day, some minutes long: without the long tests and what needs further tools.
-        #[arg(long)]
-        quick: bool,
-        /// Run nothing if something is missing; the default where the environment variable CI is `true`.
+        /// Run the rest instead: what takes long, or needs further tools, libraries of others or the original.
         #[arg(long)]
         all: bool,
+        /// Run these steps alone.
+        #[arg(long, value_name = "STEP", conflicts_with = "all")]
+        only: Vec<String>,
+        /// Do not stop at the first failure.
+        #[arg(long)]
+        keep_going: bool,
+        /// List the steps.
+        #[arg(long)]
+        list: bool,
     },
-    /// Build the Python package, lint it, and run its tests alone.
-    Python,
-    /// Run one stage of the tests.
-    Stage {
-        /// Its name in the report of `cargo xtask test`.
-        name: String,
-    },
-    /// Check that the files of a crate do not import each other in cycles.
-    Modules,
     /// Build the documentation, with its links and generated tables checked, into target/site.
     Docs {
         /// Write the generated tables into the pages instead of checking them.
         #[arg(long)]
         write: bool,
     },
-    /// Check the files that no compiler reads: workflows, forms, scripts, versions, licences.
-    Files,
     /// Build what a release consists of into target/dist: wheel, source distribution, crates.
     Dist,
-    /// Build them, install them on each CPython there is, and use them.
-    Packages,
     /// Make the pictures of the documentation again, in docs/images.
     Pictures,
-    /// Build the core for wasm32-unknown-unknown.
-    Wasm,
     /// Build the page that plays the environments in a browser into target/web.
     Web,
     /// Count the instructions of a step and compare with the budgets.
@@ -122,8 +97,6 @@ enum Task {
         #[arg(long, default_value_t = 1)]
         minutes: u64,
     },
-    /// Check the models of the worker threads under loom.
-    Loom,
     /// Set up the original in a virtual environment and print the path of its Python.
     Original,
 }
@@ -131,27 +104,20 @@ enum Task {
 impl Task {
     fn run(&self) -> Result<(), String> {
         match self {
-            Task::Test { quick: true, all } => test::run(Selection::Quick, *all),
-            Task::Test { quick: false, all } => test::run(Selection::All, *all),
-            Task::Python => test::run(Selection::Python, false),
-            Task::Stage { name } => (stages::find(name)?.run)(),
-            Task::Modules => modules::check(),
+            Task::Test { list: true, .. } => steps::list(),
+            Task::Test { all, only, keep_going, .. } => steps::run(only, *all, *keep_going),
             Task::Docs { write } => docs::build(*write),
-            Task::Files => files::check(),
-            Task::Dist => dist::build(),
-            Task::Packages => packages::test(),
-            Task::Pictures => pictures::make(),
-            Task::Wasm => wasm::build(),
+            Task::Dist => release::build(),
+            Task::Pictures => python::pictures(),
             Task::Web => web::build(),
-            Task::Instructions { record } => instructions::run(*record),
+            Task::Instructions { record } => rust::instructions(*record),
             Task::Bench { arguments } => python::bench(arguments),
-            Task::Faults { arguments } => faults::run("faults", arguments),
-            Task::Soak { arguments } => faults::run("soak", arguments),
-            Task::Live { steps } => cargo::live(*steps),
-            Task::Properties { cases } => cargo::properties(*cases),
-            Task::Fuzz { target, minutes } => cargo::fuzz(target.as_deref(), *minutes),
-            Task::Loom => cargo::loom(),
-            Task::Original => original::python().map(|python| println!("{}", python.display())),
+            Task::Faults { arguments } => rust::faults("faults", arguments),
+            Task::Soak { arguments } => rust::faults("soak", arguments),
+            Task::Live { steps } => rust::live(*steps),
+            Task::Properties { cases } => rust::properties(*cases),
+            Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), *minutes),
+            Task::Original => python::original().map(|python| println!("{}", python.display())),
         }
     }
 }

@@ -1,135 +1,239 @@
-//! The Python package: wheel, lints, tests and benchmarks.
+//! CPythons, virtual environments, and the tests of the Python packages.
+//!
+//! The environments are in `target/venvs`. uv installs what the lock files say, from one cache by hard links: packages that several
+//! environments have take their space once.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Instant;
 
-use crate::requirements::Requirement;
-use crate::venv::{Install, execute, folder, target, uv_pip_install, venv, venv_above, workspace};
-use crate::{interpreters, original};
+use crate::shell::{describe, files_below, output, recreate, run, target, workspace};
 
-const NAME: &str = "python";
-const LIBRARIES: &str = "libraries";
+const UV: &str = "uv==0.13.9";
 
-/// The folder of the virtual environment with what the tests need; creates it if it does not exist.
+/// The minor version of the original: pygame 2.4.0, which it requires, has wheels up to CPython 3.11.
+const ORIGINAL: u32 = 11;
+
+/// The versions of CPython 3 that the package supports and its tests know.
+pub const SUPPORTED: std::ops::RangeInclusive<u32> = 10..=14;
+
+/// A CPython 3 of this minor version that can make virtual environments, on the path or of pyenv.
+pub fn interpreter(minor: u32) -> Option<PathBuf> {
+    // Debian's lacks `ensurepip` without the package python3-venv.
+    const PROGRAM: &str =
+        "import sys, venv, ensurepip; print(sys.implementation.name, *sys.version_info[:2], sys.executable)";
+    let pyenv = std::env::var_os("PYENV_ROOT").map(PathBuf::from);
+    let pyenv = pyenv.or_else(|| Some(std::env::home_dir()?.join(".pyenv"))).unwrap_or_default().join("versions");
+    let of_pyenv =
+        std::fs::read_dir(pyenv).into_iter().flatten().flatten().map(|version| version.path().join("bin/python3"));
+    let on_path = [format!("python3.{minor}"), "python3".to_owned(), "python".to_owned()].map(PathBuf::from);
+    on_path.into_iter().chain(of_pyenv).find_map(|python| {
+        let printed = output(Command::new(python).args(["-I", "-c", PROGRAM])).ok()?;
+        printed.strip_prefix(&format!("cpython 3 {minor} ")).map(|path| PathBuf::from(path.trim_end()))
+    })
+}
+
+/// The CPython of the tests: the original's if there is one, otherwise the newest.
+pub fn base() -> Result<PathBuf, String> {
+    let minors = std::iter::once(ORIGINAL).chain(SUPPORTED.rev());
+    minors.into_iter().find_map(interpreter).ok_or_else(|| {
+        "CPython 3.10 to 3.14 with venv is missing; apt-get install python3 python3-venv, or pyenv install 3.11"
+            .to_owned()
+    })
+}
+
+/// uv, installed from PyPI, with its cache in the target directory and without the settings of the user.
+pub fn uv(arguments: &[&str]) -> Result<Command, String> {
+    let folder = venv_folder("uv")?;
+    let stamp = folder.join("version");
+    if !std::fs::read_to_string(&stamp).is_ok_and(|version| version == UV) {
+        run(Command::new(base()?).args(["-m", "venv", "--clear"]).arg(&folder))?;
+        let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", UV];
+        run(Command::new(folder.join("bin/python")).args(pip))?;
+        std::fs::write(&stamp, UV).map_err(describe(&stamp))?;
+    }
+    let mut uv = Command::new(folder.join("bin/uv"));
+    uv.args(arguments).env("UV_CACHE_DIR", target()?.join("uv-cache"));
+    // As pip does: otherwise the first import of PyTorch takes long, and tests have time limits.
+    uv.env("UV_PYTHON_DOWNLOADS", "never").env("UV_COMPILE_BYTECODE", "1").env_remove("VIRTUAL_ENV");
+    Ok(uv)
+}
+
+fn venv_folder(name: &str) -> Result<PathBuf, String> {
+    Ok(target()?.join("venvs").join(name))
+}
+
+/// A virtual environment with these packages of PyPI.
+pub fn tools(name: &str, python: &Path, packages: &[&str]) -> Result<PathBuf, String> {
+    let folder = venv_folder(name)?;
+    run(uv(&["venv", "--quiet", "--allow-existing", "--no-project", "--python"])?.arg(python).arg(&folder))?;
+    run(pip_install(&folder)?.args(packages))?;
+    Ok(folder)
+}
+
+/// `uv pip install` into a virtual environment.
+pub fn pip_install(environment: &Path) -> Result<Command, String> {
+    let mut command = uv(&["pip", "install", "--quiet", "--python"])?;
+    command.arg(environment.join("bin/python"));
+    Ok(command)
+}
+
+/// A virtual environment with the packages that a project's lock file has for some groups or extras, without the project itself.
+fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, String> {
+    let folder = venv_folder(name)?;
+    let mut sync =
+        uv(&["sync", "--quiet", "--locked", "--inexact", "--no-install-project", "--project", project, "--python"])?;
+    run(sync.arg(base()?).args(selection).env("UV_PROJECT_ENVIRONMENT", &folder).current_dir(workspace()))?;
+    Ok(folder)
+}
+
+/// The environment of the tests that run everywhere.
 pub fn environment() -> Result<PathBuf, String> {
-    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    venv(NAME, &base, &[Install::of_file("requirements-test.txt")?, pufferlib()?])
+    sync("python", "bindings/python", &["--group", "dev"])
 }
 
-/// The folder of the virtual environment for the examples of libraries that do not fit in [`environment`], whose packages it has
-/// too; creates it if it does not exist.
-pub fn libraries() -> Result<PathBuf, String> {
-    environment()?;
-    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    venv_above(NAME, LIBRARIES, &base, &[Install::of_file("requirements-libraries.txt")?])
+/// The environment of the documentation.
+pub fn docs() -> Result<PathBuf, String> {
+    sync("docs", "bindings/python", &["--group", "docs"])
 }
 
-/// Checks the format of the Python files and lints them.
-pub fn ruff() -> Result<(), String> {
-    let program = environment()?.join("bin/ruff");
-    for arguments in [["format", "--check"].as_slice(), &["check"]] {
-        for package in packages() {
-            execute(Command::new(&program).current_dir(package).args(arguments))?;
-        }
-        let others = [
-            "--config",
-            "bindings/python/pyproject.toml",
-            "benches",
-            "docs",
-            "tests/reference",
-            "xtask/packages",
-            "xtask/pictures",
-        ];
-        execute(Command::new(&program).current_dir(workspace()).args(arguments).args(others))?;
+/// The environment with the libraries of others, with PufferLib, and without the games and the trainer in C that it would compile.
+fn libraries() -> Result<PathBuf, String> {
+    let folder = sync("libraries", "bindings/python", &["--group", "libraries"])?;
+    let mut install = pip_install(&folder)?;
+    install.args(["--no-deps", "--no-build-isolation", "pufferlib==3.0.0", "pettingzoo==1.26.1", "shimmy==2.0.1"]);
+    install.env("NO_OCEAN", "1").env("NO_TRAIN", "1").env("PYTHONPATH", workspace().join("xtask/pufferlib"));
+    run(&mut install)?;
+    Ok(folder)
+}
+
+/// The agents' environment, with the wheel and the agents.
+fn agents() -> Result<PathBuf, String> {
+    let folder =
+        sync("agents", "agents", &["--extra", "ray", "--group", "dev", "--no-install-package", "endless-gym"])?;
+    install(&folder)?;
+    run(pip_install(&folder)?.args(["--reinstall", "--no-deps"]).arg(workspace().join("agents")))?;
+    Ok(folder)
+}
+
+/// The path of the Python that has the original.
+pub fn original() -> Result<PathBuf, String> {
+    let base = interpreter(ORIGINAL)
+        .ok_or("CPython 3.11 is missing, the newest for which the original's pygame has wheels")?;
+    // Pinned, so that every comparison is with the same original.
+    Ok(tools("original", &base, &["memory-gym==1.0.2", "numpy==1.26.4"])?.join("bin/python"))
+}
+
+/// Builds the wheel, in the profile of the Rust tests.
+pub fn wheel(profile: &str) -> Result<(), String> {
+    let bin = environment()?.join("bin");
+    let wheels = target()?.join("wheels");
+    recreate(&wheels)?;
+    let mut maturin = Command::new(bin.join("maturin"));
+    maturin.args([
+        "build",
+        "--locked",
+        "--profile",
+        profile,
+        "--manifest-path",
+        "bindings/python/Cargo.toml",
+        "--interpreter",
+    ]);
+    run(maturin.arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))
+}
+
+/// Installs the wheel that [`wheel`] built.
+fn install(environment: &Path) -> Result<(), String> {
+    let wheel = files_below(&target()?.join("wheels"))?.pop().ok_or("no wheel has been built")?;
+    run(pip_install(environment)?.args(["--reinstall", "--no-deps"]).arg(wheel))
+}
+
+/// Lints all Python files and checks their format.
+pub fn lint() -> Result<(), String> {
+    let ruff = environment()?.join("bin/ruff");
+    let others = ["benches", "docs", "tests/reference", "xtask", "--config", "bindings/python/pyproject.toml"];
+    for task in [["format", "--check"].as_slice(), &["check"]] {
+        run(Command::new(&ruff).args(task).args(["bindings/python", "agents"]).current_dir(workspace()))?;
+        run(Command::new(&ruff).args(task).args(others).current_dir(workspace()))?;
     }
     Ok(())
 }
 
-/// Checks the types of the packages.
-pub fn mypy() -> Result<(), String> {
-    let python = environment()?.join("bin/python");
-    packages().iter().try_for_each(|package| {
-        // The agents' imports of the other package are found by the path, since the two may be checked before they are installed.
-        let mut mypy = Command::new(&python);
-        execute(mypy.args(["-m", "mypy"]).env("MYPYPATH", self::package()).current_dir(package))
-    })
+/// Fails if the files of a crate or of a Python package import each other in a cycle.
+pub fn cycles() -> Result<(), String> {
+    run(Command::new(base()?).arg("xtask/cycles.py").current_dir(workspace()))
 }
 
-/// Runs the tests of both packages that a marker expression selects, as [`install`] installed them.
-pub fn pytest(markers: &str) -> Result<(), String> {
-    packages().iter().try_for_each(|package| pytest_of(package, markers))
+/// Checks types and runs the tests of the environments' package that neither take long nor need what others wrote.
+pub fn test() -> Result<(), String> {
+    let environment = environment()?;
+    install(&environment)?;
+    pytest(&environment, "bindings/python", "not slow and not libraries and not original")
 }
 
-/// Runs the tests of the environments' package that need the original.
-pub fn pytest_original() -> Result<(), String> {
-    pytest_of(&package(), "original")
+/// Runs the tests of the environments' package that take long or need the libraries of others.
+pub fn test_libraries() -> Result<(), String> {
+    let environment = libraries()?;
+    let rllib = sync("rllib", "bindings/python", &["--group", "rllib"])?;
+    [&environment, &rllib].into_iter().try_for_each(|environment| install(environment))?;
+    mypy(&environment, "bindings/python")?;
+    pytest_with(
+        &environment,
+        "bindings/python",
+        "(slow or libraries) and not original",
+        &[("ENDLESS_LIBRARIES_PYTHON", &rllib)],
+    )
 }
 
-fn pytest_of(package: &Path, markers: &str) -> Result<(), String> {
-    let mut pytest = Command::new(environment()?.join("bin/pytest"));
-    pytest.args(["-q", "--timeout", "300", "--durations", "30", "-m", markers]).current_dir(package);
-    pytest.env("ENDLESS_ORIGINAL_PYTHON", original::path()?);
-    execute(pytest.env("ENDLESS_LIBRARIES_PYTHON", folder(LIBRARIES)?.join("bin/python")))
+/// Checks the types of the agents and runs all their tests.
+pub fn test_agents() -> Result<(), String> {
+    let environment = agents()?;
+    mypy(&environment, "agents")?;
+    pytest_with(&environment, "agents", "", &[("ENDLESS_LIBRARIES_PYTHON", &environment)])
+}
+
+/// Runs the tests of the environments' package that compare with the original.
+pub fn test_original() -> Result<(), String> {
+    original()?;
+    let environment = environment()?;
+    install(&environment)?;
+    pytest(&environment, "bindings/python", "original")
+}
+
+fn mypy(environment: &Path, package: &str) -> Result<(), String> {
+    let mut mypy = Command::new(environment.join("bin/python"));
+    run(mypy.args(["-m", "mypy"]).current_dir(workspace().join(package)))
+}
+
+fn pytest(environment: &Path, package: &str, markers: &str) -> Result<(), String> {
+    pytest_with(environment, package, markers, &[("ENDLESS_ORIGINAL_PYTHON", &venv_folder("original")?)])
+}
+
+/// Runs tests, with variables that name the Pythons of other environments.
+fn pytest_with(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
+    let mut pytest = Command::new(environment.join("bin/python"));
+    pytest.args(["-m", "pytest", "-q", "--timeout", "300", "--durations", "20", "-m", markers]);
+    pytest.envs(pythons.iter().map(|(name, folder)| (name, folder.join("bin/python"))));
+    run(pytest.current_dir(workspace().join(package)))
 }
 
 /// Compares steps per second with the original's and, for scale, with EnvPool's own environments where it can be installed.
 pub fn bench(arguments: &[String]) -> Result<(), String> {
-    install("release")?;
-    let folder = environment()?;
-    let base = interpreters::for_package().ok_or_else(|| Requirement::Python.missing())?;
-    let envpool = venv("envpool", &base, &[Install::of(&["envpool==1.2.5"])]);
-    let mut script = Command::new(folder.join("bin/python"));
-    script.arg(workspace().join("benches/comparison.py"));
-    script.arg("--original").arg(original::python()?).args(arguments);
-    match envpool {
+    wheel("release")?;
+    let environment = environment()?;
+    install(&environment)?;
+    let mut script = Command::new(environment.join("bin/python"));
+    script.arg(workspace().join("benches/comparison.py")).arg("--original").arg(original()?).args(arguments);
+    match tools("envpool", &base()?, &["envpool==1.2.5"]) {
         Ok(folder) => drop(script.arg("--envpool").arg(folder.join("bin/python"))),
         Err(message) => eprintln!("without EnvPool: {message}"),
     }
-    execute(&mut script)
+    run(&mut script)
 }
 
-fn package() -> PathBuf {
-    workspace().join("bindings/python")
-}
-
-/// The folders of the environments' package and of the agents'.
-fn packages() -> [PathBuf; 2] {
-    [package(), workspace().join("agents")]
-}
-
-/// Builds the wheel in a profile of cargo and installs it and the agents into the virtual environment.
-pub fn install(profile: &str) -> Result<(), String> {
-    let folder = environment()?;
-    let wheels = target()?.join("wheels");
-    let _ = std::fs::remove_dir_all(&wheels);
-    let mut maturin = Command::new(folder.join("bin/maturin"));
-    maturin.args(["build", "--locked", "--profile", profile, "--interpreter"]).arg(folder.join("bin/python"));
-    maturin.arg("--manifest-path").arg(package().join("Cargo.toml")).arg("--out").arg(&wheels);
-    execute(&mut maturin)?;
-    let wheel = only_file(&wheels)?;
-    execute(uv_pip_install(&folder)?.args(["--reinstall", "--no-deps"]).arg(wheel).arg(workspace().join("agents")))
-}
-
-fn only_file(folder: &Path) -> Result<PathBuf, String> {
-    let file = std::fs::read_dir(folder).ok().and_then(|mut files| files.next()).and_then(Result::ok);
-    Ok(file.ok_or("maturin built no wheel")?.path())
-}
-
-/// PufferLib, which PyPI has only as a source archive, without the games and the trainer in C that it would compile.
-fn pufferlib() -> Result<Install, String> {
-    let mut install = Install::of_file("requirements-pufferlib.txt")?;
-    install.arguments.extend(["--no-deps", "--no-build-isolation"].map(str::to_owned));
-    let path = workspace().join("xtask/pufferlib").display().to_string();
-    install.environment = vec![("NO_OCEAN", "1".to_owned()), ("NO_TRAIN", "1".to_owned()), ("PYTHONPATH", path)];
-    Ok(install)
-}
-
-/// Runs a command, and prints what it is and how long it took.
-pub fn run(what: &str, command: &mut Command) -> Result<(), String> {
-    println!("==> {what}");
-    let start = Instant::now();
-    execute(command)?;
-    println!("    {:.1} s", start.elapsed().as_secs_f64());
-    Ok(())
+/// Makes all pictures in `docs/images`.
+pub fn pictures() -> Result<(), String> {
+    wheel("dev")?;
+    let environment = libraries()?;
+    install(&environment)?;
+    run(Command::new(environment.join("bin/python")).arg(workspace().join("xtask/pictures/make.py")))
 }

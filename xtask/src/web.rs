@@ -1,22 +1,89 @@
-//! The page that plays the environments in a browser, in target/web: the core as WebAssembly, and the files of
+//! The core for WebAssembly, and the page that plays the environments in a browser, in target/web: the core with the files of
 //! `engine/view/page/files`.
 
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-use crate::cargo;
-use crate::venv::{execute, target, workspace};
-use crate::wasm::Toolchain;
+use crate::shell::{cargo, describe, output, recreate, remap, run, succeeds, target, workspace};
+
+const TARGET: &str = "wasm32-unknown-unknown";
+
+/// What is missing without a toolchain.
+pub const MISSING: &str = "Rust's standard library for wasm32-unknown-unknown; rustup target add wasm32-unknown-unknown, or on Debian \
+    .ci/wasm-toolchain, which unpacks Debian's compiler under target/";
 
 /// Bytes of all files, each compressed: what a browser downloads at most.
 const LIMIT: usize = 1_000_000;
 
 /// The file that the build completes: the list of the others, and a number that changes with them.
 const WORKER: &str = "worker.js";
+
+/// A compiler with the target's standard library, or with the sources to build it from.
+pub enum Toolchain {
+    /// The one that runs this.
+    Own,
+    /// Debian's compiler in the folder where `.ci/wasm-toolchain` unpacks it; Debian has no compiled standard library of that version.
+    Debian(PathBuf),
+}
+
+impl Toolchain {
+    pub fn find() -> Option<Self> {
+        let libraries = output(Command::new("rustc").args(["--print", "target-libdir", "--target", TARGET]));
+        if libraries.is_ok_and(|folder| Path::new(folder.trim()).is_dir()) {
+            return Some(Toolchain::Own);
+        }
+        let folder = target().ok()?.join("wasm-toolchain/usr");
+        folder.join("bin/rustc").exists().then_some(Toolchain::Debian(folder))
+    }
+
+    /// Builds a crate with `cargo build`, and returns the folder of what it built.
+    fn build(&self, arguments: &[&str]) -> Result<PathBuf, String> {
+        let mut cargo = cargo(&["build", "--locked", "--release", "--target", TARGET]);
+        cargo.args(arguments);
+        // A browser downloads the result, and programs contain it: without names, lines and folders of this machine.
+        cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
+        cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
+        let mut built = target()?;
+        if let Toolchain::Debian(folder) = self {
+            // A folder of its own, so that the two compilers do not invalidate each other's builds.
+            built.push("wasm");
+            cargo.args(["-Zbuild-std=std,panic_abort", "--target-dir"]).arg(&built);
+            cargo.env("RUSTC", folder.join("bin/rustc")).env("RUSTC_BOOTSTRAP", "1");
+            let libraries = format!("lib/{}-linux-gnu", std::env::consts::ARCH);
+            for (variable, first) in
+                [("PATH", ["bin", "lib/llvm/bin"]), ("LD_LIBRARY_PATH", [&libraries, "lib/llvm/lib"])]
+            {
+                let before = std::env::var_os(variable).unwrap_or_default();
+                let before = std::env::split_paths(&before).filter(|path| !path.as_os_str().is_empty());
+                let all = first.iter().map(|path| folder.join(path)).chain(before);
+                cargo.env(variable, std::env::join_paths(all).map_err(|error| format!("{variable}: {error}"))?);
+            }
+        }
+        run(&mut cargo)?;
+        Ok(built.join(TARGET).join("release"))
+    }
+}
+
+fn toolchain() -> Result<Toolchain, String> {
+    Toolchain::find().ok_or_else(|| format!("missing: {MISSING}"))
+}
+
+/// Builds the core: without threads and without a system's entropy.
+pub fn build_core() -> Result<(), String> {
+    toolchain()?.build(&["--package", "endless-gym-core", "--no-default-features"]).map(drop)
+}
+
+/// Whether there is a Chromium for the tests.
+pub fn has_browser() -> bool {
+    let given = std::env::var("CHROMIUM").into_iter();
+    let mut programs = given.chain(["chromium", "chromium-browser", "google-chrome"].map(str::to_owned));
+    programs.any(|program| succeeds(Command::new(program).arg("--version")))
+}
 
 /// Where the page is built.
 pub fn folder() -> Result<PathBuf, String> {
@@ -29,14 +96,12 @@ pub fn folder() -> Result<PathBuf, String> {
 ///
 /// If there is no compiler for WebAssembly, or if the page has become too large.
 pub fn build() -> Result<(), String> {
-    println!("==> page");
-    let toolchain = Toolchain::find().ok_or_else(Toolchain::missing)?;
-    execute(toolchain.build()?.args(["--release", "--package", "endless-gym-web"]))?;
-    let mut files = vec![("engine.wasm".to_owned(), read(&toolchain.output()?.join("release/endless_gym_web.wasm"))?)];
+    let built = toolchain()?.build(&["--package", "endless-gym-web"])?;
+    let mut files = vec![("engine.wasm".to_owned(), read(&built.join("endless_gym_web.wasm"))?)];
     let page = workspace().join("engine/view/page/files");
-    let entries = fs::read_dir(&page).map_err(|error| describe(&page, &error))?;
+    let entries = fs::read_dir(&page).map_err(describe(&page))?;
     for entry in entries {
-        let path = entry.map_err(|error| describe(&page, &error))?.path();
+        let path = entry.map_err(describe(&page))?.path();
         files.push((path.file_name().unwrap_or_default().to_string_lossy().into_owned(), read(&path)?));
     }
     files.sort();
@@ -60,10 +125,8 @@ pub fn test() -> Result<(), String> {
     build()?;
     // Not what only measures or makes pictures.
     let tests = ["--ignored", "--test-threads", "1", "--skip", "measure"];
-    cargo::run(
-        &[&["test", "--locked", "--package", "endless-gym-web", "--test", "browser", "--"], tests.as_slice()].concat(),
-    )?;
-    cargo::run(&[&["test", "--locked", "--test", "integration", "--"], tests.as_slice(), &["browser::"]].concat())
+    run(cargo(&["test", "--locked", "--package", "endless-gym-web", "--test", "browser", "--"]).args(tests))?;
+    run(cargo(&["test", "--locked", "--test", "integration", "--"]).args(tests).arg("browser::"))
 }
 
 /// Writes the list of files, and a checksum of them all, into the service worker, which keeps them for use without a network.
@@ -79,13 +142,10 @@ fn complete_worker(files: &mut [(String, Vec<u8>)]) -> Result<(), String> {
 }
 
 fn write(folder: &Path, files: &[(String, Vec<u8>)]) -> Result<(), String> {
-    if folder.exists() {
-        fs::remove_dir_all(folder).map_err(|error| describe(folder, &error))?;
-    }
-    fs::create_dir_all(folder).map_err(|error| describe(folder, &error))?;
+    recreate(folder)?;
     files.iter().try_for_each(|(name, bytes)| {
         let path = folder.join(name);
-        fs::write(&path, bytes).map_err(|error| describe(&path, &error))
+        fs::write(&path, bytes).map_err(describe(&path))
     })
 }
 
@@ -97,9 +157,5 @@ fn compressed(bytes: &[u8]) -> usize {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, String> {
-    fs::read(path).map_err(|error| describe(path, &error))
-}
-
-fn describe(path: &Path, error: &std::io::Error) -> String {
-    format!("{}: {error}", path.display())
+    fs::read(path).map_err(describe(path))
 }

@@ -14,13 +14,8 @@ mod request;
 mod wall;
 
 use std::cell::RefCell;
-use std::collections::HashMap;
-use std::rc::Rc;
 
-use agent::Agent;
-use game::Game;
-use request::Request;
-use wall::Wall;
+use request::{App, Request};
 
 /// What [`call`] and [`open`] return: the kind of bytes in [`output`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,14 +24,6 @@ enum Kind {
     Json = 0,
     Error = 1,
     Bytes = 2,
-}
-
-#[derive(Default)]
-struct App {
-    game: Option<Game>,
-    wall: Option<Wall>,
-    /// The loaded agents by the id of their environment.
-    agents: HashMap<String, Rc<Agent>>,
 }
 
 thread_local! {

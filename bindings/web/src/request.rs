@@ -1,5 +1,6 @@
 //! The page's requests, and their answers.
 
+use std::collections::HashMap;
 use std::rc::Rc;
 
 use endless_gym_core::envs::{self, EnvSpec};
@@ -8,12 +9,20 @@ use endless_gym_core::trace::{Trace, replay};
 use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
 
-use crate::App;
 use crate::agent::Agent;
 use crate::error::WebError;
 use crate::game::{Game, Player};
 use crate::group::Group;
 use crate::wall::Wall;
+
+/// What the page plays.
+#[derive(Default)]
+pub struct App {
+    pub game: Option<Game>,
+    pub wall: Option<Wall>,
+    /// The loaded agents by the id of their environment.
+    pub agents: HashMap<String, Rc<Agent>>,
+}
 
 /// Reset parameters as a form has them: each value is text. Text that is no JSON is the text itself, so that the engine says what
 /// it should have been.

@@ -1,0 +1,121 @@
+"""Fail if the files of a crate or of a Python package import each other in a cycle: `python xtask/cycles.py`."""
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
+CRATES = ["bindings/web", "engine/cli", "engine/core", "engine/service", "engine/view", "tests/faults", "xtask"]
+
+Module = tuple[str, ...]
+
+#: Comments, texts, visibilities, and modules for tests.
+IGNORED = re.compile(
+    r'pub\([^)]*\)|//[^\n]*|"(?:\\.|[^"\\])*"|^#\[cfg\([^\n]*test\b[^\n]*\n(?:pub )?mod \w+ \{.*?^\}',
+    re.DOTALL | re.MULTILINE,
+)
+USE = re.compile(r"\buse\s+([^;]+);")
+PATH = re.compile(r"\b(?:\w+::)+\w+")
+
+
+def rust_files(folder: Path) -> Iterator[tuple[Module, str]]:
+    """The modules of a crate with their text, without files of tests."""
+    for path in folder.rglob("*.rs"):
+        if not path.stem.endswith("tests"):
+            parts = path.relative_to(folder).with_suffix("").parts
+            yield (parts[:-1] if parts[-1] in ("lib", "main", "mod") else parts), IGNORED.sub("", path.read_text())
+
+
+def flat(tree: str) -> list[list[str]]:
+    """The paths of a tree of imports, such as `a::{b, c::d}`."""
+    paths: list[list[str]] = []
+    stack: list[list[str]] = [[]]
+    words: list[str] = []
+    for token in [*re.findall(r"\w+|[{},]", re.sub(r"\bas \w+", "", tree)), ","]:
+        if token == "{":
+            stack.append(stack[-1] + words)
+            words = []
+        elif token in ",}":
+            if words:
+                paths.append(stack[-1] + words)
+            words = []
+            if token == "}":
+                stack.pop()
+        else:
+            words.append(token)
+    return paths
+
+
+def rust_imports(folder: Path) -> dict[Module, set[Module]]:
+    """The modules of a crate that each of its modules names, deepest first; a folder's `mod.rs` is a module too."""
+    files = dict(rust_files(folder))
+    found: dict[Module, set[Module]] = {}
+    for module, text in files.items():
+        paths = [path for tree in USE.findall(text) for path in flat(tree)]
+        paths += [path.split("::") for path in PATH.findall(USE.sub("", text))]
+        found[module] = set()
+        for first, *rest in paths:
+            if first == "crate":
+                target: Module = ()
+            elif first in ("self", "super"):
+                target = module[:-1] if first == "super" else module
+                while rest and rest[0] == "super":
+                    target, rest = target[:-1], rest[1:]
+            elif (*module, first) in files:  # a module names its children without a prefix
+                target = (*module, first)
+            else:
+                continue
+            while rest and (*target, rest[0]) in files:
+                target, rest = (*target, rest[0]), rest[1:]
+            found[module].add(target)
+        found[module].discard(module)
+    return found
+
+
+def python_imports(folder: Path) -> dict[Module, set[Module]]:
+    """The modules of a package that each of its modules imports, also inside functions and for types alone."""
+    files = {
+        path.relative_to(folder.parent).with_suffix("").parts: path
+        for path in folder.rglob("*.py*")
+        if path.suffix in (".py", ".pyi")
+    }
+
+    def named(parts: Module) -> Module:
+        return parts[:-1] if parts[-1] == "__init__" else parts
+
+    modules = {named(parts) for parts in files}
+    found: dict[Module, set[Module]] = {}
+    for parts, path in files.items():
+        imported = found.setdefault(named(parts), set())
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {tuple(alias.name.split(".")) for alias in node.names} & modules
+            elif isinstance(node, ast.ImportFrom):
+                origin = (
+                    *(parts[: -node.level] if node.level else ()),
+                    *(node.module.split(".") if node.module else ()),
+                )
+                # What is no module is a name of the one that it is imported from.
+                targets = {(*origin, alias.name) for alias in node.names}
+                imported |= {target if target in modules else origin for target in targets} & modules
+        imported.discard(named(parts))
+    return found
+
+
+failed = False
+for folder, imports in [
+    *((Path(crate, "src"), rust_imports) for crate in CRATES),
+    *((Path(package), python_imports) for package in PACKAGES),
+]:
+    try:
+        TopologicalSorter(imports(folder)).prepare()
+    except CycleError as error:
+        failed = True
+        print(
+            f"{folder}: files import each other in a cycle:",
+            " <- ".join("/".join(name) or "lib" for name in error.args[1]),
+        )
+sys.exit(failed)

@@ -1,0 +1,224 @@
+//! What a release consists of, made into `target/dist`: the source distribution and the wheel of the Python package, and the crates.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::shell::{
+    cargo, cargo_home, describe, files_below, output, recreate, remap, run, sysroot, target, workspace,
+};
+use crate::{python, web};
+
+/// The maturin of the tests, and what inspects wheels. Zig links against any version of the C library.
+const TOOLS: [&str; 4] = ["auditwheel==6.8.2", "maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"];
+
+/// The oldest C library that the wheel supports.
+const PLATFORM: &str = "manylinux_2_17";
+
+/// The published crates, in the order in which they depend on each other.
+const CRATES: [&str; 6] = [
+    "endless-gym-core",
+    "endless-gym-service",
+    "endless-gym-page",
+    "endless-gym-view",
+    "endless-gym-cli",
+    "endless-gym",
+];
+
+const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
+
+/// Builds and checks all of them.
+pub fn build() -> Result<(), String> {
+    let folder = folder()?;
+    let tools = python::tools("packaging", &python::base()?, &TOOLS)?;
+    match web::Toolchain::find() {
+        Some(_) => web::build()?,
+        None => println!("The program will not contain the page: missing: {}", web::MISSING),
+    }
+    recreate(&folder)?;
+    let source = source_distribution(&tools, &folder)?;
+    wheel(&tools, &source, &folder)?;
+    crates(&folder)?;
+    for file in files_below(&folder)? {
+        println!("{:>12} bytes  {}", fs::metadata(&file).map_err(describe(&file))?.len(), file.display());
+    }
+    Ok(())
+}
+
+fn folder() -> Result<PathBuf, String> {
+    Ok(target()?.join("dist"))
+}
+
+/// The only file of a folder with this suffix.
+fn only_file(folder: &Path, suffix: &str) -> Result<PathBuf, String> {
+    let mut found = files_below(folder)?;
+    found.retain(|path| path.to_string_lossy().ends_with(suffix));
+    match &found[..] {
+        [file] => Ok(file.clone()),
+        _ => Err(format!("{} must hold one file *{suffix}, found {found:?}", folder.display())),
+    }
+}
+
+/// Makes the source distribution and unpacks it. Returns the folder of its `pyproject.toml`.
+fn source_distribution(tools: &Path, folder: &Path) -> Result<PathBuf, String> {
+    let manifest = workspace().join("bindings/python/Cargo.toml");
+    run(maturin(tools, "sdist").arg("--manifest-path").arg(manifest).arg("--out").arg(folder))?;
+    let unpacked = target()?.join("dist-source");
+    recreate(&unpacked)?;
+    // The files of the archive have a fixed time. With the present time instead, cargo sees that they changed.
+    let mut tar = Command::new("tar");
+    tar.args(["--extract", "--touch", "--strip-components=1", "--file"]).arg(only_file(folder, ".tar.gz")?);
+    run(tar.arg("--directory").arg(&unpacked))?;
+    // The archive lacks members of the workspace, which the lock file still lists. All other versions stay.
+    run(cargo(&["update", "--quiet", "--workspace"]).current_dir(&unpacked))?;
+    Ok(unpacked)
+}
+
+/// Builds the wheel from the unpacked source distribution, which is thereby complete, and checks it.
+fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
+    let built = target()?.join("dist-wheel");
+    recreate(&built)?;
+    let mut maturin = maturin(tools, "build");
+    maturin.current_dir(source).args(["--locked", "--zig", "--compatibility", PLATFORM]);
+    maturin.arg("--target-dir").arg(target()?).arg("--out").arg(&built);
+    run(maturin.env("CARGO_ENCODED_RUSTFLAGS", remap(source)?))?;
+
+    // The bill of materials names the folders of the local crates. `wheel pack` writes the new checksums.
+    let wheel = |task: &[&str]| {
+        let mut wheel = Command::new(tools.join("bin/wheel"));
+        wheel.args(task);
+        wheel
+    };
+    let built_wheel = only_file(&built, ".whl")?;
+    run(wheel(&["unpack", "--dest"]).arg(&built).arg(&built_wheel))?;
+    let name = built_wheel.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let unpacked = built.join(name.splitn(3, '-').take(2).collect::<Vec<_>>().join("-"));
+    for file in files_below(&unpacked)?.iter().filter(|file| file.to_string_lossy().ends_with(".cyclonedx.json")) {
+        let text = fs::read_to_string(file).map_err(describe(file))?;
+        fs::write(file, text.replace(&source.display().to_string(), "/endless-gym")).map_err(describe(file))?;
+    }
+    check_contents(&unpacked)?;
+    run(wheel(&["pack", "--dest-dir"]).arg(folder).arg(&unpacked))?;
+    check_tag(tools, &only_file(folder, ".whl")?)
+}
+
+/// Fails if a licence is missing, or if a file names a folder of this machine.
+fn check_contents(wheel: &Path) -> Result<(), String> {
+    let files = files_below(wheel)?;
+    let has = |licence: &&str| files.iter().any(|file| file.file_name().is_some_and(|name| name == *licence));
+    if let Some(missing) = LICENCES.iter().find(|licence| !has(licence)) {
+        return Err(format!("the wheel must contain {missing}"));
+    }
+    let local =
+        [workspace().to_path_buf(), target()?, cargo_home()?, sysroot()?].map(|path| path.display().to_string());
+    for file in files {
+        let bytes = fs::read(&file).map_err(describe(&file))?;
+        if let Some(path) = local.iter().find(|path| bytes.windows(path.len()).any(|part| part == path.as_bytes())) {
+            return Err(format!("{} must not name folders of this machine, found {path}", file.display()));
+        }
+    }
+    Ok(())
+}
+
+/// Fails if auditwheel finds symbols that are newer than the wheel's tag permits, or if the tag is not for all CPythons from 3.10.
+fn check_tag(tools: &Path, wheel: &Path) -> Result<(), String> {
+    let name = wheel.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let expected = format!("{PLATFORM}_{}", std::env::consts::ARCH);
+    if !name.contains("-cp310-abi3-") || !name.contains(&expected) {
+        return Err(format!("the wheel's name must contain cp310-abi3 and {expected}, got {name}"));
+    }
+    let text = output(Command::new(tools.join("bin/auditwheel")).args(["show", "--json"]).arg(wheel))?;
+    let overall = text.lines().find(|line| line.contains("\"overall_tag\"")).unwrap_or_default();
+    if overall.contains(&expected) {
+        Ok(())
+    } else {
+        Err(format!("auditwheel must find {expected}, as in {name}, got\n{text}"))
+    }
+}
+
+/// Packages the crates and builds each from its package, against the packages of the others.
+fn crates(folder: &Path) -> Result<(), String> {
+    let version = env!("CARGO_PKG_VERSION");
+    let build = target()?.join("packaged");
+    remove_earlier(&build)?;
+    let mut package = cargo(&["package", "--locked", "--allow-dirty", "--target-dir"]);
+    package.arg(&build).args(CRATES.map(|name| format!("--package={name}")));
+    // The profiles of the workspace do not apply.
+    run(package.env("CARGO_PROFILE_DEV_DEBUG", "false"))?;
+    for name in CRATES {
+        let package = build.join(format!("package/{name}-{version}.crate"));
+        let list = output(Command::new("tar").args(["--list", "--file"]).arg(&package))?;
+        if let Some(missing) = LICENCES.iter().find(|licence| !list.contains(&format!("/{licence}\n"))) {
+            return Err(format!("the package of {name} must contain {missing}, got\n{list}"));
+        }
+        fs::copy(&package, folder.join(format!("{name}-{version}.crate"))).map_err(describe(&package))?;
+    }
+    // The tests of the core read recorded cases, which its package must contain.
+    let mut check = cargo(&["check", "--quiet", "--tests", "--manifest-path"]);
+    check.arg(build.join(format!("package/endless-gym-core-{version}/Cargo.toml"))).arg("--target-dir").arg(&build);
+    run(check.env("CARGO_PROFILE_DEV_DEBUG", "false"))
+}
+
+/// Removes what earlier runs unpacked and built of these crates. Cargo packages a workspace by way of a temporary registry in the
+/// target directory, and what comes from a registry never changes for it as long as the version is the same.
+fn remove_earlier(build: &Path) -> Result<(), String> {
+    // The folders of other registries begin with their host.
+    let mut parents = folders(&cargo_home()?.join("registry/src"), "-");
+    parents.push(build.join("debug/.fingerprint"));
+    let earlier = parents.iter().flat_map(|parent| folders(parent, "endless-gym"));
+    earlier.into_iter().try_for_each(|folder| fs::remove_dir_all(&folder).map_err(describe(&folder)))
+}
+
+/// The folders in a folder whose names begin with `prefix`; none if there is no such folder.
+fn folders(parent: &Path, prefix: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(parent).into_iter().flatten().flatten();
+    entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix)).map(|entry| entry.path()).collect()
+}
+
+/// Maturin, which looks for zig in the Python that is first on the path.
+fn maturin(tools: &Path, task: &str) -> Command {
+    let mut path = tools.join("bin").into_os_string();
+    path.push(":");
+    path.push(std::env::var_os("PATH").unwrap_or_default());
+    let mut command = Command::new(tools.join("bin/maturin"));
+    command.arg(task).env("PATH", path);
+    command
+}
+
+/// Builds all of them, installs the wheel on each CPython of this machine and the source distribution on the oldest, and uses them.
+pub fn test() -> Result<(), String> {
+    build()?;
+    let wheel = only_file(&folder()?, ".whl")?;
+    let page = if web::Toolchain::find().is_some() { "page" } else { "no page" };
+    let mut oldest = None;
+    for minor in python::SUPPORTED {
+        let Some(python) = python::interpreter(minor) else {
+            println!("not run: CPython 3.{minor}, which is not installed");
+            continue;
+        };
+        install_and_use(&python, &format!("3.{minor}"), &wheel, page)?;
+        oldest.get_or_insert(python);
+    }
+    let oldest = oldest.ok_or("no CPython has been found")?;
+    install_and_use(&oldest, "source", &only_file(&folder()?, ".tar.gz")?, "no page")
+}
+
+/// Installs a package with the versions of the lock file into an environment without anything that it does not ask for, and uses it.
+fn install_and_use(python: &Path, name: &str, package: &Path, page: &str) -> Result<(), String> {
+    let folder = target()?.join("packages").join(name);
+    recreate(&folder)?;
+    let constraints = folder.join("constraints.txt");
+    let export = ["export", "--quiet", "--locked", "--no-emit-project", "--no-hashes", "--project", "bindings/python"];
+    run(python::uv(&export)?.arg("--output-file").arg(&constraints).current_dir(workspace()))?;
+    let environment = folder.join("venv");
+    run(python::uv(&["venv", "--quiet", "--no-project", "--python"])?.arg(python).arg(&environment))?;
+    let mut install = python::pip_install(&environment)?;
+    install.args(["--reinstall-package", "endless-gym", "--constraint"]).arg(&constraints).arg(package);
+    // Of the source distribution: with the profile of the tests, for which the dependencies have been compiled.
+    run(install.env("CARGO_TARGET_DIR", target()?).env("MATURIN_PEP517_ARGS", "--profile dev"))?;
+    // In the environment's folder, so that it imports the installed package.
+    let mut check = Command::new(environment.join("bin/python"));
+    check.arg(workspace().join("xtask/packages/check.py")).args([env!("CARGO_PKG_VERSION"), page]);
+    run(check.current_dir(&folder).env_remove("PYTHONPATH"))?;
+    run(Command::new(environment.join("bin/endless")).arg("list").current_dir(&folder))
+}

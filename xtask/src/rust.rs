@@ -1,0 +1,157 @@
+//! Lints, tests and measurements of the crates.
+
+use std::fmt::Write;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use crate::python;
+use crate::shell::{self, describe, output, run, succeeds, target, workspace};
+
+/// A seed of the property tests: a failure in the tests is due to a change.
+const PROPERTY_SEED: &str = "20251122";
+
+fn cargo(arguments: &[&str]) -> Result<(), String> {
+    let mut cargo = shell::cargo(arguments);
+    // `cargo test` of the workspace builds the examples.
+    run(cargo.env("PROPTEST_RNG_SEED", PROPERTY_SEED).env("ENDLESS_EXAMPLES_BUILT", "1"))
+}
+
+pub fn format() -> Result<(), String> {
+    cargo(&["fmt", "--all", "--check"])
+}
+
+pub fn clippy() -> Result<(), String> {
+    cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "--deny", "warnings"])?;
+    let core = ["--package", "endless-gym-core", "--no-default-features", "--locked"];
+    cargo(&[&["clippy"], core.as_slice(), &["--", "--deny", "warnings"]].concat())
+}
+
+/// All tests of the workspace that are not ignored.
+pub fn test() -> Result<(), String> {
+    cargo(&["test", "--workspace", "--locked", "--no-fail-fast"])
+}
+
+/// The ignored tests but those that need a browser or the original, or only measure: slow ones, and those that the machine may forbid.
+pub fn test_ignored() -> Result<(), String> {
+    let mut arguments =
+        vec!["test", "--workspace", "--locked", "--no-fail-fast", "--lib", "--tests", "--exclude", "endless-gym-web"];
+    arguments.extend(["--", "--ignored", "--skip", "browser::", "--skip", "live::", "--skip", "measure"]);
+    if !succeeds(Command::new("unshare").args(["--mount", "--map-root-user", "true"])) {
+        println!("not run, without permission to create mount namespaces: tests in shared memory of other sizes");
+        arguments.extend([
+            "--skip",
+            "inside_",
+            "--skip",
+            "two_directories_of_one_path",
+            "--skip",
+            "too_little_shared_memory",
+        ]);
+    }
+    if !rustix::process::geteuid().is_root() {
+        println!("not run, since this is not root: tests with segments of another user");
+        arguments.extend(["--skip", "as_root_"]);
+    }
+    cargo(&arguments)
+}
+
+/// Compares with the original, from a fixed seed.
+pub fn test_original() -> Result<(), String> {
+    let tests = ["test", "--locked", "--test", "integration", "--", "--ignored", "live::"];
+    run(shell::cargo(&tests)
+        .env("ENDLESS_ORIGINAL_PYTHON", python::original()?)
+        .env("PROPTEST_RNG_SEED", PROPERTY_SEED))
+}
+
+/// Compares `steps` steps of each environment with the original, from new seeds; optimised, since it is long.
+pub fn live(steps: u64) -> Result<(), String> {
+    let tests = ["test", "--release", "--locked", "--test", "integration", "--", "--ignored", "--nocapture", "live::"];
+    let mut cargo = shell::cargo(&tests);
+    run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("ENDLESS_LIVE_STEPS", steps.to_string()))
+}
+
+/// Runs the property tests with `cases` cases each, from new seeds; optimised, since they are long.
+pub fn properties(cases: u32) -> Result<(), String> {
+    let tests = ["test", "--release", "--workspace", "--locked", "--lib", "--tests"];
+    run(shell::cargo(&tests).env("PROPTEST_CASES", cases.to_string()))
+}
+
+/// Runs the fuzz targets, or one of them, from new seeds for at least `minutes`; optimised, since it is long.
+pub fn fuzz(only: Option<&str>, minutes: u64) -> Result<(), String> {
+    let start = Instant::now();
+    loop {
+        let mut tests =
+            vec!["test", "--release", "--locked", "--package", "endless-gym-fuzz", "--test", "properties", "--"];
+        tests.extend(only.map(|target| ["--exact", target]).into_iter().flatten());
+        run(shell::cargo(&tests).env("PROPTEST_CASES", "5000").env_remove("PROPTEST_RNG_SEED"))?;
+        if start.elapsed() >= Duration::from_secs(60 * minutes) {
+            return Ok(());
+        }
+    }
+}
+
+/// Checks the models of the worker threads under loom. The flags apply to all crates, hence a target directory of their own.
+pub fn loom() -> Result<(), String> {
+    let mut cargo =
+        shell::cargo(&["test", "--locked", "--package", "endless-gym-core", "--lib", "loom_", "--target-dir"]);
+    cargo.arg(target()?.join("loom")).env("RUSTFLAGS", "--cfg loom --cfg crossbeam_loom");
+    run(cargo.env("CARGO_PROFILE_TEST_OPT_LEVEL", "2"))
+}
+
+/// The faults of the tests, always the same. A failure prints the command line that repeats it.
+pub fn test_faults() -> Result<(), String> {
+    faults("faults", &["--minutes", "2", "--seed", "1"].map(str::to_owned))
+}
+
+/// Builds the program of `tests/faults` and the engine that it starts, and runs one of its commands.
+pub fn faults(command: &str, arguments: &[String]) -> Result<(), String> {
+    cargo(&["build", "--locked", "--package", "endless-gym", "--package", "endless-gym-faults", "--bins"])?;
+    run(Command::new(target()?.join("debug/endless-gym-faults")).arg(command).args(arguments))
+}
+
+/// Environment steps that `benches/instructions.rs` counts.
+const STEPS: u64 = 250 * 16;
+
+/// Allowed deviation: processors of other kinds copy memory with other instructions.
+const MARGIN_PERCENT: u64 = 10;
+
+/// Counts the instructions of a step, which unlike times do not depend on the load of the machine, and compares them with the
+/// budgets; with `record`, writes the counts as the new budgets.
+pub fn instructions(record: bool) -> Result<(), String> {
+    let file = workspace().join("benches/instructions.txt");
+    let text = std::fs::read_to_string(&file).map_err(describe(&file))?;
+    let (mut recorded, mut failures) = (String::new(), Vec::new());
+    println!("{:30} {:>24} {:>8}", "environment", "instructions a step", "budget");
+    for line in text.lines() {
+        let (id, budget) = line.split_once(' ').unwrap_or((line, "0"));
+        let budget: u64 = budget.parse().map_err(describe(&file))?;
+        let count = count(id)? / STEPS;
+        println!("{id:30} {count:24} {budget:8}");
+        let _ = writeln!(recorded, "{id} {count}");
+        if count.abs_diff(budget) * 100 > budget * MARGIN_PERCENT {
+            failures.push(format!("{id}: {count} instructions a step, the budget is {budget} ± {MARGIN_PERCENT} %"));
+        }
+    }
+    if record {
+        return std::fs::write(&file, recorded).map_err(describe(&file));
+    }
+    if failures.is_empty() {
+        return Ok(());
+    }
+    failures.push("if the change is intended, record it: cargo xtask instructions --record".to_owned());
+    Err(failures.join("\n"))
+}
+
+/// Instructions of all counted steps of an environment, measured by callgrind.
+fn count(id: &str) -> Result<u64, String> {
+    const VALGRIND: &str =
+        "valgrind --tool=callgrind --callgrind-out-file=/dev/null --log-fd=1 --toggle-collect=instructions::steps";
+    // No `rep movsb` and `rep stosb` in the C library's `memcpy` and `memset`: callgrind counts every byte of them as an instruction.
+    const TUNABLES: &str = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
+    let runner = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
+    let mut bench =
+        shell::cargo(&["bench", "--locked", "--package", "endless-gym", "--bench", "instructions", "--", id]);
+    let printed = output(bench.env(runner, VALGRIND).env("GLIBC_TUNABLES", TUNABLES))?;
+    let collected = printed.lines().find_map(|line| Some(line.split_once("Collected :")?.1.trim()));
+    let count = collected.and_then(|count| count.parse().ok()).filter(|count| *count > 0);
+    count.ok_or_else(|| format!("callgrind counted no instructions of {id}\n{printed}"))
+}

@@ -1,0 +1,117 @@
+//! The steps of `cargo xtask test`, in the order in which they run.
+
+use std::process::Command;
+use std::time::Instant;
+
+use crate::shell::succeeds;
+use crate::{docs, files, python, release, rust, web};
+
+/// One part of the tests.
+pub struct Step {
+    pub name: &'static str,
+    /// Whether only `cargo xtask test --all` runs it.
+    rest: bool,
+    run: fn() -> Result<(), String>,
+    /// What it requires beside Rust, a linker and CPython.
+    needs: &'static [Need],
+}
+
+/// What a machine may lack.
+#[derive(Clone, Copy)]
+enum Need {
+    OriginalPython,
+    Valgrind,
+    Wasm,
+    Browser,
+}
+
+impl Need {
+    /// What is missing and how to get it, if it is.
+    fn missing(self) -> Option<&'static str> {
+        let (found, missing) = match self {
+            Need::OriginalPython => (
+                python::original().is_ok(),
+                "CPython 3.11; apt-get install python3.11 python3.11-venv, or pyenv install 3.11",
+            ),
+            Need::Valgrind => {
+                (succeeds(Command::new("valgrind").arg("--version")), "valgrind; apt-get install valgrind")
+            }
+            Need::Wasm => (web::Toolchain::find().is_some(), web::MISSING),
+            Need::Browser => {
+                (web::has_browser(), "Chromium; apt-get install chromium, or set CHROMIUM to the program's path")
+            }
+        };
+        (!found).then_some(missing)
+    }
+}
+
+const fn first(name: &'static str, run: fn() -> Result<(), String>) -> Step {
+    Step { name, rest: false, run, needs: &[] }
+}
+
+const fn rest(name: &'static str, needs: &'static [Need], run: fn() -> Result<(), String>) -> Step {
+    Step { name, rest: true, run, needs }
+}
+
+const STEPS: &[Step] = &[
+    first("format", rust::format),
+    first("rust-tests", rust::test),
+    first("clippy", rust::clippy),
+    first("import-cycles", python::cycles),
+    first("python-lint", python::lint),
+    first("wheel", || python::wheel("dev")),
+    first("python-tests", python::test),
+    rest("files", &[], files::check),
+    rest("rust-ignored", &[], rust::test_ignored),
+    rest("faults", &[], rust::test_faults),
+    rest("instructions", &[Need::Valgrind], || rust::instructions(false)),
+    rest("loom", &[], rust::loom),
+    rest("wasm", &[Need::Wasm], web::build_core),
+    rest("browser", &[Need::Wasm, Need::Browser], web::test),
+    rest("documentation", &[], || docs::build(false)),
+    rest("rust-original", &[Need::OriginalPython], rust::test_original),
+    rest("python-original", &[Need::OriginalPython], python::test_original),
+    rest("libraries", &[], python::test_libraries),
+    rest("agents", &[], python::test_agents),
+    rest("packages", &[], release::test),
+];
+
+/// Prints the names of all steps.
+pub fn list() -> Result<(), String> {
+    STEPS.iter().for_each(|step| println!("{}{}", step.name, if step.rest { " (--all)" } else { "" }));
+    Ok(())
+}
+
+/// Runs the steps with these names, or else the first ones, or with `all` the rest, up to the first failure unless `keep_going`.
+///
+/// A step whose needs the machine lacks is not run; where the environment variable CI is `true`, that is a failure.
+pub fn run(only: &[String], all: bool, keep_going: bool) -> Result<(), String> {
+    if let Some(unknown) = only.iter().find(|name| STEPS.iter().all(|step| step.name != *name)) {
+        return Err(format!("no step `{unknown}`; `cargo xtask test --list` lists them"));
+    }
+    let is_selected =
+        |step: &&Step| if only.is_empty() { step.rest == all } else { only.iter().any(|name| name == step.name) };
+    let mut report = String::new();
+    let mut failed = 0;
+    for step in STEPS.iter().filter(is_selected) {
+        println!("\n==> step {}", step.name);
+        let start = Instant::now();
+        let missing = step.needs.iter().find_map(|need| need.missing());
+        let result = missing.map_or_else(step.run, |missing| match std::env::var("CI").as_deref() {
+            Ok("true") => Err(format!("missing: {missing}")),
+            _ => Ok(()),
+        });
+        let text = match (&result, missing) {
+            (Ok(()), None) => "passed".to_owned(),
+            (Ok(()), Some(missing)) => format!("not run: {missing}"),
+            (Err(message), _) => format!("FAILED: {message}"),
+        };
+        report += &format!("{:16} {:>7.1} s  {text}\n", step.name, start.elapsed().as_secs_f64());
+        failed += usize::from(result.is_err());
+        if failed > 0 && !keep_going {
+            break;
+        }
+    }
+    println!("\n{report}");
+    if failed == 0 { Ok(()) } else { Err(format!("{failed} failed; repeat one with `cargo xtask test --only STEP`")) }
+}
