@@ -52,6 +52,8 @@ def flat(tree: str) -> list[list[str]]:
 def rust_imports(folder: Path) -> dict[Module, set[Module]]:
     """The modules of a crate that each of its modules names, deepest first; a folder's `mod.rs` is a module too."""
     files = dict(rust_files(folder))
+    # With folders that have no file of their own, but a module in the root.
+    modules = {module[:depth] for module in files for depth in range(len(module) + 1)}
     found: dict[Module, set[Module]] = {}
     for module, text in files.items():
         paths = [path for tree in USE.findall(text) for path in flat(tree)]
@@ -64,13 +66,14 @@ def rust_imports(folder: Path) -> dict[Module, set[Module]]:
                 target = module[:-1] if first == "super" else module
                 while rest and rest[0] == "super":
                     target, rest = target[:-1], rest[1:]
-            elif (*module, first) in files:  # a module names its children without a prefix
+            elif (*module, first) in modules:  # a module names its children without a prefix
                 target = (*module, first)
             else:
                 continue
-            while rest and (*target, rest[0]) in files:
+            while rest and (*target, rest[0]) in modules:
                 target, rest = (*target, rest[0]), rest[1:]
-            found[module].add(target)
+            if target in files:
+                found[module].add(target)
         found[module].discard(module)
     return found
 

@@ -1,4 +1,4 @@
-//! The page of a running engine in a real browser. `cargo xtask stage web` runs these tests.
+//! The page of a running engine in a real browser. `cargo xtask test --only browser` runs these tests.
 
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -12,7 +12,7 @@ fn the_page_opens_at_an_episode() {
     let mut command = room.endless(&arguments);
     command.env("BROWSER", &browser);
     if !endless_gym_page::is_built() {
-        // Only release builds have it; `cargo xtask packages` tests them.
+        // Only release builds have it; `cargo xtask test --only packages` tests them.
         let output = command.output().unwrap();
         assert!(!output.status.success());
         assert!(text(&output.stderr).contains("run `cargo xtask web`"), "{}", text(&output.stderr));

@@ -1,4 +1,4 @@
-//! The page in a real browser. `cargo xtask stage web` builds the page and runs these tests.
+//! The page in a real browser. `cargo xtask test --only browser` builds the page and runs these tests.
 
 mod agents;
 #[path = "../../../../tests/integration/support/chromium.rs"]

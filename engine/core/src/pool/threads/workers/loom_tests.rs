@@ -1,5 +1,5 @@
 //! The worker threads under loom: every interleaving up to a number of preemptions, and every value that an atomic load may
-//! return by the memory model. `cargo xtask loom` runs these models.
+//! return by the memory model. `cargo xtask test --only loom` runs these models.
 //!
 //! A worker that sleeps through a call for good, or does not end after the pool of threads is dropped, is a deadlock, which loom
 //! reports. A write of a worker that is not visible when the call returns is a causality violation.
