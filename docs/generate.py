@@ -125,13 +125,16 @@ def ground_truth(name: str) -> str:
 
 
 def features(name: str) -> str:
-    """Columns of the feature observation; those that differ only in numbers, such as the places of a grid, share a row."""
+    """Columns of the feature observation; those of the same meaning share a row."""
 
     def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
         names: dict[tuple[str, str], list[str]] = {}
         for each in spec["features"]:
             names.setdefault((re.sub(r"\d+", "{}", each["name"]), each["description"]), []).append(each["name"])
-        return [(f"`{ranges(template, same)}`", meaning) for (template, meaning), same in names.items()]
+        meanings: dict[str, list[str]] = {}
+        for (template, meaning), same in names.items():
+            meanings.setdefault(meaning, []).append(f"`{ranges(template, same)}`")
+        return [(", ".join(each), meaning) for meaning, each in meanings.items()]
 
     return table(["ids", "feature", "meaning"], merged(family(name), rows))
 
