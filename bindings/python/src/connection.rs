@@ -18,7 +18,7 @@ use crate::arrays::{self, Owner};
 use crate::{errors, logs};
 
 /// Longest time between two runs of Python's signal handlers, among them that of Ctrl-C.
-pub const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The steps of a group in the engine that is connected and in the one that was lost, and what became of the last request.
 type GroupFound = (Option<u64>, Option<u64>, &'static str);
@@ -179,30 +179,15 @@ impl Connection {
 }
 
 impl Connection {
-    /// Waits for an answer without the interpreter's lock, and runs Python's signal handlers meanwhile.
+    /// Waits for an answer of the engine; see [`wait`].
     fn wait<T: Send>(
         &mut self,
         py: Python<'_>,
         mut answer: impl FnMut(&mut Trainer, Duration) -> Result<T, ServiceError> + Send,
     ) -> PyResult<T> {
-        let (timeout, start) = (arguments::timeout(self.timeout)?, Instant::now());
+        let timeout = arguments::timeout(self.timeout)?;
         let trainer = self.trainer()?;
-        loop {
-            let slice = timeout.saturating_sub(start.elapsed()).min(SIGNAL_INTERVAL);
-            match py.detach(|| answer(trainer, slice)) {
-                Ok(answer) => {
-                    logs::flush(py)?;
-                    return Ok(answer);
-                }
-                Err(ServiceError::TimedOut { service, activity, .. }) => {
-                    py.check_signals()?;
-                    if start.elapsed() >= timeout {
-                        return Err(errors::service(ServiceError::TimedOut { service, waited: timeout, activity }));
-                    }
-                }
-                Err(error) => return Err(errors::service(error)),
-            }
-        }
+        wait(py, timeout, |slice| answer(trainer, slice))
     }
 
     /// The trainer, unless the connection is closed or belongs to another process.
@@ -214,6 +199,32 @@ impl Connection {
         Err(PyRuntimeError::new_err(
             "this connection belongs to the process that this process was forked from; connect to another engine in the child",
         ))
+    }
+}
+
+/// Calls `answer` with parts of the timeout until it returns something else than a timeout, without the interpreter's lock, and runs
+/// Python's signal handlers between the calls.
+pub fn wait<T: Send>(
+    py: Python<'_>,
+    timeout: Duration,
+    mut answer: impl FnMut(Duration) -> Result<T, ServiceError> + Send,
+) -> PyResult<T> {
+    let start = Instant::now();
+    loop {
+        let slice = timeout.saturating_sub(start.elapsed()).min(SIGNAL_INTERVAL);
+        match py.detach(|| answer(slice)) {
+            Ok(answer) => {
+                logs::flush(py)?;
+                return Ok(answer);
+            }
+            Err(ServiceError::TimedOut { service, activity, .. }) => {
+                py.check_signals()?;
+                if start.elapsed() >= timeout {
+                    return Err(errors::service(ServiceError::TimedOut { service, waited: timeout, activity }));
+                }
+            }
+            Err(error) => return Err(errors::service(error)),
+        }
     }
 }
 

@@ -1,14 +1,14 @@
 //! Batches of an engine that another process trains with.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use endless_gym::service::{ConnectConfig, Observers, ServiceError};
+use endless_gym::service::{ConnectConfig, Observers};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-use crate::connection::{Lease, SIGNAL_INTERVAL, wait_for_engine};
-use crate::{arguments, arrays, errors, logs};
+use crate::connection::{Lease, wait, wait_for_engine};
+use crate::{arguments, arrays, logs};
 
 /// A batch: the group, its step, the batches missed before it, and its arrays.
 type Watched<'py> = (usize, u64, u64, Bound<'py, PyTuple>);
@@ -49,21 +49,8 @@ impl Observer {
             ));
         }
         let timeout = timeout.map_or(Ok(Duration::MAX), arguments::timeout)?;
-        let (start, observers) = (Instant::now(), &mut self.observers);
-        let observed = loop {
-            let slice = timeout.saturating_sub(start.elapsed()).min(SIGNAL_INTERVAL);
-            match py.detach(|| observers.next(slice)) {
-                Ok(observed) => break observed,
-                Err(ServiceError::TimedOut { service, activity, .. }) => {
-                    py.check_signals()?;
-                    if start.elapsed() >= timeout {
-                        return Err(errors::service(ServiceError::TimedOut { service, waited: timeout, activity }));
-                    }
-                }
-                Err(error) => return Err(errors::service(error)),
-            }
-        };
-        logs::flush(py)?;
+        let observers = &mut self.observers;
+        let observed = wait(py, timeout, |slice| observers.next(slice))?;
         let (group, step) = (observed.lease.group(), observed.lease.step());
         let lease = Bound::new(py, Lease(observed.lease))?;
         let arrays = arrays::sections(&lease, lease.get().0.batch().layout())?;
