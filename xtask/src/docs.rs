@@ -65,16 +65,5 @@ fn environments() -> Result<String, String> {
 
 /// Copies a folder with everything in it.
 fn copy(from: &Path, to: &Path) -> Result<(), String> {
-    let failed = |error: std::io::Error| format!("{}: {error}", from.display());
-    fs::create_dir_all(to).map_err(failed)?;
-    for entry in fs::read_dir(from).map_err(failed)? {
-        let entry = entry.map_err(failed)?;
-        let target = to.join(entry.file_name());
-        if entry.path().is_dir() {
-            copy(&entry.path(), &target)?;
-        } else {
-            fs::copy(entry.path(), target).map_err(failed)?;
-        }
-    }
-    Ok(())
+    run(Command::new("cp").args(["--recursive", "--no-target-directory"]).arg(from).arg(to))
 }

@@ -11,7 +11,7 @@ use crate::shell::{describe, files_below, output, recreate, run, target, workspa
 const UV: &str = "uv==0.13.9";
 
 /// The minor version of the original: pygame 2.4.0, which it requires, has wheels up to CPython 3.11.
-const ORIGINAL: u32 = 11;
+pub const ORIGINAL: u32 = 11;
 
 /// The versions of CPython 3 that the package supports and its tests know.
 pub const SUPPORTED: std::ops::RangeInclusive<u32> = 10..=14;

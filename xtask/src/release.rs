@@ -9,10 +9,10 @@ use crate::shell::{
 };
 use crate::{python, web};
 
-/// The maturin of the tests, and what inspects wheels. Zig links against any version of the C library.
-const TOOLS: [&str; 4] = ["auditwheel==6.8.2", "maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"];
+/// The maturin of the tests, and what unpacks wheels. Zig links against any version of the C library.
+const TOOLS: [&str; 3] = ["maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"];
 
-/// The oldest C library that the wheel supports.
+/// The oldest C library that the wheel supports; maturin fails where a symbol is newer.
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, in the order in which they depend on each other.
@@ -98,8 +98,7 @@ fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
         fs::write(file, text.replace(&source.display().to_string(), "/endless-gym")).map_err(describe(file))?;
     }
     check_contents(&unpacked)?;
-    run(wheel(&["pack", "--dest-dir"]).arg(folder).arg(&unpacked))?;
-    check_tag(tools, &only_file(folder, ".whl")?)
+    run(wheel(&["pack", "--dest-dir"]).arg(folder).arg(&unpacked))
 }
 
 /// Fails if a licence is missing, or if a file names a folder of this machine.
@@ -118,22 +117,6 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
         }
     }
     Ok(())
-}
-
-/// Fails if auditwheel finds symbols that are newer than the wheel's tag permits, or if the tag is not for all CPythons from 3.10.
-fn check_tag(tools: &Path, wheel: &Path) -> Result<(), String> {
-    let name = wheel.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let expected = format!("{PLATFORM}_{}", std::env::consts::ARCH);
-    if !name.contains("-cp310-abi3-") || !name.contains(&expected) {
-        return Err(format!("the wheel's name must contain cp310-abi3 and {expected}, got {name}"));
-    }
-    let text = output(Command::new(tools.join("bin/auditwheel")).args(["show", "--json"]).arg(wheel))?;
-    let overall = text.lines().find(|line| line.contains("\"overall_tag\"")).unwrap_or_default();
-    if overall.contains(&expected) {
-        Ok(())
-    } else {
-        Err(format!("auditwheel must find {expected}, as in {name}, got\n{text}"))
-    }
 }
 
 /// Packages the crates and builds each from its package, against the packages of the others.

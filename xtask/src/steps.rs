@@ -17,33 +17,23 @@ pub struct Step {
 }
 
 /// What a machine may lack.
-#[derive(Clone, Copy)]
-enum Need {
-    OriginalPython,
-    Valgrind,
-    Wasm,
-    Browser,
+struct Need {
+    is_met: fn() -> bool,
+    /// What it is and how to get it.
+    what: &'static str,
 }
 
-impl Need {
-    /// What is missing and how to get it, if it is.
-    fn missing(self) -> Option<&'static str> {
-        let (found, missing) = match self {
-            Need::OriginalPython => (
-                python::original().is_ok(),
-                "CPython 3.11; apt-get install python3.11 python3.11-venv, or pyenv install 3.11",
-            ),
-            Need::Valgrind => {
-                (succeeds(Command::new("valgrind").arg("--version")), "valgrind; apt-get install valgrind")
-            }
-            Need::Wasm => (web::Toolchain::find().is_some(), web::MISSING),
-            Need::Browser => {
-                (web::has_browser(), "Chromium; apt-get install chromium, or set CHROMIUM to the program's path")
-            }
-        };
-        (!found).then_some(missing)
-    }
-}
+const ORIGINAL_PYTHON: Need = Need {
+    is_met: || python::interpreter(python::ORIGINAL).is_some(),
+    what: "CPython 3.11; apt-get install python3.11 python3.11-venv, or pyenv install 3.11",
+};
+const VALGRIND: Need =
+    Need { is_met: || succeeds(Command::new("valgrind").arg("--version")), what: "valgrind; apt-get install valgrind" };
+const WASM: Need = Need { is_met: || web::Toolchain::find().is_some(), what: web::MISSING };
+const BROWSER: Need = Need {
+    is_met: web::has_browser,
+    what: "Chromium; apt-get install chromium, or set CHROMIUM to the program's path",
+};
 
 const fn first(name: &'static str, run: fn() -> Result<(), String>) -> Step {
     Step { name, rest: false, run, needs: &[] }
@@ -64,13 +54,13 @@ const STEPS: &[Step] = &[
     rest("files", &[], files::check),
     rest("rust-ignored", &[], rust::test_ignored),
     rest("faults", &[], rust::test_faults),
-    rest("instructions", &[Need::Valgrind], || rust::instructions(false)),
+    rest("instructions", &[VALGRIND], || rust::instructions(false)),
     rest("loom", &[], rust::loom),
-    rest("wasm", &[Need::Wasm], web::build_core),
-    rest("browser", &[Need::Wasm, Need::Browser], web::test),
+    rest("wasm", &[WASM], web::build_core),
+    rest("browser", &[WASM, BROWSER], web::test),
     rest("documentation", &[], || docs::build(false)),
-    rest("rust-original", &[Need::OriginalPython], rust::test_original),
-    rest("python-original", &[Need::OriginalPython], python::test_original),
+    rest("rust-original", &[ORIGINAL_PYTHON], rust::test_original),
+    rest("python-original", &[ORIGINAL_PYTHON], python::test_original),
     rest("libraries", &[], python::test_libraries),
     rest("agents", &[], python::test_agents),
     rest("packages", &[], release::test),
@@ -96,7 +86,7 @@ pub fn run(only: &[String], all: bool, keep_going: bool) -> Result<(), String> {
     for step in STEPS.iter().filter(is_selected) {
         println!("\n==> step {}", step.name);
         let start = Instant::now();
-        let missing = step.needs.iter().find_map(|need| need.missing());
+        let missing = step.needs.iter().find(|need| !(need.is_met)()).map(|need| need.what);
         let result = missing.map_or_else(step.run, |missing| match std::env::var("CI").as_deref() {
             Ok("true") => Err(format!("missing: {missing}")),
             _ => Ok(()),
