@@ -1,7 +1,7 @@
 //! The `endless` program, as a user runs it: real processes, their output, exit status and what they leave behind.
 
 use std::fs::File;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -210,6 +210,36 @@ fn serve_serves_until_a_signal_and_leaves_nothing() {
         );
         assert_eq!(room.segments(), [""; 0]);
     }
+}
+
+#[test]
+fn serve_reads_its_configuration_as_json_from_a_file_or_standard_input() {
+    let room = Room::new("config");
+    let config =
+        r#"{"service": "one", "pool": {"id": "MysteryPath-Grid-v0", "num_envs": 3}, "groups": 2, "threads": 1}"#;
+    let file = room.config("one").namespace.root().with_extension("json");
+    std::fs::write(&file, config).unwrap();
+    let path = file.to_str().unwrap();
+    for arguments in [vec!["serve", "--child", "--config", path], vec!["serve", "--child", "--config=-"]] {
+        let mut engine = room.endless(&arguments).stdin(Stdio::piped()).spawn().unwrap();
+        let mut stdin = engine.stdin.take().unwrap();
+        if arguments.contains(&"--config=-") {
+            stdin.write_all(config.as_bytes()).unwrap();
+        }
+        let trainer = room.connect("one");
+        let served = trainer.specification();
+        assert_eq!((&*served.id, served.num_envs, served.groups), ("MysteryPath-Grid-v0", 3, 2));
+        drop(trainer);
+        drop(stdin);
+        assert!(wait(&mut engine).success());
+    }
+    std::fs::write(&file, config.replace("threads", "thread")).unwrap();
+    let error = text(&room.run(&["serve", "--config", path]).stderr).to_owned();
+    assert!(error.starts_with(&format!("endless: --config {path}: unknown field `thread`")), "{error}");
+    for option in ["--num-envs=3", "--seed=1", "--no-frames"] {
+        assert_eq!(room.run(&["serve", "--config", path, option]).status.code(), Some(2), "{option}");
+    }
+    std::fs::remove_file(file).unwrap();
 }
 
 #[test]

@@ -162,7 +162,7 @@ fn a_thousand_spotlights_fit() {
     let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
     let options = ResetOptions::Shared(options.as_object().unwrap().clone());
     let pool = PoolConfig { options, features: true, frames: None, ..PoolConfig::new("SearingSpotlights-v0", 1) };
-    let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+    let config = EngineConfig::new("gym", pool, 1);
     let mut engine = Engine::new(&EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {

@@ -7,17 +7,17 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import weakref
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from typing import Any
 
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.configuration import AutoresetMode, AutoresetName, Options, PoolConfig, checked_arguments
 from endless_gym.create import connect
 from endless_gym.engine_log import EngineLog, level
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
@@ -33,37 +33,42 @@ _numbers = count()
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
+@dataclass(frozen=True)
+class EngineConfig:
+    """The configuration of an engine: the JSON object that the engine's `EngineConfig` reads, field by field."""
+
+    service: str
+    #: The environments of one group, with the options of all groups.
+    pool: PoolConfig
+    groups: int
+    threads: int
+    batches_held: int
+    #: `{"path": ..., "every_seconds": ..., "resume": ...}`, or `None` for none.
+    checkpoint: Mapping[str, Any] | None
+
+    def json(self) -> str:
+        """The configuration as JSON text."""
+        return json_text(asdict(self))
+
+
 class EngineProcess:
     """A child process that serves environments. It stops by `end`, when nothing refers to this object, and with this process."""
 
-    def __init__(self, arguments: list[str], long_arguments: Sequence[str] = ()) -> None:
-        """Start the process.
-
-        Args:
-            arguments: Arguments of `endless serve`.
-            long_arguments: Further ones, which the process reads from a file: a command line has a limited length.
-        """
-        self.service = f"python-{os.getpid()}-{next(_numbers)}"
-        with tempfile.TemporaryFile() as file:
-            file.write("".join(f"{argument}\n" for argument in long_arguments).encode())
-            file.flush()
-            self._process = subprocess.Popen(
-                [
-                    *program(),
-                    *level(),
-                    "serve",
-                    f"--child={os.getpid()}",
-                    "--service",
-                    self.service,
-                    *arguments,
-                    f"@/dev/fd/{file.fileno()}",
-                ],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                pass_fds=[file.fileno()],
-                **_OWN_GROUP,
-            )
+    def __init__(self, config: EngineConfig) -> None:
+        """Start the process, which reads its configuration from its standard input."""
+        self.service = config.service
+        self._process = subprocess.Popen(
+            [*program(), *level(), "serve", f"--child={os.getpid()}", "--config=-"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            **_OWN_GROUP,
+        )
+        if self._process.stdin is not None:
+            # A process that has ended is reported by `connect`, with its message.
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.write(config.json().encode())
+                self._process.stdin.flush()
         self._log = EngineLog(self._process)
         # Also called at the exit of the interpreter. It must not refer to this object, which would then never be deleted.
         self._end = weakref.finalize(self, _end, self._process, self._log, os.getpid())
@@ -203,45 +208,25 @@ def serve(
     timeout = checked_timeout(timeout)
     checked_view(render_mode, view, VECTOR_MODES)
     validate_episode_options(episode_options)
-    pool = given.pools[0]
-    arguments: dict[str, Any] = {
-        "--env": pool.id,
-        "--num-envs": pool.num_envs,
-        "--threads": given.num_threads,
-        "--groups": len(given.pools),
-        "--batches-held": min(
+    if checkpoint is None and (checkpoint_every is not None or resume):
+        raise ValueError("checkpoint must name a file if checkpoint_every or resume is given")
+    saved: dict[str, Any] | None = None
+    if checkpoint is not None:
+        every = None if checkpoint_every is None else checked_timeout(checkpoint_every)
+        saved = {"path": os.fspath(checkpoint), "every_seconds": every, "resume": bool(resume)}
+    given_options = dict(options or {}) if options is None or isinstance(options, Mapping) else [*map(dict, options)]
+    config = EngineConfig(
+        service=f"python-{os.getpid()}-{next(_numbers)}",
+        pool=replace(given.pools[0], options=given_options),
+        groups=len(given.pools),
+        threads=given.num_threads,
+        batches_held=min(
             integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
             _native.MAX_BATCHES_HELD,
         ),
-        "--autoreset": pool.autoreset,
-        "--first-env": pool.first_env,
-        "--total-envs": pool.total_envs,
-    }
-    ((kind, source),) = pool.seeding.items()
-    if kind != "list" and source["seed"] is not None:
-        arguments["--seed"] = source["seed"]
-    if kind == "range":
-        arguments["--seed-range"] = f"{source['start']}..{source['end']}:{source['step']}"
-    if checkpoint is None and (checkpoint_every is not None or resume):
-        raise ValueError("checkpoint must name a file if checkpoint_every or resume is given")
-    if checkpoint is not None:
-        arguments["--checkpoint"] = os.fspath(checkpoint)
-    if checkpoint_every is not None:
-        # In whole nanoseconds, as the program reads durations.
-        arguments["--every"] = f"{round(checked_timeout(checkpoint_every) * 1e9)}ns"
-    command = [f"{name}={value}" for name, value in arguments.items()]
-    command += ["--final-observation"] if given.autoreset is AutoresetMode.SAME_STEP else []
-    command += ["--features"] if pool.features else []
-    command += ["--independent-episodes"] if pool.independent_episodes else []
-    command += given.frames.command() if given.frames else ["--no-frames"]
-    if options is None or isinstance(options, Mapping):
-        long = [f"--option={name}={json_text(value)}" for name, value in (options or {}).items()]
-    else:
-        long = [f"--env-options={json_text(dict(each))}" for each in options]
-    if kind == "list":
-        long.append(f"--seed-list={','.join(map(str, source))}")
-    command += ["--resume"] if resume else []
-    engine = EngineProcess(command, long)
+        checkpoint=saved,
+    )
+    engine = EngineProcess(config)
     try:
         return engine.connect(
             timeout,

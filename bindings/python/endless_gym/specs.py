@@ -60,19 +60,6 @@ class Frames:
         order = {name: bool(getattr(self, name)) for name in ("grayscale", "channels_first", "row_major")}
         return {"format": order, "stack": integer("stack", self.stack)}
 
-    def command(self) -> list[str]:
-        """The arguments of `endless serve`.
-
-        Raises:
-            ValueError: The stack is negative.
-        """
-        flags = {
-            "--grayscale": self.grayscale,
-            "--channels-first": self.channels_first,
-            "--row-major": self.row_major,
-        }
-        return [*(flag for flag, given in flags.items() if given), f"--frame-stack={integer('stack', self.stack)}"]
-
     @staticmethod
     def from_specification(described: dict[str, Any] | None) -> Frames | None:
         """The format of the frames in an engine's specification; `None` without frames."""

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use endless_gym_core::batch::{BLOCK_BYTES, Batch, BatchBuffer};
 use endless_gym_core::envs::{self, DEFAULT_ENV_ID, EnvSpec};
 use endless_gym_core::pool::{Pool, ResetRequest, Threads};
+use endless_gym_service::EngineConfig;
 use serde::Serialize;
 
 use super::engine_process::EngineProcess;
@@ -252,13 +253,8 @@ fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &Atomic
 }
 
 fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &AtomicBool) -> Result<Round, Failure> {
-    let mut arguments = vec![
-        format!("--env={}", spec.id),
-        format!("--num-envs={}", args.num_envs),
-        format!("--threads={}", args.threads),
-    ];
-    arguments.extend(args.environment.arguments());
-    let mut engine = EngineProcess::start(&arguments)?;
+    let pool = args.environment.configure(spec.id, args.num_envs)?;
+    let mut engine = EngineProcess::start(EngineConfig::new("endless", pool, args.threads))?;
     let mut trainer = engine.connect(stop)?;
     let mut actions = Actions::new(spec, args.num_envs);
     trainer.reset(0, ResetRequest::All)?;

@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use endless_gym_core::envs::{self, EnvSpec, Family};
-use endless_gym_core::pool::{Autoreset, Experts, ResetRequest};
+use endless_gym_core::pool::{Autoreset, Experts, PoolConfig, ResetRequest};
+use endless_gym_service::EngineConfig;
 use serde_json::{Map, Value as Json, json};
 
 use super::engine_process::EngineProcess;
@@ -84,18 +85,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         (Family::SearingSpotlights(_), Policy::Expert) => 16,
         _ => 512,
     });
-    let mut arguments: Vec<String> = [
-        ("--env", args.id.clone()),
-        ("--num-envs", num_envs.to_string()),
-        ("--groups", args.groups.to_string()),
-        ("--threads", args.threads.to_string()),
-    ]
-    .into_iter()
-    .flat_map(|(name, value)| [name.to_owned(), value])
-    .collect();
-    arguments.push("--features".to_owned());
-    arguments.extend(args.environment.arguments());
-    let mut engine = EngineProcess::start(&arguments)?;
+    let pool = PoolConfig { features: true, ..args.environment.configure(&args.id, num_envs)? };
+    let config = EngineConfig { groups: args.groups, ..EngineConfig::new("endless", pool, args.threads) };
+    let mut engine = EngineProcess::start(config)?;
     let mut trainer = engine.connect(stop)?;
     let _view = if args.view { Some(Beside::start(engine.service(), args.open)?) } else { None };
 

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, ServiceError, Trainer};
+use endless_gym_service::{ConnectConfig, EngineConfig, ServiceError, Trainer};
 
 use super::failure::Failure;
 
@@ -42,8 +42,8 @@ pub struct EngineProcess {
 }
 
 impl EngineProcess {
-    /// Starts `endless serve` with these arguments. The engine's name contains the id of this process.
-    pub fn start(arguments: &[String]) -> Result<Self, Failure> {
+    /// Starts `endless serve` with this configuration. The engine's name contains the id of this process.
+    pub fn start(config: EngineConfig) -> Result<Self, Failure> {
         let service = format!("endless-{}", std::process::id());
         let (program, first) = EXECUTABLE
             .get()
@@ -51,8 +51,13 @@ impl EngineProcess {
             .ok_or("the command that starts an engine is empty")?;
         let mut command = Command::new(program);
         let child = format!("--child={}", std::process::id());
-        command.args(first).args(["serve", &child, "--service", &service]).args(arguments);
-        Self::spawn(command, ConnectConfig::new(&service))
+        command.args(first).args(["serve", &child, "--config", "-"]);
+        let mut engine = Self::spawn(command, ConnectConfig::new(&service))?;
+        if let Some(stdin) = &mut engine.child.stdin {
+            // An error means that the engine has ended, which `connect` reports with its message.
+            let _ = serde_json::to_writer(stdin, &EngineConfig { service, ..config });
+        }
+        Ok(engine)
     }
 
     fn spawn(mut command: Command, config: ConnectConfig) -> Result<Self, Failure> {

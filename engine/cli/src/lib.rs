@@ -1,6 +1,5 @@
 //! The command line program `endless`, as a library: the binary of the crate `endless-gym` and the Python package both run [`main`].
 
-mod argument_file;
 mod bench;
 mod demo;
 mod engine_process;
@@ -38,7 +37,7 @@ use failure::Failure;
 
 /// Memory Gym environments, bit-exact to the original, served in shared memory.
 ///
-/// Without a command, `endless` runs `endless demo`. An argument `@FILE` stands for the lines of that file, each an argument. The environment variable ENDLESS_GYM_ROOT names the directory in which engines
+/// Without a command, `endless` runs `endless demo`. The environment variable ENDLESS_GYM_ROOT names the directory in which engines
 /// and trainers find each other [default: /tmp/endless-gym-UID, with the number of the user].
 #[derive(Parser)]
 #[command(name = "endless", version, about, max_term_width = 110)]
@@ -87,7 +86,7 @@ const FAILURE: u8 = 1;
 
 /// Runs the program `endless` and returns its exit status.
 ///
-/// `arguments` are the arguments without the program's name; one of the form `@FILE` stands for the lines of that file. `executable` is the command, with its first arguments, that starts the
+/// `arguments` are the arguments without the program's name. `executable` is the command, with its first arguments, that starts the
 /// program in a new process; `demo` and `bench` start an engine with it. Only the first call of a process sets it.
 ///
 /// The status is 0 after success; 1 after an error, which is printed to standard error as one line, and if `verify` finds a
@@ -100,13 +99,7 @@ const FAILURE: u8 = 1;
 /// same time in one process: a signal, and the start of one of them, affects both.
 pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
-    let arguments = match argument_file::expand(std::iter::once("endless".into()).chain(arguments)) {
-        Ok(arguments) => arguments,
-        Err(error) => {
-            output::print_error(&*error);
-            return FAILURE;
-        }
-    };
+    let arguments = std::iter::once("endless".into()).chain(arguments);
     match Cli::try_parse_from(arguments).map_err(Failure::from).and_then(run) {
         Ok(true) => 0,
         Ok(false) => FAILURE,

@@ -92,22 +92,6 @@ fn seed_range(text: &str) -> Result<(u64, u64, u64), String> {
 }
 
 impl EnvironmentArgs {
-    /// These arguments as text, for another process.
-    pub fn arguments(&self) -> Vec<String> {
-        let mut arguments: Vec<String> = self.options.iter().map(|option| format!("--option={option}")).collect();
-        arguments.extend(self.env_options.iter().map(|options| format!("--env-options={options}")));
-        arguments.extend(self.seed.map(|seed| format!("--seed={seed}")));
-        arguments.extend(self.seed_range.map(|(start, end, step)| format!("--seed-range={start}..{end}:{step}")));
-        if !self.seed_list.is_empty() {
-            let seeds: Vec<String> = self.seed_list.iter().map(u64::to_string).collect();
-            arguments.push(format!("--seed-list={}", seeds.join(",")));
-        }
-        arguments.push(format!("--first-env={}", self.first_env));
-        arguments.extend(self.total_envs.map(|total| format!("--total-envs={total}")));
-        arguments.extend(self.independent_episodes.then(|| "--independent-episodes".to_owned()));
-        arguments
-    }
-
     /// The configuration of a pool with these arguments.
     pub fn configure(&self, id: &str, num_envs: usize) -> Result<PoolConfig, Failure> {
         let options = parameters(&self.options)?;
@@ -153,33 +137,9 @@ pub fn seconds(name: &str, given: f64) -> Result<Duration, Failure> {
 
 #[cfg(test)]
 mod tests {
-    use clap::{Arg, Command, Parser};
+    use clap::{Arg, Command};
 
     use super::*;
-
-    #[test]
-    fn arguments_for_another_process_parse_to_the_same() {
-        #[derive(clap::Parser)]
-        struct Arguments {
-            #[command(flatten)]
-            environment: EnvironmentArgs,
-        }
-        let given = [
-            "",
-            "--option=-x=1",
-            "--option=arena_size=6",
-            "--seed=3",
-            "--seed-range=0..9:2",
-            "--independent-episodes",
-            "--first-env=4",
-            "--total-envs=9",
-        ];
-        let parse = |arguments: &[String]| Arguments::try_parse_from(arguments).map(|parsed| parsed.environment);
-        let given = parse(&given.map(str::to_owned)).unwrap();
-        let passed = parse(&[vec![String::new()], given.arguments()].concat()).unwrap();
-        assert_eq!(format!("{passed:?}"), format!("{given:?}"));
-        assert_eq!(passed.options, ["-x=1", "arena_size=6"]);
-    }
 
     #[test]
     fn autoreset_modes_are_given_by_their_names() {

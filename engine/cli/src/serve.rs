@@ -1,12 +1,13 @@
 //! `endless serve`.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use endless_gym_core::envs::DEFAULT_ENV_ID;
-use endless_gym_core::pool::{Autoreset, PoolConfig, Threads};
-use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, Namespace, ServiceError};
+use endless_gym_core::pool::{Autoreset, PoolConfig};
+use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, ServiceError};
+use serde::Deserialize;
 
 use super::failure::Failure;
 use super::metrics::Metrics;
@@ -14,9 +15,43 @@ use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_val
 use super::output::{grouped, print, print_error};
 use super::stop;
 
+/// The arguments that give a configuration, or their groups.
+const CONFIGURATION: [&str; 12] = [
+    "EnvironmentArgs",
+    "FrameArgs",
+    "id",
+    "num_envs",
+    "threads",
+    "groups",
+    "service",
+    "autoreset",
+    "final_observation",
+    "features",
+    "batches_held",
+    "checkpoint",
+];
+
 /// Arguments of `endless serve`.
 #[derive(clap::Args)]
 pub struct Args {
+    /// Read the engine's configuration as JSON from FILE, or from standard input for `-` [default: the options below].
+    #[arg(long, value_name = "FILE", conflicts_with_all = CONFIGURATION)]
+    config: Option<PathBuf>,
+    #[command(flatten)]
+    engine: EngineArgs,
+    /// Serve metrics for Prometheus at http://ADDRESS/metrics, such as 127.0.0.1:9100; port 0 takes any free port.
+    #[arg(long, value_name = "ADDRESS")]
+    metrics: Option<SocketAddr>,
+    /// Print nothing, and stop when standard input closes or gives a byte: for an engine that is a child process. With the id of the
+    /// parent process, also stop when that process ends.
+    #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
+    #[expect(clippy::option_option, reason = "clap's form of an option with an optional value")]
+    child: Option<Option<u32>>,
+}
+
+/// The engine's configuration.
+#[derive(clap::Args)]
+struct EngineArgs {
     /// Environment id; `endless list` lists them.
     #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
     id: String,
@@ -57,50 +92,53 @@ pub struct Args {
     /// Continue from FILE, identically, if it exists. Without this, a FILE that exists is an error.
     #[arg(long, requires = "checkpoint")]
     resume: bool,
-    /// Serve metrics for Prometheus at http://ADDRESS/metrics, such as 127.0.0.1:9100; port 0 takes any free port.
-    #[arg(long, value_name = "ADDRESS")]
-    metrics: Option<SocketAddr>,
-    /// Print nothing, and stop when standard input closes or gives a byte: for an engine that is a child process. With the id of the
-    /// parent process, also stop when that process ends.
-    #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
-    #[expect(clippy::option_option, reason = "clap's form of an option with an optional value")]
-    child: Option<Option<u32>>,
+}
+
+impl EngineArgs {
+    fn configure(&self) -> Result<EngineConfig, Failure> {
+        let pool = PoolConfig {
+            autoreset: self.autoreset,
+            final_observation: self.final_observation,
+            frames: self.frames.frames(),
+            features: self.features,
+            ..self.environment.configure(&self.id, self.num_envs)?
+        };
+        let checkpoint =
+            self.checkpoint.clone().map(|path| CheckpointConfig { path, every: self.every, resume: self.resume });
+        let (groups, batches_held) = (self.groups, self.batches_held);
+        Ok(EngineConfig { checkpoint, groups, batches_held, ..EngineConfig::new(&self.service, pool, self.threads) })
+    }
+}
+
+/// Reads a configuration from a file, or from standard input for `-`. There, it ends with its last bracket: what follows is for
+/// `--child`.
+fn read(path: &Path) -> Result<EngineConfig, Failure> {
+    let config = if path == Path::new("-") {
+        EngineConfig::deserialize(&mut serde_json::Deserializer::from_reader(std::io::stdin()))
+    } else {
+        let text = std::fs::read(path).map_err(|e| format!("--config {}: {e}", path.display()))?;
+        serde_json::from_slice(&text)
+    };
+    Ok(config.map_err(|e| format!("--config {}: {e}", path.display()))?)
 }
 
 /// Runs `endless serve`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let stop = stop::on_signal()?;
+    let mut config = args.config.as_deref().map_or_else(|| args.engine.configure(), read)?;
     if let Some(parent) = args.child {
         stop::with_parent(stop, parent);
     }
-    let pool = PoolConfig {
-        autoreset: args.autoreset,
-        final_observation: args.final_observation,
-        frames: args.frames.frames(),
-        features: args.features,
-        ..args.environment.configure(&args.id, args.num_envs)?
-    };
-    let checkpoint = args.checkpoint.as_ref().map(|path| CheckpointConfig {
-        path: path.clone(),
-        every: args.every,
-        resume: args.resume,
-    });
     let metrics = args.metrics.map(Metrics::bind).transpose()?;
-    let mut config = EngineConfig {
-        checkpoint,
-        groups: args.groups,
-        batches_held: args.batches_held,
-        ..EngineConfig::new(&args.service, pool, Threads::new(args.threads)?)
-    };
     let mut engine = Engine::new(&config)?;
     if args.child.is_none() {
-        let (groups, num_envs) = (args.groups, args.num_envs);
+        let (groups, num_envs) = (config.groups, config.pool.num_envs);
         let groups = if groups == 1 { "1 group".to_owned() } else { format!("{groups} groups") };
         print(format_args!(
             "serving {} as `{}`: {groups} of {num_envs} environments; stop with Ctrl-C",
-            args.id, args.service
+            config.pool.id, config.service
         ))?;
-        if let (Some(path), true) = (&args.checkpoint, args.resume) {
+        if let Some(CheckpointConfig { path, resume: true, .. }) = &config.checkpoint {
             let steps: Vec<_> = engine.steps().iter().map(u64::to_string).collect();
             let steps = steps.join(", ");
             print(match steps.chars().all(|c| "0, ".contains(c)) {
@@ -113,7 +151,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
     }
     if let Some(metrics) = metrics {
-        metrics.start(Namespace::default(), &args.service)?;
+        metrics.start(config.namespace.clone(), &config.service)?;
     }
     let summary = loop {
         match engine.run(stop) {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use endless_gym::pool::{PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{ConnectConfig, Engine, EngineConfig, Namespace, ServiceError, Trainer};
 
 pub const ID: &str = "MortarMayhem-Grid-v0";
@@ -134,7 +134,7 @@ impl Drop for Running {
 
 pub fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
     let pool = PoolConfig { check_drawing: true, ..PoolConfig::new(ID, num_envs) };
-    let config = EngineConfig::new(service, pool, Threads::new(1).unwrap());
+    let config = EngineConfig::new(service, pool, 1);
     EngineConfig { namespace: namespace.clone(), groups, ..config }
 }
 

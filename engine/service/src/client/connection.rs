@@ -138,7 +138,7 @@ fn create<T>(
 mod tests {
     use std::sync::mpsc::channel;
 
-    use endless_gym_core::pool::{PoolConfig, Threads};
+    use endless_gym_core::pool::PoolConfig;
 
     use super::*;
     use crate::engine::config::EngineConfig;
@@ -150,7 +150,7 @@ mod tests {
     fn a_trainer_waits_for_the_rest_of_a_dead_one() {
         let namespace = Namespace::at(format!("/tmp/endless-rest-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
-        let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+        let config = EngineConfig::new("gym", pool, 1);
         let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), observers: 0, ..config }).unwrap();
         let (to_main, ready) = channel();
         let (to_rest, end) = channel::<()>();

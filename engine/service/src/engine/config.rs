@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use endless_gym_core::pool::{MAX_ENVS, PoolConfig, PoolError, ResetOptions, Threads};
+use endless_gym_core::pool::{MAX_ENVS, PoolConfig, PoolError, ResetOptions};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::ServiceError;
 use crate::namespace::directory::{Namespace, check_name};
@@ -18,11 +19,32 @@ pub const MAX_BATCHES_HELD: usize = 16;
 pub(crate) const MAX_OBSERVERS: usize = 16;
 
 /// Configuration of an engine: what it serves, and under which name.
-#[derive(Clone, Debug)]
+///
+/// Its JSON has the names of the fields. Only `pool` is required, other fields have the defaults of [`new`](Self::new) with the name
+/// `endless`, and an unknown field is an error.
+///
+/// ```
+/// use endless_gym_service::EngineConfig;
+///
+/// let config: EngineConfig = serde_json::from_str(
+///     r#"{
+///         "service": "gym",
+///         "pool": {"id": "MortarMayhem-v0", "num_envs": 16},
+///         "groups": 2,
+///         "checkpoint": {"path": "/tmp/gym.checkpoint", "every_seconds": 60}
+///     }"#,
+/// )?;
+/// assert_eq!((config.groups, config.batches_held, config.pool.num_envs), (2, 3, 16));
+/// # Ok::<(), serde_json::Error>(())
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct EngineConfig {
     /// The engine's name: 1 to 64 letters, digits, `.`, `_` or `-`.
+    #[serde(default = "default_service")]
     pub service: String,
-    /// The namespace in which trainers find the engine.
+    /// The namespace in which trainers find the engine. In JSON, it is the path of its root directory.
+    #[serde(default)]
     pub namespace: Namespace,
     /// The environments of one group. `first_env` is the number of the first group's first environment. `total_envs` counts the
     /// environments of all groups and engines; `first_env + num_envs`, the default, stands for those of this engine alone.
@@ -30,29 +52,50 @@ pub struct EngineConfig {
     pub pool: PoolConfig,
     /// Number of groups, 1 to [`MAX_GROUPS`]. Each is stepped when its actions arrive, so that a trainer can work on one group
     /// while the engine steps another.
+    #[serde(default = "default_groups")]
     pub groups: usize,
-    /// The threads that step the environments of all groups.
-    pub threads: Threads,
+    /// Number of threads that step the environments of all groups; 0 for one per core.
+    #[serde(default)]
+    pub threads: usize,
     /// Batches of a group that a trainer or an observer may hold at a time, 1 to 16. The engine requires shared memory for two
     /// more.
+    #[serde(default = "default_batches_held")]
     pub batches_held: usize,
     /// Observers of a group that may be connected at a time, 0 to 16. They use memory only while they are connected.
+    #[serde(default = "default_observers")]
     pub observers: usize,
     /// The file to which the engine saves its environments, and from which it may continue; `None` for none.
+    #[serde(default)]
     pub checkpoint: Option<CheckpointConfig>,
+}
+
+fn default_service() -> String {
+    "endless".to_owned()
+}
+
+fn default_groups() -> usize {
+    1
+}
+
+fn default_batches_held() -> usize {
+    3
+}
+
+fn default_observers() -> usize {
+    3
 }
 
 impl EngineConfig {
     /// One group in the default namespace, with `batches_held` and `observers` of 3, without a checkpoint.
-    pub fn new(service: &str, pool: PoolConfig, threads: Threads) -> Self {
+    pub fn new(service: &str, pool: PoolConfig, threads: usize) -> Self {
         EngineConfig {
             service: service.to_owned(),
             namespace: Namespace::default(),
             pool,
-            groups: 1,
+            groups: default_groups(),
             threads,
-            batches_held: 3,
-            observers: 3,
+            batches_held: default_batches_held(),
+            observers: default_observers(),
             checkpoint: None,
         }
     }
@@ -102,16 +145,29 @@ impl EngineConfig {
 }
 
 /// Where an engine saves its environments, and whether it continues from there.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct CheckpointConfig {
     /// The file. A new checkpoint is written beside it, as `FILE.new`, and replaces it when it is complete and on the disk. As long as
     /// the engine exists, it holds a lock on `FILE.lock`, so that no other engine saves to the same file.
     pub path: PathBuf,
     /// How often the engine saves while it runs; `None` saves only when the engine stops and when a trainer asks for it.
+    #[serde(default, rename = "every_seconds", serialize_with = "write_seconds", deserialize_with = "read_seconds")]
     pub every: Option<Duration>,
     /// Whether the engine continues from the file if it exists. Otherwise a file that exists is an error, so that it is not
     /// overwritten by mistake.
+    #[serde(default)]
     pub resume: bool,
+}
+
+#[allow(clippy::ref_option)] // The signature that serde requires.
+fn write_seconds<S: Serializer>(every: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+    every.map(|every| every.as_secs_f64()).serialize(serializer)
+}
+
+fn read_seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Duration>, D::Error> {
+    let seconds = Option::<f64>::deserialize(deserializer)?;
+    seconds.map(|seconds| Duration::try_from_secs_f64(seconds).map_err(serde::de::Error::custom)).transpose()
 }
 
 impl CheckpointConfig {
@@ -126,7 +182,7 @@ mod tests {
     use super::*;
 
     fn config() -> EngineConfig {
-        EngineConfig::new("gym", PoolConfig::new("MortarMayhem-Grid-v0", 2), Threads::new(1).unwrap())
+        EngineConfig::new("gym", PoolConfig::new("MortarMayhem-Grid-v0", 2), 1)
     }
 
     #[test]
@@ -135,6 +191,19 @@ mod tests {
         assert_eq!(message(EngineConfig { batches_held: 20, ..config() }), "batches_held must be 1 to 16, got 20");
         assert_eq!(message(EngineConfig { groups: 0, ..config() }), "groups must be 1 to 64, got 0");
         assert_eq!(message(EngineConfig { observers: 17, ..config() }), "observers must be 0 to 16, got 17");
+    }
+
+    #[test]
+    fn json_has_the_fields_defaults_and_errors_of_the_type() {
+        let checkpoint =
+            CheckpointConfig { every: Some(Duration::from_millis(1500)), ..CheckpointConfig::new("/tmp/c") };
+        let full = EngineConfig { namespace: Namespace::at("/tmp/a"), checkpoint: Some(checkpoint), ..config() };
+        let text = serde_json::to_string(&full).unwrap();
+        assert_eq!(serde_json::from_str::<EngineConfig>(&text).unwrap(), full, "{text}");
+        let short = r#"{"service": "gym", "pool": {"id": "MortarMayhem-Grid-v0", "num_envs": 2}, "threads": 1}"#;
+        assert_eq!(serde_json::from_str::<EngineConfig>(short).unwrap(), config());
+        let error = serde_json::from_str::<EngineConfig>(&short.replace("threads", "thread")).unwrap_err().to_string();
+        assert!(error.starts_with("unknown field `thread`"), "{error}");
     }
 
     #[test]

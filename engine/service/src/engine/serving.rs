@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{Block, LAYOUT_VERSION, action_layout};
-use endless_gym_core::pool::{Pool, PoolError, ResetOptions};
+use endless_gym_core::pool::{Pool, PoolError, ResetOptions, Threads};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
@@ -51,7 +51,7 @@ const START_ATTEMPTS: usize = 3;
 /// use std::sync::atomic::{AtomicBool, Ordering};
 /// use std::time::Duration;
 ///
-/// use endless_gym_core::pool::{PoolConfig, ResetRequest, Threads};
+/// use endless_gym_core::pool::{PoolConfig, ResetRequest};
 /// use endless_gym_service::{ConnectConfig, Engine, EngineConfig, Namespace, Trainer};
 ///
 /// # let root = format!("/tmp/endless-doc-{}", std::process::id());
@@ -60,7 +60,7 @@ const START_ATTEMPTS: usize = 3;
 /// let namespace = Namespace::default();
 /// # */
 /// let pool = PoolConfig::new("MortarMayhem-Grid-v0", 4);
-/// let config = EngineConfig { namespace: namespace.clone(), ..EngineConfig::new("example", pool, Threads::new(1)?) };
+/// let config = EngineConfig { namespace: namespace.clone(), ..EngineConfig::new("example", pool, 1) };
 /// let mut engine = Engine::new(&config)?;
 /// let stop = AtomicBool::new(false);
 ///
@@ -115,8 +115,8 @@ impl Engine {
         config.check()?;
         let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
         discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
-        let pools = config.pools()?;
-        let pools = || pools.iter().map(|pool| Pool::new(pool, &config.threads)).collect::<Result<Vec<_>, _>>();
+        let (pools, threads) = (config.pools()?, Threads::new(config.threads)?);
+        let pools = || pools.iter().map(|pool| Pool::new(pool, &threads)).collect::<Result<Vec<_>, _>>();
         let mut attempt = 1;
         loop {
             match Self::start(config, node, pools()?) {
@@ -394,7 +394,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::pool::{PoolConfig, Threads};
+    use endless_gym_core::pool::PoolConfig;
 
     use super::*;
     use crate::namespace::directory::Namespace;
@@ -403,7 +403,7 @@ mod tests {
     fn an_engine_that_cannot_be_found_is_noticed() {
         let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
-        let config = EngineConfig::new("gym", pool, Threads::new(1).unwrap());
+        let config = EngineConfig::new("gym", pool, 1);
         let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
         let check = || {
             let lock = engine.node.lock().unwrap();

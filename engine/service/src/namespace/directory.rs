@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use iceoryx2::prelude::{Config, FileName, Path as IceoryxPath, SemanticString, ipc_threadsafe};
+use serde::{Deserialize, Serialize};
 
 use crate::error::ServiceError;
 
@@ -39,10 +40,23 @@ pub(crate) const MAX_PREFIX: usize = 16;
 /// assert_eq!(namespace, Namespace::at("/tmp/my-experiment"));
 /// assert_ne!(namespace.prefix(), Namespace::at("/tmp/another").prefix());
 /// ```
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "PathBuf", into = "PathBuf")]
 pub struct Namespace {
     root: PathBuf,
     prefix: String,
+}
+
+impl From<PathBuf> for Namespace {
+    fn from(root: PathBuf) -> Self {
+        Namespace::at(root)
+    }
+}
+
+impl From<Namespace> for PathBuf {
+    fn from(namespace: Namespace) -> Self {
+        namespace.root
+    }
 }
 
 impl Default for Namespace {

@@ -268,7 +268,7 @@ fn published_names(node: &NamespaceNode) -> Result<Vec<String>, ServiceError> {
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::pool::{PoolConfig, Threads};
+    use endless_gym_core::pool::PoolConfig;
 
     use super::*;
     use crate::{Engine, EngineConfig};
@@ -277,7 +277,7 @@ mod tests {
     fn publication_waits_for_the_lock() {
         let namespace = Namespace::at(format!("/tmp/endless-publish-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
-        let config = EngineConfig::new("model", pool, Threads::new(1).unwrap());
+        let config = EngineConfig::new("model", pool, 1);
         let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
         let specification = ServiceSpecification { service: "gym".to_owned(), ..engine.specification().clone() };
         let node = NamespaceNode::join(&namespace, Duration::ZERO).unwrap();
