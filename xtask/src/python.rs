@@ -110,9 +110,14 @@ fn libraries() -> Result<PathBuf, String> {
 fn agents() -> Result<PathBuf, String> {
     let folder =
         sync("agents", "agents", &["--extra", "ray", "--group", "dev", "--no-install-package", "endless-gym"])?;
-    install(&folder)?;
-    run(pip_install(&folder)?.args(["--reinstall", "--no-deps"]).arg(workspace().join("agents")))?;
+    install_with_agents(&folder)?;
     Ok(folder)
+}
+
+/// Installs the wheel that [`wheel`] built, and the agents without their dependencies.
+fn install_with_agents(environment: &Path) -> Result<(), String> {
+    install(environment)?;
+    run(pip_install(environment)?.args(["--reinstall", "--no-deps"]).arg(workspace().join("agents")))
 }
 
 /// The path of the Python that has the original.
@@ -174,7 +179,8 @@ pub fn test() -> Result<(), String> {
 pub fn test_libraries() -> Result<(), String> {
     let environment = libraries()?;
     let rllib = sync("rllib", "bindings/python", &["--group", "rllib"])?;
-    [&environment, &rllib].into_iter().try_for_each(|environment| install(environment))?;
+    // Snippets, an example and the notebook use the agents.
+    [&environment, &rllib].into_iter().try_for_each(|environment| install_with_agents(environment))?;
     mypy(&environment, "bindings/python")?;
     pytest_with(
         &environment,
