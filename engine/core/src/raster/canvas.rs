@@ -44,22 +44,10 @@ impl<'a> Canvas<'a> {
         Self { dirty: Some(dirty), ..self }
     }
 
-    /// Whether there are pixels to paint. Otherwise what would be painted is only to be marked as dirty.
-    #[inline]
-    pub fn has_pixels(&self) -> bool {
-        !self.pixels.is_empty()
-    }
-
     /// Whether painted pixels are marked as dirty.
     #[inline]
     pub fn tracks_dirty(&self) -> bool {
         self.dirty.is_some()
-    }
-
-    /// Whether painted pixels are marked one by one, so that no other pixel may be marked.
-    #[inline]
-    pub fn tracks_pixels(&self) -> bool {
-        self.tracks_dirty()
     }
 
     /// Marks some rows of some columns as dirty. Nothing happens without dirty tracking.
@@ -71,30 +59,6 @@ impl<'a> Canvas<'a> {
     pub fn mark_dirty(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         if let Some(dirty) = &mut self.dirty {
             mark_rows(&mut dirty[columns], rows);
-        }
-    }
-
-    /// Marks in each column the rows from `firsts` to the one before `ends`, which is 0 where there are none. Nothing happens without
-    /// dirty tracking.
-    ///
-    /// # Panics
-    ///
-    /// With dirty tracking, if a column or row lies beyond the canvas.
-    #[inline]
-    pub fn mark_spans(&mut self, firsts: &[u8], ends: &[u8]) {
-        if let Some(dirty) = &mut self.dirty {
-            for ((column, first), end) in dirty.iter_mut().zip(firsts).zip(ends) {
-                mark_rows(std::slice::from_mut(column), &(usize::from(*first)..usize::from(*end)));
-            }
-        }
-    }
-
-    /// Marks the part of a rectangle that may change as dirty. Nothing happens without dirty tracking.
-    #[inline]
-    pub fn mark_rect(&mut self, rect: Rect) {
-        if self.tracks_dirty() {
-            let mut clipped = self.clipped(rect);
-            clipped.mark_dirty(clipped.columns(), &clipped.rows());
         }
     }
 

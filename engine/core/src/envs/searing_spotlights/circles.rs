@@ -1,10 +1,102 @@
-//! Circles side by side, so that vector instructions test all of them at once: most tests of a frame are about circles that are far
-//! away, and no branch predictor knows which are near.
+//! The circles that spotlights light.
+//!
+//! A frame's circles are stored side by side, so that vector instructions test all of them at once: most tests of a frame are about
+//! circles that are far away, and no branch predictor knows which are near.
 
+use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 
-use super::circle::{Circle, Edges};
-use super::crescents::{MAX_MOVED_RADIUS, REACH};
+use super::config::BAR_HEIGHT;
+use crate::envs::screen::SCREEN;
+use crate::raster::Rect;
+
+/// Longest move along each axis of which a circle's crescents are precomputed, in pixels.
+pub(super) const REACH: i16 = 3;
+
+/// Largest radius of which crescents are precomputed. Larger circles are repainted in full.
+pub(super) const MAX_MOVED_RADIUS: i16 = 24;
+
+/// Whether the crescents of a move are precomputed. Without a branch, for vector instructions.
+#[inline]
+pub(super) fn is_short_move(radius: i16, (x, y): (i16, i16)) -> bool {
+    let is_near = |distance: i16| (distance.wrapping_add(REACH)) as u16 <= 2 * REACH as u16;
+    is_near(x) & is_near(y) & (radius <= MAX_MOVED_RADIUS)
+}
+
+/// A lit circle, in pixels of the screen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Circle {
+    /// Horizontal centre.
+    pub x: i16,
+    /// Vertical centre.
+    pub y: i16,
+    /// Radius, 0 to [`MAX_SPOT_RADIUS`](super::parameters::MAX_SPOT_RADIUS).
+    pub radius: i16,
+}
+
+/// The edges of a rectangle, in pixels of the screen, limited to what circles are compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Edges {
+    pub left: i16,
+    pub top: i16,
+    pub right: i16,
+    pub bottom: i16,
+}
+
+impl From<&Rect> for Edges {
+    #[inline]
+    fn from(rect: &Rect) -> Self {
+        let limited = |edge: i32| edge.clamp(i16::MIN.into(), i16::MAX.into()) as i16;
+        Edges {
+            left: limited(rect.x),
+            top: limited(rect.y),
+            right: limited(rect.x + rect.width),
+            bottom: limited(rect.y + rect.height),
+        }
+    }
+}
+
+impl Circle {
+    /// Its centre in pixels.
+    pub fn centre(&self) -> (i32, i32) {
+        (self.x.into(), self.y.into())
+    }
+
+    /// The smallest rectangle around it.
+    #[inline]
+    pub fn bounds(&self) -> Rect {
+        let ((x, y), radius) = (self.centre(), i32::from(self.radius));
+        Rect::new(x - radius, y - radius, 2 * radius, 2 * radius)
+    }
+
+    /// Whether a part of it may be visible: on the screen, and not only behind the bar at the top.
+    #[inline]
+    pub fn is_on_screen(&self) -> bool {
+        let (low, high) = (-self.radius, SCREEN as i16 + self.radius);
+        let is_within = |at: i16, low: i16| low < at && at < high;
+        is_within(self.x, low) && is_within(self.y, BAR_HEIGHT as i16 + low) && self.radius > 0
+    }
+
+    /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius. Without a branch, since none
+    /// could be predicted.
+    #[inline]
+    pub fn reaches(&self, rect: &Rect) -> bool {
+        let radius = i32::from(self.radius);
+        // The distance outside of the rectangle along one axis; one of `radius` is too far already.
+        let gap = |at: i16, low: i32, length: i32| {
+            let at = i32::from(at);
+            (low - at).max(at - low - length).min(radius).max(0)
+        };
+        let (x, y) = (gap(self.x, rect.x, rect.width), gap(self.y, rect.y, rect.height));
+        x * x + y * y < radius * radius
+    }
+
+    /// Whether a position is within its radius.
+    pub fn contains(&self, (x, y): (i32, i32)) -> bool {
+        let (x, y, radius) = (x - i32::from(self.x), y - i32::from(self.y), i32::from(self.radius));
+        x * x + y * y < radius * radius
+    }
+}
 
 /// Circles of a block.
 const LANES: usize = 8;
@@ -28,7 +120,7 @@ impl Block {
     }
 
     /// A bit for each circle that may light a pixel from `left` and `top` to `right` and `bottom`.
-    #[inline(always)]
+    #[inline]
     fn reaching(&self, Edges { left, top, right, bottom }: Edges) -> u16 {
         // The distance outside of the rectangle along one axis, at most 255, so that squares fit into 16 bits. That and the saturated
         // sum of squares change nothing for radii below 256. With 256, the largest, a circle just out of reach may be reported.
@@ -44,17 +136,16 @@ impl Block {
     }
 
     /// A bit for each circle that is not where `former` has it, and whether all have made no move but a precomputed one.
-    #[inline(always)]
+    #[inline]
     fn moved_since(&self, former: &Block) -> (u16, bool) {
-        let is_near = |distance: i16| (distance.wrapping_add(REACH)) as u16 <= 2 * REACH as u16;
         let (mut bits, mut all_near) = ([0; LANES], true);
         for (lane, bit) in bits.iter_mut().enumerate() {
             let x = self.x[lane].wrapping_sub(former.x[lane]);
             let y = self.y[lane].wrapping_sub(former.y[lane]);
             let moved = x | y != 0;
-            let near = is_near(x) & is_near(y) & (self.radius[lane] <= MAX_MOVED_RADIUS);
             *bit = if moved { 1 << lane } else { 0 };
-            all_near &= (self.radius[lane] == former.radius[lane]) & (!moved | near);
+            all_near &=
+                (self.radius[lane] == former.radius[lane]) & (!moved | is_short_move(self.radius[lane], (x, y)));
         }
         (bits.iter().fold(0, |all, bit| all | bit), all_near)
     }
@@ -71,7 +162,7 @@ impl Circles {
     /// The most circles of which [`Numbers`] can be made.
     pub const MAX_NUMBERED: usize = u32::BITS as usize;
 
-    #[inline(always)]
+    #[inline]
     pub fn len(&self) -> usize {
         self.len
     }
@@ -92,7 +183,7 @@ impl Circles {
     /// # Panics
     ///
     /// If there is none of that number.
-    #[inline(always)]
+    #[inline]
     pub fn get(&self, number: usize) -> Circle {
         let (block, lane) = (&self.blocks[number / LANES], number % LANES);
         Circle { x: block.x[lane], y: block.y[lane], radius: block.radius[lane] }
@@ -104,7 +195,7 @@ impl Circles {
 
     /// The circles that may light a pixel of a rectangle: those that [reach](Circle::reaches) it, and some of the largest radius
     /// that do not. Only for at most [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
-    #[inline(always)]
+    #[inline]
     pub fn reaching(&self, rect: impl Into<Edges>) -> Numbers {
         let edges = rect.into();
         let bits = |(number, block): (usize, &Block)| u32::from(block.reaching(edges)) << (number * LANES);
@@ -113,7 +204,7 @@ impl Circles {
 
     /// The circles that are not where `former` has them. `None` unless all have made no move but a precomputed one. Only for at most
     /// [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
-    #[inline(always)]
+    #[inline]
     pub fn moved_since(&self, former: &Circles) -> Option<Numbers> {
         if self.len != former.len {
             return None;
@@ -135,25 +226,25 @@ pub(super) struct Numbers(u32);
 impl Numbers {
     pub const NONE: Numbers = Numbers(0);
 
-    #[inline(always)]
+    #[inline]
     pub fn is_empty(self) -> bool {
         self.0 == 0
     }
 
     /// Those that are in both.
-    #[inline(always)]
+    #[inline]
     pub fn and(self, other: Numbers) -> Numbers {
         Numbers(self.0 & other.0)
     }
 
     /// Adds a number if `present`.
-    #[inline(always)]
+    #[inline]
     pub fn set(&mut self, number: usize, present: bool) {
         self.0 |= u32::from(present) << number;
     }
 
     /// All but one.
-    #[inline(always)]
+    #[inline]
     pub fn without(self, number: usize) -> Numbers {
         Numbers(self.0 & !(1 << number))
     }
@@ -162,7 +253,7 @@ impl Numbers {
 impl Iterator for Numbers {
     type Item = usize;
 
-    #[inline(always)]
+    #[inline]
     fn next(&mut self) -> Option<usize> {
         let number = self.0.trailing_zeros() as usize;
         // Without the lowest bit.
@@ -173,8 +264,33 @@ impl Iterator for Numbers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::envs::searing_spotlights::shape::Shape;
-    use crate::raster::Rect;
+    use crate::envs::searing_spotlights::parameters::MAX_SPOT_RADIUS;
+    use crate::raster::Disc;
+
+    #[test]
+    fn circles_are_visible_up_to_the_last_pixel() {
+        let circle = |x, y| Circle { x, y, radius: 10 };
+        for (x, y) in [(-9, 40), (93, 40), (40, 93), (40, -5), (42, 42)] {
+            assert!(circle(x, y).is_on_screen(), "{x}, {y}");
+        }
+        for (x, y) in [(-10, 40), (94, 40), (40, 94), (40, -6)] {
+            assert!(!circle(x, y).is_on_screen(), "{x}, {y}");
+        }
+        assert!(!Circle { x: 40, y: 40, radius: 0 }.is_on_screen());
+        assert!(circle(40, 40).contains((49, 40)));
+        assert!(!circle(40, 40).contains((50, 40)));
+    }
+
+    #[test]
+    fn circles_reach_what_they_light() {
+        for radius in 0..=MAX_SPOT_RADIUS {
+            let (circle, disc) = (Circle { x: 0, y: 0, radius: radius as i16 }, Disc::new(radius));
+            for (x, y) in (-radius..radius).flat_map(|x| (-radius..radius).map(move |y| (x, y))) {
+                let pixel = Rect::new(x, y, 1, 1);
+                assert!(circle.reaches(&pixel) || !disc.contains((x, y)), "radius {radius}: {x}, {y}");
+            }
+        }
+    }
 
     fn circles(circles: impl IntoIterator<Item = (i16, i16, i16)>) -> Circles {
         let mut lanes = Circles::default();
@@ -224,7 +340,7 @@ mod tests {
             for y in -5..=5 {
                 let moved = moved_by(17, (x, y), 10).moved_since(&former).map(Iterator::collect::<Vec<_>>);
                 let expected = if (x, y) == (0, 0) { vec![] } else { vec![17] };
-                assert_eq!(moved, Shape::is_precomputed(10, (x, y)).then_some(expected), "{x}, {y}");
+                assert_eq!(moved, is_short_move(10, (x, y)).then_some(expected), "{x}, {y}");
             }
         }
         assert_eq!(moved_by(3, (0, 0), 11).moved_since(&former), None, "another radius");

@@ -4,15 +4,14 @@
 //! darkened background, and each circle repaints the lit scene within it, so that nothing that stays dark is painted
 //! twice.
 
-use super::circles::Circles;
+use super::circles::{Circle, Circles};
 use super::config::BAR_HEIGHT;
-use super::light::LightChange;
-use super::pictures::{Assets, Pictures};
+use super::light::{LightChange, disc, outline};
+use super::pictures::{Assets, Pictures, Pixels};
 use super::scene::Scene;
-use super::shape::Shape;
 use super::state::State;
 use crate::envs::screen::SCREEN;
-use crate::raster::{Canvas, Damage, Rect, Sprite};
+use crate::raster::{Canvas, Damage, DiscColumn, Rect, Sprite, blend_keyed, copy_run};
 
 /// Where light and objects that are hidden in the dark are visible.
 const BELOW_BAR: Rect = Rect { x: 0, y: BAR_HEIGHT as i32, width: SCREEN as i32, height: (SCREEN - BAR_HEIGHT) as i32 };
@@ -77,34 +76,35 @@ impl Scene {
     }
 
     /// Changes a painted frame from `shown` to this scene.
-    #[inline(always)]
     pub(super) fn repaint(&self, shown: &Scene, assets: &Assets, canvas: &mut Canvas<'_>) {
         let same_light = self.darkness == shown.darkness && self.blacked_out == shown.blacked_out;
+        let same_background = self.background == shown.background;
         // In full darkness every background is black.
-        let same_background = self.background == shown.background || self.darkness == 255;
-        let mut damage = Damage::new(SCREEN, SCREEN);
+        let same_dark = same_background || self.darkness == 255;
         let many = self.circles.len().max(shown.circles.len()) > Circles::MAX_NUMBERED;
-        if many || !same_light || !same_background || self.coins_visible != shown.coins_visible {
-            damage.add(Rect::new(0, 0, SCREEN as i32, SCREEN as i32));
-            return damage.repair(canvas, |canvas| self.paint(assets, canvas));
+        let same_coins = self.coins_visible == shown.coins_visible;
+        if many || !same_light || !same_dark || !same_coins {
+            return self.paint(assets, canvas);
         }
+        let mut damage = Damage::new(SCREEN, SCREEN);
         let change = LightChange::new(shown, self);
-        if self.outlined || shown.outlined {
+        let outlined = self.outlined || shown.outlined;
+        if outlined {
             change.bounds().for_each(|rect| damage.add(rect));
         } else {
-            change.paint(assets, canvas);
+            let [dark, lit] =
+                [assets.dark(self.darkness), &assets.lit].map(|pictures| pictures.background(self.background));
+            change.paint(dark, lit, canvas);
         }
         let visible = self.visible_in_dark(assets).any();
-        if visible || self.darkness < 255 || self.outlined || shown.outlined || canvas.tracks_dirty() {
+        if visible || self.darkness < 255 || outlined {
             self.add_objects(shown, assets, &change, &mut damage);
         } else {
-            self.repaint_hidden_objects(shown, assets, &change, canvas);
+            self.repaint_hidden_objects(shown, assets, &change, &mut canvas.clipped(BELOW_BAR));
         }
         if self.bar != shown.bar {
             if visible {
                 self.bar.changes_since(&shown.bar).for_each(|field| damage.add(field));
-            } else if !canvas.has_pixels() {
-                self.bar.changes_since(&shown.bar).for_each(|field| canvas.mark_rect(field));
             } else {
                 // No object is above the bar.
                 self.bar.repaint(&shown.bar, assets.config.variant, canvas);
@@ -143,7 +143,6 @@ impl Scene {
 
     /// Repaints the objects after [`LightChange::paint`] has painted the background. Only for full darkness with all objects hidden in
     /// it: what is not lit of them is black already.
-    #[inline(always)]
     fn repaint_hidden_objects(
         &self,
         shown: &Scene,
@@ -151,7 +150,6 @@ impl Scene {
         change: &LightChange<'_>,
         canvas: &mut Canvas<'_>,
     ) {
-        let mut canvas = canvas.clipped(BELOW_BAR);
         let mut differ = false;
         for (objects, changed) in self.objects_since(shown) {
             if changed {
@@ -161,8 +159,7 @@ impl Scene {
                         differ = true;
                         let circle = self.circles.get(circle);
                         let background = assets.lit.background(self.background);
-                        let disc = &Shape::of(circle.radius).extent.disc;
-                        background.paint_disc(&mut canvas.clipped(bounds), disc, circle.centre());
+                        paint_disc(&circle, background, &mut canvas.clipped(bounds));
                     }
                 });
             }
@@ -177,11 +174,17 @@ impl Scene {
             return;
         }
         self.for_each_object(assets, &assets.lit, Objects::ALL, |sprite, (x, y)| {
-            for circle in self.circles.reaching(&sprite.bounds_at((x, y))) {
+            let bounds = sprite.bounds_at((x, y));
+            for circle in self.circles.reaching(&bounds) {
                 let circle = self.circles.get(circle);
-                sprite.blit_within(&mut canvas, x, y, &Shape::of(circle.radius).extent.disc, circle.centre());
+                sprite.blit_within(canvas, x, y, disc(circle.radius), circle.centre());
             }
         });
+    }
+
+    /// Whether a circle may light a pixel of a rectangle. Only for at most [`Circles::MAX_NUMBERED`] circles.
+    fn lights(&self, rect: &Rect) -> bool {
+        !self.circles.reaching(rect).is_empty()
     }
 
     /// Each kind of objects, and whether objects of that kind have changed.
@@ -201,7 +204,7 @@ impl Scene {
     }
 
     /// Calls `paint` with the picture and the top left corner of each selected object, from bottom to top.
-    #[inline(always)]
+    #[inline]
     fn for_each_object(
         &self,
         assets: &Assets,
@@ -228,7 +231,7 @@ impl Scene {
     /// Paints the background and the objects that are hidden in the dark, as the light shows them.
     fn paint_light(&self, assets: &Assets, hidden: Objects, canvas: &mut Canvas<'_>) {
         let dark = assets.dark(self.darkness);
-        dark.background(self.background).paint(canvas);
+        canvas.paste(dark.background(self.background).as_flattened().as_flattened());
         // In full darkness nothing is visible.
         if self.darkness < 255 {
             self.for_each_object(assets, dark, hidden, |sprite, (x, y)| sprite.blit(canvas, x, y));
@@ -237,14 +240,33 @@ impl Scene {
         let (columns, rows) = (canvas.columns(), canvas.rows());
         let clip = Rect::new(columns.start as i32, rows.start as i32, columns.len() as i32, rows.len() as i32);
         for circle in self.circles.iter().filter(|circle| circle.reaches(&clip)) {
-            let (shape, centre) = (Shape::of(circle.radius), circle.centre());
-            background.paint_disc(canvas, &shape.extent.disc, centre);
+            paint_disc(&circle, background, canvas);
             self.for_each_object(assets, &assets.lit, hidden, |sprite, (x, y)| {
-                sprite.blit_within(canvas, x, y, &shape.extent.disc, centre);
+                sprite.blit_within(canvas, x, y, disc(circle.radius), circle.centre());
             });
             if self.outlined {
-                shape.draw_outline(canvas, centre, self.darkness);
+                draw_outline(&circle, self.darkness, canvas);
             }
+        }
+    }
+}
+
+/// Paints the background within a circle.
+fn paint_disc(circle: &Circle, background: &Pixels, canvas: &mut Canvas<'_>) {
+    let (columns, rows) = (canvas.columns(), canvas.rows());
+    for DiscColumn { x, rows } in disc(circle.radius).columns(circle.centre(), &columns, rows) {
+        copy_run(background[x][rows.clone()].as_flattened(), canvas.run_mut(x, rows));
+    }
+}
+
+/// Draws the white outline of a circle, which the original paints on the translucent dark surface.
+fn draw_outline(circle: &Circle, alpha: u8, canvas: &mut Canvas<'_>) {
+    let (columns, rows, (x, y)) = (canvas.columns(), canvas.rows(), circle.centre());
+    for (right, down) in outline(circle.radius) {
+        let (x, y) = ((x + right) as usize, (y + down) as usize);
+        if columns.contains(&x) && rows.contains(&y) {
+            let pixel = canvas.pixel_mut(x, y);
+            *pixel = pixel.map(|channel| blend_keyed(255, channel, alpha));
         }
     }
 }

@@ -27,23 +27,18 @@
 //!
 //! The number of spotlights is limited to [`MAX_SPOTLIGHTS`] and their radius to [`MAX_SPOT_RADIUS`].
 
-mod circle;
 mod circles;
 mod config;
-mod crescents;
 mod drawing;
 pub mod expert;
-mod extent;
 mod features;
 mod light;
-mod light_spans;
 mod parameters;
 mod pictures;
 mod position_sampler;
 mod registry;
 mod rules;
 mod scene;
-mod shape;
 mod spotlight;
 mod state;
 #[cfg(test)]

@@ -3,12 +3,12 @@
 use std::sync::OnceLock;
 
 use super::config::Config;
+use super::light;
 use super::parameters::{Parameters, Variant};
-use super::shape::Shape;
 use super::state::Background;
 use crate::envs::character_sprites::CharacterSprites;
-use crate::envs::screen::{FRAME_BYTES, Frame, SCREEN};
-use crate::raster::{Canvas, CornerRadii, Disc, DiscColumn, Rect, Rgb, Sprite, Surface, blend_keyed, copy_run};
+use crate::envs::screen::SCREEN;
+use crate::raster::{CornerRadii, Rect, Rgb, Sprite, Surface, blend_keyed};
 
 const BLACK: Rgb = [0, 0, 0];
 const WHITE: Rgb = [255, 255, 255];
@@ -22,86 +22,22 @@ const EXIT_CLOSED: Rgb = [55, 55, 55];
 /// Side of a background's tile in pixels: 50 on the original's screen of 336 pixels, truncated at this scale.
 const TILE: usize = 12;
 
-/// A background: a chessboard of two colours, which may be equal, stored as the pixels of its two different columns.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Chessboard {
-    colors: [Rgb; 2],
-    columns: [[Rgb; SCREEN]; 2],
-}
+/// The pixels of a background, column by column.
+pub(super) type Pixels = [[Rgb; SCREEN]; SCREEN];
 
-/// For each column or row, 1 if its first tile has the second colour.
-const SECOND: [u8; SCREEN] = {
-    let mut second = [0; SCREEN];
-    let mut x = 0;
-    while x < SCREEN {
-        second[x] = (x / TILE % 2) as u8;
-        x += 1;
-    }
-    second
-};
-
-impl Chessboard {
-    /// A chessboard with the first colour in its corner.
-    fn new(colors: [Rgb; 2]) -> Self {
-        let column = |first: u8| SECOND.map(|second| colors[usize::from(first ^ second)]);
-        Chessboard { colors, columns: [column(0), column(1)] }
-    }
-
-    #[inline]
-    fn column(&self, x: usize) -> &[Rgb; SCREEN] {
-        &self.columns[usize::from(SECOND[x] & 1)]
-    }
-
-    /// The background under a black surface of some `alpha`.
-    pub fn shaded(&self, alpha: u8) -> Self {
-        Chessboard::new(self.colors.map(|color| color.map(|channel| blend_keyed(0, channel, alpha))))
-    }
-
-    /// Paints the whole background within the canvas' clip.
-    #[inline]
-    pub fn paint(&self, canvas: &mut Canvas<'_>) {
-        if self.colors[0] == self.colors[1] {
-            return canvas.fill(self.colors[0]);
-        }
-        let (columns, rows) = (canvas.columns(), canvas.rows());
-        if columns.len() < SCREEN || rows.len() < SCREEN {
-            canvas.runs_mut().for_each(|(x, run)| copy_run(self.column(x)[rows.clone()].as_flattened(), run));
-            return;
-        }
-        canvas.mark_dirty(columns, &rows);
-        // Paints the first two columns of tiles, then copies what is painted, doubling it each time.
-        let mut painted = 2 * TILE;
-        let first = canvas.pixels_mut().as_chunks_mut::<3>().0.as_chunks_mut::<SCREEN>().0.iter_mut().take(painted);
-        first.enumerate().for_each(|(x, column)| *column = *self.column(x));
-        while painted < SCREEN {
-            let count = painted.min(SCREEN - painted);
-            canvas.pixels_mut().copy_within(..count * SCREEN * 3, painted * SCREEN * 3);
-            painted += count;
-        }
-    }
-
-    /// Paints the background within a disc.
-    pub fn paint_disc(&self, canvas: &mut Canvas<'_>, disc: &Disc, center: (i32, i32)) {
-        let (columns, rows) = (canvas.columns(), canvas.rows());
-        for DiscColumn { x, rows } in disc.columns(center, &columns, rows) {
-            copy_run(self.column(x)[rows.clone()].as_flattened(), canvas.run_mut(x, rows));
-        }
-    }
-
-    fn frame(&self) -> Box<Frame> {
-        let mut frame = Box::new([0; FRAME_BYTES]);
-        self.paint(&mut Canvas::new(&mut *frame, SCREEN, SCREEN));
-        frame
-    }
+/// A chessboard with the first of two colours, which may be equal, in its corner.
+fn chessboard(colors: [Rgb; 2]) -> Box<Pixels> {
+    let pixel = |x: usize, y: usize| colors[(x / TILE + y / TILE) % 2];
+    Box::new(std::array::from_fn(|x| std::array::from_fn(|y| pixel(x, y))))
 }
 
 /// The pictures of backgrounds and objects at one darkness.
 #[derive(Debug)]
 pub(super) struct Pictures {
-    /// By [`Background`].
-    backgrounds: [Chessboard; 4],
-    /// The backgrounds as whole frames, created on first use, since most darknesses occur for one step only.
-    background_frames: [OnceLock<Box<Frame>>; 4],
+    /// The colours of the tiles, by [`Background`].
+    tiles: [[Rgb; 2]; 4],
+    /// By [`Background`], created on first use, since most darknesses occur for one step only.
+    backgrounds: [OnceLock<Box<Pixels>>; 4],
     pub coin: Sprite,
     pub exit_closed: Sprite,
     pub exit_open: Sprite,
@@ -112,8 +48,8 @@ impl Pictures {
     /// The pictures under a black surface of some `alpha`.
     fn shaded(&self, alpha: u8) -> Self {
         Pictures {
-            backgrounds: self.backgrounds.map(|background| background.shaded(alpha)),
-            background_frames: Default::default(),
+            tiles: self.tiles.map(|colors| colors.map(|color| color.map(|channel| blend_keyed(0, channel, alpha)))),
+            backgrounds: Default::default(),
             coin: self.coin.shaded(alpha),
             exit_closed: self.exit_closed.shaded(alpha),
             exit_open: self.exit_open.shaded(alpha),
@@ -121,16 +57,10 @@ impl Pictures {
         }
     }
 
-    /// A background, to paint areas with.
     #[inline]
-    pub fn background(&self, background: Background) -> &Chessboard {
-        &self.backgrounds[background as usize]
-    }
-
-    /// A background as a whole frame, to copy scattered pixels from.
-    #[inline]
-    pub fn background_frame(&self, background: Background) -> &Frame {
-        self.background_frames[background as usize].get_or_init(|| self.background(background).frame())
+    pub fn background(&self, background: Background) -> &Pixels {
+        let number = background as usize;
+        self.backgrounds[number].get_or_init(|| chessboard(self.tiles[number]))
     }
 }
 
@@ -148,17 +78,16 @@ pub struct Assets {
 impl Assets {
     /// Draws the pictures.
     pub fn new(variant: Variant, parameters: Parameters) -> Self {
-        let colors = [[WHITE, BLUE], [WHITE, RED], [WHITE; 2], [BLACK; 2]];
+        let tiles = [[WHITE, BLUE], [WHITE, RED], [WHITE; 2], [BLACK; 2]];
         // Created in advance, so that no step needs to.
-        let radii = parameters.spot_min_radius as i16..=parameters.spot_max_radius as i16;
-        radii.map(Shape::of).for_each(|_| ());
+        (parameters.spot_min_radius as i16..=parameters.spot_max_radius as i16).for_each(light::prepare);
         let config = Config::new(variant, parameters);
         let parameters = &config.parameters;
         let [exit_closed, exit_open] = exit_pictures(config.exit_side, parameters.exit_scale);
         Assets {
             lit: Pictures {
-                backgrounds: colors.map(Chessboard::new),
-                background_frames: Default::default(),
+                tiles,
+                backgrounds: Default::default(),
                 coin: coin_picture(config.coin_radius, parameters.coin_scale),
                 exit_closed,
                 exit_open,

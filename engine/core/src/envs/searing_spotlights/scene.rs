@@ -6,7 +6,6 @@ use super::circles::Circles;
 use super::config::{Config, HEALTH_WIDTH};
 use super::state::{Background, Exit, State};
 use crate::envs::character::Character;
-use crate::raster::Rect;
 
 /// What a frame shows. The circles and coins of most frames fit without an allocation.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,12 +78,6 @@ impl Scene {
             agent: state.ground_truth_agent(),
             ..Scene::without_circles(state, config)
         }
-    }
-
-    /// Whether a circle may light a pixel of a rectangle. Only for at most [`Circles::MAX_NUMBERED`] circles.
-    #[inline(always)]
-    pub(super) fn lights(&self, rect: &Rect) -> bool {
-        !self.circles.reaching(rect).is_empty()
     }
 
     #[inline]

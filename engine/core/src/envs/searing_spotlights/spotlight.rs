@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::circle::Circle;
+use super::circles::Circle;
 use super::config::MAX_COORDINATE;
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
 use crate::envs::screen::SCREEN;

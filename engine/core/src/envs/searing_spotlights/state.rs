@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::circle::Circle;
+use super::circles::Circle;
 use super::config::{Config, MAX_COORDINATE};
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
 use super::spotlight::Spotlight;

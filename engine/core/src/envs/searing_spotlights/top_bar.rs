@@ -55,7 +55,7 @@ impl Bar {
     }
 
     /// Changes a painted bar from `shown` to this one.
-    #[inline(always)]
+    #[inline]
     pub fn repaint(&self, shown: &Bar, variant: Variant, canvas: &mut Canvas<'_>) {
         let (Some(action), Some(shown_action), true) = (self.action, shown.action, self.differs_by_fields(shown))
         else {
@@ -111,7 +111,7 @@ impl Bar {
 }
 
 /// Paints columns of the bar within the canvas' clip.
-#[inline(always)]
+#[inline]
 fn fill(canvas: &mut Canvas<'_>, columns: Range<usize>, color: &Column) {
     let (clip, rows) = (canvas.columns(), canvas.rows());
     let rows = rows.start..rows.end.min(BAR_HEIGHT);
