@@ -83,12 +83,6 @@ enum Task {
         #[arg(default_value_t = 100_000)]
         steps: u64,
     },
-    /// Run the property tests from new seeds.
-    Properties {
-        /// Cases of each property.
-        #[arg(default_value_t = 2000)]
-        cases: u32,
-    },
     /// Run the fuzz targets from new seeds, as property tests.
     Fuzz {
         /// One of the targets: actions, checkpoints, layouts, options, snapshots, traces.
@@ -115,7 +109,6 @@ impl Task {
             Task::Faults { arguments } => rust::faults("faults", arguments),
             Task::Soak { arguments } => rust::faults("soak", arguments),
             Task::Live { steps } => rust::live(*steps),
-            Task::Properties { cases } => rust::properties(*cases),
             Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), *minutes),
             Task::Original => python::original().map(|python| println!("{}", python.display())),
         }

@@ -134,16 +134,8 @@ pub fn wheel(profile: &str) -> Result<(), String> {
     let wheels = target()?.join("wheels");
     recreate(&wheels)?;
     let mut maturin = Command::new(bin.join("maturin"));
-    maturin.args([
-        "build",
-        "--locked",
-        "--profile",
-        profile,
-        "--manifest-path",
-        "bindings/python/Cargo.toml",
-        "--interpreter",
-    ]);
-    run(maturin.arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))
+    maturin.args(["build", "--locked", "--manifest-path", "bindings/python/Cargo.toml", "--profile", profile]);
+    run(maturin.arg("--interpreter").arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))
 }
 
 /// Installs the wheel that [`wheel`] built.
@@ -172,7 +164,7 @@ pub fn cycles() -> Result<(), String> {
 pub fn test() -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
-    pytest(&environment, "bindings/python", "not slow and not libraries and not original")
+    pytest(&environment, "bindings/python", "not slow and not libraries and not original", &[])
 }
 
 /// Runs the tests of the environments' package that take long or need the libraries of others.
@@ -182,19 +174,15 @@ pub fn test_libraries() -> Result<(), String> {
     // Snippets, an example and the notebook use the agents.
     [&environment, &rllib].into_iter().try_for_each(|environment| install_with_agents(environment))?;
     mypy(&environment, "bindings/python")?;
-    pytest_with(
-        &environment,
-        "bindings/python",
-        "(slow or libraries) and not original",
-        &[("ENDLESS_LIBRARIES_PYTHON", &rllib)],
-    )
+    let pythons = [("ENDLESS_LIBRARIES_PYTHON", rllib.as_path())];
+    pytest(&environment, "bindings/python", "(slow or libraries) and not original", &pythons)
 }
 
 /// Checks the types of the agents and runs all their tests.
 pub fn test_agents() -> Result<(), String> {
     let environment = agents()?;
     mypy(&environment, "agents")?;
-    pytest_with(&environment, "agents", "", &[("ENDLESS_LIBRARIES_PYTHON", &environment)])
+    pytest(&environment, "agents", "", &[])
 }
 
 /// Runs the tests of the environments' package that compare with the original.
@@ -202,7 +190,7 @@ pub fn test_original() -> Result<(), String> {
     original()?;
     let environment = environment()?;
     install(&environment)?;
-    pytest(&environment, "bindings/python", "original")
+    pytest(&environment, "bindings/python", "original", &[("ENDLESS_ORIGINAL_PYTHON", &venv_folder("original")?)])
 }
 
 fn mypy(environment: &Path, package: &str) -> Result<(), String> {
@@ -210,12 +198,8 @@ fn mypy(environment: &Path, package: &str) -> Result<(), String> {
     run(mypy.args(["-m", "mypy"]).current_dir(workspace().join(package)))
 }
 
-fn pytest(environment: &Path, package: &str, markers: &str) -> Result<(), String> {
-    pytest_with(environment, package, markers, &[("ENDLESS_ORIGINAL_PYTHON", &venv_folder("original")?)])
-}
-
 /// Runs tests, with variables that name the Pythons of other environments.
-fn pytest_with(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
+fn pytest(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
     let mut pytest = Command::new(environment.join("bin/python"));
     pytest.args(["-m", "pytest", "-q", "--timeout", "300", "--durations", "20", "-m", markers]);
     pytest.envs(pythons.iter().map(|(name, folder)| (name, folder.join("bin/python"))));

@@ -33,19 +33,15 @@ pub fn test() -> Result<(), String> {
 
 /// The ignored tests but those that need a browser or the original, or only measure: slow ones, and those that the machine may forbid.
 pub fn test_ignored() -> Result<(), String> {
-    let mut arguments =
-        vec!["test", "--workspace", "--locked", "--no-fail-fast", "--lib", "--tests", "--exclude", "endless-gym-web"];
-    arguments.extend(["--", "--ignored", "--skip", "browser::", "--skip", "live::", "--skip", "measure"]);
+    let mut arguments: Vec<&str> =
+        "test --workspace --locked --no-fail-fast --lib --tests --exclude endless-gym-web -- \
+        --ignored --skip browser:: --skip live:: --skip measure"
+            .split(' ')
+            .collect();
     if !succeeds(Command::new("unshare").args(["--mount", "--map-root-user", "true"])) {
         println!("not run, without permission to create mount namespaces: tests in shared memory of other sizes");
-        arguments.extend([
-            "--skip",
-            "inside_",
-            "--skip",
-            "two_directories_of_one_path",
-            "--skip",
-            "too_little_shared_memory",
-        ]);
+        let skipped = ["inside_", "two_directories_of_one_path", "too_little_shared_memory"];
+        arguments.extend(skipped.iter().flat_map(|name| ["--skip", name]));
     }
     if !rustix::process::geteuid().is_root() {
         println!("not run, since this is not root: tests with segments of another user");
@@ -56,10 +52,8 @@ pub fn test_ignored() -> Result<(), String> {
 
 /// Compares with the original, from a fixed seed.
 pub fn test_original() -> Result<(), String> {
-    let tests = ["test", "--locked", "--test", "integration", "--", "--ignored", "live::"];
-    run(shell::cargo(&tests)
-        .env("ENDLESS_ORIGINAL_PYTHON", python::original()?)
-        .env("PROPTEST_RNG_SEED", PROPERTY_SEED))
+    let mut cargo = shell::cargo(&["test", "--locked", "--test", "integration", "--", "--ignored", "live::"]);
+    run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("PROPTEST_RNG_SEED", PROPERTY_SEED))
 }
 
 /// Compares `steps` steps of each environment with the original, from new seeds; optimised, since it is long.
@@ -67,12 +61,6 @@ pub fn live(steps: u64) -> Result<(), String> {
     let tests = ["test", "--release", "--locked", "--test", "integration", "--", "--ignored", "--nocapture", "live::"];
     let mut cargo = shell::cargo(&tests);
     run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("ENDLESS_LIVE_STEPS", steps.to_string()))
-}
-
-/// Runs the property tests with `cases` cases each, from new seeds; optimised, since they are long.
-pub fn properties(cases: u32) -> Result<(), String> {
-    let tests = ["test", "--release", "--workspace", "--locked", "--lib", "--tests"];
-    run(shell::cargo(&tests).env("PROPTEST_CASES", cases.to_string()))
 }
 
 /// Runs the fuzz targets, or one of them, from new seeds for at least `minutes`; optimised, since it is long.

@@ -71,12 +71,7 @@ pub fn output(command: &mut Command) -> Result<String, String> {
 
 /// Whether a command can be run and succeeds.
 pub fn succeeds(command: &mut Command) -> bool {
-    command
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .status()
-        .is_ok_and(|status| status.success())
+    command.stdin(Stdio::null()).output().is_ok_and(|output| output.status.success())
 }
 
 /// Empties a folder, or creates it.

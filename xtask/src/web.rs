@@ -69,13 +69,9 @@ impl Toolchain {
     }
 }
 
-fn toolchain() -> Result<Toolchain, String> {
-    Toolchain::find().ok_or_else(|| format!("missing: {MISSING}"))
-}
-
 /// Builds the core: without threads and without a system's entropy.
 pub fn build_core() -> Result<(), String> {
-    toolchain()?.build(&["--package", "endless-gym-core", "--no-default-features"]).map(drop)
+    Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-core", "--no-default-features"]).map(drop)
 }
 
 /// Whether there is a Chromium for the tests.
@@ -90,13 +86,9 @@ pub fn folder() -> Result<PathBuf, String> {
     Ok(target()?.join("web"))
 }
 
-/// Builds the page.
-///
-/// # Errors
-///
-/// If there is no compiler for WebAssembly, or if the page has become too large.
+/// Builds the page. An error if there is no compiler for WebAssembly, or if the page has become too large.
 pub fn build() -> Result<(), String> {
-    let built = toolchain()?.build(&["--package", "endless-gym-web"])?;
+    let built = Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-web"])?;
     let mut files = vec![("engine.wasm".to_owned(), read(&built.join("endless_gym_web.wasm"))?)];
     let page = workspace().join("engine/view/page/files");
     let entries = fs::read_dir(&page).map_err(describe(&page))?;
