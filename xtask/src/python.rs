@@ -200,8 +200,9 @@ fn mypy(environment: &Path, package: &str) -> Result<(), String> {
 
 /// Runs tests, with variables that name the Pythons of other environments.
 fn pytest(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
-    let mut pytest = Command::new(environment.join("bin/python"));
-    pytest.args(["-m", "pytest", "-q", "--timeout", "300", "--durations", "20", "-m", markers]);
+    // Not `python -m pytest`, which would import the package's folder instead of the installed package.
+    let mut pytest = Command::new(environment.join("bin/pytest"));
+    pytest.args(["-q", "--timeout", "300", "--durations", "20", "-m", markers]);
     pytest.envs(pythons.iter().map(|(name, folder)| (name, folder.join("bin/python"))));
     run(pytest.current_dir(workspace().join(package)))
 }

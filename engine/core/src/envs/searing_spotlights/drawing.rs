@@ -6,8 +6,8 @@
 
 use super::circles::{Circle, Circles};
 use super::config::BAR_HEIGHT;
-use super::light::{LightChange, disc, outline};
-use super::pictures::{Assets, Pictures, Pixels};
+use super::light::{LightChange, Pixels, disc, outline};
+use super::pictures::{Assets, Pictures};
 use super::scene::Scene;
 use super::state::State;
 use crate::envs::screen::SCREEN;

@@ -11,10 +11,12 @@ use smallvec::SmallVec;
 use super::circles::{Circle, Circles, Edges, MAX_MOVED_RADIUS, Numbers, REACH, is_short_move};
 use super::config::BAR_HEIGHT;
 use super::parameters::MAX_SPOT_RADIUS;
-use super::pictures::Pixels;
 use super::scene::Scene;
 use crate::envs::screen::{Frame, SCREEN};
-use crate::raster::{Canvas, Disc, DiscColumn, Rect, circle_outline, copy_run};
+use crate::raster::{Canvas, Disc, DiscColumn, Rect, Rgb, circle_outline, copy_run};
+
+/// The pixels of a background, column by column.
+pub(super) type Pixels = [[Rgb; SCREEN]; SCREEN];
 
 /// Number of circles that are searched for one that has moved.
 const WINDOW: usize = 3;

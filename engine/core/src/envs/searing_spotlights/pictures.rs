@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use super::config::Config;
-use super::light;
+use super::light::{self, Pixels};
 use super::parameters::{Parameters, Variant};
 use super::state::Background;
 use crate::envs::character_sprites::CharacterSprites;
@@ -21,9 +21,6 @@ const EXIT_CLOSED: Rgb = [55, 55, 55];
 
 /// Side of a background's tile in pixels: 50 on the original's screen of 336 pixels, truncated at this scale.
 const TILE: usize = 12;
-
-/// The pixels of a background, column by column.
-pub(super) type Pixels = [[Rgb; SCREEN]; SCREEN];
 
 /// A chessboard with the first of two colours, which may be equal, in its corner.
 fn chessboard(colors: [Rgb; 2]) -> Box<Pixels> {
