@@ -7,7 +7,6 @@ use super::light::{self, Pixels};
 use super::parameters::{Parameters, Variant};
 use super::state::Background;
 use crate::envs::character_sprites::CharacterSprites;
-use crate::envs::screen::SCREEN;
 use crate::raster::{CornerRadii, Rect, Rgb, Sprite, Surface, blend_keyed};
 
 const BLACK: Rgb = [0, 0, 0];
