@@ -231,8 +231,11 @@ def markdown(whole: dict[str, Any]) -> str:
         for name, values in row["steps_per_second"].items():
             median = row["medians"][name]
             lines.append(f"| {name} | {median:,} | {min(values):,} | {max(values):,} | {median / reference:.1f} |")
-        lines += ["", "| | target | reached |", "| --- | ---: | ---: |"]
-        lines += [f"| {target['what']} | {target['target']} | {target['reached']} |" for target in row["targets"]]
+    names = [row["id"] for row in whole["environments"]]
+    lines += ["", "## Targets", "", f"| | target | {' | '.join(names)} |", f"| --- |{' ---: |' * (len(names) + 1)}"]
+    for same in zip(*(row["targets"] for row in whole["environments"]), strict=True):
+        reached = " | ".join(str(target["reached"]) for target in same)
+        lines.append(f"| {same[0]['what']} | {same[0]['target']} | {reached} |")
     return "\n".join(lines) + "\n"
 
 

@@ -19,12 +19,6 @@ Spec = dict[str, Any]
 ROOT = Path(__file__).parent.parent
 SPECS: list[Spec] = []
 
-#: Infos of all environments, which are not in their tables.
-COMMON_INFOS = [
-    {"name": "reward", "description": "sum of the rewards of the episode"},
-    {"name": "length", "description": "steps of the episode"},
-]
-
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A table in Markdown."""
@@ -65,20 +59,20 @@ def overview(name: str) -> str:
 
 
 def actions(_: str) -> str:
-    """What the numbers of an action mean."""
+    """What the numbers of an action mean, with a row for each branch."""
 
     def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
         for branch, described in enumerate(spec["actions"]):
             place = f"`action[{branch}]`" if len(spec["actions"]) > 1 else "`action`"
-            for value, choice in enumerate(described["choices"]):
-                yield place, str(value), choice["name"], choice["description"]
+            yield place, *(f"{choice['name']}: {choice['description']}" for choice in described["choices"])
 
     found = merged(SPECS, rows)
     most = max((row[0] for row in found), key=len)
-    return table(
-        ["ids", "branch", "number", "name", "meaning"],
-        (("all others", *row[1:]) if row[0] == most else row for row in found),
-    )
+    numbers = [str(number) for number in range(max(map(len, found)) - 2)]
+    rest = [
+        ("all others" if row[0] == most else row[0], *row[1:], *[""] * (len(numbers) + 2 - len(row))) for row in found
+    ]
+    return table(["ids", "branch", *numbers], rest)
 
 
 def parameters(name: str) -> str:
@@ -108,10 +102,8 @@ def allowed(parameter: dict[str, Any]) -> str:
 
 
 def infos(name: str) -> str:
-    """Infos of an episode's last step."""
-    rows = merged(
-        family(name), lambda spec: [(f"`{each['name']}`", each["description"]) for each in COMMON_INFOS + spec["info"]]
-    )
+    """Infos of an episode's last step, in addition to those of all environments."""
+    rows = merged(family(name), lambda spec: [(f"`{each['name']}`", each["description"]) for each in spec["info"]])
     return table(["ids", "info", "meaning"], rows)
 
 
@@ -163,13 +155,16 @@ VARIANT = re.compile(
 
 
 def errors(names: str) -> str:
-    """The messages of error types, each with its cause and the help of `error_help.toml`."""
+    """The messages of error types, each with its cause; those with the same help in `error_help.toml` share a line."""
     lines = []
     for name in names.split():
         variants, help = error_types().get(name, {}), HELP.get(name, {})
         if differing := variants.keys() ^ help.keys():
             raise SystemExit(f"docs/error_help.toml, [{name}]: not both an error and a help: {', '.join(differing)}")
-        lines += [f"- `` {text} ``: {reason} *Help:* {help[key]}" for key, (text, reason) in variants.items()]
+        same: dict[str, list[str]] = {}
+        for key, (text, reason) in variants.items():
+            same.setdefault(help[key], []).append(f"`` {text} ``: {reason}")
+        lines += [f"- {' '.join(described)} *Help:* {text}" for text, described in same.items()]
     return "\n".join(lines)
 
 

@@ -121,10 +121,11 @@ def report() -> None:
     lines = [
         "# Learning with and without memory",
         "",
-        "Agents with and without memory on small tasks, with feature observations unless the name contains `pixels`. Each run is",
-        "one command, on one or two cores of a shared machine. The reward is the mean over 50 seeds that training never uses,",
-        "three episodes each. An agent without memory was trained for as many updates as the slowest earlier run with memory.",
-        "Written by `learning.py --plot` from the JSON files in this folder, which contain the learning curves and the commands.",
+        "Agents with and without memory on small tasks, with feature observations unless the name contains `pixels`.",
+        "Each run is one command, on one or two cores of a shared machine. The reward is the mean over 50 seeds that",
+        "training never uses, three episodes each. An agent without memory was trained for as many updates as the",
+        "slowest earlier run with memory. The JSON files in this folder contain the exact numbers, the learning",
+        "curves and the commands; `learning.py --plot` writes this page from them.",
     ]
     for task in TASKS:
         file = FOLDER / f"{task}.json"
@@ -133,13 +134,14 @@ def report() -> None:
         data = json.loads(file.read_text())
         best = f", {data['best_reward']} at most" if data["best_reward"] else ""
         lines += ["", f"## {task}", "", f"    {data['runs'][0]['command']}", ""]
-        lines += [
-            f"| agent | seed | steps | minutes | evaluation reward{best} |",
-            "| --- | --- | --- | --- | --- |",
-        ]
-        for row in sorted(data["runs"], key=lambda row: (row["agent"] == "none", row["agent"], row["seed"])):
-            reward = f"{row['evaluation_reward']:.3f}"
-            lines.append(f"| {row['agent']} | {row['seed']} | {row['steps']:,} | {row['minutes']:.1f} | {reward} |")
+        lines += [f"| agent | seeds | steps | minutes | evaluation reward{best} |", "| --- | --- | --- | --- | --- |"]
+        for agent in sorted({row["agent"] for row in data["runs"]}, key=lambda agent: (agent == "none", agent)):
+            rows = sorted((row for row in data["runs"] if row["agent"] == agent), key=lambda row: row["seed"])
+            seeds = ", ".join(str(row["seed"]) for row in rows)
+            steps = ", ".join(f"{row['steps'] / 1000:.0f}k" for row in rows)
+            minutes = ", ".join(f"{row['minutes']:.1f}" for row in rows)
+            rewards = ", ".join(f"{row['evaluation_reward']:.3f}" for row in rows)
+            lines.append(f"| {agent} | {seeds} | {steps} | {minutes} | {rewards} |")
         lines += ["", f"![curves]({task}.png)"]
     (FOLDER / "README.md").write_text("\n".join(lines) + "\n")
 
