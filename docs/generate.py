@@ -45,11 +45,12 @@ def short(spec: Spec) -> str:
     return spec["id"].removesuffix("-v0")
 
 
-def overview(name: str) -> str:
+def overview(_: str) -> str:
     """Environments with links to their sections."""
-    page = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
     rows = []
-    for spec in family(name):
+    for spec in SPECS:
+        name = re.sub(r"Endless-|B?(-Grid)?-v0", "", spec["id"])
+        page = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
         ((kind, choices),) = spec["action_space"].items()
         link = f"[`{spec['id']}`]({page}.md#{spec['id'].lower()})"
         rows.append(
