@@ -423,7 +423,6 @@ def from_dict(values: dict[str, Any]) -> Settings:
         KeyError: A group is missing.
     """
     values = dict(values)
-    values.pop("cuda_graphs", None)  # a setting of earlier versions
     groups = {
         "environment": Environment,
         "recurrence": Recurrence,

@@ -23,7 +23,6 @@ from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.settings import Settings
 
 STEPS, GROUPS = 16, 2
-WORKSPACE = Path(__file__).parents[2]
 
 #: Operations of one step of one group, and of one minibatch, each with its share of what is done once for a segment or an
 #: update. The Transformer-XL has two blocks, and the actions two branches. A change that needs more must say why.

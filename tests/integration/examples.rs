@@ -52,7 +52,7 @@ impl Drop for Running {
     }
 }
 
-/// The program of an example. Cargo builds all of them for `cargo test`, but none for `cargo test --test examples`. `cargo xtask test`
+/// The program of an example. Cargo builds all of them for `cargo test`, but none for `cargo test --test integration`. `cargo xtask test`
 /// sets the variable, so that the test does not wait for what cargo compiles beside it.
 fn example(name: &str) -> PathBuf {
     static BUILT: Once = Once::new();

@@ -2,7 +2,7 @@
 //!
 //! The engine plays first, with experts that err now and then, so that episodes get far; the original plays the same actions; the
 //! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original. Without it these tests cannot run, so they are
-//! ignored unless asked for; `cargo xtask test` sets the original up and asks for them. With `ENDLESS_LIVE_STEPS`, the steps to
+//! ignored unless asked for; `cargo xtask test --all` sets the original up and asks for them. With `ENDLESS_LIVE_STEPS`, the steps to
 //! compare for each id, as `cargo xtask live` sets it, every run is another one; without, all runs are the same.
 
 use std::io::{BufRead, BufReader, Write};
@@ -31,7 +31,7 @@ struct Original {
 impl Original {
     fn start() -> Self {
         let python = std::env::var("ENDLESS_ORIGINAL_PYTHON").expect(
-            "run `cargo xtask test`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
+            "run `cargo xtask test --all`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
         );
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/reference/play.py");
         let mut child = Command::new(python)
@@ -167,7 +167,7 @@ macro_rules! live {
     ($($name:ident: $id:literal,)*) => {
         $(
             #[test]
-            #[ignore = "needs the original, in the Python that ENDLESS_ORIGINAL_PYTHON names: run `cargo xtask test`"]
+            #[ignore = "needs the original, in the Python that ENDLESS_ORIGINAL_PYTHON names: run `cargo xtask test --all`"]
             fn $name() {
                 compare($id);
             }

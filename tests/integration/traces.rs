@@ -99,7 +99,7 @@ fn the_first_frames_are_the_same_byte_by_byte() {
     }
 }
 
-/// The traces alone cover these reset parameters: the published original, with which `tests/live.rs` compares, lacks them.
+/// The traces alone cover these reset parameters: the published original, with which `tests/integration/live.rs` compares, lacks them.
 #[test]
 fn traces_have_the_newest_reset_parameters() {
     for (trace, parameter) in [

@@ -1,4 +1,4 @@
-"""Plays given actions in the original and prints the trace; `tests/live.rs` runs it.
+"""Plays given actions in the original and prints the trace; `tests/integration/live.rs` runs it.
 
 Reads one request a line: {"env", "options", "views", "episodes": [{"seed", "actions"}]}. Answers each with one line: a trace as
 README.md describes it, or {"error": text} if the original raises.

@@ -10,7 +10,7 @@ use crate::{python, web};
 /// Checks the generated parts of the pages, or writes them, and builds the site. A warning, a link to a missing page or anchor, and an
 /// error message without help are errors.
 pub fn build(write: bool) -> Result<(), String> {
-    let folder = python::docs()?;
+    let folder = python::sync("docs", "bindings/python", &["--group", "docs"])?;
     let mut generate = Command::new(folder.join("bin/python"));
     generate.arg("docs/generate.py").args((!write).then_some("--check")).current_dir(workspace());
     let list = target()?.join("environments.json");

@@ -61,8 +61,10 @@ fn versions() -> Result<(), String> {
         ("xtask/src/release.rs", maturin),
         ("bindings/python/uv.lock", "\nname = \"maturin\"\nversion = \"1.16.0\"\n".to_owned()),
     ];
-    for name in ["core", "service", "view", "cli"] {
-        let line = format!("endless-gym-{name} = {{ path = \"engine/{name}\", version = \"{version}\" }}");
+    for (name, path) in
+        [("core", "core"), ("service", "service"), ("page", "view/page"), ("view", "view"), ("cli", "cli")]
+    {
+        let line = format!("endless-gym-{name} = {{ path = \"engine/{path}\", version = \"{version}\" }}");
         expected.push(("Cargo.toml", line));
     }
     for (file, text) in expected {

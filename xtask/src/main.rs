@@ -11,17 +11,11 @@ mod web;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::Parser;
 
 /// Development tasks of Endless Gym.
 #[derive(Parser)]
 #[command(bin_name = "cargo xtask")]
-struct Cli {
-    #[command(subcommand)]
-    task: Task,
-}
-
-#[derive(Subcommand)]
 enum Task {
     /// Check formatting, lint, and run the tests that need only Rust, a linker and CPython.
     Test {
@@ -95,28 +89,23 @@ enum Task {
     Original,
 }
 
-impl Task {
-    fn run(&self) -> Result<(), String> {
-        match self {
-            Task::Test { list: true, .. } => steps::list(),
-            Task::Test { all, only, keep_going, .. } => steps::run(only, *all, *keep_going),
-            Task::Docs { write } => docs::build(*write),
-            Task::Dist => release::build(),
-            Task::Pictures => python::pictures(),
-            Task::Web => web::build(),
-            Task::Instructions { record } => rust::instructions(*record),
-            Task::Bench { arguments } => python::bench(arguments),
-            Task::Faults { arguments } => rust::faults("faults", arguments),
-            Task::Soak { arguments } => rust::faults("soak", arguments),
-            Task::Live { steps } => rust::live(*steps),
-            Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), *minutes),
-            Task::Original => python::original().map(|python| println!("{}", python.display())),
-        }
-    }
-}
-
 fn main() -> ExitCode {
-    match Cli::parse().task.run() {
+    let result = match Task::parse() {
+        Task::Test { list: true, .. } => steps::list(),
+        Task::Test { all, only, keep_going, .. } => steps::run(&only, all, keep_going),
+        Task::Docs { write } => docs::build(write),
+        Task::Dist => release::build(),
+        Task::Pictures => python::pictures(),
+        Task::Web => web::build(),
+        Task::Instructions { record } => rust::instructions(record),
+        Task::Bench { arguments } => python::bench(&arguments),
+        Task::Faults { arguments } => rust::faults("faults", &arguments),
+        Task::Soak { arguments } => rust::faults("soak", &arguments),
+        Task::Live { steps } => rust::live(steps),
+        Task::Fuzz { target, minutes } => rust::fuzz(target.as_deref(), minutes),
+        Task::Original => python::original().map(|python| println!("{}", python.display())),
+    };
+    match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(message) => {
             eprintln!("xtask: {message}");

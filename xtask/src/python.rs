@@ -5,6 +5,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::shell::{describe, files_below, output, recreate, run, target, workspace};
 
@@ -78,7 +79,7 @@ pub fn pip_install(environment: &Path) -> Result<Command, String> {
 }
 
 /// A virtual environment with the packages that a project's lock file has for some groups or extras, without the project itself.
-fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, String> {
+pub fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, String> {
     let folder = venv_folder(name)?;
     let mut sync =
         uv(&["sync", "--quiet", "--locked", "--inexact", "--no-install-project", "--project", project, "--python"])?;
@@ -89,11 +90,6 @@ fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, String
 /// The environment of the tests that run everywhere.
 pub fn environment() -> Result<PathBuf, String> {
     sync("python", "bindings/python", &["--group", "dev"])
-}
-
-/// The environment of the documentation.
-pub fn docs() -> Result<PathBuf, String> {
-    sync("docs", "bindings/python", &["--group", "docs"])
 }
 
 /// The environment with the libraries of others, with PufferLib, and without the games and the trainer in C that it would compile.
@@ -128,18 +124,26 @@ pub fn original() -> Result<PathBuf, String> {
     Ok(tools("original", &base, &["memory-gym==1.0.2", "numpy==1.26.4"])?.join("bin/python"))
 }
 
-/// Builds the wheel, in the profile of the Rust tests.
+/// Builds the wheel in a profile; "dev" is that of the Rust tests.
 pub fn wheel(profile: &str) -> Result<(), String> {
     let bin = environment()?.join("bin");
     let wheels = target()?.join("wheels");
     recreate(&wheels)?;
     let mut maturin = Command::new(bin.join("maturin"));
     maturin.args(["build", "--locked", "--manifest-path", "bindings/python/Cargo.toml", "--profile", profile]);
-    run(maturin.arg("--interpreter").arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))
+    run(maturin.arg("--interpreter").arg(bin.join("python")).arg("--out").arg(&wheels).current_dir(workspace()))?;
+    IS_BUILT.store(true, Ordering::Relaxed);
+    Ok(())
 }
 
-/// Installs the wheel that [`wheel`] built.
+/// Whether this run has built the wheel.
+static IS_BUILT: AtomicBool = AtomicBool::new(false);
+
+/// Installs the wheel that [`wheel`] built in this run; builds it if none was.
 fn install(environment: &Path) -> Result<(), String> {
+    if !IS_BUILT.load(Ordering::Relaxed) {
+        wheel("dev")?;
+    }
     let wheel = files_below(&target()?.join("wheels"))?.pop().ok_or("no wheel has been built")?;
     run(pip_install(environment)?.args(["--reinstall", "--no-deps"]).arg(wheel))
 }
@@ -164,6 +168,7 @@ pub fn cycles() -> Result<(), String> {
 pub fn test() -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
+    mypy(&environment, "bindings/python")?;
     pytest(&environment, "bindings/python", "not slow and not libraries and not original", &[])
 }
 
@@ -173,7 +178,6 @@ pub fn test_libraries() -> Result<(), String> {
     let rllib = sync("rllib", "bindings/python", &["--group", "rllib"])?;
     // Snippets, an example and the notebook use the agents.
     [&environment, &rllib].into_iter().try_for_each(|environment| install_with_agents(environment))?;
-    mypy(&environment, "bindings/python")?;
     let pythons = [("ENDLESS_LIBRARIES_PYTHON", rllib.as_path())];
     pytest(&environment, "bindings/python", "(slow or libraries) and not original", &pythons)
 }
@@ -223,7 +227,6 @@ pub fn bench(arguments: &[String]) -> Result<(), String> {
 
 /// Makes all pictures in `docs/images`.
 pub fn pictures() -> Result<(), String> {
-    wheel("dev")?;
     let environment = libraries()?;
     install(&environment)?;
     run(Command::new(environment.join("bin/python")).arg(workspace().join("xtask/pictures/make.py")))

@@ -49,7 +49,6 @@ const STEPS: &[Step] = &[
     first("clippy", rust::clippy),
     first("import-cycles", python::cycles),
     first("python-lint", python::lint),
-    first("wheel", || python::wheel("dev")),
     first("python-tests", python::test),
     rest("files", &[], files::check),
     rest("rust-ignored", &[], rust::test_ignored),

@@ -204,7 +204,10 @@ def options_text(options: Mapping[str, Any] | None) -> str:
 
 def json_text(value: Any) -> str:
     """JSON text of a value, which may contain numpy's numbers and arrays."""
-    return json.dumps(value, default=_plain)
+    try:
+        return json.dumps(value, default=_plain, allow_nan=False)
+    except ValueError as error:
+        raise ValueError(f"reset parameters must be finite, got {value!r}") from error
 
 
 def _plain(value: Any) -> Any:

@@ -356,9 +356,11 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Disconnect, and stop the engine if `serve` started it. Arrays remain valid."""
-        self._backend.close()
-        if self._engine is not None:
-            self._engine.end()
+        try:
+            self._backend.close()
+        finally:
+            if self._engine is not None:
+                self._engine.end()
 
     def __enter__(self) -> EndlessVectorEnv:
         return self

@@ -172,9 +172,12 @@ impl Connection {
         Ok((found.restarted, found.incarnation, found.groups.into_iter().map(group).collect()))
     }
 
-    /// Disconnects. Arrays remain valid.
-    fn close(&mut self) {
-        self.trainer = None;
+    /// Disconnects. Arrays remain valid. While another call waits, such as one that a signal handler interrupted, that call and its
+    /// connection remain.
+    fn close(slf: &Bound<'_, Self>) {
+        if let Ok(mut connection) = slf.try_borrow_mut() {
+            connection.trainer = None;
+        }
     }
 }
 

@@ -177,10 +177,12 @@ impl Pools {
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
     }
 
-    /// Releases the environments. Arrays remain valid.
-    fn close(&mut self) {
-        self.pools.clear();
-        self.pending.clear();
+    /// Releases the environments, unless another thread steps them. Arrays remain valid.
+    fn close(slf: &Bound<'_, Self>) {
+        if let Ok(mut pools) = slf.try_borrow_mut() {
+            pools.pools.clear();
+            pools.pending.clear();
+        }
     }
 }
 

@@ -22,7 +22,7 @@ def original_python() -> str:
     """A Python that has the original, memory-gym 1.0.2."""
     python = os.environ.get("ENDLESS_ORIGINAL_PYTHON")
     if not python:
-        pytest.fail("ENDLESS_ORIGINAL_PYTHON names no Python with memory-gym 1.0.2; run `cargo xtask test`")
+        pytest.fail("ENDLESS_ORIGINAL_PYTHON names no Python with memory-gym 1.0.2; run `cargo xtask test --all`")
     return python
 
 

@@ -1,5 +1,6 @@
 """Engines that `serve` started and no call closed end when nothing refers to them, and with their process."""
 
+import contextlib
 import gc
 import importlib
 import os
@@ -143,3 +144,19 @@ def test_close_ends_the_engine_while_a_forked_child_lives() -> None:
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+
+
+def test_a_signal_handler_closes_environments_that_wait_for_the_engine() -> None:
+    envs = endless_gym.serve(ID, 1)
+    envs.reset()
+    process = envs._engine._process
+    os.kill(process.pid, signal.SIGSTOP)
+    before = signal.signal(signal.SIGALRM, lambda *_: envs.close())
+    signal.setitimer(signal.ITIMER_REAL, 0.3)
+    try:
+        # Closing wakes the engine, which may still answer.
+        with contextlib.suppress(endless_gym.EngineLost):
+            envs.step(envs.action_space.sample())
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert process.returncode == 0

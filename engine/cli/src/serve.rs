@@ -124,8 +124,9 @@ fn read(path: &Path) -> Result<EngineConfig, Failure> {
 
 /// Runs `endless serve`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let stop = stop::on_signal()?;
+    // Before `on_signal`: a signal ends the process while it waits for standard input.
     let mut config = args.config.as_deref().map_or_else(|| args.engine.configure(), read)?;
+    let stop = stop::on_signal()?;
     if let Some(parent) = args.child {
         stop::with_parent(stop, parent);
     }

@@ -39,4 +39,6 @@ pub(crate) use view::BatchMut;
 /// seed counts the environments of all groups.
 ///
 /// Version 6: requests that set the options of next episodes, and that ask for seed and options of the running ones.
-pub const LAYOUT_VERSION: u32 = 6;
+///
+/// Version 8: batches no longer say which rows of frames have changed, as those of version 7 did.
+pub const LAYOUT_VERSION: u32 = 8;
