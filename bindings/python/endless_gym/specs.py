@@ -207,7 +207,7 @@ def json_text(value: Any) -> str:
     try:
         return json.dumps(value, default=_plain, allow_nan=False)
     except ValueError as error:
-        raise ValueError(f"reset parameters must be finite, got {value!r}") from error
+        raise ValueError(f"reset parameters must be finite numbers: {error}") from error
 
 
 def _plain(value: Any) -> Any:
