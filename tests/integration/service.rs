@@ -11,7 +11,8 @@ use crate::support::service::{ID, Place, ROLE_ARGUMENTS, engine_config};
 use endless_gym::envs::{ActionError, ActionSpace, spec};
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use endless_gym::service::{
-    ConnectConfig, Engine, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer, running_engines,
+    ConnectConfig, Engine, EngineStatus, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer,
+    running_engines,
 };
 use endless_gym_core::batch::{ActionSection, Batch, Contents, action_layout, batch_layout, zeroed};
 use rustix::process::{Pid, Signal, kill_process};
@@ -291,17 +292,15 @@ fn deaths_at_any_moment_are_survived() {
 }
 
 #[test]
-fn an_engine_that_ends_keeps_its_services_until_its_specification_is_removed() {
+fn an_engine_that_ends_gives_up_its_name_without_the_lock() {
     let place = Place::new();
     let engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
-    let before = place.leftovers();
     let lock = std::fs::File::open(place.namespace().root()).unwrap();
     lock.lock().unwrap();
     std::thread::scope(|scope| {
         let ending = scope.spawn(|| drop(engine));
-        // The specification cannot be removed without the lock.
         std::thread::sleep(Duration::from_millis(200));
-        assert_eq!(place.leftovers(), before);
+        assert_eq!(EngineStatus::all(place.namespace()), []);
         lock.unlock().unwrap();
         ending.join().unwrap();
     });
@@ -482,38 +481,31 @@ fn messages_of_another_type_are_refused() {
     assert!(matches!(error, ServiceError::IncompatibleTypes { .. }), "{error}");
 }
 
-/// More than the time after which an engine removes the service of a dead engine of the same name.
-const LONGER_THAN_A_REMOVAL: Duration = Duration::from_millis(2500);
-
-/// Leaves the specification service of a killed engine, which the removal of dead nodes keeps until the returned reader is dropped.
-fn remains(place: &Place, service: &str) -> Box<dyn std::any::Any> {
+/// Leaves what a killed engine leaves.
+fn remains(place: &Place, service: &str) {
     let mut engine = place.engine(service, 1, 1);
     place.trainer(service).unwrap();
-    let reader = crate::support::foreign::reader(place.namespace(), service);
     engine.kill();
-    reader
 }
 
 #[test]
 fn remains_of_a_dead_engine_do_not_block_its_name() {
     let place = Place::new();
-    let _reader = remains(&place, "gym");
+    remains(&place, "gym");
     let _engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
     assert_eq!(running_engines(place.namespace()).unwrap(), ["gym"]);
 }
 
 #[test]
-fn remains_are_not_removed_while_another_process_holds_the_lock() {
+fn a_late_engine_finds_the_successor_of_a_dead_one() {
     let place = Place::new();
-    let reader = remains(&place, "gym");
+    remains(&place, "gym");
     let lock = std::fs::File::open(place.namespace().root()).unwrap();
     lock.lock().unwrap();
     std::thread::scope(|scope| {
         let late = scope.spawn(|| Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).map(drop));
-        std::thread::sleep(LONGER_THAN_A_REMOVAL);
+        std::thread::sleep(Duration::from_millis(500));
         // A successor takes the name while the other engine waits.
-        drop(reader);
-        crate::support::foreign::force_remove(place.namespace(), "gym");
         let _successor = crate::support::foreign::engine_of_version(place.namespace(), "gym", 999);
         lock.unlock().unwrap();
         let refused = late.join().unwrap().unwrap_err();
@@ -529,7 +521,7 @@ fn remains_are_not_removed_while_another_process_holds_the_lock() {
 #[test]
 fn of_several_engines_one_takes_the_name_of_a_dead_one() {
     let place = Place::new();
-    let _reader = remains(&place, "gym");
+    remains(&place, "gym");
     std::thread::scope(|scope| {
         let start = || Engine::new(&engine_config(place.namespace(), "gym", 1, 1));
         let threads: Vec<_> = (0..4).map(|_| scope.spawn(start)).collect();

@@ -8,14 +8,14 @@
 //!
 //! | iceoryx2 service | messaging pattern | direction | content |
 //! | --- | --- | --- | --- |
-//! | `endless-gym/NAME` | blackboard | engine → all | the [`ServiceSpecification`] as JSON |
 //! | `endless-gym/NAME/INCARNATION/act/GROUP` | publish/subscribe | trainer → engine | requests |
 //! | `endless-gym/NAME/INCARNATION/obs/GROUP` | publish/subscribe | engine → trainer, observers | responses |
 //! | `endless-gym/NAME/INCARNATION/to_engine` | event | trainer → engine | number of a group with a request |
 //! | `endless-gym/NAME/INCARNATION/to_trainer` | event | engine → trainer | number of a group with a response |
 //!
 //! The incarnation is a random number that an engine draws when it starts, so that an engine shares no service with a dead
-//! predecessor of the same name.
+//! predecessor of the same name. The [`ServiceSpecification`] is JSON text in the engine's status file, `PREFIX NAME.INCARNATION.status`
+//! in `/dev/shm`, which the engine locks (`flock`) for its life.
 //!
 //! # Messages
 //!

@@ -1,5 +1,7 @@
 //! Engines and trainers that are written against the protocol and do not use the library. They can send invalid messages.
 
+use std::fs::File;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
@@ -58,20 +60,6 @@ pub struct ResponseHeader {
     status: u32,
     padding: u32,
 }
-
-#[derive(Clone, Copy, Debug, ZeroCopySend)]
-#[type_name("endless_gym::SpecificationHead")]
-#[repr(C)]
-struct Head {
-    layout_version: u32,
-    length: u32,
-    package: [u8; 32],
-}
-
-#[derive(Clone, Copy, Debug, ZeroCopySend)]
-#[type_name("endless_gym::SpecificationPiece")]
-#[repr(C)]
-struct Piece([u8; 4096]);
 
 fn node(namespace: &Namespace) -> Node<ipc::Service> {
     std::fs::create_dir_all(namespace.root()).unwrap();
@@ -196,22 +184,6 @@ impl SharedWords {
     }
 }
 
-/// Opens a specification without the namespace's lock. Its service exists until the returned value is dropped, even if its engine
-/// dies.
-pub fn reader(namespace: &Namespace, service: &str) -> Box<dyn std::any::Any> {
-    let node = node(namespace);
-    let name = ServiceName::new(&format!("endless-gym/{service}")).unwrap();
-    let board = node.service_builder(&name).blackboard_opener::<u32>().open().unwrap();
-    Box::new((board, node))
-}
-
-/// Removes the specification of a dead engine.
-pub fn force_remove(namespace: &Namespace, service: &str) {
-    let name = ServiceName::new(&format!("endless-gym/{service}")).unwrap();
-    // SAFETY: its engine is dead, and it has no readers.
-    unsafe { node(namespace).force_remove_service(&name, MessagingPattern::Blackboard) }.unwrap();
-}
-
 /// An engine of one group that can send any batch and does not answer requests.
 pub struct Engine {
     observations: Publisher<ipc::Service, [PayloadBlock], ResponseHeader>,
@@ -273,7 +245,7 @@ impl Engine {
         let observations =
             service.publisher_builder().initial_max_slice_len(specification.batch.blocks()).create().unwrap();
         let text = serde_json::to_vec(&specification).unwrap();
-        let published = publish(&node, &specification.service, LAYOUT_VERSION, &text);
+        let published = publish(namespace, &specification.service, LAYOUT_VERSION, &text);
         Engine { observations, specification, _parts: Box::new((published, service, node)) }
     }
 
@@ -292,34 +264,51 @@ impl Engine {
     }
 }
 
-/// Publishes a specification like an engine does. It is removed when the returned value is dropped.
-fn publish(node: &Node<ipc::Service>, service: &str, layout_version: u32, text: &[u8]) -> Box<dyn std::any::Any> {
+/// A specification that is published like an engine's, until this is dropped.
+struct Published {
+    path: PathBuf,
+    /// Holds the lock.
+    _file: File,
+}
+
+impl Drop for Published {
+    fn drop(&mut self) {
+        std::fs::remove_file(&self.path).unwrap();
+    }
+}
+
+/// Writes a status file: a sequence number, the engine's record and that of one group, and the specification.
+fn publish(namespace: &Namespace, service: &str, layout_version: u32, text: &[u8]) -> Published {
+    const RECORDS: usize = (32 + 24) * 8;
+    let mut bytes = vec![0; RECORDS];
     let mut package = [0; 32];
     package[..5].copy_from_slice(b"0.0.9");
-    let head = Head { layout_version, length: text.len() as u32, package };
-    let name = ServiceName::new(&format!("endless-gym/{service}")).unwrap();
-    let mut board = node.service_builder(&name).blackboard_creator::<u32>().add(0, head);
-    for (key, bytes) in (1..).zip(text.chunks(4096)) {
-        let mut piece = Piece([0; 4096]);
-        piece.0[..bytes.len()].copy_from_slice(bytes);
-        board = board.add(key, piece);
-    }
-    let board = board.create().unwrap();
-    let writer = board.writer_builder().create().unwrap();
-    Box::new((writer, board))
+    let length = text.len() as u64;
+    let head = [&b"EGYMSTAT"[..], &layout_version.to_ne_bytes(), &7_u32.to_ne_bytes(), &package, &length.to_ne_bytes()];
+    let head = head.concat();
+    bytes[8..][..head.len()].copy_from_slice(&head);
+    // After incarnation and time of the start.
+    bytes[8 + head.len() + 16..][..4].copy_from_slice(&1_u32.to_ne_bytes());
+    bytes.extend_from_slice(text);
+    let prefix = std::fs::read_to_string(namespace.root().join("prefix")).unwrap();
+    let path = PathBuf::from(format!("/dev/shm/{prefix}{service}.{:016x}.status", 7));
+    std::fs::write(&path, bytes).unwrap();
+    let file = File::open(&path).unwrap();
+    file.lock().unwrap();
+    Published { path, _file: file }
 }
 
 /// An engine of another layout version.
 pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u32) -> Box<dyn std::any::Any> {
     let node = node(namespace);
-    let published = publish(&node, service, layout_version, b"not JSON");
+    let published = publish(namespace, service, layout_version, b"not JSON");
     Box::new((published, node))
 }
 
 /// Publishes any text as a specification.
 pub fn specification_text(namespace: &Namespace, service: &str, text: &[u8]) -> Box<dyn std::any::Any> {
     let node = node(namespace);
-    let published = publish(&node, service, LAYOUT_VERSION, text);
+    let published = publish(namespace, service, LAYOUT_VERSION, text);
     Box::new((published, node))
 }
 
@@ -331,7 +320,7 @@ pub fn specification(
 ) -> Box<dyn std::any::Any> {
     let node = node(namespace);
     let text = serde_json::to_vec(specification).unwrap();
-    let published = publish(&node, service, LAYOUT_VERSION, &text);
+    let published = publish(namespace, service, LAYOUT_VERSION, &text);
     Box::new((published, node))
 }
 
@@ -346,6 +335,6 @@ pub fn engine_of_other_type(
     let name = format!("endless-gym/{service}/{:016x}/act/0", specification.incarnation);
     let act = node.service_builder(&ServiceName::new(&name).unwrap()).publish_subscribe::<[u8]>().create().unwrap();
     let text = serde_json::to_vec(&specification).unwrap();
-    let published = publish(&node, service, LAYOUT_VERSION, &text);
+    let published = publish(namespace, service, LAYOUT_VERSION, &text);
     Box::new((published, act, node))
 }

@@ -92,7 +92,7 @@ fn find(node: &NamespaceNode, config: &ConnectConfig) -> Result<ServiceSpecifica
     if let Some(specification) = discovery::read(node, &service)? {
         return Ok(specification);
     }
-    let running = discovery::list(node)?;
+    let running = discovery::list(node);
     if running.contains(&service) {
         // It has started since it was looked for, or it is ending.
         return Err(ServiceError::EngineUnreachable { service });

@@ -341,7 +341,7 @@ impl ObserverStatusWriter {
         let _creating = node.creating().ok()?;
         let record = ObserverRecord { process: std::process::id(), group: group as u32, ..ObserverRecord::default() };
         let path = status_file::observer_path(node.prefix(), specification.incarnation, rand::random());
-        let created = StatusFile::create_observer(path, &record);
+        let created = StatusFile::create_observer(&path, &record);
         let created = created.inspect_err(|e| tracing::debug!(error = %e, "cannot publish what this observer holds"));
         created.ok().map(|file| ObserverStatusWriter { file, record })
     }

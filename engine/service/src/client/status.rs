@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::error::EngineActivity;
 use crate::namespace::directory::{Ipc, Namespace};
 use crate::namespace::identity::Identity;
-use crate::protocol::ports::SPECIFICATION_PREFIX;
+use crate::protocol::ports::SERVICE_PREFIX;
 use crate::protocol::status_file::{self, EngineRecord, GroupRecord, ObserverRecord, StatusReader, now, unpadded};
 
 /// The status of an engine, read from shared memory. Reading it affects neither the engine nor its trainer.
@@ -111,7 +111,7 @@ impl EngineStatus {
     pub fn all(namespace: &Namespace) -> Vec<Self> {
         let Some(identity) = Identity::existing(namespace) else { return Vec::new() };
         let prefix = identity.prefix();
-        let readers = status_file::paths(prefix).into_iter().filter_map(|path| StatusReader::open(&path));
+        let readers = status_file::engines(prefix).into_iter().filter_map(|(_, path)| StatusReader::open(&path));
         let running = readers.filter(StatusReader::is_alive);
         let mut found: Vec<_> = running.filter_map(|reader| EngineStatus::read(&reader, prefix)).collect();
         found.sort_by(|a, b| a.service.cmp(&b.service));
@@ -134,7 +134,7 @@ impl EngineStatus {
         EngineStatus {
             service: unpadded(&engine.service),
             id: unpadded(&engine.id),
-            process: engine.process,
+            process: engine.head.process,
             incarnation: engine.incarnation,
             num_envs: engine.num_envs,
             uptime: since(engine.started, now).unwrap_or_default(),
@@ -204,13 +204,13 @@ pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize
     for other in groups {
         let Some(record) = status.group(other) else { return EngineActivity::Unknown };
         if let Some(since) = since(record.busy_since, now()) {
-            return EngineActivity::Busy { group: other, kind: record.kind(), since, process: engine.process };
+            return EngineActivity::Busy { group: other, kind: record.kind(), since, process: engine.head.process };
         }
         if other == group && record.trainer == trainer && record.answered == number {
             return EngineActivity::Answered;
         }
     }
-    EngineActivity::NotTaken { process: engine.process }
+    EngineActivity::NotTaken { process: engine.head.process }
 }
 
 /// What the engine does while an observer waits for a batch of a group.
@@ -240,23 +240,22 @@ impl EngineStatus {
     pub fn processes(&self, namespace: &Namespace) -> EngineProcesses {
         let Some(identity) = Identity::existing(namespace) else { return EngineProcesses::default() };
         let Ok(config) = namespace.config(identity.prefix()) else { return EngineProcesses::default() };
-        let specification = format!("{SPECIFICATION_PREFIX}{}", self.service);
-        let prefix = format!("{specification}/{:016x}/", self.incarnation);
-        // The nodes of the services, and their process ids.
-        let (mut engine, mut requests, mut responses) = (HashSet::new(), HashSet::new(), HashSet::new());
+        let prefix = format!("{SERVICE_PREFIX}{}/{:016x}/", self.service, self.incarnation);
+        // The nodes of other processes than the engine's, by service, and their process ids.
+        let (mut requests, mut responses) = (HashSet::new(), HashSet::new());
         let mut process_ids = HashMap::new();
         let listed = Ipc::list(&config, |service| {
             let name = service.static_details.name().as_str();
             let nodes = match name.strip_prefix(&prefix) {
                 Some(what) if what.starts_with("act/") => &mut requests,
                 Some(what) if what.starts_with("obs/") => &mut responses,
-                None if name == specification => &mut engine,
                 _ => return CallbackProgression::Continue,
             };
             for node in service.dynamic_details.iter().flat_map(|details| &details.nodes) {
                 if let NodeState::Alive(view) = node
                     && let Some(details) = view.details()
                     && let Ok(process) = u32::try_from(details.process_id().value())
+                    && process != self.process
                 {
                     let number = node.node_id().value();
                     nodes.insert(number);
@@ -268,9 +267,8 @@ impl EngineStatus {
         if let Err(e) = listed {
             tracing::debug!(error = %e, "cannot list the services");
         }
-        // Trainers and observers open the specification only while they connect.
         let process_of = |node: &u128| process_ids.get(node).copied();
-        let trainers = requests.difference(&engine).filter_map(process_of).collect();
+        let trainers = requests.iter().filter_map(process_of).collect();
         let observers = responses.difference(&requests).filter_map(process_of).collect();
         EngineProcesses { trainers, observers }
     }

@@ -22,9 +22,6 @@ use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::wait::{LIVENESS_INTERVAL, wait};
 use crate::protocol::{discovery, ports};
 
-/// How long a trainer whose engine has ended waits for the namespace's lock, to find out whether another engine has replaced it.
-const SUCCESSOR_TIMEOUT: Duration = Duration::from_millis(100);
-
 /// Steps the environments of an engine. An engine has one trainer at a time.
 ///
 /// Every [`reset`](Trainer::reset) or [`send`](Trainer::send) to a group is answered by one batch, which
@@ -360,16 +357,13 @@ impl Trainer {
         Ok(())
     }
 
-    /// The error for an engine that has ended, which depends on whether another one has replaced it. If the namespace is locked,
-    /// it is [`ServiceError::EngineLost`].
+    /// The error for an engine that has ended, which depends on whether another one has replaced it.
     fn lost(&self) -> ServiceError {
         let (service, node) = (self.config.service.clone(), &*self.connection.node);
         if let Err(removed) = node.check_root() {
             return removed;
         }
-        let successor =
-            node.lock_within(SUCCESSOR_TIMEOUT).and_then(|lock| discovery::read_locked(node, &service, &lock));
-        match successor {
+        match discovery::read(node, &service) {
             Ok(Some(other)) if other.incarnation != self.specification.incarnation => {
                 ServiceError::EngineRestarted { service }
             }

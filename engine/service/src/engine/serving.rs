@@ -15,10 +15,9 @@ use crate::engine::status_writer::{EngineSummary, StatusWriter};
 use crate::error::{CheckpointError, PACKAGE_VERSION, Rejection, ServiceError};
 use crate::namespace::descriptors;
 use crate::namespace::directory::Ipc;
-use crate::namespace::lock::NamespaceLock;
 use crate::namespace::memory::PrefaultedChunks;
 use crate::namespace::node::NamespaceNode;
-use crate::protocol::discovery::{self, PublishedSpecification};
+use crate::protocol::discovery;
 use crate::protocol::message::{RequestKind, ResponseHeader, copied};
 use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
@@ -85,14 +84,13 @@ const START_ATTEMPTS: usize = 3;
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Engine {
-    // Dropped first: a process that finds the specification expects all other services.
-    _published: PublishedSpecification,
+    // Dropped first: a process that finds the specification expects all services.
+    status: StatusWriter,
     // Ports must be dropped before the node.
     groups: Vec<Group>,
     to_trainer: Notifier<Ipc>,
     to_engine: Listener<Ipc>,
     specification: ServiceSpecification,
-    status: StatusWriter,
     checkpointer: Option<Checkpointer>,
     node: NamespaceNode,
 }
@@ -160,24 +158,21 @@ impl Engine {
         if let Some(checkpointer) = &checkpointer {
             checkpointer.resume(&mut groups, &mut status)?;
         }
-        // Last: a process that finds the specification expects all other services.
-        let (lock, published) = discovery::publish(&node, &specification)?;
-        let found = Self::check_published(&node, &specification, &lock);
+        // Last: a process that finds the specification expects all services.
+        let lock = node.lock()?;
+        discovery::refuse_second_engine(&node, &config.service, &lock)?;
+        status.publish()?;
         drop(lock);
-        found?;
+        Self::check_published(&node, &specification)?;
         let (service, process) = (&*specification.service, specification.engine_pid);
         tracing::info!(service, process, id = &*specification.id, groups = specification.groups, "engine started");
-        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, _published: published, node })
+        Ok(Engine { groups, to_trainer, to_engine, specification, status, checkpointer, node })
     }
 
     /// Fails unless a trainer could find the engine and all of its services.
-    fn check_published(
-        node: &NamespaceNode,
-        specification: &ServiceSpecification,
-        lock: &NamespaceLock,
-    ) -> Result<(), ServiceError> {
+    fn check_published(node: &NamespaceNode, specification: &ServiceSpecification) -> Result<(), ServiceError> {
         let ServiceSpecification { service, incarnation, groups, .. } = specification;
-        let found = discovery::read_locked(node, service, lock)?;
+        let found = discovery::read(node, service)?;
         if found.is_none_or(|found| found.incarnation != *incarnation) {
             return Err(ServiceError::EngineUnreachable { service: service.clone() });
         }
@@ -405,14 +400,11 @@ mod tests {
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);
         let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
-        let check = || {
-            let lock = engine.node.lock().unwrap();
-            Engine::check_published(&engine.node, engine.specification(), &lock)
-        };
+        let check = || Engine::check_published(&engine.node, engine.specification());
         check().unwrap();
         let services = namespace.root().join("services");
         std::fs::rename(&services, namespace.root().join("elsewhere")).unwrap();
-        assert!(matches!(check(), Err(ServiceError::EngineUnreachable { .. })));
+        assert!(matches!(check(), Err(ServiceError::EngineRestarted { .. })));
         std::fs::rename(namespace.root().join("elsewhere"), &services).unwrap();
         check().unwrap();
         drop(engine);

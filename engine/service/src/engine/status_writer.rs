@@ -1,27 +1,38 @@
 //! The status of an engine as it serves requests.
 
+use std::path::PathBuf;
+
 use crate::engine::group::Outcome;
-use crate::error::ServiceError;
+use crate::error::{PACKAGE_VERSION, ServiceError};
 use crate::protocol::message::RequestHeader;
 use crate::protocol::specification::ServiceSpecification;
-use crate::protocol::status_file::{self, EngineRecord, GroupRecord, MAGIC, StatusFile, now, padded};
+use crate::protocol::status_file::{self, EngineHead, EngineRecord, GroupRecord, MAGIC, StatusFile, now, padded};
 
 /// Keeps the records of an engine and publishes every change. Publishing takes some dozens of nanoseconds.
 #[derive(Debug)]
 pub(crate) struct StatusWriter {
     file: StatusFile,
+    path: PathBuf,
     engine: EngineRecord,
     groups: Vec<GroupRecord>,
 }
 
 impl StatusWriter {
-    /// Publishes the status of an engine that starts. `prefix` is that of the files of its namespace.
+    /// The status and the specification of an engine that starts; [`publish`](Self::publish) lets others find them. `prefix` is
+    /// that of the files of its namespace.
     pub(crate) fn create(prefix: &str, specification: &ServiceSpecification) -> Result<Self, ServiceError> {
         let (service, incarnation) = (&specification.service, specification.incarnation);
-        let engine = EngineRecord {
+        let text = serde_json::to_vec(specification);
+        let text = text.map_err(|e| ServiceError::middleware("cannot write the specification")(e.to_string()))?;
+        let head = EngineHead {
             magic: MAGIC,
             layout_version: specification.layout_version,
             process: specification.engine_pid,
+            package: padded(PACKAGE_VERSION),
+            specification_bytes: text.len() as u64,
+        };
+        let engine = EngineRecord {
+            head,
             incarnation,
             started: now(),
             groups: specification.groups as u32,
@@ -34,8 +45,13 @@ impl StatusWriter {
             service: padded(service),
         };
         let path = status_file::path(prefix, service, incarnation);
-        let file = StatusFile::create(path, &engine, specification.groups)?;
-        Ok(StatusWriter { file, engine, groups: vec![GroupRecord::default(); specification.groups] })
+        let file = StatusFile::create(&path, &engine, specification.groups, &text)?;
+        Ok(StatusWriter { file, path, engine, groups: vec![GroupRecord::default(); specification.groups] })
+    }
+
+    /// Lets other processes find the engine, under its name.
+    pub(crate) fn publish(&mut self) -> Result<(), ServiceError> {
+        self.file.publish(&self.path)
     }
 
     /// Changes the engine's record.

@@ -1,16 +1,11 @@
-//! The lock of a namespace, which serialises everything that creates or removes a node or a specification service.
-//!
-//! iceoryx2 removes a service by its name. A process that has decided to remove the service of a dead engine could therefore
-//! remove that of a successor which has taken the name in the meantime. The lock covers decision and removal:
+//! The lock of a namespace, which serialises everything that creates or removes a node, or takes an engine's name:
 //!
 //! - join the namespace: read or create its identity, and create a node;
-//! - publish a specification, and remove what a dead engine left under its name;
-//! - close the specification service of an engine that ends, and leave the namespace;
-//! - remove the resources of dead nodes and orphans, which is skipped if the lock is not free;
-//! - read a specification, because the last process that closes a service removes it.
+//! - look for a running engine of a name, and publish another one's specification;
+//! - leave the namespace;
+//! - remove the resources of dead nodes and orphans, which is skipped if the lock is not free.
 //!
-//! Readers exclude each other too: with a shared lock, many waiting trainers could starve an engine that starts. The lock is an
-//! advisory `flock` on the namespace's directory: it leaves no file behind, and the kernel releases it when its holder dies.
+//! The lock is an advisory `flock` on the namespace's directory: it leaves no file behind, and the kernel releases it when its holder dies.
 //!
 //! It is held for milliseconds. A holder that is stopped (SIGSTOP, a debugger, a frozen container) may be in the middle of a
 //! removal, so its lock is never broken: the others wait for as long as their caller does, continue within a millisecond when it

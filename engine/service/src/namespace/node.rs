@@ -120,11 +120,6 @@ impl NamespaceNode {
         cleanup::refresh(self.config());
     }
 
-    /// The namespace's directory.
-    pub(crate) fn root(&self) -> &Path {
-        &self.root
-    }
-
     /// Removes the resources of processes that have died, and returns the number of these processes. Does nothing while another
     /// process holds the namespace's lock.
     pub(crate) fn remove_dead_nodes(&self) -> usize {

@@ -29,8 +29,8 @@ pub(crate) type ResponseSubscriber = Subscriber<Ipc, [PayloadBlock], ResponseHea
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and processes that are about to be refused.
 const MAX_NODES: usize = 64;
 
-/// Names of one engine's services. All names except the specification's contain the incarnation, so that a restarted engine
-/// shares nothing with the services that a dead one left.
+/// Names of one engine's services. They contain the incarnation, so that a restarted engine shares nothing with the services that
+/// a dead one left.
 #[derive(Clone, Debug)]
 pub(crate) struct ServiceNames {
     service: String,
@@ -40,23 +40,16 @@ pub(crate) struct ServiceNames {
 /// Name of the port of an observer that has paused. Others have none.
 pub(crate) const RESUMED: &str = "resumed";
 
-/// Prefix of the names of all specification services.
-pub(crate) const SPECIFICATION_PREFIX: &str = "endless-gym/";
+/// Prefix of the names of all services.
+pub(crate) const SERVICE_PREFIX: &str = "endless-gym/";
 
 impl ServiceNames {
     pub(crate) fn new(service: &str, incarnation: u64) -> Self {
         ServiceNames { service: service.to_owned(), incarnation }
     }
 
-    pub(crate) fn specification(service: &str) -> Result<ServiceName, ServiceError> {
-        Self::name(format!("{SPECIFICATION_PREFIX}{service}"))
-    }
-
     fn of_incarnation(&self, what: &str) -> Result<ServiceName, ServiceError> {
-        Self::name(format!("{SPECIFICATION_PREFIX}{}/{:016x}/{what}", self.service, self.incarnation))
-    }
-
-    fn name(text: String) -> Result<ServiceName, ServiceError> {
+        let text = format!("{SERVICE_PREFIX}{}/{:016x}/{what}", self.service, self.incarnation);
         ServiceName::new(&text).map_err(|e| ServiceError::middleware("cannot create a service name")(e.to_string()))
     }
 }

@@ -1,4 +1,4 @@
-//! The files in shared memory that hold the status of an engine and of its observers.
+//! The files in shared memory that hold the status of an engine, with its specification, and of its observers.
 //!
 //! The engine or the observer maps its file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a
 //! writer does can harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence
@@ -38,6 +38,7 @@ const WORD: usize = size_of::<u64>();
 const ENGINE_WORDS: usize = 32;
 const GROUP_WORDS: usize = 24;
 const OBSERVER_WORDS: usize = 8;
+const _: () = assert!(size_of::<EngineHead>() < size_of::<EngineRecord>());
 const _: () = assert!(size_of::<EngineRecord>() / WORD < ENGINE_WORDS && size_of::<GroupRecord>() / WORD < GROUP_WORDS);
 const _: () = assert!(size_of::<ObserverRecord>() / WORD < OBSERVER_WORDS);
 
@@ -54,9 +55,13 @@ pub(crate) fn observer_path(prefix: &str, incarnation: u64, number: u64) -> Path
     Path::new(DIRECTORY).join(format!("{prefix}{incarnation:016x}.{number:016x}{OBSERVER_SUFFIX}"))
 }
 
-/// The status files of a namespace's engines.
-pub(crate) fn paths(prefix: &str) -> Vec<PathBuf> {
-    paths_with(prefix, SUFFIX)
+/// The names of a namespace's engines, and their status files.
+pub(crate) fn engines(prefix: &str) -> Vec<(String, PathBuf)> {
+    let service = |path: &Path| {
+        let name = path.file_name()?.to_str()?.strip_prefix(prefix)?.strip_suffix(SUFFIX)?;
+        Some(name.rsplit_once('.')?.0.to_owned())
+    };
+    paths_with(prefix, SUFFIX).into_iter().filter_map(|path| Some((service(&path)?, path))).collect()
 }
 
 /// The records of an engine's observers that are running.
@@ -78,7 +83,7 @@ fn paths_with(prefix: &str, suffix: &str) -> Vec<PathBuf> {
 
 /// Removes the files of dead engines and observers.
 pub(crate) fn remove_abandoned(prefix: &str) {
-    for path in paths(prefix).into_iter().chain(paths_with(prefix, OBSERVER_SUFFIX)) {
+    for path in paths_with(prefix, SUFFIX).into_iter().chain(paths_with(prefix, OBSERVER_SUFFIX)) {
         let Some(file) = open(&path) else { continue };
         if flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok() {
             tracing::debug!(path = %path.display(), "removing the status of a dead process");
@@ -106,10 +111,11 @@ fn words(groups: usize) -> usize {
 pub(crate) struct StatusFile {
     start: NonNull<AtomicU64>,
     words: usize,
+    /// The name that the file has now.
     path: PathBuf,
     process: u32,
     /// Holds the lock.
-    _file: File,
+    file: File,
 }
 
 // SAFETY: the mapping belongs to this value alone, and its words are atomic.
@@ -118,17 +124,34 @@ unsafe impl Send for StatusFile {}
 unsafe impl Sync for StatusFile {}
 
 impl StatusFile {
-    /// Creates the file of an engine with these records. It appears under its name complete and locked.
-    pub(crate) fn create(path: PathBuf, engine: &EngineRecord, groups: usize) -> Result<Self, ServiceError> {
-        Self::with_record(path, words(groups), bytemuck::cast_slice(std::slice::from_ref(engine)))
+    /// Creates the file of an engine with these records and the text of its specification, which readers find after
+    /// [`publish`](Self::publish) only.
+    pub(crate) fn create(
+        path: &Path,
+        engine: &EngineRecord,
+        groups: usize,
+        specification: &[u8],
+    ) -> Result<Self, ServiceError> {
+        Self::with_record(path, words(groups), bytemuck::cast_slice(std::slice::from_ref(engine)), specification)
     }
 
     /// Creates the file of an observer.
-    pub(crate) fn create_observer(path: PathBuf, record: &ObserverRecord) -> Result<Self, ServiceError> {
-        Self::with_record(path, OBSERVER_WORDS, bytemuck::cast_slice(std::slice::from_ref(record)))
+    pub(crate) fn create_observer(path: &Path, record: &ObserverRecord) -> Result<Self, ServiceError> {
+        let mut file =
+            Self::with_record(path, OBSERVER_WORDS, bytemuck::cast_slice(std::slice::from_ref(record)), &[])?;
+        file.publish(path)?;
+        Ok(file)
     }
 
-    fn with_record(path: PathBuf, words: usize, record: &[u64]) -> Result<Self, ServiceError> {
+    /// Gives the file its name. It is complete and locked by then.
+    pub(crate) fn publish(&mut self, path: &Path) -> Result<(), ServiceError> {
+        fs::rename(&self.path, path)
+            .map_err(|e| ServiceError::middleware("cannot publish the status")(format!("{}: {e}", path.display())))?;
+        path.clone_into(&mut self.path);
+        Ok(())
+    }
+
+    fn with_record(path: &Path, words: usize, record: &[u64], text: &[u8]) -> Result<Self, ServiceError> {
         let failed = |e: &dyn std::fmt::Display| ServiceError::middleware("cannot create the status")(e.to_string());
         let unnamed = path.with_extension("new");
         let file = File::options()
@@ -140,7 +163,7 @@ impl StatusFile {
             .map_err(|e| failed(&format_args!("{}: {e}", unnamed.display())))?;
         let prepared = flock(&file, FlockOperation::NonBlockingLockExclusive)
             // Without allocation, writing to the mapping of a file for which there is no memory raises SIGBUS.
-            .and_then(|()| fallocate(&file, FallocateFlags::empty(), 0, (words * WORD) as u64))
+            .and_then(|()| fallocate(&file, FallocateFlags::empty(), 0, (words * WORD + text.len()) as u64))
             .and_then(|()| {
                 // SAFETY: a new mapping at an address that the system chooses.
                 unsafe {
@@ -153,12 +176,9 @@ impl StatusFile {
             failed(&e)
         })?;
         let start = NonNull::new(start.cast()).ok_or_else(|| failed(&"the mapping has no address"))?;
-        let status = StatusFile { start, words, path, process: std::process::id(), _file: file };
+        let status = StatusFile { start, words, path: unnamed, process: std::process::id(), file };
         status.write(0, record);
-        fs::rename(&unnamed, &status.path).map_err(|e| {
-            let _ = fs::remove_file(&unnamed);
-            failed(&e)
-        })?;
+        status.file.write_all_at(text, (words * WORD) as u64).map_err(|e| failed(&e))?;
         Ok(status)
     }
 
@@ -212,6 +232,30 @@ impl StatusReader {
         reader.engine().map(|_| reader)
     }
 
+    /// Opens the file of an engine of any version.
+    pub(crate) fn open_any(path: &Path) -> Option<Self> {
+        let reader = StatusReader { file: open(path)? };
+        reader.head().map(|_| reader)
+    }
+
+    /// The first fields of an engine's record, of any version; `None` if they cannot be read.
+    pub(crate) fn head(&self) -> Option<EngineHead> {
+        self.read::<EngineHead>(0).filter(|head| head.magic == MAGIC)
+    }
+
+    /// The text of an engine's specification; `None` if the file is too short.
+    pub(crate) fn specification(&self) -> Option<Vec<u8>> {
+        let engine = self.engine()?;
+        let offset = (words(engine.groups as usize) * WORD) as u64;
+        let length = engine.head.specification_bytes;
+        if self.file.metadata().ok()?.len() < offset.checked_add(length)? {
+            return None;
+        }
+        let mut text = vec![0; usize::try_from(length).ok()?];
+        self.file.read_exact_at(&mut text, offset).ok()?;
+        Some(text)
+    }
+
     /// The record of an observer that is running; `None` if it cannot be read.
     fn running_observer(path: &Path) -> Option<ObserverRecord> {
         let reader = StatusReader { file: open(path)? };
@@ -261,13 +305,24 @@ impl StatusReader {
 /// First word of a status file.
 pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"EGYMSTAT");
 
+/// How to read the rest of an engine's file. Its form must never change, so that every version recognises an engine of another.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct EngineHead {
+    pub magic: u64,
+    pub layout_version: u32,
+    pub process: u32,
+    /// Version of the engine's package, padded with zeros.
+    pub package: [u8; 32],
+    /// Length of the specification, which follows the records as JSON text.
+    pub specification_bytes: u64,
+}
+
 /// What concerns the whole engine. Times are in nanoseconds of CLOCK_MONOTONIC, 0 for none.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct EngineRecord {
-    pub magic: u64,
-    pub layout_version: u32,
-    pub process: u32,
+    pub head: EngineHead,
     pub incarnation: u64,
     pub started: u64,
     pub groups: u32,
@@ -288,7 +343,7 @@ impl EngineRecord {
     /// Whether a reader of this version can use the record.
     pub(crate) fn is_valid(&self) -> bool {
         let groups = usize::try_from(self.groups).unwrap_or(usize::MAX);
-        self.magic == MAGIC && self.layout_version == LAYOUT_VERSION && (1..=MAX_GROUPS).contains(&groups)
+        self.head.magic == MAGIC && self.head.layout_version == LAYOUT_VERSION && (1..=MAX_GROUPS).contains(&groups)
     }
 }
 
@@ -377,8 +432,14 @@ mod tests {
 
     fn record() -> EngineRecord {
         let (id, service) = (padded("MortarMayhem-v0"), padded("gym"));
-        let (magic, layout_version) = (MAGIC, LAYOUT_VERSION);
-        EngineRecord { magic, layout_version, groups: 2, num_envs: 3, id, service, ..EngineRecord::zeroed() }
+        let head = EngineHead { magic: MAGIC, layout_version: LAYOUT_VERSION, ..EngineHead::zeroed() };
+        EngineRecord { head, groups: 2, num_envs: 3, id, service, ..EngineRecord::zeroed() }
+    }
+
+    fn published(path: &Path, groups: usize) -> StatusFile {
+        let mut file = StatusFile::create(path, &record(), groups, b"").unwrap();
+        file.publish(path).unwrap();
+        file
     }
 
     fn place(name: &str) -> PathBuf {
@@ -388,7 +449,7 @@ mod tests {
     #[test]
     fn records_are_read_as_they_were_written() {
         let path = place("read");
-        let file = StatusFile::create(path.clone(), &record(), 2).unwrap();
+        let file = published(&path, 2);
         let reader = StatusReader::open(&path).unwrap();
         assert_eq!(reader.engine(), Some(record()));
         let mode = fs::metadata(&path).unwrap().permissions().mode();
@@ -406,7 +467,7 @@ mod tests {
     #[test]
     fn a_record_is_never_read_half_written() {
         let path = place("torn");
-        let file = StatusFile::create(path.clone(), &record(), 1).unwrap();
+        let file = published(&path, 1);
         let reader = StatusReader::open(&path).unwrap();
         let same = |n: u64| GroupRecord { step: n, taken: n, answered: n, undelivered: n, ..GroupRecord::default() };
         std::thread::scope(|scope| {
@@ -424,7 +485,7 @@ mod tests {
     fn what_is_no_status_of_a_running_engine_is_refused_or_removed() {
         let prefix = format!("endless-status-odd-{}_", std::process::id());
         let running = path(&prefix, "running", 1);
-        let file = StatusFile::create(running.clone(), &record(), 1).unwrap();
+        let file = published(&running, 1);
         let [other, short, dead] = ["other", "short", "dead"].map(|name| path(&prefix, name, 1));
         fs::write(&other, [7; 4096]).unwrap();
         fs::write(&short, [0; 9]).unwrap();
@@ -432,10 +493,10 @@ mod tests {
         assert!(StatusReader::open(&other).is_none() && StatusReader::open(&short).is_none());
         assert!(StatusReader::open(&path(&prefix, "missing", 1)).is_none());
         assert!(!StatusReader::open(&dead).unwrap().is_alive());
-        assert_eq!(paths(&prefix).len(), 4);
+        assert_eq!(engines(&prefix).len(), 4);
         let [observer, gone] = [1, 2].map(|number| observer_path(&prefix, 9, number));
         let seen = ObserverRecord { group: 1, held: 2, ..ObserverRecord::default() };
-        let file_of_observer = StatusFile::create_observer(observer.clone(), &seen).unwrap();
+        let file_of_observer = StatusFile::create_observer(&observer, &seen).unwrap();
         fs::copy(&observer, &gone).unwrap();
         assert_eq!(StatusReader::running_observer(&observer), Some(seen));
         assert_eq!(StatusReader::running_observer(&gone), None);
@@ -443,8 +504,8 @@ mod tests {
         assert_eq!(observer_paths(&prefix, 9), [observer]);
         drop(file_of_observer);
         assert!(observer_paths(&prefix, 9).is_empty());
-        assert_eq!(paths(&prefix), [running]);
+        assert_eq!(engines(&prefix), [("running".to_owned(), running)]);
         drop(file);
-        assert!(paths(&prefix).is_empty());
+        assert!(engines(&prefix).is_empty());
     }
 }
