@@ -81,8 +81,10 @@ pub fn pip_install(environment: &Path) -> Result<Command, String> {
 /// A virtual environment with the packages that a project's lock file has for some groups or extras, without the project itself.
 pub fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, String> {
     let folder = venv_folder(name)?;
+    // uv always takes the agents' lock file for stale, since the other package in it is a folder.
+    let lock = if project == "agents" { "--frozen" } else { "--locked" };
     let mut sync =
-        uv(&["sync", "--quiet", "--locked", "--inexact", "--no-install-project", "--project", project, "--python"])?;
+        uv(&["sync", "--quiet", lock, "--inexact", "--no-install-project", "--project", project, "--python"])?;
     run(sync.arg(base()?).args(selection).env("UV_PROJECT_ENVIRONMENT", &folder).current_dir(workspace()))?;
     Ok(folder)
 }

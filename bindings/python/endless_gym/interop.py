@@ -88,13 +88,17 @@ def pin_memory(array: NDArray[Any]) -> bool:
     return reason is None
 
 
-def mapping_of(address: int) -> tuple[int, int]:
-    """First address and size in bytes of the memory mapping of this process that contains `address`."""
+def mapping_of(address: int, size: int = 1) -> tuple[int, int]:
+    """First address and size in bytes of the memory mappings of this process that contain `size` bytes at `address`."""
+    start = None
     with open("/proc/self/maps") as maps:
         for line in maps:
             first, end = (int(number, 16) for number in line.split(maxsplit=1)[0].split("-"))
             if first <= address < end:
-                return first, end - first
+                start = first
+            # The kernel may divide the heap into adjacent mappings.
+            if start is not None and end >= address + size:
+                return start, end - start
     raise ValueError(f"no mapping at address {address:#x}")
 
 
@@ -111,7 +115,7 @@ def _pin(array: NDArray[Any]) -> str | None:
         return "PyTorch is not installed"
     if not torch.cuda.is_available():
         return "PyTorch finds no CUDA device"
-    first, size = mapping_of(array.ctypes.data)
+    first, size = mapping_of(array.ctypes.data, array.nbytes)
     if first in _PINNED:
         return None
     runtime = torch.cuda.cudart()
