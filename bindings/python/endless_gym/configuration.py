@@ -82,9 +82,9 @@ def checked_arguments(
     autoreset: AutoresetName | AutoresetMode,
     observation: ObservationName,
     frames: Frames | None,
-    independent_episodes: bool = False,
-    first_env: int = 0,
-    total_envs: int | None = None,
+    independent_episodes: bool,
+    first_env: int,
+    total_envs: int | None,
 ) -> Arguments:
     """Check arguments of `make_vec`.
 

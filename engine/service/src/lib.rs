@@ -14,8 +14,8 @@
 //! | `endless-gym/NAME/INCARNATION/to_trainer` | event | engine → trainer | number of a group with a response |
 //!
 //! The incarnation is a random number that an engine draws when it starts, so that an engine shares no service with a dead
-//! predecessor of the same name. The [`ServiceSpecification`] is JSON text in the engine's status file, `PREFIX NAME.INCARNATION.status`
-//! in `/dev/shm`, which the engine locks (`flock`) for its life.
+//! predecessor of the same name. The [`ServiceSpecification`] is JSON text in the engine's status file in
+//! `/dev/shm`, `NAME.INCARNATION.status` behind the namespace's prefix, which the engine locks (`flock`) for its life.
 //!
 //! # Messages
 //!
@@ -105,6 +105,7 @@ mod namespace {
 /// What an engine and its clients exchange.
 mod protocol {
     pub(crate) mod discovery;
+    pub(crate) mod limits;
     pub(crate) mod message;
     pub(crate) mod ports;
     pub(crate) mod specification;
@@ -138,11 +139,12 @@ pub use client::observer::{Observed, Observer, Observers};
 pub use client::requests::{GroupReconnection, LastRequest, Reconnection};
 pub use client::status::{EngineProcesses, EngineStatus, GroupStatus, ObserverStatus};
 pub use client::trainer::Trainer;
-pub use engine::config::{CheckpointConfig, EngineConfig, MAX_BATCHES_HELD, MAX_GROUPS};
+pub use engine::config::{CheckpointConfig, EngineConfig};
 pub use engine::serving::Engine;
 pub use engine::status_writer::EngineSummary;
 pub use error::{CHECKPOINT_VERSION, CheckpointError, EngineActivity, Rejection, ServiceError};
 pub use namespace::directory::{Namespace, ROOT_VARIABLE};
 pub use namespace::process::LockHolder;
 pub use protocol::discovery::running_engines;
+pub use protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS};
 pub use protocol::specification::ServiceSpecification;

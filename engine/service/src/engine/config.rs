@@ -8,15 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::ServiceError;
 use crate::namespace::directory::{Namespace, check_name};
-
-/// Maximum number of groups of an engine.
-pub const MAX_GROUPS: usize = 64;
-
-/// Maximum number of batches of a group that a trainer or an observer may hold.
-pub const MAX_BATCHES_HELD: usize = 16;
-
-/// Maximum number of observers of a group.
-pub(crate) const MAX_OBSERVERS: usize = 16;
+use crate::protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
 
 /// Configuration of an engine: what it serves, and under which name.
 ///

@@ -6,7 +6,7 @@ use endless_gym_core::pool::{Autoreset, MAX_ENVS};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 
-use crate::engine::config::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
+use crate::protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
 use crate::protocol::ports::LeaseLimits;
 
 /// Describes an engine and its environments. The engine publishes it as JSON under its name.

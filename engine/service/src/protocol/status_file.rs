@@ -22,8 +22,8 @@ use rustix::fs::{FallocateFlags, FlockOperation, OFlags, fallocate, flock};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
 
-use crate::engine::config::MAX_GROUPS;
 use crate::error::ServiceError;
+use crate::protocol::limits::MAX_GROUPS;
 use crate::protocol::message::RequestKind;
 
 const DIRECTORY: &str = "/dev/shm";
@@ -85,7 +85,8 @@ fn paths_with(prefix: &str, suffix: &str) -> Vec<PathBuf> {
 pub(crate) fn remove_abandoned(prefix: &str) {
     for path in paths_with(prefix, SUFFIX).into_iter().chain(paths_with(prefix, OBSERVER_SUFFIX)) {
         let Some(file) = open(&path) else { continue };
-        if flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok() {
+        // Shared: with an exclusive lock, this process would look like the writer to others.
+        if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
             tracing::debug!(path = %path.display(), "removing the status of a dead process");
             // An error means that another process has removed it.
             let _ = fs::remove_file(&path);
