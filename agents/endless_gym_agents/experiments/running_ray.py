@@ -56,7 +56,7 @@ class _RayProcess:
 
         self._given = (list(command), machine.nice, machine.environment(0), str(log.resolve()))
         # One call waits for the end of the process, another sends signals.
-        made = ray.remote(num_cpus=machine.job_cores, num_gpus=gpus, max_concurrency=2)(_Host)
+        made = ray.remote(num_cpus=machine.job_cores, num_gpus=gpus, max_concurrency=2)(_Host)  # type: ignore[call-overload]
         self._host: Any = made.remote()
         self._ready: Any = self._host.ready.remote()
         self._end: Any = None

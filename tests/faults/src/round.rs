@@ -61,7 +61,10 @@ fn faults(scene: &mut Scene<'_>, rights: Rights) -> Result<(), String> {
 fn recover(scene: &mut Scene<'_>, since: Duration) -> Result<Option<Duration>, String> {
     let next = scene.next_batch(since, LIMIT)?;
     if next.is_none() {
-        let errors: Vec<_> = scene.outcome.errors.iter().map(|(kind, count)| format!("{kind} {count}")).collect();
+        let last = |kind: &str| scene.last_errors.get(kind).map_or("", String::as_str);
+        let errors = scene.outcome.errors.iter();
+        let errors: Vec<_> =
+            errors.map(|(kind, count)| format!("{kind} {count}, the last of them: {}", last(kind))).collect();
         scene.fail(
             "no recovery",
             format!("no correct batch within {LIMIT:?}; errors of the round: {}", errors.join(", ")),

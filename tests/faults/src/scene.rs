@@ -63,6 +63,8 @@ pub struct Scene<'a> {
     /// The last correct batch: its time, its trainer and its engine.
     last_batch: Option<(Duration, u32, u32)>,
     started: u64,
+    /// The text of the last error of each kind.
+    pub last_errors: HashMap<String, String>,
 }
 
 impl<'a> Scene<'a> {
@@ -92,6 +94,7 @@ impl<'a> Scene<'a> {
             ledger: Ledger::default(),
             last_batch: None,
             started: 0,
+            last_errors: HashMap::new(),
         }
     }
 
@@ -280,6 +283,7 @@ impl<'a> Scene<'a> {
             Event::End => {}
             Event::Error { during, kind, text, engine } => {
                 *self.outcome.errors.entry(kind.clone()).or_default() += 1;
+                self.last_errors.insert(kind.clone(), text.clone());
                 let is_lost = matches!(kind.as_str(), "EngineLost" | "EngineRestarted");
                 // An engine without its directory starts again in the same process.
                 let is_removed = self.began_before(process, self.removed);

@@ -64,20 +64,26 @@ pub(crate) fn connect_to_engine<T>(
 ) -> Result<(Arc<NamespaceNode>, T, ServiceSpecification), ServiceError> {
     let start = Instant::now();
     let node = Arc::new(NamespaceNode::join(&config.namespace, config.timeout)?);
+    // Joining may have taken longer than a transition.
+    let joined = Instant::now();
     loop {
         let result = find(&node, config).and_then(|specification| {
             memory::check_free(memory::MARGIN)?;
             connect(&node, &specification).map(|ports| (ports, specification))
         });
-        let patience = match &result {
+        let is_waiting = match &result {
             // The engine is not running yet, or it was replaced while this process connected.
-            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. }) => config.timeout,
-            Err(ServiceError::EngineUnreachable { .. }) => config.timeout.max(TRANSITION_TIMEOUT),
-            _ => Duration::ZERO,
+            Err(ServiceError::UnknownEngine { .. } | ServiceError::EngineRestarted { .. }) => {
+                start.elapsed() < config.timeout
+            }
+            Err(ServiceError::EngineUnreachable { .. }) => {
+                start.elapsed() < config.timeout || joined.elapsed() < TRANSITION_TIMEOUT
+            }
+            _ => false,
         };
         match result {
             Ok((ports, specification)) => return Ok((node, ports, specification)),
-            Err(_) if start.elapsed() < patience => {
+            Err(_) if is_waiting => {
                 node.remove_dead_nodes();
                 std::thread::sleep(RETRY_INTERVAL);
             }

@@ -134,15 +134,18 @@ impl NamespaceNode {
 
     /// Removes the resources of processes that have died, and those that they had not completed. Returns the number of processes.
     pub(crate) fn clean(&self, lock: &NamespaceLock) -> usize {
+        // The nodes are listed before the segments are examined: all that these processes leave is there by then.
+        let dead = self.dead_nodes();
         let all = self.identity.try_exclusive(lock);
-        // iceoryx2 waits forever for the size of an unsized segment.
-        match &all {
-            Some(all) => cleanup::remove_unsized_segments(self.config(), lock, all),
-            None if cleanup::has_unsized_segments(self.config()) => return 0,
-            None => {}
+        if let Some(all) = &all {
+            cleanup::remove_unsized_segments(self.config(), lock, all);
         }
         let mut removed = 0;
-        for node in self.dead_nodes().into_iter().filter(|node| node.details().is_some()) {
+        for node in dead.into_iter().filter(|node| node.details().is_some()) {
+            // iceoryx2 waits forever for the size of an unsized segment, and a process that creates one may be killed at any time.
+            if cleanup::has_unsized_segments(self.config()) {
+                break;
+            }
             let process = node.details().as_ref().map(|details| details.process_id().value());
             // iceoryx2 creates a node to tell others of the removal, which writes to shared memory.
             if let Err(e) = memory::check_free(memory::NODE_BYTES) {
