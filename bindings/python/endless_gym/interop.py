@@ -6,6 +6,7 @@ import sys
 import warnings
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
@@ -16,12 +17,15 @@ if TYPE_CHECKING:
 #: DLPack's number of the CPU, which is the device of all arrays.
 _CPU = (1, 0)
 
+#: Whether numpy can mark read-only arrays, which DLPack supports since its version 1.0.
+_NUMPY_HAS_FLAG = np.lib.NumpyVersion(np.__version__) >= "2.1.0"
+
 
 class DLPackView:
     """An array for `from_dlpack` of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
 
     The tensor shares the array's memory and keeps it alive. A library that supports DLPack 1.0 receives read-only arrays with the
-    read-only flag. Libraries that do not support it, and PyTorch, which ignores the flag, receive a writable tensor if the
+    read-only flag, which numpy sets from 2.1 on. For other libraries, and PyTorch, which ignores the flag, it is writable if the
     environments are in this process: the next frames in that memory are then drawn in full, so that writes do no harm, but cost
     time. Arrays of environments in another process are not exported to such libraries: use `torch_view` for PyTorch, or
     `DLPackView(array.copy())`.
@@ -46,9 +50,17 @@ class DLPackView:
         """
         if dl_device is not None and (int(dl_device[0]), int(dl_device[1])) != _CPU:
             raise BufferError(f"dl_device must be the CPU, {_CPU}, got {dl_device}")
+        array = self._array.copy() if copy else self._array
+        if array.flags.writeable:
+            return array.__dlpack__()
         is_torch = sys._getframe(1).f_globals.get("__name__") == "torch.utils.dlpack"
-        has_flag = max_version is not None and max_version[0] >= 1 and not is_torch
-        return _native.dlpack(self._array.copy() if copy else self._array, has_flag)
+        if max_version is not None and max_version[0] >= 1 and not is_torch and _NUMPY_HAS_FLAG:
+            return array.__dlpack__(max_version=max_version)
+        if not _native.note_export(array):
+            raise BufferError(
+                "the array is read-only, and the consumer does not support DLPack's read-only flag; export a copy: array.copy()"
+            )
+        return _native.writable_view(array).__dlpack__()
 
     def __dlpack_device__(self) -> tuple[int, int]:
         """The CPU."""
@@ -62,12 +74,11 @@ def torch_view(array: NDArray[Any]) -> torch.Tensor:
     a write to that of environments in another process kills this process. `tensor.clone()` is a copy that may be written to.
 
     Raises:
-        TypeError: The array's dtype has no counterpart in DLPack.
+        TypeError: PyTorch has no counterpart of the array's dtype.
     """
-    from torch.utils.dlpack import from_dlpack
+    import torch
 
-    tensor: torch.Tensor = from_dlpack(_native.dlpack_unchecked(array))
-    return tensor
+    return torch.from_numpy(_native.writable_view(array))
 
 
 def pin_memory(array: NDArray[Any]) -> bool:

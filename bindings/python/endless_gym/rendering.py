@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
+from endless_gym.specs import json_text
 
 #: What a picture shows: what the agent sees, uint8 (84, 84, 3), or the original's ground-truth view, uint8 (336, 336, 3).
 View = Literal["agent", "ground_truth"]
@@ -48,10 +49,15 @@ class SnapshotRenderer:
     """Draws environments from their snapshots, in this process, without changing the environments."""
 
     def __init__(self, id: str, view: View) -> None:
-        self._native = _native.Renderer(id)
+        self._native = _native.Single(json_text({"id": id, "num_envs": 1}))
+        # Only an environment that was reset can be restored.
+        self._native.reset(0, "{}")
         self._view = view
 
     def render(self, snapshots: Iterable[bytes]) -> tuple[NDArray[np.uint8], ...]:
         """One picture for each snapshot, indexed `[row][column][channel]`."""
-        draw = self._native.frame if self._view == "agent" else self._native.ground_truth_view
-        return tuple(draw(snapshot) for snapshot in snapshots)
+        return tuple(self._picture(snapshot) for snapshot in snapshots)
+
+    def _picture(self, snapshot: bytes) -> NDArray[np.uint8]:
+        self._native.restore(snapshot)
+        return self._native.rgb_array() if self._view == "agent" else self._native.ground_truth_view(True)

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use endless_gym::batch::{BatchBuffer, Block, Layout};
+use numpy::npyffi::NPY_ARRAY_WRITEABLE;
 use numpy::{PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
@@ -70,6 +71,7 @@ impl Buffers {
 
 /// Notes that Python code may write to the buffer that `array` is a view of; the pool then draws its frames in full when it next
 /// writes to it. Returns whether `array` is a view of such a buffer.
+#[pyfunction]
 pub fn note_export(array: &Bound<'_, PyUntypedArray>) -> bool {
     let py = array.py();
     let mut object = array.clone().into_any();
@@ -84,4 +86,14 @@ pub fn note_export(array: &Bound<'_, PyUntypedArray>) -> bool {
         let Some(base) = base else { return false };
         object = base;
     }
+}
+
+/// A view of an array, for libraries that take writable arrays only. Whoever writes to it must own the memory, or have noted the
+/// export.
+#[pyfunction]
+pub fn writable_view<'py>(array: &Bound<'py, PyUntypedArray>) -> PyResult<Bound<'py, PyUntypedArray>> {
+    let view = array.call_method0("view")?.cast_into::<PyUntypedArray>()?;
+    // SAFETY: the view is a new object, which nothing else refers to.
+    unsafe { (*view.as_array_ptr()).fields.flags |= NPY_ARRAY_WRITEABLE };
+    Ok(view)
 }

@@ -6,14 +6,12 @@ mod arguments;
 mod arrays;
 mod buffers;
 mod connection;
-mod dlpack;
 mod ends;
 mod errors;
 mod experts;
 mod logs;
 mod observer;
 mod pool;
-mod renderer;
 mod single;
 
 use std::ffi::OsString;
@@ -52,15 +50,14 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<experts::Experts>()?;
     module.add_class::<observer::Observer>()?;
     module.add_class::<pool::Pools>()?;
-    module.add_class::<renderer::Renderer>()?;
     module.add_class::<single::Single>()?;
     module.add_class::<connection::Connection>()?;
     module.add_function(wrap_pyfunction!(arguments::frame_shape, module)?)?;
+    module.add_function(wrap_pyfunction!(buffers::note_export, module)?)?;
+    module.add_function(wrap_pyfunction!(buffers::writable_view, module)?)?;
     module.add_function(wrap_pyfunction!(pool::check_pool_config, module)?)?;
     module.add_function(wrap_pyfunction!(connection::running_engines, module)?)?;
     module.add_function(wrap_pyfunction!(connection::segment_prefix, module)?)?;
-    module.add_function(wrap_pyfunction!(dlpack::dlpack, module)?)?;
-    module.add_function(wrap_pyfunction!(dlpack::dlpack_unchecked, module)?)?;
     module.add_function(wrap_pyfunction!(ends::ended_episodes, module)?)?;
     module.add_function(wrap_pyfunction!(endless, module)?)?;
     module.add_function(wrap_pyfunction!(specs, module)?)

@@ -42,7 +42,7 @@ def test_torch_view_takes_every_dtype_and_strided_parts(observation: np.ndarray)
         np.testing.assert_array_equal(endless_gym.torch_view(array).numpy(), array)
     part = observation[1::2, :, ::3]
     np.testing.assert_array_equal(endless_gym.torch_view(part).numpy(), part)
-    with pytest.raises(TypeError, match="DLPack"):
+    with pytest.raises(TypeError, match="str_"):
         endless_gym.torch_view(np.array(["a"]))
 
 
