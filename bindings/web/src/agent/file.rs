@@ -15,44 +15,18 @@ const MAX_NUMBERS: usize = 16 << 20;
 /// A file that is no agent, or not one that can act.
 #[derive(Debug, Error)]
 pub enum AgentFileError {
-    /// It starts otherwise.
     #[error("the file must be an exported agent, which starts with `{}`", String::from_utf8_lossy(MAGIC))]
     Magic,
-    /// It was written by another version of the exporter.
     #[error("an exported agent must be of version {VERSION}, got {given}; export it again")]
-    Version {
-        /// Version of the file.
-        given: u32,
-    },
-    /// It ends too early, or has bytes after its end.
+    Version { given: u32 },
     #[error("the file of an agent must have {expected} bytes according to its header, got {given}")]
-    Length {
-        /// Bytes that it should have.
-        expected: usize,
-        /// Bytes that it has.
-        given: usize,
-    },
-    /// The header cannot be read.
+    Length { expected: usize, given: usize },
     #[error("the header of an agent cannot be read: {0}")]
     Header(serde_json::Error),
-    /// A layer is missing, or has another shape than its neighbours.
     #[error("the agent must have a tensor `{name}` of shape {expected}, got {given}")]
-    Tensor {
-        /// Name of the tensor.
-        name: String,
-        /// The shape that the network needs.
-        expected: String,
-        /// The shape of the file, or `none`.
-        given: String,
-    },
-    /// A weight is infinite or no number.
+    Tensor { name: String, expected: String, given: String },
     #[error("the weights of an agent must be finite, got {given} in `{name}`")]
-    NotFinite {
-        /// Name of the tensor.
-        name: String,
-        /// The weight.
-        given: f32,
-    },
+    NotFinite { name: String, given: f32 },
 }
 
 #[derive(Debug, Deserialize)]

@@ -179,31 +179,3 @@ fn a_flash_says_what_happens_by_more_than_colour() {
     assert_eq!(found, json!([["reward", "+", "none"], ["success", "✓", "none"]]));
     assert_eq!(browser.complaints, Vec::<String>::new());
 }
-
-/// Not a test: `cargo test --package endless-gym-web --test browser -- --ignored --nocapture measure_start`.
-#[test]
-#[ignore = "a measurement"]
-fn measure_start_and_frame_rate() {
-    let (server, mut browser) = (PageServer::start(), start("start"));
-    let mut times = Vec::new();
-    for _ in 0..5 {
-        visit(&mut browser, &server, &format!("env={ID}&seed=1"));
-        // The first frame of the environment is on the screen two frames after it is drawn.
-        times.push(browser.value("endless.firstFrame").as_f64().unwrap());
-    }
-    times.sort_by(f64::total_cmp);
-    println!(
-        "navigation to first frame: {:.0} ms (median of 5), {:.0} (best), {:.0} (worst)",
-        times[2], times[0], times[4]
-    );
-    for pace in [25, 10_000] {
-        visit(&mut browser, &server, "wall=all&count=100&by=expert");
-        browser.value(&format!("endless.wall.pace.stepsPerSecond = {pace}; 0"));
-        let frames = browser.value(
-            "new Promise((done) => { let frames = 0; const start = performance.now(); const next = (now) => { frames += 1; \
-             if (now - start >= 5000) done(frames / (now - start) * 1000); else requestAnimationFrame(next) }; \
-             requestAnimationFrame(next) })",
-        );
-        println!("wall of 100 environments at {pace} steps a second: {:.1} frames a second", frames.as_f64().unwrap());
-    }
-}
