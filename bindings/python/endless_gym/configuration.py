@@ -33,33 +33,6 @@ MODES = {name: AutoresetMode[name.upper()] for name in _native.AUTORESET_MODES}
 
 
 @dataclass(frozen=True)
-class PoolConfig:
-    """The configuration of a group of environments: the JSON object that the engine's `PoolConfig` reads, field by field."""
-
-    id: str
-    num_envs: int
-    #: One mapping for all environments, or one for each.
-    options: Options | Sequence[Options]
-    #: A name in `MODES`.
-    autoreset: str
-    final_observation: bool
-    #: `{"continue": {"seed": s}}`, `{"range": {"start": a, "end": b, "step": c, "seed": s}}` or `{"list": [...]}`.
-    seeding: Mapping[str, Any]
-    independent_episodes: bool
-    #: `None` omits the frames.
-    frames: Mapping[str, Any] | None
-    features: bool
-    #: Number of the first environment among those of all groups.
-    first_env: int
-    #: Environments of all groups of the trainer together.
-    total_envs: int
-
-    def json(self) -> str:
-        """The configuration as JSON text."""
-        return json_text(vars(self))
-
-
-@dataclass(frozen=True)
 class Arguments:
     """The checked arguments that `make_vec` and `serve` share."""
 
@@ -67,8 +40,8 @@ class Arguments:
     num_threads: int
     autoreset: AutoresetMode
     frames: Frames | None
-    #: The configuration of each group, which the engine has checked.
-    pools: list[PoolConfig]
+    #: The configuration of each group, which the engine has checked: the JSON object of its `PoolConfig`.
+    pools: list[dict[str, Any]]
 
 
 def checked_arguments(
@@ -102,24 +75,24 @@ def checked_arguments(
     total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
     frames, features = contents(observation, frames)
     pools = [
-        PoolConfig(
-            id=described.id,
-            num_envs=num_envs,
-            options=_pool_options(options, group * num_envs, num_envs, groups),
-            autoreset=mode.name.lower(),
-            final_observation=True,
-            seeding=source,
-            independent_episodes=bool(independent_episodes),
-            frames=frames.configuration() if frames else None,
-            features=features,
+        {
+            "id": described.id,
+            "num_envs": num_envs,
+            "options": _pool_options(options, group * num_envs, num_envs, groups),
+            "autoreset": mode.name.lower(),
+            "final_observation": True,
+            "seeding": source,
+            "independent_episodes": bool(independent_episodes),
+            "frames": frames.configuration() if frames else None,
+            "features": features,
             # Environments are numbered over all groups.
-            first_env=first_env + group * num_envs,
-            total_envs=total_envs,
-        )
+            "first_env": first_env + group * num_envs,
+            "total_envs": total_envs,
+        }
         for group in range(groups)
     ]
     for pool in pools:
-        _native.check_pool_config(pool.json())
+        _native.check_pool_config(json_text(pool))
     return Arguments(described, threads, mode, frames, pools)
 
 

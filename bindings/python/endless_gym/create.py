@@ -8,12 +8,11 @@ from typing import Any
 
 from endless_gym import _native
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.backends import Backend
 from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Options, checked_arguments, options_list
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.results import Results
-from endless_gym.specs import Frames, ObservationName, Spec, spec
+from endless_gym.specs import Frames, ObservationName, Spec, json_text, spec
 from endless_gym.vector import EndlessVectorEnv
 
 
@@ -88,11 +87,11 @@ def make_vec(
         first_env,
         total_envs,
     )
-    pools = _native.Pools([config.json() for config in given.pools], given.num_threads)
+    pools = _native.Pools([json_text(config) for config in given.pools], given.num_threads)
     layout = json.loads(pools.layout())
     return _environments(
         pools,
-        Results(given.described, layout, given.pools[0].num_envs, given.frames, given.autoreset, copy),
+        Results(given.described, layout, given.pools[0]["num_envs"], given.frames, given.autoreset, copy),
         given.described,
         given.autoreset,
         episode_options,
@@ -163,7 +162,7 @@ def specified_results(specification: Mapping[str, Any], copy: bool) -> tuple[Spe
 
 
 def _environments(
-    backend: Backend,
+    backend: _native.Backend,
     results: Results,
     described: Spec,
     autoreset: AutoresetMode,

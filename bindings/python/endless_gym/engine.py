@@ -10,14 +10,13 @@ import sys
 import time
 import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
 from itertools import count
 from typing import Any
 
 from endless_gym import _native
 from endless_gym.arguments import integer
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, AutoresetName, Options, PoolConfig, checked_arguments
+from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
 from endless_gym.create import connect
 from endless_gym.engine_log import EngineLog, level
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
@@ -33,30 +32,12 @@ _numbers = count()
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
-@dataclass(frozen=True)
-class EngineConfig:
-    """The configuration of an engine: the JSON object that the engine's `EngineConfig` reads, field by field."""
-
-    service: str
-    #: The environments of one group, with the options of all groups.
-    pool: PoolConfig
-    groups: int
-    threads: int
-    batches_held: int
-    #: `{"path": ..., "every_seconds": ..., "resume": ...}`, or `None` for none.
-    checkpoint: Mapping[str, Any] | None
-
-    def json(self) -> str:
-        """The configuration as JSON text."""
-        return json_text(asdict(self))
-
-
 class EngineProcess:
     """A child process that serves environments. It stops by `end`, when nothing refers to this object, and with this process."""
 
-    def __init__(self, config: EngineConfig) -> None:
-        """Start the process, which reads its configuration from its standard input."""
-        self.service = config.service
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        """Start the process, which reads the JSON object of its `EngineConfig` from its standard input."""
+        self.service = config["service"]
         self._process = subprocess.Popen(
             [*program(), *level(), "serve", f"--child={os.getpid()}", "--config=-"],
             stdin=subprocess.PIPE,
@@ -67,7 +48,7 @@ class EngineProcess:
         if self._process.stdin is not None:
             # A process that has ended is reported by `connect`, with its message.
             with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.write(config.json().encode())
+                self._process.stdin.write(json_text(config).encode())
                 self._process.stdin.flush()
         self._log = EngineLog(self._process)
         # Also called at the exit of the interpreter. It must not refer to this object, which would then never be deleted.
@@ -215,17 +196,16 @@ def serve(
         every = None if checkpoint_every is None else checked_timeout(checkpoint_every)
         saved = {"path": os.fspath(checkpoint), "every_seconds": every, "resume": bool(resume)}
     given_options = dict(options or {}) if options is None or isinstance(options, Mapping) else [*map(dict, options)]
-    config = EngineConfig(
-        service=f"python-{os.getpid()}-{next(_numbers)}",
-        pool=replace(given.pools[0], options=given_options),
-        groups=len(given.pools),
-        threads=given.num_threads,
-        batches_held=min(
-            integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD) + bool(episode_info),
-            _native.MAX_BATCHES_HELD,
-        ),
-        checkpoint=saved,
-    )
+    batches = integer("batches_held", batches_held, 1, _native.MAX_BATCHES_HELD)
+    config = {
+        "service": f"python-{os.getpid()}-{next(_numbers)}",
+        # The environments of one group, with the options of all groups.
+        "pool": {**given.pools[0], "options": given_options},
+        "groups": len(given.pools),
+        "threads": given.num_threads,
+        "batches_held": min(batches + bool(episode_info), _native.MAX_BATCHES_HELD),
+        "checkpoint": saved,
+    }
     engine = EngineProcess(config)
     try:
         return engine.connect(

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from endless_gym import _native
 from endless_gym.arguments import mapping
-from endless_gym.backends import Backend
 from endless_gym.configuration import AutoresetMode
 from endless_gym.next_options import NextOptions, Options, RunningEpisode, running_episodes
 from endless_gym.results import Results, Step
@@ -48,7 +47,7 @@ class EpisodeTracker:
         self,
         group: int,
         num_envs: int,
-        backend: Backend,
+        backend: _native.Backend,
         options: NextOptions,
         autoreset: AutoresetMode,
         choose: EpisodeOptions | None,
@@ -192,7 +191,7 @@ class TrackedVectorEnv(EndlessVectorEnv):
 
     def __init__(
         self,
-        backend: Backend,
+        backend: _native.Backend,
         results: Results,
         described: Spec,
         autoreset: AutoresetMode,

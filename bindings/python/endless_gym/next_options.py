@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from endless_gym import _native
 from endless_gym.arguments import mapping
-from endless_gym.backends import Backend
 from endless_gym.specs import options_text
 
 Options = Mapping[str, Any]
@@ -28,7 +28,7 @@ class RunningEpisode(NamedTuple):
     ended: bool
 
 
-def running_episodes(backend: Backend, group: int, envs: Iterable[int]) -> dict[int, RunningEpisode]:
+def running_episodes(backend: _native.Backend, group: int, envs: Iterable[int]) -> dict[int, RunningEpisode]:
     """Seeds and options of the running episodes of environments."""
     found = backend.running_episodes(group, list(envs))
     return {env: RunningEpisode(seed, json.loads(options), ended) for env, seed, options, ended in found}
@@ -41,7 +41,7 @@ class NextOptions:
     options of the backend's environments, and sends only changes.
     """
 
-    def __init__(self, backend: Backend, num_envs: int, created: Sequence[Options], is_known: bool) -> None:
+    def __init__(self, backend: _native.Backend, num_envs: int, created: Sequence[Options], is_known: bool) -> None:
         """Prepare for a backend.
 
         `created` has one mapping for all environments, or one for each of all groups; `is_known` tells whether the backend's

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.backends import Backend, GroupReconnection, Reconnection
 from endless_gym.configuration import AutoresetMode, Options
 from endless_gym.descriptions import documented, metadata
 from endless_gym.next_options import NextOptions, RunningEpisode, running_episodes
@@ -22,6 +21,30 @@ from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_
 from endless_gym.reset_requests import ResetRequests, Seeds
 from endless_gym.results import Results, Step
 from endless_gym.specs import Spec, all_specs
+
+
+class GroupReconnection(NamedTuple):
+    """What `reconnect` found out about a group."""
+
+    #: Batches that the group has returned in the engine that is connected now, counted on from the checkpoint that it resumed
+    #: from; `None` if its status cannot be read.
+    step: int | None
+    #: Batches that it had returned in the engine that ended; `None` if the engine is the same, or if its status cannot be read.
+    lost_step: int | None
+    #: What became of the last request: `none` if there was none, `pending` if `recv` can return its result, `played` if it was
+    #: executed once, `not_played` if never, and `unknown` if the engine ended while it executed it.
+    last_request: _native.LastRequest
+
+
+class Reconnection(NamedTuple):
+    """What `reconnect` found."""
+
+    #: Whether the engine is another run than before. Otherwise the connection and the results that were not received are kept.
+    restarted: bool
+    #: A number that identifies the run of the engine that is connected now.
+    incarnation: int
+    #: By group.
+    groups: list[GroupReconnection]
 
 
 @documented(all_specs().values())
@@ -46,7 +69,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def __init__(
         self,
-        backend: Backend,
+        backend: _native.Backend,
         results: Results,
         described: Spec,
         autoreset: AutoresetMode,
