@@ -27,6 +27,7 @@ import gymnasium
 import numpy as np
 
 import endless_gym
+from endless_gym.__main__ import measure
 from endless_gym.program import program
 
 IDS = ["Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"]
@@ -78,17 +79,8 @@ class Original:
 
 def vector(make: Any, id: str, num_envs: int, threads: int, seconds: float) -> float:
     """Steps per second of `make_vec` or `serve`."""
-    with make(id, num_envs, num_threads=threads or None, seed=0) as envs:
-        envs.reset()
-        envs.action_space.seed(0)
-        actions = [np.asarray(envs.action_space.sample()) for _ in range(251)]
-        for number in range(20):
-            envs.step(actions[number])
-        batches, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            envs.step(actions[batches % len(actions)])
-            batches += 1
-        return batches * num_envs / (time.perf_counter() - start)
+    with make(id, num_envs, num_threads=threads or None) as envs:
+        return measure(envs, seconds)
 
 
 def single(id: str, seconds: float) -> float:
@@ -136,18 +128,13 @@ def scale(args: argparse.Namespace) -> dict[str, float]:
     contenders: dict[str, Any] = {"memory copy, GB/s written": (memory_bandwidth,)}
     if args.envpool:
         for id in ENVPOOL:
-            contenders[f"EnvPool's {id}, {SIZES[0]} environments, steps/s"] = (
-                envpool,
-                args.envpool,
-                id,
-                SIZES[0],
-                args.seconds,
-            )
+            name = f"EnvPool's {id}, {SIZES[0]} environments, steps/s"
+            contenders[name] = (envpool, args.envpool, id, SIZES[0], args.seconds)
     results: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(args.rounds):
-        for name, (measure, *arguments) in contenders.items():
+        for name, (contender, *arguments) in contenders.items():
             progress(name)
-            results[name].append(measure(*arguments))
+            results[name].append(contender(*arguments))
     progress("")
     return {name: round(statistics.median(values), 1) for name, values in results.items()}
 
@@ -167,9 +154,9 @@ def compare(id: str, original: Original, args: argparse.Namespace) -> dict[str, 
         contenders[f"serve, {size} environments"] = (vector, endless_gym.serve, id, size, args.threads)
     results: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(args.rounds):
-        for name, (measure, *arguments) in contenders.items():
+        for name, (contender, *arguments) in contenders.items():
             progress(f"{id}, round {number + 1} of {args.rounds}: {name}")
-            results[name].append(measure(*arguments, args.seconds))
+            results[name].append(contender(*arguments, args.seconds))
         for size in SIZES:
             progress(f"{id}, round {number + 1} of {args.rounds}: Rust, {size} environments")
             for name, value in rust(id, size, args.threads, args.seconds).items():
@@ -202,19 +189,6 @@ def targets(medians: dict[str, float], original: float) -> list[dict[str, Any]]:
         {"what": what, "target": target, "reached": round(reached, 2), "met": reached >= target}
         for what, target, reached in rows
     ]
-
-
-def show(row: dict[str, Any]) -> None:
-    """Print the tables of one environment id."""
-    reference = row["medians"][row["best_original"]]
-    print(f"{row['id']:46}{'steps/s':>12}{'lowest':>12}{'highest':>12}{'x best original':>17}")
-    for name, values in row["steps_per_second"].items():
-        median = row["medians"][name]
-        print(f"  {name:44}{median:12,}{min(values):12,}{max(values):12,}{median / reference:17.1f}")
-    for target in row["targets"]:
-        met = "met" if target["met"] else "MISSED"
-        print(f"  {target['what']}: {target['reached']:.2f}, target {target['target']:.2f}, {met}")
-    print(flush=True)
 
 
 def markdown(whole: dict[str, Any]) -> str:
@@ -272,19 +246,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables to this file, as Markdown")
     args = parser.parse_args()
-    described = machine()
-    print(", ".join(f"{name} {value}" for name, value in described.items()))
-    print(f"medians of {args.rounds} rounds of {args.seconds} s\n", flush=True)
-    shown_scale = scale(args)
-    for name, value in shown_scale.items():
-        print(f"{name:58}{value:14,}")
-    print(flush=True)
-    original, rows = Original(args.original), []
-    for id in args.ids:
-        rows.append(compare(id, original, args))
-        show(rows[-1])
-    whole = {"machine": described, "rounds": args.rounds, "seconds": args.seconds}
-    whole |= {"scale": shown_scale, "environments": rows}
+    whole = {"machine": machine(), "rounds": args.rounds, "seconds": args.seconds, "scale": scale(args)}
+    original = Original(args.original)
+    whole["environments"] = [compare(id, original, args) for id in args.ids]
+    print(markdown(whole))
     if args.markdown:
         args.markdown.write_text(markdown(whole))
     if args.json:

@@ -55,10 +55,7 @@ GROUPS = {
         "serve, 1024 environments": "1,024, in shared memory",
         "make_vec, 1024 environments": "1,024, in process",
     },
-    "EnvPool, for scale": {
-        "EnvPool's Pong-v5": "Pong, 64",
-        "EnvPool's CartPole-v1": "CartPole, 64",
-    },
+    "EnvPool, for scale": {"EnvPool's Pong-v5": "Pong, 64", "EnvPool's CartPole-v1": "CartPole, 64"},
 }
 
 #: Agents of the learning curve.

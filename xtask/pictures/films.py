@@ -80,15 +80,9 @@ _FADE = (0.7, 0.4, 0.15)
 
 def film(id: str, seed: int, steps: int, options: tuple[str, ...] = ()) -> Film:
     """Play an episode, at most `steps` steps."""
-    arguments = [
-        "frames",
-        "--env",
-        id,
-        f"--seed={seed}",
-        f"--steps={steps}",
-        *(f"--option={given}" for given in options),
-    ]
-    raw = np.frombuffer(subprocess.check_output([*program(), *arguments]), np.uint8).reshape(-1, sum(_FRAME_BYTES))
+    command = [*program(), "frames", f"--env={id}", f"--seed={seed}", f"--steps={steps}"]
+    command += [f"--option={given}" for given in options]
+    raw = np.frombuffer(subprocess.check_output(command), np.uint8).reshape(-1, sum(_FRAME_BYTES))
     observation, view = np.split(raw, _FRAME_BYTES[:1], axis=1)
     scale = VIEW // SCREEN  # the view repeats each pixel
     view = view.reshape(-1, VIEW, VIEW, 3)[:, ::scale, ::scale]
