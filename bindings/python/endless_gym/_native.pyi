@@ -92,10 +92,7 @@ class Observer:
 class Experts:
     def __init__(self, id: str, num_envs: int) -> None: ...
     def act(
-        self,
-        features: NDArray[np.float32],
-        vector_observation: NDArray[np.float32] | None,
-        turn: NDArray[np.uint8],
+        self, features: NDArray[np.float32], vector_observation: NDArray[np.float32] | None, turn: NDArray[np.uint8]
     ) -> NDArray[np.int64]: ...
 
 def frame_shape(frames: str) -> list[int]: ...

@@ -12,7 +12,7 @@ from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Optio
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.results import Results
-from endless_gym.specs import Frames, ObservationName, Spec, json_text, spec
+from endless_gym.specs import Frames, ObservationName, json_text, spec
 from endless_gym.vector import EndlessVectorEnv
 
 
@@ -92,8 +92,6 @@ def make_vec(
     return _environments(
         pools,
         Results(given.described, layout, given.pools[0]["num_envs"], given.frames, given.autoreset, copy),
-        given.described,
-        given.autoreset,
         episode_options,
         episode_info,
         options=options_list(options),
@@ -136,12 +134,9 @@ def connect(
     checked_view(render_mode, view, VECTOR_MODES)
     connection = _native.Connection(service, timeout)
     specification = json.loads(connection.specification())
-    described, results = specified_results(specification, copy)
     return _environments(
         connection,
-        results,
-        described,
-        MODES[specification["autoreset"]],
+        specified_results(specification, copy),
         episode_options,
         episode_info,
         options=specification["options"],
@@ -154,24 +149,20 @@ def connect(
     )
 
 
-def specified_results(specification: Mapping[str, Any], copy: bool) -> tuple[Spec, Results]:
-    """The specification of an engine's environment id, and the results of its batches."""
+def specified_results(specification: Mapping[str, Any], copy: bool) -> Results:
+    """The results of an engine's batches, from its specification."""
     described, frames = spec(specification["id"]), Frames.from_specification(specification["frames"])
     mode = MODES[specification["autoreset"]]
-    return described, Results(described, specification["batch"], specification["num_envs"], frames, mode, copy)
+    return Results(described, specification["batch"], specification["num_envs"], frames, mode, copy)
 
 
 def _environments(
     backend: _native.Backend,
     results: Results,
-    described: Spec,
-    autoreset: AutoresetMode,
     episode_options: EpisodeOptions | None,
     episode_info: bool,
     **arguments: Any,
 ) -> EndlessVectorEnv:
     if validate_episode_options(episode_options) is None and not episode_info:
-        return EndlessVectorEnv(backend, results, described, autoreset, **arguments)
-    return TrackedVectorEnv(
-        backend, results, described, autoreset, episode_options=episode_options, episode_info=episode_info, **arguments
-    )
+        return EndlessVectorEnv(backend, results, **arguments)
+    return TrackedVectorEnv(backend, results, episode_options=episode_options, episode_info=episode_info, **arguments)

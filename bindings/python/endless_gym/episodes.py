@@ -13,7 +13,6 @@ from endless_gym.arguments import mapping
 from endless_gym.configuration import AutoresetMode
 from endless_gym.next_options import NextOptions, Options, RunningEpisode, running_episodes
 from endless_gym.results import Results, Step
-from endless_gym.specs import Spec
 from endless_gym.vector import EndlessVectorEnv
 
 #: Chooses the options of an environment's next episode. It is called with the number of the environment over all groups, the
@@ -46,18 +45,17 @@ class EpisodeTracker:
     def __init__(
         self,
         group: int,
-        num_envs: int,
         backend: _native.Backend,
+        results: Results,
         options: NextOptions,
-        autoreset: AutoresetMode,
         choose: EpisodeOptions | None,
         has_info: bool,
-        copy: bool,
     ) -> None:
+        num_envs = results.num_envs
         self._group, self._first = group, group * num_envs
         self._backend, self._options, self._choose, self._has_info = backend, options, choose, has_info
-        self._next_step = autoreset is AutoresetMode.NEXT_STEP
-        self._same_step = autoreset is AutoresetMode.SAME_STEP
+        self._next_step = results.autoreset is AutoresetMode.NEXT_STEP
+        self._same_step = results.autoreset is AutoresetMode.SAME_STEP
         # For each environment, the number of its next episode.
         self._numbers = [0] * num_envs
         # The environments whose next episode may begin in the next step and has no options yet.
@@ -71,7 +69,7 @@ class EpisodeTracker:
         self._reset_envs: Sequence[int] | None = None
         # With next-step auto-reset, the environments whose next episode begins in the next step.
         self._ended = np.zeros(num_envs, dtype=np.bool_)
-        self._copy = copy
+        self._copy = results.copy
         # What `info` has. The arrays are read-only and replaced, not changed, since the caller may keep them.
         self._seeds = np.zeros(num_envs, dtype=np.uint64)
         self._has_seed = np.zeros(num_envs, dtype=np.bool_)
@@ -193,20 +191,16 @@ class TrackedVectorEnv(EndlessVectorEnv):
         self,
         backend: _native.Backend,
         results: Results,
-        described: Spec,
-        autoreset: AutoresetMode,
         *,
         episode_options: EpisodeOptions | None,
         episode_info: bool,
         **arguments: Any,
     ) -> None:
         """As for `EndlessVectorEnv`, with the arguments of `make_vec`."""
-        super().__init__(backend, results, described, autoreset, **arguments)
+        super().__init__(backend, results, **arguments)
         self._chooses = episode_options is not None
         self._trackers = [
-            EpisodeTracker(
-                group, self.num_envs, backend, self._options, autoreset, episode_options, episode_info, results.copy
-            )
+            EpisodeTracker(group, backend, results, self._options, episode_options, episode_info)
             for group in range(backend.groups)
         ]
 

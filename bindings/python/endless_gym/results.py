@@ -26,6 +26,8 @@ class Results:
     """Names the arrays of a batch as Gymnasium does.
 
     Attributes:
+        described: The specification of the environment id.
+        autoreset: The auto-reset mode.
         num_envs: Environments of a batch.
         observation_space: The space of one environment's observation.
         copy: Whether all arrays are writable copies.
@@ -42,7 +44,7 @@ class Results:
         copy: bool,
     ) -> None:
         """`layout` is the layout of a batch; with `copy`, all arrays are writable copies."""
-        self._described, self.copy, self.num_envs = described, copy, num_envs
+        self.described, self.autoreset, self.num_envs, self.copy = described, autoreset, num_envs, copy
         self._index = {section["name"]: place for place, section in enumerate(layout["sections"])}
         self._observed = self._places("")
         self._final_observed = self._places("final_")
@@ -94,7 +96,7 @@ class Results:
             return
         ended, returns, lengths, columns = ends
         final: dict[str, Any] = {"reward": returns, "_reward": ended, "length": lengths, "_length": ended}
-        for (name, _), column in zip(self._described.info, columns, strict=True):
+        for (name, _), column in zip(self.described.info, columns, strict=True):
             final[name], final[f"_{name}"] = column, ended
         if not self._same_step:
             info.update(final)

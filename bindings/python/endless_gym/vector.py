@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from endless_gym import _native
 from endless_gym.arguments import integer, mapping
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, Options
+from endless_gym.configuration import Options
 from endless_gym.descriptions import documented, metadata
 from endless_gym.next_options import NextOptions, RunningEpisode, running_episodes
 from endless_gym.rendering import VECTOR_MODES, SnapshotRenderer, View, checked_view
 from endless_gym.reset_requests import ResetRequests, Seeds
 from endless_gym.results import Results, Step
-from endless_gym.specs import Spec, all_specs
+from endless_gym.specs import all_specs
 
 
 class GroupReconnection(NamedTuple):
@@ -71,8 +71,6 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self,
         backend: _native.Backend,
         results: Results,
-        described: Spec,
-        autoreset: AutoresetMode,
         *,
         options: Sequence[Options] = ({},),
         knows_options: bool = True,
@@ -86,6 +84,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         `options` are those given at creation: one mapping for all environments, or one for each of all groups. `knows_options` is
         false if the environments may have others. `engine` is the engine's process if it belongs to this object.
         """
+        described = results.described
         shown = checked_view(render_mode, view, VECTOR_MODES)
         self.render_mode = render_mode
         self._renderer = None if shown is None else SnapshotRenderer(described.id, shown)
@@ -100,7 +99,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
         self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
         self.metadata = {
-            "autoreset_mode": autoreset,
+            "autoreset_mode": results.autoreset,
             "render_fps": described.render_fps,
             "render_modes": list(VECTOR_MODES),
         }
@@ -111,11 +110,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._options = NextOptions(backend, num_envs, options, knows_options)
 
     def reset(  # type: ignore[override]
-        self,
-        *,
-        seed: Seeds = None,
-        options: Options | None = None,
-        group: int | None = None,
+        self, *, seed: Seeds = None, options: Options | None = None, group: int | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every environment, or in those of `options["reset_mask"]`.
 

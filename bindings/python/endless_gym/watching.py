@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,11 +58,11 @@ class Watch:
         observer = _native.Observer(service, group, 3e7 if self._timeout is None else self._timeout)
         specification = json.loads(observer.specification())
         self._observer: _native.Observer | None = observer
-        described, self._results = specified_results(specification, copy)
+        self._results = specified_results(specification, copy)
         self.id: str = specification["id"]
         self.num_envs, self.num_groups = specification["num_envs"], specification["groups"]
         self.observation_space = batch_space(self._results.observation_space, self.num_envs)
-        self.action_space = batch_space(described.action_space(), self.num_envs)
+        self.action_space = batch_space(self._results.described.action_space(), self.num_envs)
         self.missed = 0
 
     def __iter__(self) -> Watch:
@@ -95,9 +94,7 @@ class Watch:
     def __enter__(self) -> Watch:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
 

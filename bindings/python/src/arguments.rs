@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use endless_gym::batch::Frames;
 use endless_gym::envs::ActionSpace;
-use endless_gym::pool::{NextOptions, PoolConfig, ResetRequest, RunningEpisode};
+use endless_gym::pool::{ResetRequest, RunningEpisode};
 use endless_gym::service::timeout_from_seconds;
 use numpy::{
     Element, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
@@ -13,7 +13,7 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyByteArray;
 use serde::de::DeserializeOwned;
-use serde_json::{Map, Value as Json};
+use serde_json::Value as Json;
 
 use crate::errors;
 
@@ -126,13 +126,8 @@ pub fn frame_shape(frames: &str) -> PyResult<Vec<usize>> {
     Ok(json::<Frames>(frames)?.shape())
 }
 
-/// The configuration of a pool, from JSON text.
-pub fn pool_config(text: &str) -> PyResult<PoolConfig> {
-    json(text)
-}
-
-/// A value from JSON text that the package has written.
-fn json<T: DeserializeOwned>(text: &str) -> PyResult<T> {
+/// A configuration from JSON text that the package has written.
+pub fn json<T: DeserializeOwned>(text: &str) -> PyResult<T> {
     serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("invalid configuration: {error}")))
 }
 
@@ -141,13 +136,8 @@ pub fn timeout(seconds: f64) -> PyResult<Duration> {
     timeout_from_seconds(seconds).map_err(errors::service)
 }
 
-/// Reset parameters from the JSON text of an object.
-pub fn options(text: &str) -> PyResult<Map<String, Json>> {
-    serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
-}
-
-/// The options of next episodes, from the JSON text of a list of objects with `options` and `envs`.
-pub fn next_options(text: &str) -> PyResult<Vec<NextOptions>> {
+/// Reset parameters from the JSON text of an object, or those of next episodes from a list of objects with `options` and `envs`.
+pub fn options<T: DeserializeOwned>(text: &str) -> PyResult<T> {
     serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("options must be JSON objects: {error}")))
 }
 

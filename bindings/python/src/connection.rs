@@ -5,7 +5,7 @@
 use std::time::{Duration, Instant};
 
 use endless_gym::batch::Block;
-
+use endless_gym::pool::{NextOptions, OptionMap};
 use endless_gym::service::{
     self, BatchLease, ConnectConfig, GroupReconnection, LastRequest, Namespace, ServiceError, Trainer,
 };
@@ -107,7 +107,7 @@ impl Connection {
     /// Requests a reset, whose result `receive` returns.
     #[pyo3(signature = (group, request=None, options=None))]
     fn send_reset(&mut self, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
-        let options = options.map(arguments::options).transpose()?;
+        let options: Option<OptionMap> = options.map(arguments::options).transpose()?;
         let request = Reset::request(request.as_ref());
         self.trainer()?.reset_with(group, request, options.as_ref()).map_err(errors::service)
     }
@@ -135,9 +135,9 @@ impl Connection {
         self.wait(py, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
-    /// Sets the options of next episodes; see `arguments::next_options`.
+    /// Sets the options of next episodes; see `arguments::options`.
     fn set_options(&mut self, py: Python<'_>, group: usize, sets: &str) -> PyResult<()> {
-        let sets = arguments::next_options(sets)?;
+        let sets: Vec<NextOptions> = arguments::options(sets)?;
         self.wait(py, |trainer, slice| trainer.set_options(group, &sets, slice))
     }
 

@@ -4,13 +4,12 @@
 
 use endless_gym::batch::Block;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
-use endless_gym::pool::{Pool, PoolError, Threads};
+use endless_gym::pool::{NextOptions, OptionMap, Pool, PoolConfig, PoolError, Threads};
 use endless_gym::service::ServiceError;
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
-use serde_json::{Map, Value as Json};
 
 use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
@@ -19,7 +18,7 @@ use crate::{arrays, errors};
 /// Checks the configuration of a group, from JSON text, without making environments.
 #[pyfunction]
 pub fn check_pool_config(config: &str) -> PyResult<()> {
-    arguments::pool_config(config)?.validate().map_err(errors::pool)
+    arguments::json::<PoolConfig>(config)?.validate().map_err(errors::pool)
 }
 
 /// The environments of one group, and the buffers of its batches.
@@ -37,7 +36,7 @@ enum Message {
     /// A step with the group's `actions`.
     Step,
     /// A reset.
-    Reset { request: Option<Reset>, options: Option<Map<String, Json>> },
+    Reset { request: Option<Reset>, options: Option<OptionMap> },
 }
 
 /// Groups of environments of one id; each group is stepped in lockstep.
@@ -61,7 +60,7 @@ impl Pools {
     fn new(configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
         let threads = Threads::new(num_threads).map_err(errors::pool)?;
         let group = |config: &String| {
-            let pool = Pool::new(&arguments::pool_config(config)?, &threads).map_err(errors::pool)?;
+            let pool = Pool::new(&arguments::json(config)?, &threads).map_err(errors::pool)?;
             Ok(Group { pool, buffers: Buffers::default(), actions: Vec::new() })
         };
         let pools: Vec<Group> = configs.iter().map(group).collect::<PyResult<_>>()?;
@@ -96,7 +95,7 @@ impl Pools {
         request: Option<Reset>,
         options: Option<&str>,
     ) -> PyResult<Bound<'py, PyTuple>> {
-        let options = options.map(arguments::options).transpose()?;
+        let options: Option<OptionMap> = options.map(arguments::options).transpose()?;
         self.idle(group)?.reset(py, request.as_ref(), options.as_ref())
     }
 
@@ -156,9 +155,9 @@ impl Pools {
         self.idle(group)?.pool.restore(env, snapshot).map_err(errors::snapshot)
     }
 
-    /// Sets the options of next episodes; see `arguments::next_options`.
+    /// Sets the options of next episodes; see `arguments::options`.
     fn set_options(&mut self, group: usize, sets: &str) -> PyResult<()> {
-        let sets = arguments::next_options(sets)?;
+        let sets: Vec<NextOptions> = arguments::options(sets)?;
         self.idle(group)?.pool.set_options(&sets).map_err(errors::pool)
     }
 
@@ -240,7 +239,7 @@ impl Group {
         &mut self,
         py: Python<'py>,
         request: Option<&Reset>,
-        options: Option<&Map<String, Json>>,
+        options: Option<&OptionMap>,
     ) -> PyResult<Bound<'py, PyTuple>> {
         self.write(py, |pool, batch| pool.reset_with(Reset::request(request), options, batch))
     }

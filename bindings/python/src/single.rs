@@ -3,7 +3,7 @@
 use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
 use endless_gym::envs::{ActionSpace, FRAME_BYTES, SCREEN};
-use endless_gym::pool::{Pool, ResetRequest, SavedEnv, Threads};
+use endless_gym::pool::{OptionMap, Pool, ResetRequest, SavedEnv, Threads};
 use numpy::{Element, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -29,16 +29,15 @@ impl Single {
     /// `config` is JSON text, with one environment.
     #[new]
     fn new(config: &str) -> PyResult<Self> {
-        let config = arguments::pool_config(config)?;
         let threads = Threads::new(1).map_err(errors::pool)?;
-        let pool = Pool::new(&config, &threads).map_err(errors::pool)?;
+        let pool = Pool::new(&arguments::json(config)?, &threads).map_err(errors::pool)?;
         let blocks = zeroed(pool.layout().blocks());
         let action_shape = ActionShape::single(&pool.spec().action_space);
         Ok(Single { pool, blocks, action_shape, action: Vec::new() })
     }
 
     fn reset<'py>(&mut self, py: Python<'py>, seed: Option<u64>, options: &str) -> PyResult<Arrays<'py>> {
-        let options = arguments::options(options)?;
+        let options: OptionMap = arguments::options(options)?;
         let request = seed.map_or(ResetRequest::All, ResetRequest::Seed);
         self.pool.reset_with(request, Some(&options), &mut self.blocks).map_err(errors::pool)?;
         self.arrays(py)

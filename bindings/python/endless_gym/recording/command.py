@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any
 
 from endless_gym.recording.recorder import Recording, record
@@ -54,23 +55,14 @@ def _interrupt(number: int, frame: object) -> None:
 
 def show(recording: Recording, as_json: bool) -> None:
     """Print what was recorded."""
-    numbers = {
-        "dataset": recording.dataset,
-        "path": str(recording.path),
-        "episodes": recording.episodes,
-        "steps": recording.steps,
-        "mean_return": recording.mean_return,
-        "mean_length": recording.mean_length,
-        "megabytes": recording.megabytes,
-        "seconds": recording.seconds,
-        "episodes_per_minute": recording.episodes / recording.seconds * 60,
-    }
+    per_minute = recording.episodes / recording.seconds * 60
+    numbers = {**asdict(recording), "path": str(recording.path), "episodes_per_minute": per_minute}
     if as_json:
         print(json.dumps(numbers))
         return
     print(f"{recording.episodes:,} episodes, {recording.steps:,} steps, {recording.megabytes:,.1f} MB")
     print(f"mean return {recording.mean_return:.3f}, mean length {recording.mean_length:.1f}")
-    print(f"{recording.seconds:.1f} s, {numbers['episodes_per_minute']:,.0f} episodes per minute")
+    print(f"{recording.seconds:.1f} s, {per_minute:,.0f} episodes per minute")
     print(f"{recording.path}\nminari.load_dataset({recording.dataset!r})")
 
 

@@ -13,10 +13,7 @@ from endless_gym.specs import ObservationName, Spec
 
 #: Chooses actions for observations of n environments by their keys, given which are the first of an episode, bool (n,), and which
 #: environments need an action, bool (n,). Returns actions in the shape of a vector environment.
-Actor: TypeAlias = Callable[
-    [Mapping[str, NDArray[Any]], NDArray[np.bool_], NDArray[np.bool_]],
-    NDArray[np.int64],
-]
+Actor: TypeAlias = Callable[[Mapping[str, NDArray[Any]], NDArray[np.bool_], NDArray[np.bool_]], NDArray[np.int64]]
 
 
 class Player(Protocol):
