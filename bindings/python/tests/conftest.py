@@ -3,12 +3,11 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from endless_gym import _native
+from support import segments
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -17,22 +16,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.original)
 
 
+def _python(variable: str, contents: str) -> str:
+    python = os.environ.get(variable)
+    if not python:
+        pytest.fail(f"{variable} names no Python with {contents}; run `cargo xtask test --all`")
+    return python
+
+
 @pytest.fixture(scope="session")
 def original_python() -> str:
     """A Python that has the original, memory-gym 1.0.2."""
-    python = os.environ.get("ENDLESS_ORIGINAL_PYTHON")
-    if not python:
-        pytest.fail("ENDLESS_ORIGINAL_PYTHON names no Python with memory-gym 1.0.2; run `cargo xtask test --all`")
-    return python
+    return _python("ENDLESS_ORIGINAL_PYTHON", "memory-gym 1.0.2")
 
 
 @pytest.fixture(scope="session")
 def libraries_python() -> str:
     """A Python with the dependency group `rllib`: Ray, JAX and Jupyter's kernel, and with the agents."""
-    python = os.environ.get("ENDLESS_LIBRARIES_PYTHON")
-    if not python:
-        pytest.fail("ENDLESS_LIBRARIES_PYTHON names no Python with the group `rllib`; run `cargo xtask test --all`")
-    return python
+    return _python("ENDLESS_LIBRARIES_PYTHON", "the group `rllib`")
 
 
 @pytest.fixture
@@ -61,17 +61,6 @@ def own_namespace() -> Iterator[Path]:
     # Processes that the tests start import the installed package, not the sources in their working directory.
     os.environ["PYTHONSAFEPATH"] = "1"
     yield Path(root)
-    left = _segments()
+    left = segments()
     shutil.rmtree(root, ignore_errors=True)
     assert not left, f"left in /dev/shm: {sorted(left)}"
-
-
-@pytest.fixture(scope="session")
-def segments(own_namespace: Path) -> Callable[[], set[str]]:
-    """The shared memory segments of this test run."""
-    return _segments
-
-
-def _segments() -> set[str]:
-    prefix = _native.segment_prefix()
-    return {name for name in os.listdir("/dev/shm") if name.startswith(prefix)}

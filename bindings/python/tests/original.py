@@ -1,6 +1,6 @@
 """Plays the original: actions from a file, everything that it returns to another. Runs in the original's Python.
 
-Usage: original.py ID ACTIONS.npy OPTIONS.json OUT.npz
+Usage: original.py ID ACTIONS.npy OPTIONS OUT.pickle
 """
 
 import json

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import warnings
 
 import numpy as np
 import pytest
+from support import same
 
 import endless_gym
 
@@ -34,6 +36,20 @@ def reference(env_id: str, num_envs: int, autoreset: str, seed: int, **kwargs):
     return envs, envs.reset(seed=seed)[0]
 
 
+@pytest.mark.parametrize(
+    ("module", "name", "autoreset", "library"),
+    [("sb3", "EndlessVecEnv", "same_step", "Stable-Baselines3"), ("torchrl", "EndlessEnv", "disabled", "TorchRL")],
+)
+def test_other_reset_modes_and_groups_are_refused(module, name, autoreset, library):
+    adapt = getattr(importlib.import_module(f"endless_gym.{module}"), name)
+    for kwargs, match in (
+        ({}, f'autoreset must be "{autoreset}" for {library}, got "next_step"'),
+        ({"groups": 2, "autoreset": autoreset}, f"groups must be 1 for {library}, got 2"),
+    ):
+        with endless_gym.make_vec(SHORT, 1, **kwargs) as envs, pytest.raises(ValueError, match=match):
+            adapt(envs)
+
+
 class TestStableBaselines3:
     @pytest.fixture(autouse=True)
     def adapter(self):
@@ -47,19 +63,14 @@ class TestStableBaselines3:
         venv = self.make(env_id, num_envs=5)
         venv.seed(3)
         obs = venv.reset()
-        assert obs.shape == (5, *FRAME)
-        assert obs.dtype == np.uint8
+        assert (obs.shape, obs.dtype) == ((5, *FRAME), np.uint8)
         assert venv.observation_space.contains(obs[0])
         assert len(venv.reset_infos) == 5
         obs, rewards, dones, infos = venv.step(random_actions(venv, np.random.default_rng(0), 5))
-        assert obs.shape == (5, *FRAME)
-        assert obs.dtype == np.uint8
-        assert rewards.shape == (5,)
-        assert rewards.dtype == np.float32
-        assert dones.shape == (5,)
-        assert dones.dtype == np.bool_
-        assert len(infos) == 5
-        assert all(isinstance(info, dict) for info in infos)
+        assert (obs.shape, obs.dtype) == ((5, *FRAME), np.uint8)
+        assert (rewards.shape, rewards.dtype) == ((5,), np.float32)
+        assert (dones.shape, dones.dtype) == ((5,), np.bool_)
+        assert [type(info) for info in infos] == [dict] * 5
         rewards += 1  # on-policy algorithms add to the rewards of episodes that were cut off
         venv.close()
 
@@ -150,13 +161,6 @@ class TestStableBaselines3:
             venv.reset()
         venv.close()
 
-    def test_rejects_other_reset_modes(self):
-        with (
-            endless_gym.make_vec(SHORT, num_envs=1) as envs,
-            pytest.raises(ValueError, match='autoreset must be "same_step" for Stable-Baselines3, got "next_step"'),
-        ):
-            self.adapt(envs)
-
     def test_wrappers_and_ppo_accept_the_adapter(self):
         from stable_baselines3 import PPO
         from stable_baselines3.common.evaluation import evaluate_policy
@@ -234,11 +238,6 @@ for read in (lambda: obs_as_tensor(observation, "cpu"), lambda: torch.as_tensor(
             assert ended >= 4
             assert len(terminal) == ended, "terminal observations may be kept: they hold no shared memory"
 
-    def test_rejects_groups(self):
-        envs = endless_gym.make_vec(SHORT, num_envs=1, groups=2, autoreset="same_step")
-        with envs, pytest.raises(ValueError, match="groups must be 1 for Stable-Baselines3, got 2"):
-            self.adapt(envs)
-
 
 class TestTorchRL:
     @pytest.fixture(autouse=True)
@@ -256,63 +255,43 @@ class TestTorchRL:
         check_env_specs(env, seed=0, break_when_any_done="both")
         env.close()
 
-    def test_rollout_is_what_the_environments_return(self):
-        import torch
-
-        num_envs, steps, rng = 6, 150, np.random.default_rng(2)
-        envs, obs = reference(SHORT, num_envs, "disabled", seed=7)
-        env = self.make(SHORT, num_envs=num_envs)
-        env.set_seed(7)
-        actions = torch.from_numpy(np.stack([random_actions(envs, rng, num_envs) for _ in range(steps)]))
-        numbers = iter(actions)
-        data = env.rollout(steps, lambda td: td.set("action", next(numbers)), break_when_any_done=False)
-        assert data.batch_size == (num_envs, steps)
-        ended = 0
-        for t in range(steps):
-            now = data[:, t]
-            np.testing.assert_array_equal(now["observation"], obs)
-            obs, reward, terminated, truncated, _ = envs.step(actions[t].numpy())
-            np.testing.assert_array_equal(now["next", "observation"], obs)
-            np.testing.assert_array_equal(now["next", "reward"][:, 0], reward.astype(np.float32))
-            np.testing.assert_array_equal(now["next", "terminated"][:, 0], terminated)
-            np.testing.assert_array_equal(now["next", "truncated"][:, 0], truncated)
-            done = terminated | truncated
-            np.testing.assert_array_equal(now["next", "done"][:, 0], done)
-            ended += done.sum()
-            if done.any():
-                obs, _ = envs.reset(options={"reset_mask": done})
-        assert ended >= num_envs
-        env.close()
-        envs.close()
-
-    @pytest.mark.parametrize(
-        "env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "Endless-SearingSpotlights-v0"]
-    )
-    def test_final_infos_and_ground_truth_are_kept(self, env_id):
+    @pytest.mark.parametrize("env_id", [SHORT, "MysteryPath-Grid-v0", "Endless-SearingSpotlights-v0"])
+    def test_rollout_is_what_the_environments_return(self, env_id):
         import torch
 
         num_envs, steps, rng = 4, 120, np.random.default_rng(5)
         options = {"max_steps": 30}
-        envs, _ = reference(env_id, num_envs, "disabled", seed=3, options=options)
+        envs, obs = reference(env_id, num_envs, "disabled", seed=3, options=options)
         env = self.make(env_id, num_envs=num_envs, options=options)
         env.set_seed(3)
         actions = torch.from_numpy(np.stack([random_actions(envs, rng, num_envs) for _ in range(steps)]))
         numbers = iter(actions)
         data = env.rollout(steps, lambda td: td.set("action", next(numbers)), break_when_any_done=False)
+        assert data.batch_size == (num_envs, steps)
         described, ended = endless_gym.spec(env_id), 0
         names = ["reward", "length", *(name for name, _ in described.info)]
         assert sorted(data["next", "final_info"].keys()) == sorted(names)
         for t in range(steps):
-            *_, terminated, _, info = envs.step(actions[t].numpy())
-            given = data["next", "final_info"][:, t]
+            now = data[:, t]
+            np.testing.assert_array_equal(now["observation"], obs)
+            obs, reward, terminated, truncated, info = envs.step(actions[t].numpy())
+            done = terminated | truncated
+            wanted = {
+                "reward": reward.astype(np.float32),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": done,
+            }
+            same({name: now["next", name][:, 0] for name in wanted}, wanted)
+            np.testing.assert_array_equal(now["next", "observation"], obs)
             for name in names:
-                expected = info.get(name, np.zeros(num_envs))
-                np.testing.assert_array_equal(given[name][:, 0], np.where(terminated, expected, 0))
+                expected = np.where(terminated, info.get(name, np.zeros(num_envs)), 0)
+                np.testing.assert_array_equal(now["next", "final_info", name][:, 0], expected)
             if described.ground_truth:
-                np.testing.assert_array_equal(data["next", "ground_truth"][:, t], info["ground_truth"])
-            ended += terminated.sum()
-            if terminated.any():
-                envs.reset(options={"reset_mask": terminated})
+                np.testing.assert_array_equal(now["next", "ground_truth"], info["ground_truth"])
+            ended += done.sum()
+            if done.any():
+                obs, _ = envs.reset(options={"reset_mask": done})
         assert ended >= num_envs
         assert {name: data["next", "final_info", name].is_floating_point() for name, _ in described.info} == {
             name: not is_integer for name, is_integer in described.info
@@ -329,23 +308,11 @@ class TestTorchRL:
         np.testing.assert_array_equal(first["observation"], kept)
         env.close()
 
-    def test_rejects_other_reset_modes(self):
-        with (
-            endless_gym.make_vec(SHORT, num_envs=1) as envs,
-            pytest.raises(ValueError, match='autoreset must be "disabled" for TorchRL, got "next_step"'),
-        ):
-            self.adapt(envs)
-
     def test_adapter_works_over_a_served_engine(self):
         with endless_gym.serve(SHORT, num_envs=4, autoreset="disabled") as envs:
             data = self.adapt(envs).rollout(100, break_when_any_done=False)
             assert data.batch_size == (4, 100), "a rollout keeps more observations than an engine lends"
             assert data["next", "done"].sum() >= 4
-
-    def test_rejects_groups(self):
-        envs = endless_gym.make_vec(SHORT, num_envs=1, groups=2, autoreset="disabled")
-        with envs, pytest.raises(ValueError, match="groups must be 1 for TorchRL, got 2"):
-            self.adapt(envs)
 
 
 class TestPufferLib:
@@ -365,13 +332,10 @@ class TestPufferLib:
         assert env.driver_env is env
         obs, infos = env.reset(seed=0)
         assert obs.shape == env.observation_space.shape == (4, *FRAME)
-        assert obs.dtype == np.uint8
         assert infos == []
         obs, rewards, terminals, truncations, infos = env.step(random_actions(env, np.random.default_rng(0), 4))
-        assert obs.shape == (4, *FRAME)
-        assert obs.dtype == np.uint8
-        assert rewards.shape == (4,)
-        assert rewards.dtype == np.float32
+        assert (obs.shape, obs.dtype) == ((4, *FRAME), np.uint8)
+        assert (rewards.shape, rewards.dtype) == ((4,), np.float32)
         assert terminals.shape == truncations.shape == (4,)
         assert terminals.dtype == truncations.dtype == np.bool_
         assert env.masks.all()

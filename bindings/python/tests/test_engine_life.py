@@ -7,13 +7,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+from support import await_end_of_engines
 
 import endless_gym
 
@@ -38,17 +38,13 @@ def play(envs: endless_gym.EndlessVectorEnv) -> np.ndarray:
     return envs.step(ACTIONS)[0]
 
 
-def pid(envs: endless_gym.EndlessVectorEnv) -> int:
-    return envs._engine.pid
-
-
 def test_an_engine_ends_when_its_name_is_assigned_again(no_collector: None) -> None:
     observations = []
     for _ in range(3):
         envs = endless_gym.serve(ID, 4)
         observations.append(play(envs))
         assert endless_gym.running_engines() == [envs._engine.service]
-    last, process = observations[-1].copy(), pid(envs)
+    last, process = observations[-1].copy(), envs._engine.pid
     del envs
     assert endless_gym.running_engines() == []
     assert not Path(f"/proc/{process}").exists()
@@ -107,24 +103,7 @@ def test_engines_end_with_the_kernel_of_a_notebook() -> None:
     finally:
         kernel.kill()
         kernel.communicate()
-    end = time.monotonic() + 10
-    while endless_gym.running_engines() and time.monotonic() < end:
-        time.sleep(0.05)
-    assert endless_gym.running_engines() == []
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_forked_child_does_not_end_the_engine_of_its_parent() -> None:
-    envs = endless_gym.serve(ID, 4)
-    envs.reset()
-    child = os.fork()
-    if child == 0:
-        del envs
-        gc.collect()
-        os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    envs.step(ACTIONS)
-    envs.close()
+    await_end_of_engines()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -12,25 +12,18 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from support import exact
 
 import endless_gym
 
 IDS = list(endless_gym.all_specs())
+#: Reset parameters with which random actions end several episodes.
 OPTIONS = {
+    **{id: {"command_count": [2]} for id in IDS if id.startswith("MortarMayhem")},
+    **{id: {"max_steps": 40} for id in IDS if "MysteryPath" in id},
     "SearingSpotlights-v0": {"num_coins": [3], "agent_health": 2},
-    "MortarMayhem-Grid-v0": {"command_count": [3]},
+    "Endless-SearingSpotlights-v0": {"max_steps": 40},
 }
-
-
-def plain(value: object) -> object:
-    """As the original's side of the test writes it."""
-    if isinstance(value, np.ndarray):
-        return ("array", str(value.dtype), value.shape, value.tobytes())
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return value
 
 
 @pytest.mark.parametrize("id", IDS)
@@ -50,7 +43,7 @@ def test_env_equals_the_original_step_by_step(id: str, original_python: str, tmp
         for name, given, original in zip(
             ("observation", "reward", "terminated", "truncated", "info", "render"), entry, wanted, strict=True
         ):
-            assert plain(given) == original, f"{name}, {len(expected)} before the end"
+            assert exact(given) == original, f"{name}, {len(expected)} before the end"
 
     observation, info = env.reset(seed=11, options=options)
     check(observation, None, None, None, info, env.render())
@@ -63,12 +56,15 @@ def test_env_equals_the_original_step_by_step(id: str, original_python: str, tmp
     assert unwrapped.has_ground_truth_info == described["has_ground_truth_info"]
     assert repr(getattr(unwrapped, "ground_truth_space", None)) == described["ground_truth_space"]
     assert unwrapped.max_episode_steps == described["max_episode_steps"]
+    ends = 0
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(int(action[0]) if len(action) == 1 else action)
         check(observation, reward, terminated, truncated, info, env.render())
         if terminated:
             observation, info = env.reset(options=options)
             check(observation, None, None, None, info, env.render())
+            ends += 1
+    assert ends >= 2
     assert not expected
 
 
@@ -83,8 +79,6 @@ def test_rgb_array_is_the_observation_by_rows() -> None:
     env = gymnasium.make("EndlessGym/MysteryPath-v0", render_mode="rgb_array")
     observation, _ = env.reset(seed=1)
     np.testing.assert_array_equal(env.render(), observation.swapaxes(0, 1))
-    with pytest.raises(ValueError, match="ansi"):
-        endless_gym.Env("MysteryPath-v0", render_mode="ansi")
 
 
 @pytest.mark.parametrize("id", ["MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"])
@@ -130,12 +124,6 @@ def test_wrong_arguments_and_calls_raise() -> None:
         env.step([0, 0])
     with pytest.raises(ValueError, match="arena_sise"):
         env.reset(options={"arena_sise": 2})
-    env.reset()
-    for wrong in ([0, 3], [0], [0, 0, 0], [-1, 0], [2**40, 0]):
-        with pytest.raises(ValueError, match=r"action|\[3, 3\]"):
-            env.step(wrong)
-    with pytest.raises(TypeError, match="integers"):
-        env.step([0.5, 0])
     with pytest.raises(ValueError, match="MortarMayhem-v0"):
         endless_gym.Env("Mortar")
 
@@ -162,11 +150,7 @@ def test_the_originals_ids_and_classes_make_equal_environments() -> None:
 
 
 #: How a second environment is made from one.
-COPIES = {
-    "deepcopy": copy.deepcopy,
-    "copy": copy.copy,
-    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
-}
+COPIES = {"deepcopy": copy.deepcopy, "copy": copy.copy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
 @pytest.mark.parametrize("how", COPIES.values(), ids=COPIES)
@@ -186,7 +170,7 @@ def test_copies_continue_identically_and_independently(how: Any, id: str) -> Non
     assert other.observation_space == env.observation_space
     actions = [env.action_space.sample() for _ in range(150)]
     played = [list(play(each, actions)) for each in (env, other)]
-    assert plain(played[0]) == plain(played[1])
+    assert exact(played[0]) == exact(played[1])
 
 
 def play(env: endless_gym.Env, actions: list[Any]) -> Any:
@@ -203,7 +187,7 @@ def test_a_copy_of_an_environment_with_independent_episodes_draws_the_same_seeds
     env.reset(seed=1)
     other = copy.deepcopy(env)
     actions = [env.action_space.sample() for _ in range(90)]
-    assert plain(list(play(env, actions))) == plain(list(play(other, actions)))
+    assert exact(list(play(env, actions))) == exact(list(play(other, actions)))
 
 
 @pytest.mark.parametrize("how", COPIES.values(), ids=COPIES)
@@ -235,11 +219,11 @@ def test_async_vector_env_plays_as_sync_vector_env(where: str, context: str) -> 
     sync = gymnasium.make_vec(id, 2, vectorization_mode="sync", **kwargs)
     asynchronous = gymnasium.make_vec(id, 2, vectorization_mode="async", vector_kwargs={"context": context}, **kwargs)
     try:
-        assert plain(sync.reset(seed=1)) == plain(asynchronous.reset(seed=1))
+        assert exact(sync.reset(seed=1)) == exact(asynchronous.reset(seed=1))
         sync.action_space.seed(1)
         for _ in range(12):
             actions = sync.action_space.sample()
-            assert plain(sync.step(actions)) == plain(asynchronous.step(actions))
+            assert exact(sync.step(actions)) == exact(asynchronous.step(actions))
     finally:
         asynchronous.close()
 
@@ -283,7 +267,7 @@ def test_observations_equal_a_vector_environments(id: str, kwargs: dict[str, Any
         given, wanted = env.reset(seed=1)[0], envs.reset(seed=1)[0]
         for _ in range(30):
             assert given in env.observation_space
-            assert plain(given) == plain(
+            assert exact(given) == exact(
                 {key: value[0] for key, value in wanted.items()} if isinstance(wanted, dict) else wanted[0]
             )
             actions = envs.action_space.sample()

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import WHERE, exact
 
 import endless_gym
 
 #: An agent that does nothing ends an episode within some dozens of steps.
 ID = "MortarMayhem-Grid-v0"
-WHERE = [endless_gym.make_vec, endless_gym.serve]
 MODES = ["next_step", "same_step", "disabled"]
 ONE, TWO, THREE = ({"command_count": [count]} for count in (1, 2, 3))
 Envs = endless_gym.EndlessVectorEnv
@@ -363,7 +363,7 @@ def test_episodes_are_played_again(id: str, where: Callable[..., Envs]) -> None:
                     shown[env].append(row(observation, env))
                     continue
                 final = info["final_info"]
-                shown[env].append(info["final_obs"][env])
+                shown[env].append(exact(info["final_obs"][env]))
                 seed, options = int(final["seed"][env]), final["options"][env]
                 assert final["_seed"][env]
                 assert options == short
@@ -379,9 +379,9 @@ def test_episodes_are_played_again(id: str, where: Callable[..., Envs]) -> None:
 
 
 def row(observation: Any, env: int) -> Any:
-    if isinstance(observation, dict):
-        return {key: part[env].copy() for key, part in observation.items()}
-    return observation[env].copy()
+    return exact(
+        {key: part[env] for key, part in observation.items()} if isinstance(observation, dict) else observation[env]
+    )
 
 
 def compare(shown: list[Any], rewards: list[float], steps: Any) -> bool:
@@ -390,13 +390,7 @@ def compare(shown: list[Any], rewards: list[float], steps: Any) -> bool:
     assert [step.reward for step in steps[1:]] == rewards
     assert [step.terminated for step in steps] == [False] * (len(steps) - 1) + [True]
     assert steps[-1].info["length"] == len(rewards)
-
-    def equal(one: Any, other: Any) -> bool:
-        if isinstance(one, dict):
-            return all(np.array_equal(one[key], other[key]) for key in one)
-        return np.array_equal(one, other)
-
-    return all(equal(one, step.observation) for one, step in zip(shown, steps, strict=True))
+    return shown == [exact(step.observation) for step in steps]
 
 
 def test_wrong_replays_raise_typed_errors() -> None:

@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support import segments
 
 import endless_gym
 
@@ -31,12 +32,7 @@ def run(
     """Run the example with `arguments`, and return what it printed, and the last line's numbers."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""} | variables
     ran = subprocess.run(
-        [python, EXAMPLES / script, *arguments],
-        cwd=cwd,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        [python, EXAMPLES / script, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert "Traceback" not in ran.stderr
@@ -48,7 +44,38 @@ def run(
 
 
 def test_every_example_has_a_test():
-    assert {f"test_{path.stem}" for path in EXAMPLES.glob("*.py")} <= set(globals())
+    tested = {example.split()[0] for example, *_ in RUNS} | {f"{name.removeprefix('test_')}.py" for name in globals()}
+    assert {path.name for path in EXAMPLES.glob("*.py")} <= tested
+
+
+SHORT_ID, GRID_ID, DICT_ID = "Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"
+ROLLOUT, BATCHES = "--num-steps 32", r"(?s)(batch=\(8, 32\) observation=\(8, 32, 84, 84, 3\).*){2}"
+#: Arguments of an example, the environments, and what it prints; random actions end episodes of `SHORT_ID`.
+RUNS = [
+    (f"sb3_recurrent_ppo.py {ROLLOUT} --hidden-size 32", [SHORT_ID, GRID_ID, DICT_ID], "train/"),
+    (f"torchrl_rollout.py {ROLLOUT}", [SHORT_ID, GRID_ID], BATCHES),
+    (f"torchrl_rollout.py {ROLLOUT} --num-workers 2", [SHORT_ID], BATCHES),
+    *(
+        (f"pufferlib_rollout.py --backend {backend}", [SHORT_ID, GRID_ID], r"observations=\(8, 84, 84, 3\) uint8")
+        for backend in ("PufferEnv", "Serial", "Multiprocessing")
+    ),
+    ("jax_service.py", [SHORT_ID, GRID_ID, DICT_ID], r"observation=\(8, 84, 84, 3\) uint8 shared=True"),
+]
+
+
+@pytest.mark.parametrize(
+    ("example", "env_id", "printed"), [(example, id, printed) for example, ids, printed in RUNS for id in ids]
+)
+def test_example_runs(tmp_path, request, example, env_id, printed):
+    script, *arguments = example.split()
+    python = request.getfixturevalue("libraries_python") if script == "jax_service.py" else sys.executable
+    sizes = ("--env-id", env_id, "--num-envs", "8", "--total-timesteps", "512")
+    output, summary = run(script, tmp_path, *arguments, *sizes, python=python)
+    assert summary[1] == "512"
+    assert re.search(printed, output)
+    if env_id == SHORT_ID:
+        assert summary[3] != "none yet"
+    assert not segments()
 
 
 @pytest.mark.parametrize("script", ["cleanrl_ppo.py", "torchrl_rollout.py", "rllib_ppo.py"])
@@ -78,64 +105,10 @@ def test_command_lines_are_right_as_written(tmp_path, libraries_python, script):
     assert lines, "the docstring shows no command"
     python = libraries_python if "import jax" in text else sys.executable
     usage = subprocess.run([python, EXAMPLES / script, "--help"], capture_output=True, text=True, check=True).stdout
+    few = "--total-timesteps 512" + " --num-envs 8 --num-steps 32" * ("--num-steps" in usage)
     for line in lines:
-        few = [
-            "--total-timesteps",
-            "512",
-            *(["--num-envs", "8", "--num-steps", "32"] if "--num-steps" in usage else []),
-        ]
-        _, summary = run(script, tmp_path, *shlex.split(line), *few, python=python)
+        _, summary = run(script, tmp_path, *shlex.split(line), *few.split(), python=python)
         assert int(summary[1]) >= 512
-
-
-@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
-def test_sb3_recurrent_ppo(tmp_path, env_id):
-    sizes = ("--num-envs", "8", "--num-steps", "32", "--total-timesteps", "512", "--hidden-size", "32")
-    output, summary = run("sb3_recurrent_ppo.py", tmp_path, "--env-id", env_id, *sizes)
-    assert summary[1] == "512"
-    assert "train/" in output, "no update was made"
-    if env_id.startswith("Endless"):
-        assert summary[3] != "none yet"
-        assert "ep_rew_mean" in output
-
-
-@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0"])
-def test_torchrl_rollout(tmp_path, env_id):
-    sizes = ("--num-envs", "8", "--num-steps", "32", "--total-timesteps", "512")
-    output, summary = run("torchrl_rollout.py", tmp_path, "--env-id", env_id, *sizes)
-    assert summary[1] == "512"
-    assert output.count("batch=(8, 32) observation=(8, 32, 84, 84, 3)") == 2
-    if env_id.startswith("Endless"):
-        assert summary[3] != "none yet"
-
-
-def test_torchrl_rollout_with_workers(tmp_path, segments):
-    sizes = ("--num-envs", "8", "--num-workers", "2", "--num-steps", "32", "--total-timesteps", "512")
-    output, summary = run("torchrl_rollout.py", tmp_path, *sizes)
-    assert summary[1] == "512"
-    assert output.count("batch=(8, 32) observation=(8, 32, 84, 84, 3)") == 2
-    assert summary[3] != "none yet"
-    assert not segments()
-
-
-@pytest.mark.parametrize(
-    ("env_id", "backend"),
-    [
-        ("Endless-MortarMayhem-v0", "PufferEnv"),
-        ("Endless-MortarMayhem-v0", "Serial"),
-        ("Endless-MortarMayhem-v0", "Multiprocessing"),
-        ("MysteryPath-Grid-v0", "PufferEnv"),
-        ("MysteryPath-Grid-v0", "Serial"),
-        ("MysteryPath-Grid-v0", "Multiprocessing"),
-    ],
-)
-def test_pufferlib_rollout(tmp_path, env_id, backend):
-    sizes = ("--num-envs", "8", "--total-timesteps", "512")
-    output, summary = run("pufferlib_rollout.py", tmp_path, "--env-id", env_id, "--backend", backend, *sizes)
-    assert summary[1] == "512"
-    assert "observations=(8, 84, 84, 3) uint8" in output
-    if env_id.startswith("Endless"):
-        assert summary[3] != "none yet"
 
 
 @pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0"])
@@ -193,17 +166,6 @@ def test_rllib_ppo_remembers_a_command(tmp_path, ray_folder, libraries_python):
     assert returns["gru"] > returns["none"] + 0.02
 
 
-@pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
-def test_jax_service(tmp_path, libraries_python, segments, env_id):
-    sizes = ("--num-envs", "8", "--total-timesteps", "512")
-    output, summary = run("jax_service.py", tmp_path, "--env-id", env_id, *sizes, python=libraries_python)
-    assert summary[1] == "512"
-    assert "observation=(8, 84, 84, 3) uint8 shared=True" in output
-    if env_id.startswith("Endless"):
-        assert summary[3] != "none yet"
-    assert not segments()
-
-
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
 @pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MysteryPath-v0"])
 def test_behaviour_cloning(tmp_path, env_id):
@@ -240,7 +202,7 @@ ACTORS = ("--num-envs", "8", "--num-steps", "16", "--hidden-size", "16")
 
 @pytest.mark.parametrize("service", [(), ("--service",)])
 @pytest.mark.parametrize("env_id", ["Endless-MortarMayhem-v0", "MysteryPath-Grid-v0"])
-def test_asynchronous_actors(tmp_path, segments, env_id, service):
+def test_asynchronous_actors(tmp_path, env_id, service):
     sizes = ("--total-timesteps", "2048", "--batch-trajectories", "2")
     output, summary = run(
         "asynchronous_actors.py", tmp_path, "--env-id", env_id, "--options", "{}", *ACTORS, *sizes, *service
@@ -268,7 +230,7 @@ def test_asynchronous_actors_learn_one_command(tmp_path):
 
 
 @pytest.mark.parametrize("ended", ["actor", "learner", "ctrl-c"])
-def test_asynchronous_actors_end_together(tmp_path, segments, ended):
+def test_asynchronous_actors_end_together(tmp_path, ended):
     """Within seconds, with a message, and nothing is left in /dev/shm."""
     process = subprocess.Popen(
         [sys.executable, EXAMPLES / "asynchronous_actors.py", *ACTORS, "--total-timesteps", "100000000", "--service"],

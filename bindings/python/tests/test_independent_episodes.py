@@ -1,14 +1,11 @@
 """With `independent_episodes`, an episode depends on its seed and options alone, in new and in used environments."""
 
-import subprocess
-from collections.abc import Iterator
-
 import gymnasium
 import numpy as np
 import pytest
+from support import WHERE, engine_of_program, exact
 
 import endless_gym
-from endless_gym.program import program
 
 IDS = list(endless_gym.all_specs())
 #: Options of earlier episodes that leave something behind.
@@ -19,31 +16,15 @@ LEFT = {
 }
 
 
-def flat(value: object) -> Iterator[bytes | object]:
-    """Every byte of what a reset or a step returns, without the times of episodes."""
-    if isinstance(value, dict):
-        for key in sorted(value):
-            if key != "t":
-                yield key
-                yield from flat(value[key])
-    elif isinstance(value, np.ndarray) and value.dtype != object:
-        yield value.tobytes()
-    elif isinstance(value, (tuple, list, np.ndarray)):
-        for each in value:
-            yield from flat(each)
-    else:
-        yield value
-
-
 def played(envs, seed: int, options: dict, steps: int) -> list[object]:
-    """All that an environment or a vector environment returns for the seed and the same actions."""
+    """All that an environment or a vector environment returns for the seed and the same actions, as `exact` values."""
     envs.action_space.seed(seed)
-    out = list(flat(envs.reset(seed=seed, options=options)))
+    out = [exact(envs.reset(seed=seed, options=options))]
     for _ in range(steps):
         step = envs.step(envs.action_space.sample())
-        out += flat(step)
+        out.append(exact(step))
         if isinstance(envs, gymnasium.Env) and step[2]:
-            out += flat(envs.reset())
+            out.append(exact(envs.reset()))
     return out
 
 
@@ -75,16 +56,7 @@ def test_used_vector_environments_play_what_new_ones_do(id: str, autoreset: str,
     assert used == new
 
 
-@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
-def test_without_the_option_the_last_character_is_shown(where) -> None:
-    with where("Endless-MortarMayhem-v0", 1) as envs:
-        played(envs, 3, {}, 70)
-        used = played(envs, 11, {}, 20)
-    with endless_gym.make_vec("Endless-MortarMayhem-v0", 1) as envs:
-        assert played(envs, 11, {}, 20) != used
-
-
-@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+@pytest.mark.parametrize("where", WHERE)
 def test_later_episodes_do_not_depend_on_the_actions(where) -> None:
     """Searing Spotlights draws from the generator in every episode, for each new spotlight."""
 
@@ -106,25 +78,13 @@ def test_later_episodes_do_not_depend_on_the_actions(where) -> None:
 
 
 def test_the_program_serves_independent_episodes() -> None:
-    arguments = [
-        "--env",
-        "Endless-MortarMayhem-v0",
-        "--num-envs",
-        "2",
-        "--independent-episodes",
-        "--service",
-        "independent",
-    ]
-    engine = subprocess.Popen([*program(), "serve", "--child", *arguments], stdin=subprocess.PIPE)
-    try:
+    id = "Endless-MortarMayhem-v0"
+    with engine_of_program("independent", id, "--num-envs=2", "--independent-episodes"):
         with endless_gym.connect("independent") as envs:
             played(envs, 3, {"agent_scale": 0.4}, 70)
             used = played(envs, 11, {}, 100)
-        with endless_gym.make_vec("Endless-MortarMayhem-v0", 2, independent_episodes=True) as envs:
+        with endless_gym.make_vec(id, 2, independent_episodes=True) as envs:
             assert used == played(envs, 11, {}, 100)
-    finally:
-        engine.communicate()
-    assert engine.returncode == 0
 
 
 def test_a_checkpoint_of_dependent_episodes_is_refused(tmp_path) -> None:

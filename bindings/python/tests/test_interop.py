@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+from support import WHERE
 
 import endless_gym
 from endless_gym import interop
@@ -117,7 +118,7 @@ print("done")
     assert ran.stdout == "done\n", ran.stdout + ran.stderr
 
 
-@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+@pytest.mark.parametrize("where", WHERE)
 def test_from_dlpack_takes_the_arrays_themselves(where) -> None:
     with where("Endless-MortarMayhem-v0", 2, seed=1) as envs:
         envs.reset()

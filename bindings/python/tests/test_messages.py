@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from support import WHERE, same
 
 import endless_gym
 
@@ -37,7 +38,7 @@ def outcome(call: Callable[..., object], *arguments: object) -> object:
     )
 
 
-@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+@pytest.mark.parametrize("where", WHERE)
 def test_actions_are_copied(where) -> None:
     with (
         where(ID, NUM_ENVS, groups=GROUPS, seed=4) as envs,
@@ -53,9 +54,7 @@ def test_actions_are_copied(where) -> None:
             buffer[:] = -1
             for group in range(GROUPS):
                 twin.send(np.full((NUM_ENVS, 2), (step + group) % 3), group)
-                received, wanted = envs.recv(group), twin.recv(group)
-                for given, expected in zip(received[:4], wanted[:4], strict=True):
-                    np.testing.assert_array_equal(given, expected)
+                same(envs.recv(group)[:4], twin.recv(group)[:4])
 
 
 def test_a_pending_answer_is_an_error_in_every_call() -> None:

@@ -1,5 +1,6 @@
 """Processes that die, are interrupted, or fork."""
 
+import gc
 import logging
 import os
 import shutil
@@ -8,11 +9,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support import await_end_of_engines, engine_of_program, same, segments
 
 import endless_gym
 from endless_gym.program import program
@@ -21,8 +22,10 @@ ID = "Endless-MortarMayhem-v0"
 ACTIONS = np.zeros((4, 2), dtype=np.int64)
 
 
-def test_a_dead_engine_is_an_exception() -> None:
+def test_a_dead_engine_is_an_exception_and_leaves_nothing() -> None:
+    before = segments()
     envs = endless_gym.serve(ID, 4)
+    assert segments() > before
     observation, _ = envs.reset()
     kept = observation.copy()
     os.kill(envs._engine.pid, signal.SIGKILL)
@@ -30,25 +33,18 @@ def test_a_dead_engine_is_an_exception() -> None:
         for _ in range(3):
             envs.step(ACTIONS)
     np.testing.assert_array_equal(observation, kept)
+    del observation
     envs.close()
+    assert segments() <= before
 
 
-def test_the_engine_ends_with_its_environments_and_with_its_process() -> None:
+def test_an_engine_has_one_trainer_and_ends_with_its_environments() -> None:
     with endless_gym.serve(ID, 4) as envs:
         service = envs._engine.service
         assert service in endless_gym.running_engines()
         with pytest.raises(ConnectionError, match="already has a trainer"):
             endless_gym.connect(service, timeout=1)
     assert service not in endless_gym.running_engines()
-    program = f"import endless_gym, time; e = endless_gym.serve({ID!r}, 4); print('up', flush=True); time.sleep(60)"
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "up\n"
-    process.kill()
-    process.wait()
-    end = time.monotonic() + 10
-    while endless_gym.running_engines() and time.monotonic() < end:
-        time.sleep(0.05)
-    assert endless_gym.running_engines() == []
 
 
 def test_ctrl_c_reaches_python_while_it_waits() -> None:
@@ -75,8 +71,6 @@ with endless_gym.serve({ID!r}, 4) as envs:
 
 
 def test_other_threads_run_while_one_waits() -> None:
-    import threading
-
     with endless_gym.serve(ID, 4) as envs:
         envs.reset()
         os.kill(envs._engine.pid, signal.SIGSTOP)
@@ -93,55 +87,52 @@ def test_other_threads_run_while_one_waits() -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_forked_child_does_no_harm() -> None:
-    with endless_gym.serve(ID, 4) as envs, endless_gym.make_vec(ID, 64, num_threads=2) as inside:
-        many = np.zeros((64, 2), dtype=np.int64)
-        envs.reset()
-        inside.reset()
+    envs, inside = endless_gym.serve(ID, 4), endless_gym.make_vec(ID, 64, num_threads=2)
+    many = np.zeros((64, 2), dtype=np.int64)
+    envs.reset()
+    inside.reset()
+    inside.step(many)
+    child = os.fork()
+    if child == 0:
+        refused = 0
+        for those, actions in ((envs, ACTIONS), (inside, many)):
+            try:
+                those.step(actions)
+            except RuntimeError:
+                refused += 1
+        # The engine does not end with the environments of the child.
+        del envs, inside, those
+        gc.collect()
+        os._exit(refused)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
+    for _ in range(10):
+        envs.step(ACTIONS)
         inside.step(many)
-        child = os.fork()
-        if child == 0:
-            refused = 0
-            for those, actions in ((envs, ACTIONS), (inside, many)):
-                try:
-                    those.step(actions)
-                except RuntimeError:
-                    refused += 1
-            del envs, inside
-            os._exit(refused)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
-        for _ in range(10):
-            envs.step(ACTIONS)
-            inside.step(many)
+    envs.close()
 
 
 def test_reconnecting_to_an_engine_that_was_started_again() -> None:
-    def engine() -> subprocess.Popen:
-        command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=again"]
-        return subprocess.Popen(command, stdin=subprocess.PIPE)
-
-    first = engine()
-    envs = endless_gym.connect("again")
-    envs.reset()
-    first.kill()
-    first.wait()
+    with engine_of_program("again", ID, "--num-envs=4") as first:
+        envs = endless_gym.connect("again")
+        envs.reset()
+        first.kill()
+        first.wait()
     with pytest.raises(endless_gym.EngineLost):
         envs.step(ACTIONS)
-    second = engine()
-    found = envs.reconnect()
-    assert found.restarted and found.groups[0].step == 0 and found.groups[0].lost_step == 1
-    assert found.groups[0].last_request in ("played", "not_played")
-    assert envs.reset(seed=1)[0].shape == (4, 84, 84, 3)
-    envs.step(ACTIONS)
-    envs.close()
-    second.stdin.close()
-    assert second.wait(10) == 0
+    with engine_of_program("again", ID, "--num-envs=4"):
+        found = envs.reconnect()
+        assert found.restarted and found.groups[0].step == 0 and found.groups[0].lost_step == 1
+        assert found.groups[0].last_request in ("played", "not_played")
+        assert envs.reset(seed=1)[0].shape == (4, 84, 84, 3)
+        envs.step(ACTIONS)
+        envs.close()
 
 
 def test_an_interrupted_step_is_played_once() -> None:
     with endless_gym.serve(ID, num_envs=4, seed=1) as envs, endless_gym.make_vec(ID, num_envs=4, seed=1) as twin:
         envs.reset()
         twin.reset()
-        engine = endless_gym_process(envs)
+        engine = envs._engine.pid
         os.kill(engine, signal.SIGSTOP)
         interrupt = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
         interrupt.start()
@@ -159,11 +150,6 @@ def test_an_interrupted_step_is_played_once() -> None:
             np.testing.assert_array_equal(envs.step(ACTIONS)[0], twin.step(ACTIONS)[0])
 
 
-def endless_gym_process(envs: endless_gym.EndlessVectorEnv) -> int:
-    """The process id of the engine that `serve` started."""
-    return envs._engine.pid
-
-
 def test_package_includes_the_program() -> None:
     command = [sys.executable, "-c", "import sys; from endless_gym.cli import main; sys.exit(main())"]
     listed = subprocess.run([*command, "list", "--json"], capture_output=True, text=True, check=True)
@@ -177,56 +163,26 @@ def test_package_includes_the_program() -> None:
     assert ID in subprocess.run(table, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_killed_engine_leaves_nothing(segments: Callable[[], set[str]]) -> None:
-    before = segments()
-    envs = endless_gym.serve(ID, 4)
-    assert segments() > before
-    os.kill(envs._engine.pid, signal.SIGKILL)
-    envs.close()
-    assert segments() <= before
-
-
 def test_a_running_engine_without_final_observations() -> None:
     """As `endless serve --autoreset same-step` starts it."""
-    name = "without-final"
-    engine = subprocess.Popen(
-        [
-            *program(),
-            "serve",
-            "--child",
-            "--service",
-            name,
-            "--num-envs",
-            "4",
-            "--seed",
-            "1",
-            "--autoreset",
-            "same-step",
-        ],
-        stdin=subprocess.PIPE,
-    )
-    try:
-        with (
-            endless_gym.connect(name) as envs,
-            endless_gym.make_vec("Endless-MortarMayhem-v0", 4, seed=1, autoreset="same_step") as twin,
-        ):
-            assert not envs.has_final_observation
-            assert twin.has_final_observation
-            envs.reset()
-            twin.reset()
-            ends = 0
-            for _ in range(100):
-                (*step, info), (*wanted, whole) = (each.step(np.zeros((4, 2), np.int64)) for each in (envs, twin))
-                for given, expected in zip(step, wanted, strict=True):
-                    np.testing.assert_array_equal(given, expected)
-                assert info.keys() == whole.keys() - {"final_obs", "_final_obs"}
-                if "final_info" in info:
-                    np.testing.assert_array_equal(info["final_info"]["reward"], whole["final_info"]["reward"])
-                ends += int(step[2].sum())
-            assert ends > 4
-    finally:
-        engine.communicate()
-    assert engine.returncode == 0
+    with (
+        engine_of_program("without-final", ID, "--num-envs=4", "--seed=1", "--autoreset=same-step"),
+        endless_gym.connect("without-final") as envs,
+        endless_gym.make_vec(ID, 4, seed=1, autoreset="same_step") as twin,
+    ):
+        assert not envs.has_final_observation
+        assert twin.has_final_observation
+        envs.reset()
+        twin.reset()
+        ends = 0
+        for _ in range(100):
+            (*step, info), (*wanted, whole) = (each.step(ACTIONS) for each in (envs, twin))
+            same(step, wanted)
+            assert info.keys() == whole.keys() - {"final_obs", "_final_obs"}
+            if "final_info" in info:
+                np.testing.assert_array_equal(info["final_info"]["reward"], whole["final_info"]["reward"])
+            ends += int(step[2].sum())
+        assert ends > 4
 
 
 #: Starts an engine or connects to one, forks a worker that lives on, and prints its process id.
@@ -239,10 +195,6 @@ if worker == 0:
     time.sleep(60)
     os._exit(0)
 print(worker, flush=True)
-if sys.argv[1] == "close":
-    start = time.monotonic()
-    envs.close()
-    print(time.monotonic() - start, flush=True)
 time.sleep(60)
 """
 
@@ -252,45 +204,28 @@ def forking(how: str) -> tuple[subprocess.Popen, int]:
     return process, int(process.stdout.readline())
 
 
-def test_an_engine_closes_at_once_while_a_forked_worker_lives() -> None:
-    process, worker = forking("close")
-    try:
-        assert float(process.stdout.readline()) < 3
-        assert endless_gym.running_engines() == []
-    finally:
-        process.kill()
-        os.kill(worker, signal.SIGKILL)
-        process.wait()
-
-
 def test_an_engine_ends_with_its_parent_while_a_forked_worker_lives() -> None:
     process, worker = forking("serve")
     try:
         assert len(endless_gym.running_engines()) == 1
         process.kill()
         process.wait()
-        end = time.monotonic() + 3
-        while endless_gym.running_engines() and time.monotonic() < end:
-            time.sleep(0.02)
-        assert endless_gym.running_engines() == []
+        await_end_of_engines(3)
     finally:
         os.kill(worker, signal.SIGKILL)
 
 
 def test_a_dead_trainer_is_replaced_while_its_forked_worker_lives() -> None:
-    command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=forking"]
-    engine = subprocess.Popen(command, stdin=subprocess.PIPE)
-    process, worker = forking("connect")
-    try:
-        process.kill()
-        process.wait()
-        with endless_gym.connect("forking", timeout=5) as envs:
-            envs.reset()
-            envs.step(ACTIONS)
-    finally:
-        os.kill(worker, signal.SIGKILL)
-        engine.stdin.close()
-        assert engine.wait() == 0
+    with engine_of_program("forking", ID, "--num-envs=4"):
+        process, worker = forking("connect")
+        try:
+            process.kill()
+            process.wait()
+            with endless_gym.connect("forking", timeout=5) as envs:
+                envs.reset()
+                envs.step(ACTIONS)
+        finally:
+            os.kill(worker, signal.SIGKILL)
 
 
 def test_a_dead_trainer_is_replaced_by_another_fork_of_the_same_process() -> None:
@@ -315,15 +250,10 @@ if second == 0:
     os._exit(0)
 os.waitpid(second, 0)
 """
-    command = [*program(), "serve", "--child", f"--env={ID}", "--num-envs=4", "--service=family"]
-    engine = subprocess.Popen(command, stdin=subprocess.PIPE)
-    try:
+    with engine_of_program("family", ID, "--num-envs=4"):
         endless_gym.connect("family").close()
         family = subprocess.run([sys.executable, "-c", program_text], stdout=subprocess.PIPE, text=True, timeout=60)
         assert family.stdout.splitlines() == ["['family']", "connected"]
-    finally:
-        engine.stdin.close()
-        assert engine.wait() == 0
 
 
 def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
@@ -335,9 +265,7 @@ def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
         for group in range(2):
             for each in (envs, twin):
                 each.send(ACTIONS + 1, group)
-            received, expected = envs.recv(group), twin.recv(group)
-            for given, wanted in zip(received[:4], expected[:4], strict=True):
-                np.testing.assert_array_equal(given, wanted)
+            same(envs.recv(group)[:4], twin.recv(group)[:4])
 
     with endless_gym.serve(ID, **settings, checkpoint=file, checkpoint_every=3600.0) as envs:
         for each in (envs, twin):
@@ -345,7 +273,7 @@ def test_an_engine_resumes_from_its_checkpoint(tmp_path: Path) -> None:
         for _ in range(150):
             step(envs)
         assert envs.checkpoint() == [151, 151]
-        os.kill(endless_gym_process(envs), signal.SIGKILL)
+        os.kill(envs._engine.pid, signal.SIGKILL)
     with pytest.raises(RuntimeError, match="state exists; resume from it"):
         endless_gym.serve(ID, **settings, checkpoint=file)
     with endless_gym.serve(ID, **settings, checkpoint=file, resume=True) as envs:
@@ -395,17 +323,7 @@ def test_the_errors_of_an_engine_are_logged(caplog: pytest.LogCaptureFixture, tm
     # The last one fails as well, and with it the engine.
     last = caplog.records[-1]
     assert (last.name, last.levelno) == ("endless_gym.engine", logging.ERROR)
-    assert last.message.startswith(
-        f"engine {endless_gym_process(envs)}: checkpoint {folder}/state cannot be written"
-    ), last
-
-
-def test_an_engine_that_is_stopped_ends_regularly() -> None:
-    envs = endless_gym.serve(ID, 4)
-    process = envs._engine._process
-    os.kill(process.pid, signal.SIGSTOP)
-    envs.close()
-    assert process.returncode == 0
+    assert last.message.startswith(f"engine {envs._engine.pid}: checkpoint {folder}/state cannot be written"), last
 
 
 def test_ctrl_c_ends_the_program_while_it_starts(tmp_path: Path) -> None:

@@ -13,14 +13,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from support import rest_of_terminal
 
 import endless_gym
 from endless_gym.cli import main as program_main
 
-pytestmark = [
-    pytest.mark.libraries,
-    pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11"),
-]
+pytestmark = [pytest.mark.libraries, pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")]
 
 IDS = list(endless_gym.all_specs())
 
@@ -295,13 +293,7 @@ def test_ctrl_c_leaves_no_data_set(root: Path, number: signal.Signals) -> None:
     while b"/100000" not in shown or not any(root.glob(".recording-*")):
         shown += os.read(leader, 4096)
     process.send_signal(number)
-    try:
-        while part := os.read(leader, 4096):
-            shown += part
-    except OSError:
-        # The end of a terminal.
-        pass
-    os.close(leader)
+    shown += rest_of_terminal(leader)
     assert process.communicate(timeout=60)[0] == ""
     assert process.returncode == 130
     assert shown.endswith(b"endless record: stopped, and wrote nothing\r\n")

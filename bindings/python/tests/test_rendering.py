@@ -10,6 +10,7 @@ import numpy as np
 import pygame
 import pytest
 from gymnasium.utils.play import play
+from support import WHERE, same
 from wrappers import SHORT, recorded
 
 import endless_gym
@@ -18,7 +19,6 @@ from endless_gym.window import Window
 __all__ = ["recorded"]
 
 IDS = list(endless_gym.all_specs())
-WHERE = [endless_gym.make_vec, endless_gym.serve]
 
 
 @pytest.fixture
@@ -64,8 +64,7 @@ def test_a_batch_is_rendered_as_its_environments(where: Any, mode: str) -> None:
 
 def compare(pictures: Any, singles: list[endless_gym.Env], id: str) -> None:
     assert isinstance(pictures, tuple)
-    for picture, env in zip(pictures, singles, strict=True):
-        np.testing.assert_array_equal(picture, env.render(), err_msg=id)
+    same(pictures, [env.render() for env in singles], id)
 
 
 def test_a_clue_that_follows_an_obeyed_one_is_rendered_in_its_time() -> None:
@@ -101,15 +100,13 @@ def test_rendering_changes_nothing(where: Any) -> None:
         envs.reset()
         plain.reset()
         first = envs.render()
-        for given, wanted in zip(envs.render(), first, strict=True):
-            np.testing.assert_array_equal(given, wanted)
+        same(envs.render(), first)
         other = envs.render(group=1)
         assert any((one != two).any() for one, two in zip(first, other, strict=True))
         for _ in range(30):
             envs.render()
             actions = plain.action_space.sample()
-            for given, wanted in zip(envs.step(actions)[:4], plain.step(actions), strict=False):
-                np.testing.assert_array_equal(given, wanted)
+            same(envs.step(actions)[:4], plain.step(actions)[:4])
         assert plain.render() is None
 
 

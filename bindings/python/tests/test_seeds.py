@@ -1,64 +1,14 @@
-"""Episodes have the same seeds in this process, in an engine process, and in the original under Gymnasium."""
-
-import json
-import os
-import pickle
-import subprocess
-import zlib
-from pathlib import Path
+"""Episodes have the same seeds in this process, in an engine process, and in Gymnasium's vector environment."""
 
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from support import WHERE
 
 import endless_gym
 
 ID = "Endless-MortarMayhem-v0"
-WHERE = [endless_gym.make_vec, endless_gym.serve]
 GROUPS, NUM_ENVS = 2, 2
-STEPS = 120
-
-
-def short_episodes(id: str) -> dict[str, object]:
-    """Reset parameters with which random actions end several episodes."""
-    if id.startswith("MortarMayhem"):
-        return {"command_count": [2]}
-    return {} if id == ID else {"max_steps": 40}
-
-
-@pytest.mark.parametrize("id", endless_gym.all_specs())
-def test_episodes_after_a_reset_are_the_originals(id: str, original_python: str, tmp_path: Path) -> None:
-    """Gymnasium's vector environment seeds at the reset, and then resets without a seed."""
-    options = short_episodes(id)
-    space = endless_gym.make_vec(id, GROUPS * NUM_ENVS).action_space
-    space.seed(3)
-    actions = np.array([space.sample() for _ in range(STEPS)])
-    np.save(tmp_path / "actions.npy", actions)
-    arguments = [id, "41", tmp_path / "actions.npy", json.dumps(options), tmp_path / "out.pickle"]
-    program = Path(__file__).parent / "original_vector.py"
-    environment = os.environ | {"PYTHONPATH": str(program.parent)}
-    subprocess.run([original_python, program, *arguments], check=True, capture_output=True, env=environment)
-    expected = pickle.loads((tmp_path / "out.pickle").read_bytes())
-
-    def frames(observation: object) -> list[int]:
-        shown = observation["visual_observation"] if isinstance(observation, dict) else observation
-        return [zlib.crc32(frame.tobytes()) for frame in shown]
-
-    for where in WHERE:
-        ends = 0
-        with where(id, NUM_ENVS, groups=GROUPS, seed=0, options=options, autoreset="same_step") as envs:
-            for group in range(GROUPS):
-                own = slice(group * NUM_ENVS, (group + 1) * NUM_ENVS)
-                assert frames(envs.reset(seed=41, group=group)[0]) == expected[0][0][own]
-                for step, (action, wanted) in enumerate(zip(actions, expected[1:], strict=True)):
-                    envs.send(action[own], group)
-                    observation, reward, terminated, *_ = envs.recv(group)
-                    place = f"{where.__name__}, group {group}, step {step}"
-                    assert terminated.tolist() == wanted[2][own], place
-                    assert reward.tolist() == wanted[1][own], place
-                    assert frames(observation) == wanted[0][own], place
-                    ends += int(terminated.sum())
-        assert ends >= 2 * GROUPS * NUM_ENVS
 
 
 def episodes(envs: endless_gym.EndlessVectorEnv, group: int = 0, number: int = 3) -> list[list[bytes]]:

@@ -1,4 +1,11 @@
-"""Every code block of the documentation runs as it is shown."""
+"""Every fenced code block of the documentation runs as it is shown.
+
+A comment before a block says how to treat it; readers of the page do not see it:
+
+    <!-- not run: REASON -->    the block is not run; the reason is reported
+    <!-- continues -->          the block is run after the one before it, in the same folder; Python blocks share their names
+    <!-- libraries -->          the block is run with the dependency group `rllib`
+"""
 
 from __future__ import annotations
 
@@ -6,12 +13,69 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
 import pytest
-from snippets import ROOT, SHELL, Block, blocks, pages, programs
+from support import segments
+
+ROOT = Path(__file__).parents[3]
+FENCE = re.compile(
+    r"^(?P<indent> *)```(?P<language>[a-z]*)(?P<attributes>\S*)[^\n]*\n(?P<code>.*?)^(?P=indent)```$", re.M | re.S
+)
+COMMENT = re.compile(r"<!-- (not run: (?P<reason>.+?)|(?P<continues>continues)|(?P<libraries>libraries)) -->\s*\Z")
+SHELL = ("sh", "bash", "console")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced code block."""
+
+    file: Path
+    line: int
+    language: str
+    code: str
+    #: Why it is not run.
+    reason: str = ""
+    continues: bool = False
+    libraries: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.file.relative_to(ROOT)}:{self.line}"
+
+
+def pages() -> list[Path]:
+    """Every page for users."""
+    return [ROOT / "README.md", ROOT / "bindings/python/README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(file: Path) -> Iterator[Block]:
+    """The blocks of a file, in order."""
+    text = file.read_text()
+    for found in FENCE.finditer(text):
+        comment = COMMENT.search(text[: found.start()])
+        reason = (comment and comment["reason"]) or ""
+        continues, libraries = (bool(comment and comment[name]) for name in ("continues", "libraries"))
+        line = text[: found.start()].count("\n") + 1
+        yield Block(file, line, found["language"], textwrap.dedent(found["code"]), reason, continues, libraries)
+
+
+def programs(file: Path) -> list[list[Block]]:
+    """The blocks that run, each with those that continue it."""
+    runs: list[list[Block]] = []
+    for block in blocks(file):
+        if block.reason or block.language not in ("python", *SHELL):
+            continue
+        if block.continues:
+            runs[-1].append(block)
+        else:
+            runs.append([block])
+    return runs
+
 
 TIMEOUT = 280
 #: Engines remove their segments. Not SIGINT, which Python's start would swallow.
@@ -25,7 +89,7 @@ LANGUAGES = {"python", "rust", "text", "toml", "yaml", "dockerfile", *SHELL}
 @pytest.mark.slow
 @pytest.mark.libraries
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in PROGRAMS])
-def test_snippet_runs(program: list[Block], tmp_path: Path, segments: Callable[[], set[str]]) -> None:
+def test_snippet_runs(program: list[Block], tmp_path: Path) -> None:
     for is_shell, part in groupby(program, lambda block: block.language in SHELL):
         code = "\n".join(block.code for block in part)
         shell = ["bash", "-euo", "pipefail", "-m", "-c", f"trap '{END_JOBS}' EXIT\n{code}"]
@@ -36,9 +100,7 @@ def test_snippet_runs(program: list[Block], tmp_path: Path, segments: Callable[[
 @pytest.mark.slow
 @pytest.mark.libraries
 @pytest.mark.parametrize("program", [pytest.param(program, id=program[0].name) for program in OF_LIBRARIES])
-def test_library_snippet_runs(
-    program: list[Block], tmp_path: Path, segments: Callable[[], set[str]], libraries_python: str, ray_folder: str
-) -> None:
+def test_library_snippet_runs(program: list[Block], tmp_path: Path, libraries_python: str, ray_folder: str) -> None:
     assert [block.language for block in program] == ["python"] * len(program)
     code = "\n".join(block.code for block in program)
     run([libraries_python, "-c", code], tmp_path, program[0].name)
@@ -69,15 +131,6 @@ def test_blocks_have_a_known_language() -> None:
             assert block.language in LANGUAGES, block.name
             # The integration tests run the examples.
             assert block.language != "rust", f"{block.name}: link a file of engine/examples instead"
-
-
-def test_snippets_that_do_not_run_say_why(capsys: pytest.CaptureFixture[str]) -> None:
-    left = [block for page in pages() for block in blocks(page) if block.reason]
-    with capsys.disabled():
-        print("\ncode blocks that are not run:")
-        for block in left:
-            print(f"  {block.name}: {block.reason}")
-    assert all(len(block.reason) > 10 for block in left)
 
 
 def test_snippets_of_docstrings_define_their_names() -> None:

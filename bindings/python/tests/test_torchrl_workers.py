@@ -1,10 +1,10 @@
 """TorchRL's collector in several processes, each with an engine of its own."""
 
 import os
-from collections.abc import Callable
 
 import numpy as np
 import pytest
+from support import segments
 
 import endless_gym
 
@@ -25,7 +25,7 @@ def test_environments_must_be_divisible_among_the_workers() -> None:
 
 
 @pytest.mark.slow
-def test_workers_play_the_episodes_of_one_process(segments: Callable[[], set[str]]) -> None:
+def test_workers_play_the_episodes_of_one_process() -> None:
     """Each plays its share of what one process plays with the same actions: no seed is used twice, and none is left out."""
     makers = EndlessEnv.workers(ID, ENVS, WORKERS, seed=40, options={"max_steps": 5})
     collector = MultiCollector(

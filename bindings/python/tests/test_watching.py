@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from support import rest_of_terminal
 
 import endless_gym
 from endless_gym.program import program
@@ -120,10 +121,7 @@ def test_missed_batches_are_counted(trainer: Trainer) -> None:
 
 @pytest.mark.parametrize("trainer", [(3, "steps")], indirect=True)
 def test_all_groups_are_watched_or_one(trainer: Trainer) -> None:
-    with (
-        endless_gym.watch(trainer.service) as batches,
-        endless_gym.watch(trainer.service, group=1, copy=True) as one,
-    ):
+    with endless_gym.watch(trainer.service) as batches, endless_gym.watch(trainer.service, group=1, copy=True) as one:
         for _ in range(3):
             trainer.step()
             watched = [next(batches) for _ in range(3)]
@@ -265,14 +263,8 @@ def test_the_program_updates_one_line_of_a_terminal(trainer: Trainer) -> None:
     while text.count(b"steps/s") < 3:
         text += os.read(leader, 4096)
     assert trainer.end() == "trained\n"
-    try:
-        while part := os.read(leader, 4096):
-            text += part
-    except OSError:
-        # The end of a terminal.
-        pass
+    text += rest_of_terminal(leader)
     assert process.wait(60) == 0
-    os.close(leader)
     live, *others = text.decode().replace("\r\n", "\n").split("\n")
     assert live.count("\r\x1b[2K") >= 3
     assert others == ["the engine has ended", ""]

@@ -7,7 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from wrappers import SHORT, SINGLE, VECTOR, Case, Refuses, plain, recorded, same, torch
+from support import same
+from wrappers import SHORT, SINGLE, VECTOR, Case, Refuses, plain, recorded, torch
 
 import endless_gym
 
@@ -148,29 +149,6 @@ def play(case: Case, envs: VectorEnv, name: str) -> Any:
     if getattr(wrapped, "recording", False):
         wrapped.stop_recording()
     return returned
-
-
-@pytest.mark.parametrize("where", WHERE.values(), ids=WHERE)
-@pytest.mark.parametrize("mode", AutoresetMode)
-def test_recorded_statistics_equal_the_final_infos(where: Any, mode: AutoresetMode) -> None:
-    id = "MysteryPath-Grid-v0"
-    with where(id, NUM_ENVS, autoreset=mode, options=SHORT[id], seed=1) as envs:
-        wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
-        wrapped.reset()
-        ends = 0
-        for _ in range(STEPS):
-            *_, terminated, _, info = wrapped.step(wrapped.action_space.sample())
-            if not terminated.any():
-                assert "episode" not in info
-                continue
-            ends += 1
-            final = info.get("final_info", info)
-            for key, ours in (("r", "reward"), ("l", "length")):
-                np.testing.assert_array_equal(info["episode"][key], final[ours])
-            np.testing.assert_array_equal(info["_episode"], terminated)
-            if mode is AutoresetMode.DISABLED:
-                wrapped.reset(options={"reset_mask": terminated.copy()})
-        assert ends > 1
 
 
 @pytest.mark.parametrize("where", WHERE.values(), ids=WHERE)

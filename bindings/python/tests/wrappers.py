@@ -221,16 +221,3 @@ def plain(value: Any) -> Any:
     if torch is not None and isinstance(value, torch.Tensor):
         value = value.numpy()
     return value.copy() if isinstance(value, np.ndarray) else value
-
-
-def same(given: Any, wanted: Any, path: str) -> None:
-    if isinstance(wanted, dict):
-        assert set(given) == set(wanted), path
-        for key, value in wanted.items():
-            same(given[key], value, f"{path}.{key}")
-    elif isinstance(wanted, list):
-        assert len(given) == len(wanted), path
-        for number, (one, other) in enumerate(zip(given, wanted, strict=True)):
-            same(one, other, f"{path}[{number}]")
-    else:
-        np.testing.assert_array_equal(given, wanted, err_msg=path)
