@@ -49,6 +49,8 @@ class EndlessVecEnv(VecEnv):
       The dict of an environment whose episode continues is reused in every step and must not be modified.
 
     `info` is the info of the last step as the vector environment returned it, in arrays.
+
+    `step` and `reset` raise what those of `EndlessVectorEnv` raise.
     """
 
     def __init__(self, envs: EndlessVectorEnv) -> None:
@@ -87,9 +89,6 @@ class EndlessVecEnv(VecEnv):
 
         Raises:
             ValueError: The options of the environments differ, or a reset parameter is unknown or out of its range.
-            TimeoutError: A served engine did not answer in time.
-            EngineLost: A served engine has ended.
-            TooManyBatchesHeld: Arrays of too many earlier steps of a served engine are referenced.
         """
         options = self._options[0]
         if any(other != options for other in self._options):
@@ -111,14 +110,6 @@ class EndlessVecEnv(VecEnv):
 
         Returns:
             Observations, rewards, dones and infos, as the class describes.
-
-        Raises:
-            TypeError: The actions are not integers.
-            ValueError: The actions have another shape, or one is out of its range. No environment was stepped.
-            RuntimeError: The environments have not been reset.
-            TimeoutError: A served engine did not answer in time.
-            EngineLost: A served engine has ended.
-            TooManyBatchesHeld: Arrays of too many earlier steps of a served engine are referenced.
         """
         observations, rewards, terminated, truncated, self.info = self.envs.step(self._actions)
         dones = np.logical_or(terminated, truncated)

@@ -22,7 +22,7 @@ ID = "Endless-MortarMayhem-v0"
 ACTIONS = np.zeros((4, 2), dtype=np.int64)
 
 
-def test_a_dead_engine_is_an_exception_and_leaves_nothing() -> None:
+def test_a_killed_engine_raises_an_exception_and_leaves_nothing() -> None:
     before = segments()
     envs = endless_gym.serve(ID, 4)
     assert segments() > before

@@ -2,7 +2,7 @@
 
 A comment before a block says how to treat it; readers of the page do not see it:
 
-    <!-- not run: REASON -->    the block is not run; the reason is reported
+    <!-- not run: REASON -->    the block is not run, for that reason
     <!-- continues -->          the block is run after the one before it, in the same folder; Python blocks share their names
     <!-- libraries -->          the block is run with the dependency group `rllib`
 """

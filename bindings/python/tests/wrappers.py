@@ -25,14 +25,10 @@ except ImportError:
 
 #: Reset parameters with which episodes end within some steps.
 SHORT: dict[str, dict[str, Any]] = {
-    **{
-        f"MortarMayhem{name}-v0": {"command_count": [1], "explosion_duration": [1], "explosion_delay": [2]}
-        for name in ("", "-Grid", "B", "B-Grid")
-    },
-    "MysteryPath-v0": {"max_steps": 4},
-    "MysteryPath-Grid-v0": {"max_steps": 4},
-    **{f"Endless-{name}-v0": {"max_steps": 4} for name in ("MortarMayhem", "MysteryPath", "SearingSpotlights")},
-    "SearingSpotlights-v0": {"max_steps": 4},
+    id: {"command_count": [1], "explosion_duration": [1], "explosion_delay": [2]}
+    if id.startswith("MortarMayhem")
+    else {"max_steps": 4}
+    for id in endless_gym.all_specs()
 }
 for id in ("MortarMayhem-v0", "MortarMayhem-Grid-v0"):
     SHORT[id] |= {"command_show_duration": [1], "command_show_delay": [0]}
