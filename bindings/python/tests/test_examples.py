@@ -64,7 +64,8 @@ RUNS = [
 
 
 @pytest.mark.parametrize(
-    ("example", "env_id", "printed"), [(example, id, printed) for example, ids, printed in RUNS for id in ids]
+    ("example", "env_id", "printed"),
+    [pytest.param(example, id, printed, id=f"{example} {id}") for example, ids, printed in RUNS for id in ids],
 )
 def test_example_runs(tmp_path, request, example, env_id, printed):
     script, *arguments = example.split()
