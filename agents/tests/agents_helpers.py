@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from endless_gym_agents.agent import Agent, AgentMemory
+from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import PRESETS, Model, Recurrence, Settings, Transformer
 
 FEATURES = {"features": (6,)}
@@ -47,22 +48,43 @@ def ends(steps: int, envs: int) -> torch.Tensor:
 
 
 def play(
-    agent: Agent, memory: AgentMemory, observed: torch.Tensor, done: torch.Tensor
+    agent: Agent, memory: AgentMemory, observed: torch.Tensor | dict[str, torch.Tensor], done: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Act on given observations (T, N, 6) as one segment.
+    """Act on given observations, by key or features (T, N, 6), as one segment.
 
     Returns:
         Reset mask (T, N), actions (T, N, 2), log-probabilities (T, N, 2), and values (T, N).
     """
-    agent.memory.begin_segment(memory.state, observed.shape[0])
+    parts = observed if isinstance(observed, dict) else {"features": observed}
+    agent.memory.begin_segment(memory.state, len(done))
     rows = []
     generator = torch.Generator().manual_seed(7)
-    for observation, end in zip(observed, done, strict=True):
+    for step, end in enumerate(done):
         reset_mask = memory.reset_mask
-        output = agent.act({"features": observation}, memory, generator)
+        output = agent.act({key: part[step] for key, part in parts.items()}, memory, generator)
         rows.append((reset_mask, output.action, output.log_prob, output.value))
         memory.reset(end)
     # A rollout ends with a bootstrap value, which must not change the memory.
-    agent.bootstrap_value({"features": observed[-1]}, memory)
+    agent.bootstrap_value({key: part[-1] for key, part in parts.items()}, memory)
     reset_mask, action, log_prob, value = (torch.stack(column) for column in zip(*rows, strict=True))
     return reset_mask, action, log_prob, value
+
+
+def segment_of(agent: Agent, memory: AgentMemory, observed: dict[str, torch.Tensor], steps: int, envs: int) -> Segment:
+    """A segment that the agent collects, with random rewards and ground truths.
+
+    Log-probabilities and values are perturbed, as in a later epoch.
+    """
+    reset_mask, action, log_prob, value = play(agent, memory, observed, ends(steps, envs))
+    draws = torch.Generator().manual_seed(2)
+    return Segment(
+        observation=observed,
+        reset_mask=reset_mask,
+        action=action,
+        log_prob=log_prob + 0.2 * torch.randn(log_prob.shape, generator=draws),
+        value=value + 0.2 * torch.randn(value.shape, generator=draws),
+        reward=torch.randn(steps, envs, generator=draws),
+        done=ends(steps, envs),
+        ground_truth=torch.randn(steps, envs, 2, generator=draws) if agent.ground_truth else None,
+        last_value=torch.randn(envs, generator=draws),
+    )

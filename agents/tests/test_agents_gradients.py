@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agents_helpers import BRANCHES, ends, make, observations, play, settings
+from agents_helpers import BRANCHES, ends, make, observations, play, segment_of, settings
 from test_agents_memory import KINDS
 
 from endless_gym_agents import losses
@@ -29,22 +29,6 @@ def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> lis
     return [name for name, weight in agent.named_parameters() if weight.grad is None or not weight.grad.any()]
 
 
-def segment_of(agent: Agent, observation: dict[str, torch.Tensor], played: tuple[torch.Tensor, ...]) -> Segment:
-    reset_mask, action, log_prob, value = played
-    draws = torch.Generator().manual_seed(2)
-    return Segment(
-        observation=observation,
-        reset_mask=reset_mask,
-        action=action,
-        log_prob=log_prob,
-        value=value + 0.05 * torch.randn(value.shape, generator=draws),
-        reward=torch.randn(STEPS, ENVS, generator=draws),
-        done=ends(STEPS, ENVS),
-        ground_truth=torch.randn(STEPS, ENVS, 2, generator=draws) if agent.ground_truth else None,
-        last_value=torch.randn(ENVS, generator=draws),
-    )
-
-
 # The observation of the agents `stack` and `position` is transformed in `act`, before the network.
 @pytest.mark.parametrize("name", [name for name in KINDS if name not in ("stack", "position")])
 def test_every_weight_gets_a_gradient(name: str) -> None:
@@ -53,7 +37,7 @@ def test_every_weight_gets_a_gradient(name: str) -> None:
     memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
     # The second segment: the hidden states of recurrent layers are no longer zero.
     play(agent, memory, observed, ends(STEPS, ENVS))
-    segment = segment_of(agent, {"features": observed}, play(agent, memory, observed, ends(STEPS, ENVS)))
+    segment = segment_of(agent, memory, {"features": observed}, STEPS, ENVS)
     assert without_gradient(agent, segment, memory) == []
 
 
@@ -87,20 +71,13 @@ def test_every_weight_of_an_agent_with_all_heads_gets_a_gradient(kind: str) -> N
     memory, draws = agent.initial_memory(ENVS), torch.Generator().manual_seed(4)
     frames = torch.randint(0, 256, (STEPS, ENVS, 84, 84, 3), dtype=torch.uint8, generator=draws)
     observation = {FRAME: frames, "vector_observation": torch.randn(STEPS, ENVS, 5, generator=draws)}
-    agent.memory.begin_segment(memory.state, STEPS)
-    rows = []
-    for step, done in enumerate(ends(STEPS, ENVS)):
-        reset_mask = memory.reset_mask
-        output = agent.act({key: part[step] for key, part in observation.items()}, memory, draws)
-        rows.append((reset_mask, output.action, output.log_prob, output.value))
-        memory.reset(done)
-    played = tuple(torch.stack(column) for column in zip(*rows, strict=True))
-    assert without_gradient(agent, segment_of(agent, observation, played), memory) == []
+    segment = segment_of(agent, memory, observation, STEPS, ENVS)
+    assert without_gradient(agent, segment, memory) == []
 
 
 def test_a_weight_without_gradient_is_found() -> None:
     agent = make("trxl")
     agent.memory.blocks[0].fc.weight.requires_grad_(False)
     memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
-    segment = segment_of(agent, {"features": observed}, play(agent, memory, observed, ends(STEPS, ENVS)))
+    segment = segment_of(agent, memory, {"features": observed}, STEPS, ENVS)
     assert without_gradient(agent, segment, memory) == ["memory.layers.0.fc.weight"]
