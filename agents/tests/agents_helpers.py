@@ -9,6 +9,31 @@ from endless_gym_agents.agent import Agent, AgentMemory
 from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import PRESETS, Model, Recurrence, Settings, Transformer
 
+#: An experiment of `endless-reproduce`: one run of six updates, with checkpoints every second.
+EXPERIMENT: dict[str, Any] = {
+    "title": "Mine",
+    "section": "-",
+    "about": "A test.",
+    "kind": "curves",
+    "seeds": 1,
+    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
+    "runs": [
+        {
+            "name": "gru",
+            "env": "MortarMayhem-Grid-v0",
+            "flags": {
+                "preset": "quick",
+                "agent": "gru",
+                "environment.option": ["command_count=[1, 2]"],
+                "environment.num-envs": 8,
+                "ppo.updates": 6,
+                "ppo.steps": 256,
+                "recurrence.hidden-size": 16,
+            },
+        }
+    ],
+}
+
 FEATURES = {"features": (6,)}
 BRANCHES = (3, 2)
 

@@ -8,38 +8,9 @@ from typing import Any
 from other_device import WAITING
 from torch.utils._python_dispatch import TorchDispatchMode
 
-#: Operations that only make a view: they compute nothing on a device.
-VIEWS = {
-    *(
-        "alias",
-        "as_strided",
-        "detach",
-        "diagonal",
-        "expand",
-        "narrow",
-        "permute",
-        "_reshape_alias",
-        "select",
-        "slice",
-        "split",
-    ),
-    *(
-        "split_with_sizes",
-        "squeeze",
-        "t",
-        "transpose",
-        "unbind",
-        "unfold",
-        "unsafe_split",
-        "_unsafe_view",
-        "unsqueeze",
-        "view",
-    ),
-}
-
 
 class Operations(TorchDispatchMode):
-    """Context that counts operations.
+    """Context that counts operations, without those that only make a view: they compute nothing on a device.
 
     Attributes:
         calls: Number of calls by name of the operation.
@@ -52,7 +23,7 @@ class Operations(TorchDispatchMode):
     @property
     def computed(self) -> int:
         """Number of operations that compute something."""
-        return sum(number for name, number in self.calls.items() if name not in VIEWS)
+        return self.calls.total()
 
     @property
     def waiting(self) -> int:
@@ -60,5 +31,7 @@ class Operations(TorchDispatchMode):
         return sum(number for name, number in self.calls.items() if name in WAITING)
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.calls[operation.overloadpacket.__name__] += 1
+        name = operation.overloadpacket.__name__
+        if not operation.is_view and name not in ("_unsafe_view", "unsafe_split"):
+            self.calls[name] += 1
         return operation(*args, **(kwargs or {}))

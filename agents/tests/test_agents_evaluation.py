@@ -220,31 +220,6 @@ def test_the_table_says_which_metric_to_trust() -> None:
         assert "*" not in printed(env) and "Trust" not in printed(env)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("", "no path given; expected checkpoint files"),
-        ("nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
-        (".", "no checkpoint in .; expected the folder of a run"),
-        ("text.pt", "text.pt is not a checkpoint of this version of endless-train"),
-        ("text.pt --seeds 0", "--seeds and --repetitions must be 1 or more, got 0 and 3"),
-        ("text.pt --json none/results.json", "cannot write none/results.json: no folder none"),
-        ("text.pt --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
-    ],
-)
-def test_errors_are_one_line(
-    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "text.pt").write_text("not a checkpoint\n")
-    monkeypatch.setattr(sys, "argv", ["endless-eval", *arguments.split()])
-    assert protocol.main() == 1
-    error = capsys.readouterr().err
-    assert error.startswith("endless-eval: ")
-    assert message in error
-    assert error.count("\n") == 1
-
-
 def test_ctrl_c_stops_cleanly(runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted(*arguments: object, **more: object) -> None:
         raise KeyboardInterrupt

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from agents_helpers import BRANCHES, ends, make, observations, play, segment_of, settings
-from test_agents_memory import KINDS
+from test_agents_memory import KINDS, TRANSFORMERS, agent_of
 
 from endless_gym_agents import losses
 from endless_gym_agents.agent import Agent, AgentMemory
@@ -32,8 +32,7 @@ def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> lis
 # The observation of the agents `stack` and `position` is transformed in `act`, before the network.
 @pytest.mark.parametrize("name", [name for name in KINDS if name not in ("stack", "position")])
 def test_every_weight_gets_a_gradient(name: str) -> None:
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent = agent_of(name)
     memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
     # The second segment: the hidden states of recurrent layers are no longer zero.
     play(agent, memory, observed, ends(STEPS, ENVS))
@@ -41,11 +40,10 @@ def test_every_weight_gets_a_gradient(name: str) -> None:
     assert without_gradient(agent, segment, memory) == []
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+@pytest.mark.parametrize("name", TRANSFORMERS)
 def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
     """Sequences of one step are computed in another way than longer ones."""
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent = agent_of(name)
     memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
     play(agent, memory, observed, ends(STEPS, ENVS))
     reset_mask, *_ = play(agent, memory, observed, ends(STEPS, ENVS))

@@ -9,7 +9,7 @@ from agents_helpers import BRANCHES, ends, make, observations, play, settings, t
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.memory import balanced_split
 from endless_gym_agents.settings import PRESETS, Recurrence
-from endless_gym_agents.transformer import Block, Gate, TransformerMemory
+from endless_gym_agents.transformer import Block, TransformerMemory
 
 STEPS, ENVS = 24, 3
 
@@ -43,6 +43,7 @@ KINDS = {
     "trxl, single steps, learned": ("trxl", transformer(sequence_length=1, positional_encoding="learned")),
     "gtrxl": ("gtrxl", transformer(gate_bias=2.0)),
 }
+TRANSFORMERS = [name for name in KINDS if "trxl" in name]
 WITH_STATE = [name for name in KINDS if name not in ("none", "position")]
 
 
@@ -52,10 +53,14 @@ def short_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("endless_gym_agents.transformer.SHORTEST_PART", 5)
 
 
+def agent_of(name: str) -> Agent:
+    kind, changes = KINDS[name]
+    return make(kind, **changes)
+
+
 @pytest.fixture(params=KINDS)
 def agent(request: pytest.FixtureRequest) -> Agent:
-    kind, changes = KINDS[request.param]
-    return make(kind, **changes)
+    return agent_of(request.param)
 
 
 @pytest.mark.parametrize("minibatches", [1, 3])
@@ -98,8 +103,7 @@ def test_epochs_follow_one_another(agent: Agent) -> None:
 @pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
 def test_rank_may_have_no_step_of_a_minibatch(name: str) -> None:
     """A rank with one of three environments: its steps are in some of the minibatches, and the others can be made, too."""
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent = agent_of(name)
     memory, done = agent.initial_memory(1), ends(STEPS, 1)
     reset_mask, *_ = play(agent, memory, observations(STEPS, 1), done)
     everywhere = reset_mask.expand(STEPS, ENVS)
@@ -127,8 +131,7 @@ def test_groups_are_concatenated_along_the_environments() -> None:
 @pytest.mark.parametrize("name", WITH_STATE)
 def test_act_does_not_leak(name: str) -> None:
     """An observation influences only the later steps of its own episode in its own environment."""
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent = agent_of(name)
     done = torch.zeros(STEPS, ENVS, dtype=torch.bool)
     done[9, 1] = True  # the changed step belongs to the episode of steps 0 to 9
     observed = observations(STEPS, ENVS)
@@ -148,8 +151,7 @@ def test_act_does_not_leak(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in WITH_STATE if KINDS[name][0] != "stack"])
 def test_forward_does_not_leak(name: str) -> None:
     """The gradient of one step's value with respect to all observations is nonzero only up to that step, within its episode."""
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent, (kind, changes) = agent_of(name), KINDS[name]
     memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
     done[9, 1] = True
     observed = observations(STEPS, ENVS)
@@ -170,11 +172,10 @@ def test_forward_does_not_leak(name: str) -> None:
         assert reached == {(t, 1) for t in range(max(10, 15 - 15 % length), 16)}
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+@pytest.mark.parametrize("name", TRANSFORMERS)
 def test_cached_token_influences_the_next_window_of_its_episode(name: str) -> None:
     """A cached token influences exactly the next `window - 1` steps of its own episode."""
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent = agent_of(name)
     window = agent.memory.settings.window
     memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
     done[13, 1] = True
@@ -198,12 +199,11 @@ def test_cached_token_influences_the_next_window_of_its_episode(name: str) -> No
         assert torch.equal(differs, expected)
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if "trxl" in name])
+@pytest.mark.parametrize("name", TRANSFORMERS)
 @pytest.mark.parametrize("recording", [True, False])
 def test_kv_cache_equals_a_loop_over_windows(name: str, recording: bool) -> None:
     """Transformer-XL against a plain loop that projects the window of each step and environment separately."""
-    kind, changes = KINDS[name]
-    agent = make(kind, **changes)
+    agent = agent_of(name)
     memory, steps = agent.initial_memory(ENVS), 5 * STEPS
     observed, done = observations(steps, ENVS), ends(steps, ENVS)
     outputs = []
@@ -260,57 +260,28 @@ def _sinusoid(angle: float, width: int) -> torch.Tensor:
 
 def _plain_block(block: Block, x: torch.Tensor, tokens: list[torch.Tensor], ages: list[int]) -> torch.Tensor:
     attention = block.attention
-    heads, size, width = attention.heads, attention.size, x.shape[-1]
 
-    def projected(layer: torch.nn.Linear, vector: torch.Tensor, head: int) -> torch.Tensor:
-        part = slice(head * size, (head + 1) * size)
-        return layer.weight @ vector[part] if layer.in_features == size else (layer.weight @ vector)[part]
+    def projected(layer: torch.nn.Linear, vectors: torch.Tensor) -> torch.Tensor:
+        if layer.in_features == attention.size:
+            return layer(vectors.unflatten(-1, (attention.heads, -1)))
+        return layer(vectors).unflatten(-1, (attention.heads, -1))
 
-    normal = [block.norm_tokens(token) for token in tokens]
-    query = block.norm_query(x)
-    summed = torch.zeros(width)
-    for head in range(heads if tokens else 0):
-        q = projected(attention.queries, query, head)
-        scores = []
-        for token, age in zip(normal, ages, strict=True):
-            k = projected(attention.keys, token, head)
-            if attention.relative:
-                r = projected(attention.distances, _sinusoid(age, width), head)
-                scores.append((q + attention.content_bias[head, 0]) @ k + (q + attention.distance_bias[head, 0]) @ r)
-            else:
-                scores.append(q @ k)
-        weights = torch.softmax(torch.stack(scores) / math.sqrt(width), dim=0)
-        mixed = sum(w * projected(attention.values, token, head) for w, token in zip(weights, normal, strict=True))
-        summed[head * size : (head + 1) * size] = mixed
-    attended = attention.fc_out(summed)
-    x = x + attended if block.gate_attention is None else _plain_gate(block.gate_attention, x, attended)
+    attended = torch.zeros_like(x)
+    if tokens:
+        normal, query = block.norm_tokens(torch.stack(tokens)), projected(attention.queries, block.norm_query(x))
+        scores = torch.einsum("hs,ths->th", query, projected(attention.keys, normal))
+        if attention.relative:
+            distances = torch.stack([_sinusoid(age, len(x)) for age in ages])
+            scores += torch.einsum("hs,ths->th", attention.content_bias[:, 0], projected(attention.keys, normal))
+            biased = query + attention.distance_bias[:, 0]
+            scores += torch.einsum("hs,ths->th", biased, projected(attention.distances, distances))
+        weights = torch.softmax(scores / math.sqrt(len(x)), dim=0)
+        attended = torch.einsum("th,ths->hs", weights, projected(attention.values, normal)).flatten()
+    attended = attention.fc_out(attended)
+    # `test_agents_authors.py` tests the gates.
+    x = x + attended if block.gate_attention is None else block.gate_attention(x, attended)
     added = torch.relu(block.fc(block.norm_fc(x)))
-    return x + added if block.gate_fc is None else _plain_gate(block.gate_fc, x, added)
-
-
-def _plain_gate(gate: Gate, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    width = x.shape[-1]
-    w_r, w_z, w_g = gate.from_y.weight.split(width)
-    u_r, u_z = gate.from_x.weight.split(width)
-    r, z = torch.sigmoid(w_r @ y + u_r @ x), torch.sigmoid(w_z @ y + u_z @ x - gate.bias)
-    return (1 - z) * x + z * torch.tanh(w_g @ y + gate.from_reset.weight @ (r * x))
-
-
-def test_gru_cell_from_its_equations() -> None:
-    """One step of the GRU agent, computed from the equations of the GRU."""
-    agent = make("gru")
-    x = agent.memory.embedding(agent.encoder({"features": observations(1, 1)[0]}))[0]
-    parts = agent.memory.recurrent
-    hidden = torch.randn(16)
-    memory = agent.initial_memory(1)
-    memory.state.hidden[0, 0, 0] = hidden
-    memory.reset_mask[:] = False
-    i_r, i_z, i_n = (parts.weight_ih_l0 @ x + parts.bias_ih_l0).split(16)
-    h_r, h_z, h_n = (parts.weight_hh_l0 @ hidden + parts.bias_hh_l0).split(16)
-    r, z = torch.sigmoid(i_r + h_r), torch.sigmoid(i_z + h_z)
-    expected = (1 - z) * torch.tanh(i_n + r * h_n) + z * hidden
-    agent.act({"features": observations(1, 1)[0]}, memory)
-    assert_close(memory.state.hidden[0, 0, 0], expected.detach())
+    return x + added if block.gate_fc is None else block.gate_fc(x, added)
 
 
 def test_bootstrap_value_does_not_change_the_memory() -> None:
@@ -325,8 +296,8 @@ def test_bootstrap_value_does_not_change_the_memory() -> None:
 
 
 def test_memory_resumes_from_its_state_dict() -> None:
-    for kind, changes in KINDS.values():
-        agent, observed, done = make(kind, **changes), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
+    for name in KINDS:
+        agent, observed, done = agent_of(name), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
         memory, other = agent.initial_memory(ENVS), agent.initial_memory(ENVS)
         play(agent, memory, observed[:STEPS], done[:STEPS])
         other.load_state_dict(memory.state_dict())

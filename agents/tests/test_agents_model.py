@@ -3,19 +3,19 @@
 import math
 from dataclasses import asdict, replace
 
-import numpy as np
 import pytest
 import torch
-from agents_helpers import BRANCHES, make, settings, transformer
+from agents_helpers import BRANCHES, make, settings
 
 from endless_gym import make_vec, spec
 from endless_gym_agents import curves
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
-from endless_gym_agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
+from endless_gym_agents.heads import PolicyHead, ReconstructionHead
 from endless_gym_agents.memory import Minibatch
-from endless_gym_agents.settings import PRESETS, Recurrence, Settings, Transformer, from_dict, to_dict
-from endless_gym_agents.transformer import Block, Gate, TransformerMemory
+from endless_gym_agents.settings import PRESETS, Recurrence, Transformer, from_dict, to_dict
+from endless_gym_agents.train import parse
+from endless_gym_agents.transformer import Block, TransformerMemory
 
 PAPER = PRESETS["paper"]
 
@@ -129,22 +129,6 @@ def test_preset_throughput_has_more_environments_and_equal_steps_per_update() ->
     assert given.environment.num_envs * given.ppo.steps == PAPER.environment.num_envs * PAPER.ppo.steps
     assert given.recurrence.sequence_length == given.transformer.sequence_length == given.ppo.steps
     assert replace(given.ppo, steps=PAPER.ppo.steps) == PAPER.ppo
-
-
-def test_preset_old_differs_only_in_its_column() -> None:
-    old = PRESETS["old"]
-    assert (old.ppo.gamma, old.ppo.clip_range, old.ppo.value_coefficient) == (0.99, 0.2, 0.25)
-    assert (old.ppo.learning_rate, old.ppo.final_learning_rate) == (3.0e-4, 1.0e-4)
-    assert (old.ppo.final_entropy_coefficient, old.ppo.max_gradient_norm) == (1.0e-5, 0.5)
-    assert old.ppo.advantage_normalisation == "minibatch"
-    assert not old.recurrence.embedding
-    names = (
-        "gamma advantage_normalisation clip_range value_coefficient learning_rate final_learning_rate "
-        "final_entropy_coefficient max_gradient_norm"
-    )
-    same = {name: getattr(PAPER.ppo, name) for name in names.split()}
-    assert replace(old.ppo, **same) == PAPER.ppo
-    assert replace(old, preset="paper", ppo=PAPER.ppo, recurrence=PAPER.recurrence) == PAPER
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -290,57 +274,15 @@ def test_reconstruction_head_takes_the_output_of_the_memory() -> None:
     assert agent.body[0].weight.grad is None
 
 
-def test_heads_are_two_layer_perceptrons() -> None:
-    """Against a computation with Python floats."""
-
-    def row(layer: torch.nn.Linear, x: list[float]) -> list[float]:
-        weights, biases = layer.weight.tolist(), layer.bias.tolist()
-        return [sum(w * v for w, v in zip(ws, x, strict=True)) + b for ws, b in zip(weights, biases, strict=True)]
-
-    torch.manual_seed(2)
-    x = torch.randn(3, 5)
-    policy, value, truth = PolicyHead(5, 4, BRANCHES), ValueHead(5, 4, 0.5), GroundTruthHead(5, 4, 2)
-    for head in (policy, value, truth):
-        for parameter in head.parameters():
-            parameter.data.normal_()
-    outputs = [torch.cat(policy(x), 1), value(x).unsqueeze(1), truth(x)]
-    layers = [(policy.hidden[0], [*policy.branches])] + [(head.layers[0], [head.layers[2]]) for head in (value, truth)]
-    for output, (hidden, last) in zip(outputs, layers, strict=True):
-        for given, found in zip(x.tolist(), output.tolist(), strict=True):
-            middle = [max(0.0, v) for v in row(hidden, given)]
-            assert found == pytest.approx([v for layer in last for v in row(layer, middle)], rel=1e-4, abs=1e-5)
-
-
-def test_reconstruction_head_is_a_stack_of_transposed_convolutions() -> None:
-    """Against a loop over cells that adds the kernels, in numpy with float64."""
-    torch.manual_seed(2)
-    head = ReconstructionHead(5, 3)
-    for parameter in head.parameters():
-        parameter.data.normal_(std=0.1)
-    given = torch.randn(2, 5)
-    linear, *convolutions = (layer for layer in head.layers if hasattr(layer, "weight"))
-    for x, found in zip(given, head(given).detach().numpy(), strict=True):
-        weight, bias = linear.weight.detach().numpy().astype(float), linear.bias.detach().numpy()
-        frame = np.maximum(weight @ x.numpy() + bias, 0.0).reshape(64, 7, 7)
-        for layer in convolutions:
-            kernel, stride = layer.weight.detach().numpy().astype(float), layer.stride[0]
-            size = (frame.shape[1] - 1) * stride + kernel.shape[2]
-            out = np.zeros((kernel.shape[1], size, size)) + layer.bias.detach().numpy()[:, None, None]
-            for i, j in np.ndindex(frame.shape[1:]):
-                cell = np.tensordot(frame[:, i, j], kernel, 1)
-                out[:, i * stride : i * stride + kernel.shape[2], j * stride : j * stride + kernel.shape[3]] += cell
-            frame = out if layer is convolutions[-1] else np.maximum(out, 0.0)
-        np.testing.assert_allclose(found, frame, rtol=1e-3, atol=1e-3)
-
-
-def test_reconstruction_head_mirrors_the_shapes_of_the_encoder() -> None:
-    """The shapes of the layers are those of the Atari encoder in reverse order."""
-    x, shapes = torch.randn(1, 32), []
-    for layer in ReconstructionHead(32, 4).layers:
+def test_reconstruction_head_mirrors_the_encoder() -> None:
+    """The shapes of the layers are those of the Atari encoder in reverse order; all layers but the last have a ReLU."""
+    x, shapes, head = torch.randn(1, 32), [], ReconstructionHead(32, 4)
+    for layer in head.layers:
         x = layer(x)
         shapes.append(tuple(x.shape[1:]))
     assert shapes[2] == (64, 7, 7)
     assert [shapes[i] for i in (3, 5, 7)] == [(64, 9, 9), (32, 20, 20), (4, 84, 84)]
+    assert [number for number, layer in enumerate(head.layers) if isinstance(layer, torch.nn.ReLU)] == [1, 4, 6]
 
 
 def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
@@ -366,57 +308,30 @@ def test_uniform_weights_are_within_their_bound_and_close_to_it(kind: str, bound
         assert 0.98 * bound * factor < float(weight.abs().max()) <= bound * factor, name
 
 
-def test_orthogonal_initialisation_gives_orthogonal_weights() -> None:
-    block = Block(Transformer(width=64, heads=4, shared_heads=False, initialisation="orthogonal"))
-    for weight in (block.fc.weight, block.attention.queries.weight):
-        torch.testing.assert_close(weight @ weight.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
-
-
-def test_gates_start_orthogonal_and_relative_biases_at_0() -> None:
-    """The matrices of the gates have the initialisation of the block, each on its own; the biases of the encoding are 0."""
+def test_blocks_start_orthogonal_and_relative_biases_at_0() -> None:
+    """Each matrix of the gates is orthogonal on its own; the biases of the encoding are 0."""
     changes = {"shared_heads": False, "gating": True, "positional_encoding": "relative"}
     block = Block(Transformer(width=64, heads=4, initialisation="orthogonal", gate_bias=2.0, **changes))
+    matrices = [block.fc.weight, block.attention.queries.weight]
     for gate in (block.gate_attention, block.gate_fc):
-        for matrix in (*gate.from_y.weight.chunk(3), *gate.from_x.weight.chunk(2), gate.from_reset.weight):
-            torch.testing.assert_close(matrix @ matrix.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
+        matrices += [*gate.from_y.weight.chunk(3), *gate.from_x.weight.chunk(2), gate.from_reset.weight]
         assert torch.equal(gate.bias, torch.full((64,), 2.0))
+    for matrix in matrices:
+        torch.testing.assert_close(matrix @ matrix.T, 2 * torch.eye(64), rtol=1e-4, atol=1e-4)
     assert not block.attention.content_bias.any() and not block.attention.distance_bias.any()
 
 
-@pytest.mark.parametrize("bias", [0.0, 2.0])
-def test_gate_with_zero_weights_scales_by_its_bias(bias: float) -> None:
-    """With zero weights the candidate is 0 and x is scaled by 1 - sigmoid(-bias), which is closer to 1 for a bias of 2."""
-    gate, x = Gate(8, bias), torch.randn(5, 8)
-    for layer in (gate.from_x, gate.from_y, gate.from_reset):
-        layer.weight.data.zero_()
-    torch.testing.assert_close(gate(x, torch.randn(5, 8)), x * (1 - 1 / (1 + math.exp(bias))))
-
-
-def test_absolute_encoding_counts_from_the_end_of_its_table() -> None:
-    """Row p is the encoding of `positions - 1 - p`: the sines of all frequencies, then the cosines."""
-    agent = make("trxl", **transformer(positions=10))
-    table = agent.memory.table
-    assert table.shape == (10, 16)
-    torch.testing.assert_close(table[9], torch.tensor([0.0] * 8 + [1.0] * 8))
-    assert float(table[6, 1]) == pytest.approx(math.sin(3 / 10_000 ** (2 / 16)), abs=1e-6)
-    assert float(table[6, 9]) == pytest.approx(math.cos(3 / 10_000 ** (2 / 16)), abs=1e-6)
-
-
-def test_every_setting_is_documented() -> None:
+def test_every_setting_is_documented(capsys: pytest.CaptureFixture[str]) -> None:
     """tyro takes the help text of a field from the docstring below it."""
-    import contextlib
-    import io
-
-    from endless_gym_agents.train import parse
-
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed), pytest.raises(SystemExit):
+    with pytest.raises(SystemExit):
         parse(["--help"])
-    text = " ".join(printed.getvalue().replace("│", " ").split())
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for flag in ("--env", "--agent", "--ppo.learning-rate", "--transformer.window", "--recurrence.sequence-length"):
         assert flag in text
     assert "(default: 0.000275)" in text
+
+
+def test_flags_override_the_preset() -> None:
     assert parse(["--preset", "old"]) == PRESETS["old"]
     changed = parse(["--preset", "old", "--agent", "lstm", "--ppo.gamma", "0.9"])
     assert changed == replace(PRESETS["old"], agent="lstm", ppo=replace(PRESETS["old"].ppo, gamma=0.9))
-    assert isinstance(changed, Settings)

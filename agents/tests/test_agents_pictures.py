@@ -3,7 +3,6 @@
 import csv
 import json
 import stat
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,29 +124,6 @@ def test_interrupted_video_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("nowhere", "no checkpoint nowhere"),
-        ("nowhere --out video.avi", "--out must end in .gif, .webp or .mp4, got `video.avi`"),
-        ("nowhere --out none/video.gif", "cannot write none/video.gif: no folder none"),
-        ("nowhere --out video.mp4", "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg"),
-        ("nowhere --seeds", "--seeds must contain at least one seed, got none"),
-    ],
-)
-def test_errors_of_enjoy_are_one_line(
-    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    monkeypatch.setattr(sys, "argv", ["endless-enjoy", *arguments.split()])
-    assert enjoy.main() == 1
-    error = capsys.readouterr().err
-    assert error.startswith(f"endless-enjoy: {message}")
-    assert error.count("\n") == 1
-
-
 def experiment(env: str, name: str, label: str, scores: list[list[float]]) -> Experiment:
     """With checkpoints at 10, 20, ... steps."""
     steps = [10 * (place + 1) for place in range(len(scores[0]))]
@@ -238,26 +214,3 @@ def test_training_rewards(run: Path, tmp_path: Path) -> None:
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
     assert curve["steps"] == [row["steps"] for row in rows]
     assert curve["scores"] == [[row["episode/reward"] for row in rows]]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("nowhere.json", "no such file or folder: nowhere.json"),
-        ("text.json", "text.json is not a file of `endless-eval --json`"),
-        (".", "no progress.jsonl in .; expected the folder of a run"),
-        ("--env NoSuch-v0", "no curves of environment `NoSuch-v0`; the paper has curves of "),
-        ("one.json --aggregate finite", "gru: the finite plot needs evaluations in all of MortarMayhem-v0, "),
-    ],
-)
-def test_errors_of_plots_are_one_line(
-    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "text.json").write_text("{}")
-    results(tmp_path / "one.json", experiment("MysteryPath-v0", "task_progress", "gru", [[0.5]]))
-    monkeypatch.setattr(sys, "argv", ["endless-plot", *arguments.split()])
-    assert plot.main() == 1
-    error = capsys.readouterr().err
-    assert error.startswith(f"endless-plot: {message}")
-    assert error.count("\n") == 1

@@ -7,13 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import optuna
 import psutil
 import pytest
+from agents_helpers import EXPERIMENT
 from rich.console import Console
 
 from endless_gym_agents import checkpoint, search
@@ -25,6 +25,41 @@ pytest.importorskip("ray")
 pytestmark = pytest.mark.slow
 
 SCRIPT = Path(__file__).parent / "ray_search.py"
+#: A small run with an engine process and a checkpoint after each update.
+SMALL = "--preset quick --env MortarMayhem-Grid-v0 --agent gru --environment.num-envs 4 --environment.engine process"
+SMALL += " --ppo.steps 16 --ppo.minibatches 1 --checkpoint-interval 1 --recurrence.hidden-size 16"
+SEARCH = [*SMALL.split(), "--parameters", "ppo.epochs", "--stage", "single"]
+
+
+@contextlib.contextmanager
+def started(folder: Path, *command: str | Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A program in the folder, which writes to the file `output`; at the end all processes of its session are killed.
+
+    Ray's processes are in the session of the program, which can therefore be ended as a whole.
+    """
+    with (folder / "output").open("w") as output:
+        process = subprocess.Popen(
+            [*command],
+            cwd=folder,
+            env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        for left in _session(process.pid):
+            with contextlib.suppress(psutil.Error):
+                left.kill()
+        process.wait()
+
+
+def wait_for_updates(process: subprocess.Popen[bytes], folder: Path, *runs: Path) -> None:
+    """Wait until the runs have made two updates."""
+    while not all((run / "progress.jsonl").exists() and len(_rows(run)) >= 2 for run in runs):
+        assert process.poll() is None, (folder / "output").read_text()
+        time.sleep(0.01)
 
 
 def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]) -> None:
@@ -36,28 +71,11 @@ def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], s
     folder_of_environments = Path(sys.executable).parents[2]
     spaced.symlink_to(folder_of_environments)
     python = spaced / Path(sys.executable).relative_to(folder_of_environments)
-    environments = ["--environment.num-envs", "4", "--environment.engine", "process", "--agent", "gru"]
-    sizes = ["--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "6", "--checkpoint-interval", "1"]
-    sizes += ["--recurrence.hidden-size", "16"]
-    searched = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single"]
-    pruning = ["--period", "1", "--warm-up", "4", "--startup-trials", "1"]
-    command = ["--preset", "quick", "--folder", "search", *environments, *sizes, *searched, *pruning]
-    # Ray's processes are in the session of the search, which can be ended as a whole.
-    with subprocess.Popen(
-        [python, SCRIPT, *command, "--ray", "--workers", "2"],
-        cwd=tmp_path,
-        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    ) as ran:
-        try:
-            output, _ = ran.communicate(timeout=280)
-        except BaseException:
-            _kill_session(ran.pid)
-            raise
-    assert ran.returncode == 0, output
+    pruning = ["--period", "1", "--warm-up", "4", "--startup-trials", "1", "--ppo.updates", "6"]
+    with started(tmp_path, python, SCRIPT, *SEARCH, "--folder", "search", *pruning, "--ray", "--workers", "2") as ran:
+        assert ran.wait(280) == 0, (tmp_path / "output").read_text()
+        assert not segments()
+        assert not _left_by(ray_folder)
     folder = tmp_path / "search"
     study = optuna.load_study(study_name="search", storage=f"sqlite:///{folder / 'study.db'}")
     ended = [(trial.params["ppo.epochs"], trial.state.name, trial.value) for trial in study.trials]
@@ -78,8 +96,6 @@ def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], s
     assert (rows[:2], rows[2] == before[2]) == (before[:2], False)
 
     assert [file.name for file in (folder / "locks").iterdir()] == ["study"]
-    assert not segments()
-    assert not _left_by(ray_folder)
 
 
 def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
@@ -89,39 +105,15 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ctrl-C in a terminal, which all processes of its group receive."""
-    sizes = [
-        "--environment.num-envs",
-        "4",
-        "--environment.engine",
-        "process",
-        "--ppo.steps",
-        "16",
-        "--ppo.minibatches",
-        "1",
-    ]
-    sizes += ["--ppo.updates", "100000", "--checkpoint-interval", "1", "--recurrence.hidden-size", "16"]
-    given = ["--preset", "quick", "--folder", str(tmp_path / "search"), "--env", "MortarMayhem-Grid-v0", *sizes]
-    given += ["--parameters", "ppo.epochs", "--stage", "single", "--agent", "gru"]
+    given = [*SEARCH, "--folder", str(tmp_path / "search"), "--ppo.updates", "100000"]
     runs = [tmp_path / "search" / f"trial-000{number}" for number in (0, 1)]
-    with (tmp_path / "output").open("w") as output:
-        started = subprocess.Popen(
-            [sys.executable, "-m", "endless_gym_agents.search", *given, "--ray", "--workers", "2"],
-            cwd=tmp_path,
-            env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    try:
-        while not all((run / "progress.jsonl").exists() and len(_rows(run)) >= 2 for run in runs):
-            assert started.poll() is None, (tmp_path / "output").read_text()
-            time.sleep(0.05)
-        os.killpg(started.pid, signal.SIGINT)
-        assert started.wait(60) == 130, (tmp_path / "output").read_text()
+    program = [sys.executable, "-m", "endless_gym_agents.search"]
+    with started(tmp_path, *program, *given, "--ray", "--workers", "2") as process:
+        wait_for_updates(process, tmp_path, *runs)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(60) == 130, (tmp_path / "output").read_text()
         # The engines end by themselves when their trainers have.
-        assert not psutil.wait_procs(_session(started.pid), timeout=30)[1]
-    finally:
-        _kill_session(started.pid)
+        assert not psutil.wait_procs(_session(process.pid), timeout=30)[1]
     assert "endless-search: stopped" in (tmp_path / "output").read_text()
     assert not _left_by(ray_folder)
     assert not segments()
@@ -142,59 +134,22 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
         assert [json.loads(row)["update"] for row in _rows(run)] == list(range(1, done + 2))
 
 
-#: One run of six updates, with checkpoints every second.
-EXPERIMENT: dict[str, Any] = {
-    "title": "Mine",
-    "section": "-",
-    "about": "A test.",
-    "kind": "curves",
-    "seeds": 1,
-    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
-    "runs": [
-        {
-            "name": "gru",
-            "env": "MortarMayhem-Grid-v0",
-            "flags": {
-                "preset": "quick",
-                "agent": "gru",
-                "environment.engine": "process",
-                "environment.num-envs": 8,
-                "ppo.updates": 6,
-                "ppo.steps": 256,
-                "recurrence.hidden-size": 16,
-            },
-        }
-    ],
-}
-
-
 def test_an_experiment_on_ray_is_stopped_and_resumed(
     tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]
 ) -> None:
     """Ctrl-C stops its run after an update, with a checkpoint; the same command completes it, and then has nothing to do."""
-    (tmp_path / "mine.json").write_text(json.dumps(EXPERIMENT))
+    (own,) = EXPERIMENT["runs"]
+    runs = [own | {"flags": own["flags"] | {"environment.engine": "process"}}]
+    (tmp_path / "mine.json").write_text(json.dumps(EXPERIMENT | {"runs": runs}))
     run = tmp_path / "out" / "runs" / "MortarMayhem-Grid-v0" / "gru" / "seed-1"
     program = [sys.executable, "-m", "endless_gym_agents.reproduce", "mine.json", "--out", "out", "--device", "cpu"]
 
     def reproduced(is_interrupted: bool) -> str:
-        with (tmp_path / "output").open("w") as output:
-            started = subprocess.Popen(
-                [*program, "--ray", "--jobs", "1", "--nice", "0"],
-                cwd=tmp_path,
-                env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-        try:
-            while is_interrupted and not ((run / "progress.jsonl").exists() and len(_rows(run)) >= 2):
-                assert started.poll() is None, (tmp_path / "output").read_text()
-                time.sleep(0.01)
+        with started(tmp_path, *program, "--ray", "--jobs", "1", "--nice", "0") as process:
             if is_interrupted:
-                os.killpg(started.pid, signal.SIGINT)
-            assert started.wait(250) == (130 if is_interrupted else 0), (tmp_path / "output").read_text()
-        finally:
-            _kill_session(started.pid)
+                wait_for_updates(process, tmp_path, run)
+                os.killpg(process.pid, signal.SIGINT)
+            assert process.wait(250) == (130 if is_interrupted else 0), (tmp_path / "output").read_text()
         assert not _left_by(ray_folder)
         assert not segments()
         return (tmp_path / "output").read_text()
@@ -228,12 +183,6 @@ def _session(session: int) -> list[psutil.Process]:
             if os.getsid(process.pid) == session:
                 found.append(process)
     return found
-
-
-def _kill_session(session: int) -> None:
-    for process in _session(session):
-        with contextlib.suppress(psutil.Error):
-            process.kill()
 
 
 def _command_line(process: psutil.Process) -> list[str]:

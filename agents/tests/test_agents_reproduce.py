@@ -1,6 +1,5 @@
 """The experiments of the paper as data: files, scales, plans, and runs that are stopped and resumed."""
 
-import importlib.util
 import json
 import os
 import re
@@ -16,8 +15,9 @@ import numpy as np
 import psutil
 import pytest
 import torch
+from agents_helpers import EXPERIMENT
 
-from endless_gym_agents import checkpoint, reproduce
+from endless_gym_agents import checkpoint
 from endless_gym_agents.curves import published
 from endless_gym_agents.experiments import definitions, planning, report, running
 from endless_gym_agents.reproduce import ReproduceArguments, execute
@@ -26,35 +26,10 @@ from endless_gym_agents.train import parse
 
 NAMES = definitions.names()
 
-#: One run of six updates, with checkpoints every second.
-OWN: dict[str, Any] = {
-    "title": "Mine",
-    "section": "-",
-    "about": "A test.",
-    "kind": "curves",
-    "seeds": 1,
-    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
-    "runs": [
-        {
-            "name": "gru",
-            "env": "MortarMayhem-Grid-v0",
-            "flags": {
-                "preset": "quick",
-                "agent": "gru",
-                "environment.option": ["command_count=[1, 2]"],
-                "environment.num-envs": 8,
-                "ppo.updates": 6,
-                "ppo.steps": 256,
-                "recurrence.hidden-size": 16,
-            },
-        }
-    ],
-}
-
 
 def own(folder: Path, **changes: Any) -> Path:
     file = folder / "mine.json"
-    file.write_text(json.dumps(OWN | changes))
+    file.write_text(json.dumps(EXPERIMENT | changes))
     return file
 
 
@@ -145,28 +120,7 @@ def test_runs_of_one_name_are_the_same_run() -> None:
 )
 def test_mistakes_in_an_experiment_file_are_named(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        definitions.parse("mine", json.dumps(OWN | changes))
-
-
-def test_errors_are_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for arguments, message in {
-        "": "no experiment given; `endless-reproduce --list` lists them",
-        "nope": "experiment must be one of finite, .*; got `nope`",
-        "nope.json": "no such file: nope.json",
-        "finite --scale 2": "--scale must be greater than 0 and at most 1, or tiny; got `2`",
-        "finite --scale small": "--scale must be .* got `small`",
-        "finite --nice 20 --status": "--nice must be 0 to 19, got 20",
-        "finite --jobs -1 --status": "--jobs must be 0 or more, got -1",
-    }.items():
-        monkeypatch.setattr(sys, "argv", ["endless-reproduce", *arguments.split()])
-        assert reproduce.main() == 1
-        error = capsys.readouterr().err
-        assert re.match(f"endless-reproduce: {message}", error), error
-        assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+        definitions.parse("mine", json.dumps(EXPERIMENT | changes))
 
 
 def test_a_scale_makes_everything_smaller() -> None:
@@ -186,7 +140,7 @@ def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -
         {"name": agent, "env": "MortarMayhem-v0", "flags": {"agent": agent, "ppo.updates": 10}}
         for agent in ("gru", "lstm", "trxl")
     ]
-    experiment = definitions.parse("mine", json.dumps(OWN | {"runs": runs, "seeds": 2}))
+    experiment = definitions.parse("mine", json.dumps(EXPERIMENT | {"runs": runs, "seeds": 2}))
     planned = planning.jobs(experiment, tmp_path, 1)
     assert [(job.run.name, job.seed) for job in planned] == [(a, s) for s in (1, 2) for a in ("gru", "lstm", "trxl")]
     assert planning.remaining_seconds(planned, 1) is None
@@ -209,14 +163,14 @@ def test_the_status_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFixt
     given = ReproduceArguments((str(own(tmp_path)),), status=True, out=tmp_path / "out", jobs=1)
     execute(given)
     assert capsys.readouterr().out.startswith("not started  MortarMayhem-Grid-v0 gru seed 1, update 0 of 6\n")
-    (job,) = planning.jobs(definitions.parse("mine", json.dumps(OWN)), tmp_path / "out", 1)
+    (job,) = planning.jobs(definitions.parse("mine", json.dumps(EXPERIMENT)), tmp_path / "out", 1)
     log_of(job, 6, 2.0)
     execute(given)
     assert "MortarMayhem-Grid-v0 gru seed 1, update 6 of 6, evaluation left\n" in capsys.readouterr().out
 
 
 def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
-    experiment = definitions.parse("mine", json.dumps(OWN))
+    experiment = definitions.parse("mine", json.dumps(EXPERIMENT))
     (job,) = planning.jobs(experiment, tmp_path, 1)
     job.folder.mkdir(parents=True)
     given = job.run.settings()
@@ -258,7 +212,7 @@ def test_wall_time_draws_the_published_curves_over_both_times(tmp_path: Path) ->
     values = {"mean": 4.0}
     flags = {"agent": "gru", "ppo.updates": 3}
     runs = [{"name": "gru", "env": "MysteryPath-v0", "flags": flags, "published": "gru", "values": values}]
-    experiment = definitions.parse("mine", json.dumps(OWN | {"kind": "wall-time", "runs": runs}))
+    experiment = definitions.parse("mine", json.dumps(EXPERIMENT | {"kind": "wall-time", "runs": runs}))
     (job,) = planning.jobs(experiment, tmp_path, 1)
     log_of(job, 3, 2.0)
     (row,), (figure,) = report._wall_time([job], tmp_path / "out")
@@ -281,23 +235,6 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed[NAMES.index("endless")]["runs"][0]["updates"] == 50_000
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--ray", "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"),
-        ("--ray auto --job-cpus 0", "--job-cpus must be 1 or more, got 0"),
-        ("--ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
-    ],
-)
-def test_errors_of_the_flag_ray_are_one_line(
-    arguments: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)  # of Ray
-    monkeypatch.setattr(sys, "argv", ["endless-reproduce", "endless", *arguments.split()])
-    assert reproduce.main() == 1
-    assert re.match(f"endless-reproduce: {message}", capsys.readouterr().err)
-
-
 @pytest.fixture(scope="module")
 def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an undisturbed run, in its folder `through`."""
@@ -315,6 +252,13 @@ def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_path: Path) -> None:
     """A run that is killed, or stopped by Ctrl-C, continues; then everything is done, and nothing runs again."""
     own(tmp_path)
+
+    def completed() -> str:
+        again = start(tmp_path, "stopped")
+        text, _ = again.communicate(timeout=280)
+        assert again.returncode == 0, text
+        return text
+
     begun = start(tmp_path, "stopped")
     wait_for_updates(run_folder(tmp_path, "stopped"), 3)
     if how == "kill":
@@ -326,10 +270,7 @@ def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_pa
     assert begun.returncode == (1 if how == "kill" else 130), text
     done = checkpoint.load(run_folder(tmp_path, "stopped")).update
     assert 2 <= done < 6
-    again = start(tmp_path, "stopped")
-    text, _ = again.communicate(timeout=280)
-    assert again.returncode == 0, text
-    assert "resumed at update" in text
+    assert "resumed at update" in completed()
     rows, model = outcome(run_folder(tmp_path, "stopped"))
     expected_rows, expected = outcome(run_folder(through, "through"))
     assert len(rows) == 6
@@ -338,9 +279,7 @@ def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_pa
     tables = [folder / "mine" / "table.csv" for folder in (tmp_path / "stopped", through / "through")]
     assert tables[0].read_text() == tables[1].read_text()
     before = os.stat(run_folder(tmp_path, "stopped") / "progress.jsonl").st_mtime_ns
-    skipped = start(tmp_path, "stopped")
-    text, _ = skipped.communicate(timeout=280)
-    assert skipped.returncode == 0, text
+    text = completed()
     assert "1 of 1 jobs done" in text
     assert "started" not in text
     assert "resumed" not in text

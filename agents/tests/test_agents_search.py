@@ -1,10 +1,8 @@
 """The hyperparameter search: search space, order of the trials, pruning, and resumption."""
 
-import importlib.util
 import json
 import multiprocessing
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -13,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import psutil
 import pytest
@@ -44,6 +42,12 @@ def small(folder: Path, **changes: Any) -> SearchArguments:
 
 def states(trials: Trials) -> list[str]:
     return [trial.state.name for trial in trials.study.trials]
+
+
+def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
+    """Final and intermediate rewards of the complete trials, by their number of epochs."""
+    done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
+    return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
 
 
 def test_search_space_is_the_table_of_the_paper() -> None:
@@ -176,39 +180,22 @@ def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkey
     search.run_trials(resumed)
     assert states(resumed) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
 
-    def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
-        done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
-        return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
-
     assert values(resumed) == values(through)
     assert not (tmp_path / "broken" / "trial-0003").exists()
 
 
-def test_trials_are_pruned_after_the_warm_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rewards, watched = {3: 1.0, 2: 0.5, 4: 2.0}, {}
-
-    def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
-        for update in range(1, given.ppo.updates + 1):
-            watched[given.ppo.epochs] = update
-            if watch(update, {"episode/reward": rewards[given.ppo.epochs]}):
-                break
-        return Path(given.run)
-
-    monkeypatch.setattr(search, "train", played)
-    given = small(tmp_path, stage="single", warm_up=6, startup_trials=1, period=2)
-    given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
-    trials = Trials(given, QUIET)
-    search.run_trials(trials)
-    assert watched == {3: 10, 2: 6, 4: 10}
-    assert states(trials) == ["COMPLETE", "PRUNED", "COMPLETE"]
-    assert trials.study.best_params == {"ppo.epochs": 4}
-
-
-@pytest.mark.parametrize(("pruner", "updates"), [("asha", {3: 10, 2: 2, 4: 10}), ("none", {3: 10, 2: 10, 4: 10})])
-def test_asha_prunes_from_the_first_trial_on_and_none_never(
-    pruner: Literal["asha", "none"], updates: dict[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("changes", "updates"),
+    [
+        ({"warm_up": 6, "startup_trials": 1}, {3: 10, 2: 6, 4: 10}),
+        # ASHA keeps the best of the trials that have reached an update, from the first trial on.
+        ({"warm_up": 2, "pruner": "asha"}, {3: 10, 2: 2, 4: 10}),
+        ({"warm_up": 2, "pruner": "none"}, {3: 10, 2: 10, 4: 10}),
+    ],
+)
+def test_trials_that_fall_behind_are_pruned(
+    changes: dict[str, Any], updates: dict[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """ASHA keeps the best of the trials that have reached an update, from the first trial on."""
     rewards, watched = {3: 1.0, 2: 0.5, 4: 2.0}, {}
 
     def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
@@ -218,10 +205,13 @@ def test_asha_prunes_from_the_first_trial_on_and_none_never(
                 break
 
     monkeypatch.setattr(search, "train", played)
-    given = small(tmp_path, stage="single", warm_up=2, period=2, pruner=pruner)
+    given = small(tmp_path, stage="single", period=2, **changes)
     given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
-    search.run_trials(Trials(given, QUIET))
+    trials = Trials(given, QUIET)
+    search.run_trials(trials)
     assert watched == updates
+    assert states(trials) == ["COMPLETE", "PRUNED" if updates[2] < 10 else "COMPLETE", "COMPLETE"]
+    assert trials.study.best_params == {"ppo.epochs": 4}
 
 
 def killed_once(trials: Trials, share: search_workers.Share | None) -> None:
@@ -259,10 +249,6 @@ def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -
     search_workers.run_workers(shared, killed_once)
     assert states(shared) == ["FAIL", "COMPLETE", "COMPLETE", "COMPLETE"]
     assert [file.name for file in (tmp_path / "shared/locks").iterdir()] == ["study"]
-
-    def values(trials: Trials) -> dict[int, tuple[float | None, dict[int, float]]]:
-        done = [trial for trial in trials.study.trials if trial.state.name == "COMPLETE"]
-        return {trial.params["ppo.epochs"]: (trial.value, trial.intermediate_values) for trial in done}
 
     assert values(shared) == values(through)
     # The rows up to the checkpoint are those of the killed process, with its times.
@@ -358,35 +344,6 @@ def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) 
     left = Trials(given, QUIET)
     assert states(left) == ["FAIL", "FAIL", "WAITING"]
     assert left.remaining() == (0, 3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--env NoSuch-v0", "id must be one of .*, got 'NoSuch-v0'"),
-        ("--parameters ppo.gamma", "--parameters for gru must be among ppo.epochs, "),
-        ("--percentile 0", "--percentile must be greater than 0 and at most 100, got 0.0"),
-        ("--run mine", "--run and --resume are not supported: the search names its runs; use --folder"),
-        ("--time-limit 3", "--time-limit and --target-reward are not supported: "),
-        ("--ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
-        ("--trials -1", "--trials must be 0 or more, got -1"),
-        ("--period 0", "--period must be 1 or more, got 0"),
-        ("--workers -1", "--workers must be 0 or more, got -1"),
-        ("--trial-cpus 0", "--trial-cpus must be 1 or more, got 0"),
-        ("--ray", "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"),
-    ],
-)
-def test_errors_are_one_line(
-    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)  # of Ray
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["endless-search", *arguments.split()])
-    assert search.main() == 1
-    error = capsys.readouterr().err
-    assert re.match(f"endless-search: {message}", error)
-    assert error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_command_line_includes_the_training_flags() -> None:

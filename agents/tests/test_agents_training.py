@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -28,7 +27,7 @@ from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.ppo import learn, make_optimizer
 from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.settings import PRESETS, Settings
-from endless_gym_agents.train import check_resumable, choose_device, main, parse, restore_generator, train
+from endless_gym_agents.train import check_resumable, choose_device, parse, restore_generator, train
 
 GRID = "MortarMayhem-Grid-v0"
 
@@ -316,41 +315,6 @@ def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: P
                     ended += [float(info["final_info"]["reward"][env]) for env in np.flatnonzero(reset_mask[group])]
             assert sorted(episode["reward"] for episode in episodes) == sorted(ended)
         assert segment.done.any()
-
-
-def test_evaluation_plays_each_seed_equally_often(tmp_path: Path) -> None:
-    agent = checkpoint.load(train(small("gru", tmp_path / "run", 1))).agent
-    results = evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
-    assert [result["seed"] for result in results] == list(range(200_000, 200_007)) * 3
-    assert all(result["length"] > 0 for result in results)
-    assert mean(results) == pytest.approx(sum(result["reward"] for result in results) / 21)
-    # Sampling differs between the repetitions of a seed, and is reproducible with the same `action_seed`.
-    assert results == evaluate(agent, range(200_000, 200_007), 3, num_threads=1)
-    assert results != evaluate(agent, range(200_000, 200_007), 3, num_threads=1, action_seed=1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--env NoSuch-v0", "id must be one of .*, got 'NoSuch-v0'"),
-        (f"--env {GRID} --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
-        (f"--env {GRID} --ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
-        ("--resume nowhere", "no run in nowhere; expected a folder with settings.json"),
-        (f"--env {GRID} --environment.option command_count=[1] colour=1", "colour"),
-        (f"--env {GRID} --environment.option colour=1 --environment.engine process", "colour"),
-    ],
-)
-def test_errors_are_one_line(
-    arguments: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["endless-train", *arguments.split()])
-    assert main() == 1
-    error = capsys.readouterr().err
-    assert error.startswith("endless-train: ")
-    assert re.search(message, error)
-    assert error.count("\n") == 1
-    assert not list(tmp_path.rglob("settings.json")), "the folder can be used again"
 
 
 def test_resumed_run_keeps_its_settings(tmp_path: Path) -> None:

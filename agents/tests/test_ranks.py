@@ -30,24 +30,10 @@ ARGUMENTS = " ".join(
         "--transformer.window 8 --transformer.sequence-length 8 --model.vector-width 16 --model.head-width 16",
     )
 ).split()
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+Start = Callable[..., subprocess.Popen[str]]
 #: Updates of a run that does not end by itself.
 ENDLESS = ["--ppo.updates", "100000"]
-
-
-def start(run: Path, ranks: int, *arguments: str, restarts: int = 0) -> subprocess.Popen[str]:
-    """Start a run of several ranks. What it prints is beside its folder, in a file."""
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
-    module = [f"--max-restarts={restarts}", "-m", "endless_gym_agents.train", "--"]
-    run.parent.mkdir(parents=True, exist_ok=True)
-    with log(run).open("w") as output:
-        return subprocess.Popen(
-            [*torchrun, *module, *ARGUMENTS, *arguments, "--run", str(run)],
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "TERM": "dumb", "COLUMNS": "200"},
-            start_new_session=True,
-        )
 
 
 def log(run: Path) -> Path:
@@ -90,10 +76,26 @@ def ranks_of(process: subprocess.Popen[str]) -> dict[int, int]:
 
 
 @pytest.fixture
-def stopped() -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes that are killed after the test, with their children."""
-    processes: list[subprocess.Popen[str]] = []
-    yield processes
+def start() -> Iterator[Start]:
+    """Starts a run of several ranks; what it prints is beside its folder, in a file. After the test it is killed."""
+    processes = []
+
+    def start(run: Path, ranks: int, *arguments: str, restarts: int = 0) -> subprocess.Popen[str]:
+        module = [f"--nproc-per-node={ranks}", f"--max-restarts={restarts}", "-m", "endless_gym_agents.train", "--"]
+        run.parent.mkdir(parents=True, exist_ok=True)
+        with log(run).open("w") as output:
+            process = subprocess.Popen(
+                [*TORCHRUN, *module, *ARGUMENTS, *arguments, "--run", str(run)],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                text=True,
+                env=os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "TERM": "dumb", "COLUMNS": "200"},
+                start_new_session=True,
+            )
+        processes.append(process)
+        return process
+
+    yield start
     for process in processes:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -110,7 +112,9 @@ def stopped() -> Iterator[list[subprocess.Popen[str]]]:
         ("trxl", 2, "--environment.num-envs 2 --environment.groups 1 --transformer.sequence-length 16"),
     ],
 )
-def test_ranks_compute_what_one_process_computes(tmp_path: Path, agent: str, ranks: int, arguments: str) -> None:
+def test_ranks_compute_what_one_process_computes(
+    tmp_path: Path, agent: str, ranks: int, arguments: str, start: Start
+) -> None:
     given = ["--agent", agent, *arguments.split()]
     alone = train(parse([*ARGUMENTS, *given, "--run", str(tmp_path / "one")]))
     together = finished(start(tmp_path / "several", ranks, *given), tmp_path / "several")
@@ -128,14 +132,12 @@ def test_ranks_compute_what_one_process_computes(tmp_path: Path, agent: str, ran
 
 @pytest.mark.slow
 def test_a_killed_rank_ends_the_run_which_starts_again(
-    tmp_path: Path, segments: Callable[[], set[str]], stopped: list[subprocess.Popen[str]]
+    tmp_path: Path, segments: Callable[[], set[str]], start: Start
 ) -> None:
     run, engines = tmp_path / "run", ("--agent", "gru", "--environment.engine", "process")
     undisturbed = start(tmp_path / "undisturbed", 2, *engines, "--ppo.updates", "12")
-    stopped.append(undisturbed)
     finished(undisturbed, tmp_path / "undisturbed")
     process = start(run, 2, *engines, "--ppo.updates", "12", restarts=1)
-    stopped.append(process)
     wait_until(lambda: len(rows(run)) >= 2, process, run)
     os.kill(ranks_of(process)[1], signal.SIGKILL)
     finished(process, run)
@@ -148,12 +150,9 @@ def test_a_killed_rank_ends_the_run_which_starts_again(
 
 
 @pytest.mark.slow
-def test_all_ranks_end_within_seconds_of_one(
-    tmp_path: Path, segments: Callable[[], set[str]], stopped: list[subprocess.Popen[str]]
-) -> None:
+def test_all_ranks_end_within_seconds_of_one(tmp_path: Path, segments: Callable[[], set[str]], start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "none", "--environment.engine", "process", *ENDLESS)
-    stopped.append(process)
     wait_until(lambda: len(rows(run)) >= 1, process, run)
     ranks = ranks_of(process)
     os.kill(ranks[0], signal.SIGKILL)
@@ -166,12 +165,9 @@ def test_all_ranks_end_within_seconds_of_one(
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(
-    tmp_path: Path, stopped: list[subprocess.Popen[str]]
-) -> None:
+def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(tmp_path: Path, start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "trxl", *ENDLESS)
-    stopped.append(process)
     wait_until(lambda: len(rows(run)) >= 2, process, run)
     # As Ctrl-C in a terminal does, which torchrun then passes on.
     os.killpg(process.pid, signal.SIGINT)
@@ -183,10 +179,8 @@ def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(
     # Exactly, with the same ranks: two more updates are those of a run that was not interrupted.
     more = ["--ppo.updates", str(done + 2)]
     undisturbed = start(tmp_path / "undisturbed", 2, "--agent", "trxl", *more)
-    stopped.append(undisturbed)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    resume = ["-m", "endless_gym_agents.train", "--", "--resume", str(run), *more]
-    subprocess.run(command + resume, check=True, timeout=250, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    resume = ["--nproc-per-node=2", "-m", "endless_gym_agents.train", "--", "--resume", str(run), *more]
+    subprocess.run([*TORCHRUN, *resume], check=True, timeout=250, env=os.environ | {"OMP_NUM_THREADS": "1"})
     finished(undisturbed, tmp_path / "undisturbed")
     for name, weights in last(tmp_path / "undisturbed")["model"].items():
         assert torch.equal(last(run)["model"][name], weights), name
@@ -212,10 +206,8 @@ names = [file.read_text() for file in Path("/proc/self/task").glob("*/comm")]
 assert not any("gloo" in name for name in names), names
 """
     )
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", program]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=250, env=os.environ | {"OMP_NUM_THREADS": "1"}
-    )
+    command, environment = [*TORCHRUN, "--nproc-per-node=2", program], os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=250, env=environment)
     assert done.returncode == 0, done.stderr
     assert len(rows(tmp_path / "run")) == 3
 

@@ -1,0 +1,99 @@
+"""Errors of the user are one line on standard error, with exit status 1, and leave no file."""
+
+import importlib.util
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from endless_gym_agents import enjoy, plot, protocol, reproduce, search, train
+
+GRID = "--env MortarMayhem-Grid-v0"
+NO_RAY = "--ray needs Ray Tune, but ray is not installed: pip install 'ray\\[tune\\]'"
+PROGRAMS = {
+    "endless-train": train.main,
+    "endless-eval": protocol.main,
+    "endless-enjoy": enjoy.main,
+    "endless-plot": plot.main,
+    "endless-search": search.main,
+    "endless-reproduce": reproduce.main,
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("endless-train --env NoSuch-v0", "id must be one of .*, got 'NoSuch-v0'"),
+        (f"endless-train {GRID} --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
+        (f"endless-train {GRID} --ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
+        ("endless-train --resume nowhere", "no run in nowhere; expected a folder with settings.json"),
+        (f"endless-train {GRID} --environment.option command_count=[1] colour=1", ".*colour"),
+        (f"endless-train {GRID} --environment.option colour=1 --environment.engine process", ".*colour"),
+        ("endless-eval", "no path given; expected checkpoint files"),
+        ("endless-eval nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
+        ("endless-eval .", "no checkpoint in .; expected the folder of a run"),
+        ("endless-eval text.pt", "text.pt is not a checkpoint of this version of endless-train"),
+        ("endless-eval text.pt --seeds 0", "--seeds and --repetitions must be 1 or more, got 0 and 3"),
+        ("endless-eval text.pt --json none/results.json", "cannot write none/results.json: no folder none"),
+        ("endless-eval text.pt --device nonsense", "--device must be auto, cpu, cuda or cuda:INDEX, got `nonsense`"),
+        ("endless-enjoy nowhere", "no checkpoint nowhere"),
+        ("endless-enjoy nowhere --out video.avi", "--out must end in .gif, .webp or .mp4, got `video.avi`"),
+        ("endless-enjoy nowhere --out none/video.gif", "cannot write none/video.gif: no folder none"),
+        (
+            "endless-enjoy nowhere --out video.mp4",
+            "an .mp4 needs ffmpeg, which is not installed: pip install imageio-ffmpeg",
+        ),
+        ("endless-enjoy nowhere --seeds", "--seeds must contain at least one seed, got none"),
+        ("endless-plot nowhere.json", "no such file or folder: nowhere.json"),
+        ("endless-plot text.json", "text.json is not a file of `endless-eval --json`"),
+        ("endless-plot .", "no progress.jsonl in .; expected the folder of a run"),
+        ("endless-plot --env NoSuch-v0", "no curves of environment `NoSuch-v0`; the paper has curves of "),
+        (
+            "endless-plot one.json --aggregate finite",
+            "gru: the finite plot needs evaluations in all of MortarMayhem-v0, ",
+        ),
+        ("endless-search --env NoSuch-v0", "id must be one of .*, got 'NoSuch-v0'"),
+        ("endless-search --parameters ppo.gamma", "--parameters for gru must be among ppo.epochs, "),
+        ("endless-search --percentile 0", "--percentile must be greater than 0 and at most 100, got 0.0"),
+        ("endless-search --run mine", "--run and --resume are not supported: the search names its runs; use --folder"),
+        ("endless-search --time-limit 3", "--time-limit and --target-reward are not supported: "),
+        ("endless-search --ppo.epochs 0", "--ppo.epochs must be 1 or more, got 0"),
+        ("endless-search --trials -1", "--trials must be 0 or more, got -1"),
+        ("endless-search --period 0", "--period must be 1 or more, got 0"),
+        ("endless-search --workers -1", "--workers must be 0 or more, got -1"),
+        ("endless-search --trial-cpus 0", "--trial-cpus must be 1 or more, got 0"),
+        ("endless-search --ray", NO_RAY),
+        ("endless-reproduce", "no experiment given; `endless-reproduce --list` lists them"),
+        ("endless-reproduce nope", "experiment must be one of finite, .*; got `nope`"),
+        ("endless-reproduce nope.json", "no such file: nope.json"),
+        ("endless-reproduce finite --scale 2", "--scale must be greater than 0 and at most 1, or tiny; got `2`"),
+        ("endless-reproduce finite --scale small", "--scale must be .* got `small`"),
+        ("endless-reproduce finite --nice 20 --status", "--nice must be 0 to 19, got 20"),
+        ("endless-reproduce finite --jobs -1 --status", "--jobs must be 0 or more, got -1"),
+        ("endless-reproduce endless --ray", NO_RAY),
+        ("endless-reproduce endless --ray auto --job-cpus 0", "--job-cpus must be 1 or more, got 0"),
+        ("endless-reproduce endless --ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
+    ],
+)
+def test_an_error_is_one_line(
+    command: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text.pt").write_text("not a checkpoint\n")
+    (tmp_path / "text.json").write_text("{}")
+    run = {"run": "a", "seed": 1, "steps": [10], "metrics": {"task_progress": [0.5]}}
+    experiment = {"env": "MysteryPath-v0", "label": "gru", "options": {}, "runs": [run]}
+    (tmp_path / "one.json").write_text(json.dumps({"experiments": [experiment]}))
+    if "--ray" in command:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", str(tmp_path))  # without ffmpeg
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", command.split())
+    program = command.split()[0]
+    assert PROGRAMS[program]() == 1
+    error = capsys.readouterr().err
+    assert re.match(f"{program}: {message}", error), error
+    assert error.count("\n") == 1
+    assert {file.name for file in tmp_path.rglob("*") if file.is_file()} == {"text.pt", "text.json", "one.json"}
