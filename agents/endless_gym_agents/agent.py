@@ -38,7 +38,7 @@ from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
 from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
 from endless_gym_agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
-from endless_gym_agents.heads import GroundTruthHead, PolicyHead, ReconstructionHead, ValueHead
+from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
 from endless_gym_agents.recurrent import RecurrentMemory
 from endless_gym_agents.settings import Settings
@@ -77,17 +77,13 @@ class AgentMemory:
     def state_dict(self) -> dict[str, Any]:
         """Everything as tensors and numbers by name, for a checkpoint."""
         # The keys are those of the checkpoint format.
-        return {
-            "first": self.reset_mask,
-            "observer": self.transform_state.tensors,
-            "state": self.state.state_dict(),
-        }
+        return {"first": self.reset_mask, "observer": self.transform_state, "state": self.state.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Load what `state_dict` returned, for the same number of environments; tensors are moved to this memory's device."""
         device = self.reset_mask.device
         self.reset_mask = state_dict["first"].to(device)
-        self.transform_state.tensors = {name: tensor.to(device) for name, tensor in state_dict["observer"].items()}
+        self.transform_state = {name: tensor.to(device) for name, tensor in state_dict["observer"].items()}
         self.state.load_state_dict(state_dict["state"])
 
 
@@ -195,7 +191,7 @@ class Agent(nn.Module):
         width = settings.model.body_width or (self.memory.width if has_memory else settings.recurrence.hidden_size)
         self.body = nn.Sequential(orthogonal(nn.Linear(self.memory.width, width)), nn.ReLU())
         self.policy = PolicyHead(width, settings.model.head_width, branches)
-        self.value = ValueHead(width, settings.model.head_width, settings.model.value_gain)
+        self.value = Perceptron(width, settings.model.head_width, 1, settings.model.value_gain)
         self.reconstruction: ReconstructionHead | None = None
         if settings.ppo.reconstruction_coefficient:
             if FRAME not in shapes:
@@ -204,14 +200,14 @@ class Agent(nn.Module):
                     f"{', '.join(shapes)}; use --environment.observation rgb or the coefficient 0"
                 )
             self.reconstruction = ReconstructionHead(self.memory.width, self.transform.shapes[FRAME][-1])
-        self.ground_truth: GroundTruthHead | None = None
+        self.ground_truth: Perceptron | None = None
         if settings.ppo.ground_truth_coefficient:
             if not ground_truth:
                 raise ValueError(
                     f"--ppo.ground-truth-coefficient needs a ground truth, and {settings.env} has none; "
                     "use an endless environment or the coefficient 0"
                 )
-            self.ground_truth = GroundTruthHead(self.memory.width, settings.model.head_width, ground_truth)
+            self.ground_truth = Perceptron(self.memory.width, settings.model.head_width, ground_truth)
         self._weights: ActingWeights | None = None
         self._watched: list[nn.Parameter] = []
         self.to(self.device)
@@ -224,17 +220,9 @@ class Agent(nn.Module):
 
     def compile_parts(self) -> None:
         """Compile, with `torch.compile`, the submodules whose input shapes are constant or nearly so; on CUDA as CUDA graphs."""
-        parts: list[nn.Module | None] = [
-            self.encoder,
-            self.body,
-            self.policy,
-            self.value,
-            self.reconstruction,
-            self.ground_truth,
-        ]
-        if isinstance(self.memory, TransformerMemory):
-            parts += [*self.memory.blocks]
-        for part in parts:
+        blocks = self.memory.blocks if isinstance(self.memory, TransformerMemory) else []
+        heads = (self.policy, self.value, self.reconstruction, self.ground_truth)
+        for part in (self.encoder, self.body, *heads, *blocks):
             if part is not None:
                 part.compile(mode="reduce-overhead" if self.device.type == "cuda" else None)
 
@@ -262,19 +250,19 @@ class Agent(nn.Module):
         Raises:
             ValueError: The observation is not of the kind that the agent was trained on.
         """
-        observed, transform_update = self.observe(self.to_tensors(observation), memory)
+        observed, transform_state = self.observe(self.to_tensors(observation), memory)
         noise = None if greedy else self.noise((len(memory.reset_mask),), generator)
         decision = self.decide(observed, memory, noise)
-        self.remember(memory, decision, transform_update)
+        self.remember(memory, decision, transform_state)
         weights = self.acting_weights()
         log_prob = weights.log_prob(decision.outputs, decision.action)
         return ActOutput(decision.action, log_prob, decision.outputs[:, -1], observed)
 
-    def observe(self, observation: Observation, memory: AgentMemory) -> tuple[Observation, dict[str, Tensor]]:
+    def observe(self, observation: Observation, memory: AgentMemory) -> tuple[Observation, TransformState]:
         """Transform an observation of n environments, tensors on the agent's device, without updating the memory.
 
         Returns:
-            The observation that the network takes, and the update of the transform for `remember`.
+            The observation that the network takes, and the transform's state after it, for `remember`.
         """
         return self.transform.apply(observation, memory.transform_state, memory.reset_mask)
 
@@ -307,11 +295,11 @@ class Agent(nn.Module):
         return Decision(action, outputs, memory_update)
 
     @torch.no_grad()
-    def remember(self, memory: AgentMemory, decision: Decision, transform_update: dict[str, Tensor]) -> None:
+    def remember(self, memory: AgentMemory, decision: Decision, transform_state: TransformState) -> None:
         """Update the memory after `decide`; the next observation continues the episodes until `AgentMemory.reset`."""
         with self.autocast():
             self.memory.update_state(memory.state, decision.memory_update)
-        self.transform.update_state(memory.transform_state, transform_update)
+        memory.transform_state = transform_state
         memory.reset_mask = memory.no_reset
 
     @torch.no_grad()
@@ -361,7 +349,7 @@ class Agent(nn.Module):
             embedded = self.memory.embed(self.encoder(observation))
             memory_output = self.memory(embedded if rows is None else embedded.index_select(0, rows), minibatch)
             hidden = self.body(memory_output)
-            logits, value = self.policy(hidden), self.value(hidden)
+            logits, value = self.policy(hidden), self.value(hidden).squeeze(-1)
             frame = self.reconstruction(memory_output) if self.reconstruction is not None else None
             truth = self.ground_truth(memory_output) if self.ground_truth is not None else None
         return AgentOutput([branch.log_softmax(-1) for branch in logits], value, frame, truth)

@@ -8,7 +8,7 @@ checkpoint.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym_agents import metrics
+from endless_gym_agents.checkpoint import read_settings
 from endless_gym_agents.logs import PROGRESS, read_progress
 from endless_gym_agents.results import Experiment, label
-from endless_gym_agents.settings import from_dict
 from endless_gym_agents.statistics import interquartile_mean, stratified_bootstrap
 
 Floats = NDArray[np.float64]
@@ -126,7 +126,7 @@ def training(run: Path) -> Curve:
         raise FileNotFoundError(
             f"no {PROGRESS} in {run}; expected the folder of a run, or a file of `endless-eval --json`"
         )
-    settings = from_dict(json.loads((run / "settings.json").read_text()))
+    settings = read_settings(run)
     rows = [row for row in read_progress(run) if row.get("episode/reward") is not None]
     if not rows:
         raise ValueError(f"no episode of the run {run} has ended yet; train longer")
@@ -171,15 +171,12 @@ def aggregate(family: Family, curves: Sequence[Curve]) -> list[Curve]:
     aggregated = []
     for (source, name), own in found.items():
         if _WITH_RECONSTRUCTION not in own and (source, f"{name}_rec") in found:
-            own = _with_reconstruction(own, found[source, f"{name}_rec"])
+            # The curve with reconstruction in the environment where the paper uses it.
+            others = found[source, f"{name}_rec"].items()
+            own = own | {env: curve for env, curve in others if env == _WITH_RECONSTRUCTION}
         if set(own) == set(FAMILIES[family]):
             aggregated.append(_aggregate_one(family, name, [own[env] for env in FAMILIES[family]]))
     return aggregated
-
-
-def _with_reconstruction(own: Mapping[str, Curve], others: Mapping[str, Curve]) -> dict[str, Curve]:
-    """Add the curve with reconstruction in the environment where the paper uses it."""
-    return {**own, **{env: curve for env, curve in others.items() if env == _WITH_RECONSTRUCTION}}
 
 
 def _aggregate_one(family: str, name: str, curves: Sequence[Curve]) -> Curve:

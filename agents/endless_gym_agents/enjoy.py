@@ -23,7 +23,7 @@ from endless_gym.create import make_vec
 from endless_gym.specs import ObservationName, spec
 from endless_gym.vector import EndlessVectorEnv
 from endless_gym_agents import command, video
-from endless_gym_agents.agent import Agent, observation_shapes
+from endless_gym_agents.agent import Agent
 from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
 from endless_gym_agents.train import choose_device
@@ -86,7 +86,6 @@ class EpisodeRecorder:
     def _episode(self, envs: EndlessVectorEnv, seed: int, generator: torch.Generator) -> Iterator[video.Frame]:
         settings, memory = self.agent.settings, self.agent.initial_memory(1)
         env_spec = spec(settings.env)
-        keys = observation_shapes(env_spec, settings.environment.observation)
         observation, _ = envs.reset(seed=[seed])
         reward, length, done = 0.0, 0, False
         self.rewards.append(0.0)
@@ -94,11 +93,7 @@ class EpisodeRecorder:
         frame = self._frame(envs, observation, f"{settings.env}  seed {seed}  step 0")
         yield frame
         while not done and not (self.max_steps and length >= self.max_steps):
-            single = next(iter(keys))
-            observed = (
-                {key: observation[key] for key in keys} if isinstance(observation, dict) else {single: observation}
-            )
-            action = self.agent.act(observed, memory, generator, self.greedy).action.cpu().numpy()
+            action = self.agent.act(observation, memory, generator, self.greedy).action.cpu().numpy()
             observation, rewards, terminated, truncated, _ = envs.step(env_spec.batched_actions(action))
             reward, length = reward + float(rewards[0]), length + 1
             done = bool(terminated[0] or truncated[0])

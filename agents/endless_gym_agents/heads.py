@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from torch import Tensor, nn
@@ -31,20 +32,20 @@ class PolicyHead(nn.Module):
         return [branch(x).float() for branch in self.branches]
 
 
-class ValueHead(nn.Module):
-    """The state value: an estimate of the discounted return."""
+class Perceptron(nn.Module):
+    """Two fully connected layers: the state value, or an estimate of `info["ground_truth"]`."""
 
-    def __init__(self, input_width: int, width: int, gain: float) -> None:
+    def __init__(self, input_width: int, width: int, outputs: int, gain: float = math.sqrt(2)) -> None:
         """Make the head with `width` hidden units; `gain` scales the initial weights of the output layer."""
         super().__init__()
         self.layers = nn.Sequential(
-            orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, 1), gain)
+            orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, outputs), gain)
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """The values, float32 (n,), for inputs float (n, input width)."""
-        value: Tensor = self.layers(x).squeeze(-1)
-        return value.float()
+        """float32 (n, outputs), for inputs float (n, input width)."""
+        outputs: Tensor = self.layers(x)
+        return outputs.float()
 
 
 class ReconstructionHead(nn.Module):
@@ -64,19 +65,3 @@ class ReconstructionHead(nn.Module):
         """The logits of the frame, float32 (n, channels, 84, 84), for inputs float (n, input width)."""
         logits: Tensor = self.layers(x)
         return logits.float()
-
-
-class GroundTruthHead(nn.Module):
-    """Estimates `info["ground_truth"]`."""
-
-    def __init__(self, input_width: int, width: int, entries: int) -> None:
-        """Make the head with `width` hidden units for a ground truth of `entries` numbers."""
-        super().__init__()
-        self.layers = nn.Sequential(
-            orthogonal(nn.Linear(input_width, width)), nn.ReLU(), orthogonal(nn.Linear(width, entries))
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The estimates, float32 (n, entries), for inputs float (n, input width)."""
-        estimate: Tensor = self.layers(x)
-        return estimate.float()

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 import secrets
-from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -104,30 +103,10 @@ class SilentLogger(Logger):
         pass
 
 
-class Episodes:
-    """The final infos of the last 100 episodes.
-
-    Attributes:
-        recent: The infos, oldest first.
-    """
-
-    def __init__(self, infos: Iterable[dict[str, float]] = ()) -> None:
-        """Start with the infos of earlier episodes."""
-        self.recent: deque[dict[str, float]] = deque(infos, maxlen=RECENT)
-
-    def add(self, infos: Iterable[dict[str, float]]) -> None:
-        """Append the infos of more episodes."""
-        self.recent.extend(infos)
-
-    def is_full(self) -> bool:
-        """Whether 100 episodes have ended."""
-        return len(self.recent) == RECENT
-
-    def means(self) -> dict[str, float]:
-        """Mean of each entry under the key `episode/NAME`; empty if no episode has ended."""
-        if not self.recent:
-            return {}
-        return {f"episode/{key}": sum(info[key] for info in self.recent) / len(self.recent) for key in self.recent[0]}
+def means(episodes: Collection[dict[str, float]]) -> dict[str, float]:
+    """Mean of each final info of the episodes under the key `episode/NAME`; empty without episodes."""
+    names = next(iter(episodes), {})
+    return {f"episode/{name}": sum(infos[name] for infos in episodes) / len(episodes) for name in names}
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:

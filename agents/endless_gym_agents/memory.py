@@ -14,9 +14,9 @@ With the same weights both give the same outputs.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeAlias, TypeVar, overload
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -37,14 +37,13 @@ class Minibatch:
     everywhere: Tensor
 
 
-class MemoryState(ABC):
-    """The state of n environments between two steps."""
+class MemoryState:
+    """The state of n environments between two steps; that of `NoMemory` is empty."""
 
-    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """The state as tensors and numbers by name, for a checkpoint."""
+        return {}
 
-    @abstractmethod
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Load what `state_dict` returned; tensors are moved to this state's device."""
 
@@ -52,6 +51,20 @@ class MemoryState(ABC):
 StateT = TypeVar("StateT", bound=MemoryState)
 UpdateT = TypeVar("UpdateT")
 MinibatchT = TypeVar("MinibatchT", bound=Minibatch)
+
+
+class Minibatches(Generic[MinibatchT]):
+    """Minibatches that are made when they are needed, so that the memory of one is used at a time."""
+
+    def __init__(self, parts: Sequence[Tensor], make: Callable[[Tensor], MinibatchT]) -> None:
+        """Make the minibatches; minibatch i is `make(parts[i])`."""
+        self._parts, self._make = parts, make
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __iter__(self) -> Iterator[MinibatchT]:
+        return map(self._make, self._parts)
 
 
 class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
@@ -107,7 +120,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         generator: torch.Generator,
         own: range | None = None,
         epochs: int = 1,
-    ) -> Sequence[MinibatchT]:
+    ) -> Minibatches[MinibatchT]:
         """Shuffle a recorded segment and divide it into minibatches, of which every rank has the same number.
 
         Args:
@@ -165,39 +178,7 @@ def is_own(envs: Tensor, own: range) -> Tensor:
     return (envs >= own.start) & (envs < own.stop)
 
 
-class LazyMinibatches(Sequence[MinibatchT]):
-    """Minibatches that are made when they are needed, so that the memory of one is used at a time."""
-
-    def __init__(self, parts: Sequence[Tensor], make: Callable[[Tensor], MinibatchT]) -> None:
-        """Make the sequence; minibatch i is `make(parts[i])`."""
-        self._parts, self._make = parts, make
-
-    def __len__(self) -> int:
-        return len(self._parts)
-
-    @overload
-    def __getitem__(self, index: int) -> MinibatchT: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[MinibatchT]: ...
-
-    def __getitem__(self, index: int | slice) -> MinibatchT | Sequence[MinibatchT]:
-        if isinstance(index, slice):
-            return LazyMinibatches(self._parts[index], self._make)
-        return self._make(self._parts[index])
-
-
-class NoState(MemoryState):
-    """The empty state of `NoMemory`."""
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        del state_dict
-
-
-class NoMemory(Memory[NoState, None, Minibatch]):
+class NoMemory(Memory[MemoryState, None, Minibatch]):
     """The identity: the output is the encoding of the current observation."""
 
     def __init__(self, input_width: int, device: torch.device) -> None:
@@ -206,29 +187,29 @@ class NoMemory(Memory[NoState, None, Minibatch]):
         self.width, self.embedding = input_width, None
         self.device = device
 
-    def initial_state(self, num_envs: int) -> NoState:
+    def initial_state(self, num_envs: int) -> MemoryState:
         del num_envs
-        return NoState()
+        return MemoryState()
 
-    def begin_segment(self, state: NoState, steps: int) -> None:
+    def begin_segment(self, state: MemoryState, steps: int) -> None:
         del state, steps
 
-    def step(self, x: Tensor, state: NoState, reset_mask: Tensor | None) -> tuple[Tensor, None]:
+    def step(self, x: Tensor, state: MemoryState, reset_mask: Tensor | None) -> tuple[Tensor, None]:
         del state, reset_mask
         return x, None
 
-    def update_state(self, state: NoState, update: None) -> None:
+    def update_state(self, state: MemoryState, update: None) -> None:
         del state, update
 
     def minibatches(
         self,
-        states: Sequence[NoState],
+        states: Sequence[MemoryState],
         reset_mask: Tensor,
         num_minibatches: int,
         generator: torch.Generator,
         own: range | None = None,
         epochs: int = 1,
-    ) -> Sequence[Minibatch]:
+    ) -> Minibatches[Minibatch]:
         del states
         envs = reset_mask.shape[1]
         own = range(envs) if own is None else own
@@ -242,7 +223,7 @@ class NoMemory(Memory[NoState, None, Minibatch]):
 
         permutations = [torch.randperm(reset_mask.numel(), generator=generator) for _ in range(epochs)]
         parts = [part for permutation in permutations for part in permutation.chunk(num_minibatches)]
-        return LazyMinibatches(parts, minibatch)
+        return Minibatches(parts, minibatch)
 
     def forward(self, x: Tensor, minibatch: Minibatch) -> Tensor:
         del minibatch

@@ -24,7 +24,7 @@ from endless_gym.recording import record
 from endless_gym.recording.players import Actor
 from endless_gym.specs import ObservationName, spec
 from endless_gym_agents import command
-from endless_gym_agents.agent import Agent, observation_shapes
+from endless_gym_agents.agent import Agent
 from endless_gym_agents.train import choose_device
 
 
@@ -85,15 +85,13 @@ class AgentPlayer:
         agent, memory = self._agent, self._agent.initial_memory(num_envs)
         state = np.random.SeedSequence([self._action_seed, first_episode]).generate_state(1, np.uint64)
         generator = torch.Generator(agent.device).manual_seed(int(state[0] >> 1))
-        keys = observation_shapes(self._spec, agent.settings.environment.observation)
 
         def act(
             observation: Mapping[str, NDArray[Any]], episode_start: NDArray[np.bool_], active: NDArray[np.bool_]
         ) -> NDArray[np.int64]:
             del active
             memory.reset(episode_start)
-            observed = {key: observation[key] for key in keys}
-            action = agent.act(observed, memory, generator, self._greedy).action
+            action = agent.act(observation, memory, generator, self._greedy).action
             return self._spec.batched_actions(action.cpu().numpy())
 
         return act

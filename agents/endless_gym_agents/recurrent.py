@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from endless_gym_agents.encoders import orthogonal
-from endless_gym_agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
+from endless_gym_agents.memory import Memory, MemoryState, Minibatch, Minibatches, is_own, shuffled
 from endless_gym_agents.recurrence import packed_layers
 from endless_gym_agents.settings import Recurrence
 
@@ -99,7 +99,6 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
                 nn.init.orthogonal_(parameter, 2**0.5)
             else:
                 nn.init.zeros_(parameter)
-
         self._cells: list[list[Tensor]] = []
 
     def initial_state(self, num_envs: int) -> RecurrentState:
@@ -149,7 +148,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         generator: torch.Generator,
         own: range | None = None,
         epochs: int = 1,
-    ) -> Sequence[RecurrentMinibatch]:
+    ) -> Minibatches[RecurrentMinibatch]:
         length, (steps, envs) = self.settings.sequence_length, reset_mask.shape
         own = range(envs) if own is None else own
         stored = torch.stack(
@@ -178,7 +177,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             everywhere = indices if everywhere is None else everywhere
             return RecurrentMinibatch(indices, everywhere, batch_sizes, hidden)
 
-        return LazyMinibatches(shuffled(lengths.tolist(), num_minibatches, epochs, generator), minibatch)
+        return Minibatches(shuffled(lengths.tolist(), num_minibatches, epochs, generator), minibatch)
 
     def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
         x = x.float()

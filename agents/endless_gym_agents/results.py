@@ -3,35 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from endless_gym_agents import metrics
-from endless_gym_agents.settings import Recurrence, Settings, to_dict
+from endless_gym_agents.settings import Recurrence, Settings
 from endless_gym_agents.statistics import Summary, summarise
-
-#: Settings that may differ between the runs of an experiment: the seed, and settings that do not affect learning.
-_PER_RUN = (
-    "seed",
-    "run",
-    "resume",
-    "device",
-    "threads",
-    "bind_cores",
-    "compile",
-    "checkpoint_interval",
-    "keep_checkpoints",
-    "on_engine_failure",
-    "time_limit",
-    "target_reward",
-    "stop_when_learnt",
-    "wandb",
-    "view",
-)
 
 
 @dataclass
@@ -130,17 +111,14 @@ class Experiments:
 
     def __init__(self) -> None:
         """Start without experiments."""
-        self._found: dict[str, Experiment] = {}
+        self._found: dict[Hashable, Experiment] = {}
 
     def of(self, settings: Settings) -> Experiment:
         """The experiment of a run with these settings; created if it does not exist."""
-        values = {name: value for name, value in to_dict(settings).items() if name not in _PER_RUN}
-        values["preset"] = ""
-        # The engine and its threads do not affect learning.
-        values["environment"] = {**values["environment"], "engine": "", "num_threads": 0}
-        # Runs of different lengths belong to one experiment.
-        values["ppo"] = {name: value for name, value in values["ppo"].items() if name != "updates"}
-        key = json.dumps(values, sort_keys=True)
+        # The engine and its threads do not affect learning, and runs of different lengths belong to one experiment.
+        environment = replace(settings.environment, engine="thread", num_threads=0)
+        networks = (settings.recurrence, settings.transformer, settings.model)
+        key = (settings.env, settings.agent, settings.bf16, environment, networks, replace(settings.ppo, updates=0))
         if key not in self._found:
             name, taken = label(settings), [one.label for one in self.all() if one.env == settings.env]
             number = sum(other == name or other.startswith(f"{name} (") for other in taken)
@@ -172,7 +150,7 @@ def to_json(
         name, _ = metrics.metric(experiment.env)
         values["metric"] = name
         values["summary"] = [
-            {"steps": step, "over": over, **summary.to_dict()} for step, summary, over in experiment.summaries(name)
+            {"steps": step, "over": over, **asdict(summary)} for step, summary, over in experiment.summaries(name)
         ]
         written.append(values)
     return {"protocol": dict(protocol), "experiments": written}

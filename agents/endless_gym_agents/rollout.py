@@ -11,7 +11,7 @@ updated while the environments step; log-probabilities and values are computed f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -24,7 +24,7 @@ from endless_gym_agents.environments import Environments, StepResult
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.repeats import EmbeddedFrames
 from endless_gym_agents.transfers import HostCopy, Outcome, Upload
-from endless_gym_agents.transforms import Identity
+from endless_gym_agents.transforms import Identity, TransformState
 
 
 @dataclass
@@ -58,21 +58,13 @@ class Segment:
     def flat(self) -> Segment:
         """The segment with steps and environments in one dimension, (T * N, ...); step t of environment n has index t * N + n."""
 
-        def flatten(tensor: Tensor) -> Tensor:
-            return tensor.flatten(0, 1)
+        def flatten(part: Any) -> Any:
+            if isinstance(part, dict):
+                return {key: flatten(each) for key, each in part.items()}
+            return None if part is None else part.flatten(0, 1)
 
-        return Segment(
-            observation={key: flatten(part) for key, part in self.observation.items()},
-            reset_mask=flatten(self.reset_mask),
-            action=flatten(self.action),
-            log_prob=flatten(self.log_prob),
-            value=flatten(self.value),
-            reward=flatten(self.reward),
-            done=flatten(self.done),
-            ground_truth=None if self.ground_truth is None else flatten(self.ground_truth),
-            last_value=self.last_value,
-            first_occurrence=None if self.first_occurrence is None else flatten(self.first_occurrence),
-        )
+        parts = {name: flatten(part) for name, part in vars(self).items() if name != "last_value"}
+        return replace(self, **parts)
 
     def distinct(self, indices: Tensor) -> tuple[Observation, Tensor | None]:
         """The observations of steps of a flattened segment; equal ones once, if it is known which are equal.
@@ -225,7 +217,7 @@ class RolloutCollector:
     def _act(self, group: int, step: int, noise: Tensor, clock: Clock) -> None:
         memory, current, part, agent = self.memories[group], self.current[group], self._parts[group], self.agent
         with clock.measure("inference"):
-            slots, update = part.observation[step], dict[str, Tensor]()
+            slots, update = part.observation[step], TransformState()
             if isinstance(agent.transform, Identity):
                 # Straight into the segment, where the network reads it.
                 for key, value in agent.as_mapping(current.observation).items():

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from endless_gym_agents.settings import Settings
+from endless_gym_agents.settings import Settings, value
 
 #: A value of a parameter.
 Choice = str | int | float | bool
@@ -70,15 +70,6 @@ def space(base: Settings, only: Sequence[str] = ()) -> Space:
         for name, listed in choices.items()
         if not names or name in names
     }
-
-
-def value(settings: Settings, name: str) -> Choice:
-    """The value of a parameter in the settings."""
-    found: Any = settings
-    for part in name.split("."):
-        found = getattr(found, part)
-    chosen: Choice = found
-    return chosen
 
 
 def with_choices(settings: Settings, choices: Mapping[str, Choice]) -> Settings:

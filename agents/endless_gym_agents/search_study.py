@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from endless_gym_agents import checkpoint
+from endless_gym_agents.experiments.planning import flags
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.search_space import Choice, Space, single_changes, space, with_choices
 from endless_gym_agents.settings import Settings, to_dict
@@ -124,31 +125,32 @@ class SearchArguments:
         return bool(self.ray) or self.workers > 1
 
 
+@dataclass
 class Trial:
     """A trial that this process has begun, with the lock that says so.
 
     Attributes:
-        number: Number of the trial in the study.
+        trials: The trials of the search.
+        asked: The `optuna.Trial`.
         settings: Settings of its run, validated.
+        lock: The locked file of the trial.
         reward: The last reward that was observed; None before the first episode has ended.
         pruned: Whether it is to be pruned.
+        reported: The last update that was reported.
     """
 
-    def __init__(self, trials: Trials, asked: Any, settings: Settings, lock: IO[str]) -> None:
-        """Make the trial.
+    trials: Trials
+    asked: Any
+    settings: Settings
+    lock: IO[str]
+    reward: float | None = None
+    pruned: bool = False
+    reported: int = 0
 
-        Args:
-            trials: The trials of the search.
-            asked: The `optuna.Trial`.
-            settings: Settings of its run, validated.
-            lock: The locked file of the trial.
-        """
-        self.number: int = asked.number
-        self.settings = settings
-        self.reward: float | None = None
-        self.pruned = False
-        self._trials, self._asked, self._lock = trials, asked, lock
-        self._reported = 0
+    @property
+    def number(self) -> int:
+        """Number of the trial in the study."""
+        return int(self.asked.number)
 
     def observe(self, update: int, reward: float | None) -> bool:
         """Note the mean reward at an update.
@@ -161,19 +163,19 @@ class Trial:
             Whether the trial is to be pruned.
         """
         self.reward = self.reward if reward is None else reward
-        is_due = update % self._trials.arguments.period == 0 and self._reported < update < self.settings.ppo.updates
+        is_due = update % self.trials.arguments.period == 0 and self.reported < update < self.settings.ppo.updates
         if is_due and self.reward is not None:
-            self._asked.report(self.reward, update)
-            self._reported = update
-            self.pruned = self._asked.should_prune()
+            self.asked.report(self.reward, update)
+            self.reported = update
+            self.pruned = self.asked.should_prune()
         return self.pruned
 
     def complete(self) -> None:
         """The run is done, or pruned: tell the study."""
         if self.pruned:
-            self._trials.say(f"trial {self.number} is pruned")
+            self.trials.say(f"trial {self.number} is pruned")
         elif self.reward is None:
-            self._trials.say(f"trial {self.number}: no episode has ended; increase --ppo.updates")
+            self.trials.say(f"trial {self.number}: no episode has ended; increase --ppo.updates")
         done = not self.pruned and self.reward is not None
         self._tell("COMPLETE" if done else "PRUNED", self.reward if done else None)
 
@@ -183,23 +185,23 @@ class Trial:
 
     def postpone(self, reason: str) -> None:
         """The run failed: another trial resumes it, but not in this call of the search, in which it would fail again."""
-        self._trials.say(f"trial {self.number} {reason}")
-        self._trials.postponed.add(self.number)
+        self.trials.say(f"trial {self.number} {reason}")
+        self.trials.postponed.add(self.number)
         self._tell("FAIL")
 
     def fail(self, reason: str) -> None:
         """The run failed in a way that would repeat itself: it is never resumed."""
-        self._trials.say(f"trial {self.number} {reason}")
-        self._asked.set_user_attr(_FAILED, True)
+        self.trials.say(f"trial {self.number} {reason}")
+        self.asked.set_user_attr(_FAILED, True)
         self._tell("FAIL")
 
     def _tell(self, state: str, value: float | None = None) -> None:
         from optuna.trial import TrialState
 
         # The state first: a running trial without a lock has been left by its process.
-        self._trials.study.tell(self.number, value, state=TrialState[state])
-        Path(self._lock.name).unlink(missing_ok=True)
-        self._lock.close()
+        self.trials.study.tell(self.number, value, state=TrialState[state])
+        Path(self.lock.name).unlink(missing_ok=True)
+        self.lock.close()
 
 
 class Trials:
@@ -376,56 +378,48 @@ class Trials:
 
     def changed(self, choices: Mapping[str, Choice]) -> str:
         """The flags of `endless-train` for the choices that differ from the initial settings."""
-        flags = []
-        for name, choice in choices.items():
-            if name in self.space and choice != self.space[name][0]:
-                flag = name.replace("_", "-")
-                if isinstance(choice, bool):
-                    group, _, entry = flag.rpartition(".")
-                    flags.append(f"--{flag}" if choice else f"--{group}.no-{entry}")
-                else:
-                    flags.append(f"--{flag} {choice}")
-        return " ".join(flags)
+        different = {
+            name.replace("_", "-"): choice
+            for name, choice in choices.items()
+            if name in self.space and choice != self.space[name][0]
+        }
+        return " ".join(flags(different))
 
     def report(self) -> None:
         """Write the best settings and all trials to `best.json`, and print the ten best; does nothing if no trial is complete.
 
         The file is replaced as a whole: readers find all of the old one or all of the new one.
         """
-        # Another process of the search writes the same files.
-        with self._locked():
-            self._report()
-
-    def _report(self) -> None:
         from optuna.trial import TrialState
 
-        done = self.study.get_trials(states=(TrialState.COMPLETE,))
-        done.sort(key=lambda trial: -(trial.value or 0.0))
-        pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))
-        if not done:
-            return
-        table = Table(title=f"{len(done)} trials complete, {pruned} pruned", title_justify="left", box=box.SIMPLE)
-        for name in ("trial", "reward", "changes"):
-            table.add_column(name, justify="left" if name == "changes" else "right")
-        for trial in done[:10]:
-            table.add_row(str(trial.number), f"{trial.value:.4f}", self.changed(trial.params) or "none")
-        self.console.print(table)
-        best = to_dict(with_choices(self.arguments.settings, done[0].params))
-        trials = [
-            {"trial": trial.number, "state": trial.state.name, "reward": trial.value, "choices": trial.params}
-            for trial in self.study.trials
-        ]
-        found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
-        temporary = self.folder / f"{BEST}.new"
-        temporary.write_text(json.dumps(found, indent=1) + "\n")
-        os.replace(temporary, self.folder / BEST)
-        settings, changed = self.arguments.settings, self.changed(done[0].params)
-        start = f"--env {settings.env} --preset {settings.preset}"
-        start += "" if "--agent" in changed else f" --agent {settings.agent}"
-        self.console.print(
-            f"the best settings are in {self.folder / BEST}; as flags, in addition to your own:", soft_wrap=True
-        )
-        self.console.print(f"endless-train {start} {changed}".rstrip(), soft_wrap=True)
+        with self._locked():  # Another process of the search writes the same files.
+            done = self.study.get_trials(states=(TrialState.COMPLETE,))
+            done.sort(key=lambda trial: -(trial.value or 0.0))
+            pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))
+            if not done:
+                return
+            table = Table(title=f"{len(done)} trials complete, {pruned} pruned", title_justify="left", box=box.SIMPLE)
+            for name in ("trial", "reward", "changes"):
+                table.add_column(name, justify="left" if name == "changes" else "right")
+            for trial in done[:10]:
+                table.add_row(str(trial.number), f"{trial.value:.4f}", self.changed(trial.params) or "none")
+            self.console.print(table)
+            best = to_dict(with_choices(self.arguments.settings, done[0].params))
+            trials = [
+                {"trial": trial.number, "state": trial.state.name, "reward": trial.value, "choices": trial.params}
+                for trial in self.study.trials
+            ]
+            found = {"reward": done[0].value, "trial": done[0].number, "settings": best, "trials": trials}
+            temporary = self.folder / f"{BEST}.new"
+            temporary.write_text(json.dumps(found, indent=1) + "\n")
+            os.replace(temporary, self.folder / BEST)
+            settings, changed = self.arguments.settings, self.changed(done[0].params)
+            start = f"--env {settings.env} --preset {settings.preset}"
+            start += "" if "--agent" in changed else f" --agent {settings.agent}"
+            self.console.print(
+                f"the best settings are in {self.folder / BEST}; as flags, in addition to your own:", soft_wrap=True
+            )
+            self.console.print(f"endless-train {start} {changed}".rstrip(), soft_wrap=True)
 
 
 def resumable(settings: Settings) -> tuple[Settings, list[dict[str, Any]]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Literal
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
@@ -23,6 +24,21 @@ TRAINING_SEEDS = range(100_000)
 
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
+
+#: The least value of settings that are numbers.
+_LEAST = {
+    1: (
+        *("environment.num-envs", "environment.groups"),
+        *("ppo.decay-updates", "ppo.steps", "ppo.epochs", "ppo.minibatches"),
+        *("recurrence.layers", "recurrence.hidden-size", "recurrence.sequence-length"),
+        *("transformer.layers", "transformer.heads", "transformer.width", "transformer.sequence-length"),
+        *("model.stack", "model.vector-width", "model.head-width", "checkpoint-interval"),
+    ),
+    0: (
+        *("threads", "ppo.updates", "environment.num-threads"),
+        *("model.body-width", "transformer.positions", "transformer.window"),
+    ),
+}
 
 
 def paper_run_length(env: str, agent: str) -> int:
@@ -258,38 +274,11 @@ class Settings:
         env_spec = spec(self.env)
         env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
-        positive = {
-            "environment.num-envs": environment.num_envs,
-            "environment.groups": environment.groups,
-            "ppo.decay-updates": ppo.decay_updates,
-            "ppo.steps": ppo.steps,
-            "ppo.epochs": ppo.epochs,
-            "ppo.minibatches": ppo.minibatches,
-            "recurrence.layers": self.recurrence.layers,
-            "recurrence.hidden-size": self.recurrence.hidden_size,
-            "recurrence.sequence-length": self.recurrence.sequence_length,
-            "transformer.layers": transformer.layers,
-            "transformer.heads": transformer.heads,
-            "transformer.width": transformer.width,
-            "transformer.sequence-length": transformer.sequence_length,
-            "model.stack": self.model.stack,
-            "model.vector-width": self.model.vector_width,
-            "model.head-width": self.model.head_width,
-            "checkpoint-interval": self.checkpoint_interval,
-        }
-        for name, number in positive.items():
-            if number < 1:
-                raise ValueError(f"--{name} must be 1 or more, got {number}")
-        for name, number in {
-            "threads": self.threads,
-            "ppo.updates": ppo.updates,
-            "environment.num-threads": environment.num_threads,
-            "model.body-width": self.model.body_width,
-            "transformer.positions": transformer.positions,
-            "transformer.window": transformer.window,
-        }.items():
-            if number < 0:
-                raise ValueError(f"--{name} must be 0 or more, got {number}")
+        for least, names in _LEAST.items():
+            for name in names:
+                number = value(self, name.replace("-", "_"))
+                if number < least:
+                    raise ValueError(f"--{name} must be {least} or more, got {number}")
         if environment.num_envs % environment.groups:
             raise ValueError(
                 f"--environment.num-envs must be a multiple of --environment.groups, got {environment.num_envs} environments and "
@@ -343,6 +332,11 @@ class Settings:
     def _longest_episode(self) -> int:
         """Longest possible episode in steps; 0 in endless environments and without step limit."""
         return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
+
+
+def value(settings: Settings, name: str) -> Any:
+    """The value of a setting by its name, with underscores and a dot after its group."""
+    return attrgetter(name)(settings)
 
 
 def _replace(settings: Settings, **groups: dict[str, Any]) -> Settings:

@@ -7,7 +7,7 @@ Scores are arrays (runs, tasks): each column contains the scores of the independ
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,10 +86,6 @@ class Summary:
     iqm: float
     low: float
     high: float
-
-    def to_dict(self) -> dict[str, float]:
-        """The estimates by name, for JSON."""
-        return asdict(self)
 
 
 def summarise(scores: ArrayLike) -> Summary:

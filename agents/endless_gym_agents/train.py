@@ -15,6 +15,7 @@ import json
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -29,7 +30,7 @@ from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
 from endless_gym_agents.learnt import learnt
-from endless_gym_agents.logs import Episodes, Logger, SilentLogger
+from endless_gym_agents.logs import RECENT, Logger, SilentLogger, means
 from endless_gym_agents.ppo import learn, make_optimizer
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.rollout import RolloutCollector
@@ -107,14 +108,15 @@ def train_rank(
             agent.compile_parts()
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)
-        episodes, update, steps = Episodes(), 0, 0
+        update, steps = 0, 0
+        episodes: deque[dict[str, float]] = deque(maxlen=RECENT)
         if resumed is not None:
             update, steps = resumed["update"], resumed["steps"]
             agent.load_state_dict(resumed["model"])
             optimizer.load_state_dict(resumed["optimizer"])
             for name, generator in generators.items():
                 restore_generator(generator, resumed["generators"][name], settings.seed + update)
-            episodes.add(resumed["episodes"])
+            episodes.extend(resumed["episodes"])
             players = resumed["player"].get("ranks", [resumed["player"]])
             if len(players) == ranks.size:
                 collector.load_state_dict(players[ranks.rank])
@@ -134,7 +136,7 @@ def train_rank(
                 "optimizer": optimizer.state_dict(),
                 "generators": {name: generator.get_state() for name, generator in generators.items()},
                 "player": players[0] if ranks.size == 1 else {"ranks": players},
-                "episodes": list(episodes.recent),
+                "episodes": list(episodes),
             }
             checkpoint.save(run, state, settings.keep_checkpoints)
 
@@ -161,23 +163,25 @@ def train_rank(
             new_steps = settings.environment.num_envs * ppo.steps
             update, steps = update + 1, steps + new_steps
             for infos in ranks.everywhere(ended):
-                episodes.add(infos)
-            means = episodes.means()
+                episodes.extend(infos)
+            recent = means(episodes)
             rate = new_steps / (time.perf_counter() - start)
-            logger.update({"update": update, "steps": steps, "steps_per_second": rate} | means | learning, clock.take())
+            logger.update(
+                {"update": update, "steps": steps, "steps_per_second": rate} | recent | learning, clock.take()
+            )
 
             minutes = (time.monotonic() - started) / 60
             if settings.time_limit and minutes >= settings.time_limit:
                 stop.requested = True
-            reward, target = means.get("episode/reward"), settings.target_reward
-            if reward is not None and target is not None and episodes.is_full() and reward >= target:
+            reward, target = recent.get("episode/reward"), settings.target_reward
+            if reward is not None and target is not None and len(episodes) == RECENT and reward >= target:
                 stop.requested = True
-            if settings.stop_when_learnt and target is None and episodes.is_full():
-                success = learnt(environments.spec, settings.options(), means)
+            if settings.stop_when_learnt and target is None and len(episodes) == RECENT:
+                success = learnt(environments.spec, settings.options(), recent)
                 stop.requested = stop.requested or success is not None
             if environments.failure is not None:
                 stop.requested = True
-            if watch is not None and watch(update, means):
+            if watch is not None and watch(update, recent):
                 stop.requested = True
             # All ranks stop after the same update.
             stops = any(ranks.everywhere(stop.requested))

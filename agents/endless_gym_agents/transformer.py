@@ -43,7 +43,7 @@ from torch.nn import functional
 
 from endless_gym_agents.acting import Affine, linear_relu, transposed
 from endless_gym_agents.encoders import orthogonal
-from endless_gym_agents.memory import LazyMinibatches, Memory, MemoryState, Minibatch, is_own, shuffled
+from endless_gym_agents.memory import Memory, MemoryState, Minibatch, Minibatches, is_own, shuffled
 from endless_gym_agents.settings import Transformer
 from endless_gym_agents.transformer_cache import Projection, RingCache, ring_ages
 
@@ -575,7 +575,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         generator: torch.Generator,
         own: range | None = None,
         epochs: int = 1,
-    ) -> Sequence[TransformerMinibatch]:
+    ) -> Minibatches[TransformerMinibatch]:
         steps, envs = reset_mask.shape
         own = range(envs) if own is None else own
         length = min(self.settings.sequence_length, steps)
@@ -613,7 +613,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             return made
 
         split = shuffled([length] * (envs * sequences), num_minibatches, epochs, generator)
-        return LazyMinibatches(split, minibatch)
+        return Minibatches(split, minibatch)
 
     def _sequences(self, tokens: Tensor, position: Tensor, past: int, steps: int, length: int) -> MakeMinibatch:
         """Makes minibatches of sequences, each with its own tokens.

@@ -7,7 +7,7 @@ encoded step number of the episode. Its state is kept between steps like that of
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -21,15 +21,8 @@ POSITION_WIDTH, POSITIONS = 16, 512
 POSITION = "position"
 
 
-@dataclass
-class TransformState:
-    """What a transform keeps of n environments between two steps.
-
-    Attributes:
-        tensors: Tensors (n, ...) by name.
-    """
-
-    tensors: dict[str, Tensor] = field(default_factory=dict)
+#: What a transform keeps of n environments between two steps: tensors (n, ...) by name.
+TransformState: TypeAlias = dict[str, Tensor]
 
 
 class ObservationTransform(ABC):
@@ -45,7 +38,7 @@ class ObservationTransform(ABC):
     @abstractmethod
     def apply(
         self, observation: Observation, state: TransformState, reset_mask: Tensor
-    ) -> tuple[Observation, dict[str, Tensor]]:
+    ) -> tuple[Observation, TransformState]:
         """Transform one observation of n environments without changing the state.
 
         Args:
@@ -54,12 +47,8 @@ class ObservationTransform(ABC):
             reset_mask: Whether the observation is the first of an episode, bool (n,).
 
         Returns:
-            The agent's observation, and the update for `update_state`.
+            The agent's observation, and the state after this step.
         """
-
-    def update_state(self, state: TransformState, update: dict[str, Tensor]) -> None:
-        """Write the update that `apply` returned into the state."""
-        state.tensors = update
 
 
 class Identity(ObservationTransform):
@@ -71,11 +60,11 @@ class Identity(ObservationTransform):
 
     def initial_state(self, num_envs: int) -> TransformState:
         del num_envs
-        return TransformState()
+        return {}
 
     def apply(
         self, observation: Observation, state: TransformState, reset_mask: Tensor
-    ) -> tuple[Observation, dict[str, Tensor]]:
+    ) -> tuple[Observation, TransformState]:
         del state, reset_mask
         return observation, {}
 
@@ -99,22 +88,20 @@ class FrameStack(ObservationTransform):
         self.shapes = {key: (*shape[:-1], shape[-1] * count) for key, shape in self.single.items()}
 
     def initial_state(self, num_envs: int) -> TransformState:
-        return TransformState(
-            {
-                key: torch.zeros(
-                    (num_envs, *shape), dtype=torch.uint8 if key == FRAME else torch.float32, device=self.device
-                )
-                for key, shape in self.shapes.items()
-            }
-        )
+        return {
+            key: torch.zeros(
+                (num_envs, *shape), dtype=torch.uint8 if key == FRAME else torch.float32, device=self.device
+            )
+            for key, shape in self.shapes.items()
+        }
 
     def apply(
         self, observation: Observation, state: TransformState, reset_mask: Tensor
-    ) -> tuple[Observation, dict[str, Tensor]]:
+    ) -> tuple[Observation, TransformState]:
         stacks = {}
         for key, newest in observation.items():
             newest = grey(newest) if key == FRAME else newest
-            shifted = torch.cat([state.tensors[key][..., self.single[key][-1] :], newest], dim=-1)
+            shifted = torch.cat([state[key][..., self.single[key][-1] :], newest], dim=-1)
             filled = newest.repeat(*(1 for _ in newest.shape[:-1]), self.count)
             stacks[key] = torch.where(reset_mask.view(-1, *(1 for _ in newest.shape[1:])), filled, shifted)
         return stacks, stacks
@@ -136,12 +123,12 @@ class PositionalEncoding(ObservationTransform):
         self.table = torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1).float().to(device)
 
     def initial_state(self, num_envs: int) -> TransformState:
-        return TransformState({"next": torch.zeros(num_envs, dtype=torch.long, device=self.device)})
+        return {"next": torch.zeros(num_envs, dtype=torch.long, device=self.device)}
 
     def apply(
         self, observation: Observation, state: TransformState, reset_mask: Tensor
-    ) -> tuple[Observation, dict[str, Tensor]]:
-        position = state.tensors["next"].masked_fill(reset_mask, 0)
+    ) -> tuple[Observation, TransformState]:
+        position = state["next"].masked_fill(reset_mask, 0)
         encoded = self.table[position.clamp(max=POSITIONS - 1)]
         return {**observation, POSITION: encoded}, {"next": position + 1}
 

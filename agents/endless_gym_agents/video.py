@@ -100,19 +100,8 @@ def _webp(file: Path, frames: Iterator[Frame], fps: int) -> None:
 def _mp4(file: Path, frames: Iterator[Frame], fps: int) -> None:
     first = next(frames)
     height, width, _ = first.shape
-    arguments = [
-        _ffmpeg(),
-        "-y",
-        "-loglevel",
-        "error",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        f"{width}x{height}",
-    ]
-    arguments += ["-r", str(fps), "-i", "-", "-pix_fmt", "yuv420p", str(file)]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+    arguments = [_ffmpeg(), "-y", "-loglevel", "error", *source, "-pix_fmt", "yuv420p", str(file)]
     with subprocess.Popen(arguments, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
         try:

@@ -81,7 +81,7 @@ def test_minibatch_loss_is_the_weighted_sum(kind: str, normalisation: str) -> No
     agent = Agent(settings(kind, ppo=ppo), {"features": (6,)}, BRANCHES, ground_truth=2)
     memory = agent.initial_memory(4)
     segment = segment_of(agent, memory, {"features": observations(16, 4)}, 16, 4)
-    minibatch = agent.memory.minibatches([memory.state], segment.reset_mask, 3, torch.Generator().manual_seed(0))[1]
+    minibatch, *_ = agent.memory.minibatches([memory.state], segment.reset_mask, 3, torch.Generator().manual_seed(0))
     segment, advantages, returns = segment.flat(), torch.randn(64), torch.randn(64)
     loss, parts = minibatch_loss(agent, segment, minibatch, advantages, returns, ppo, 0.05)
 

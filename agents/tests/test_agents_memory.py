@@ -238,7 +238,7 @@ def _plain_transformer(agent: Agent, observed: torch.Tensor, done: torch.Tensor)
                     tokens = [episode[t][layer] + _encoding(module, t) for t in window]
                     x = _plain_block(block, x, tokens, [now - t for t in window])
                 episode.append(inputs)
-                values[step, env] = agent.value(agent.body(x.unsqueeze(0)))[0]
+                values[step, env] = agent.value(agent.body(x))
             if done[step, env]:
                 episode = []
     return values

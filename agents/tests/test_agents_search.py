@@ -22,9 +22,9 @@ from endless_gym_agents import search, search_ray, search_workers
 from endless_gym_agents.command import load_checkpoint
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.search import parse
-from endless_gym_agents.search_space import single_changes, space, value, with_choices
+from endless_gym_agents.search_space import single_changes, space, with_choices
 from endless_gym_agents.search_study import SearchArguments, Trials
-from endless_gym_agents.settings import PRESETS, Settings
+from endless_gym_agents.settings import PRESETS, Settings, value
 from endless_gym_agents.train import train
 
 QUIET = Console(quiet=True)
