@@ -25,28 +25,15 @@ from endless_gym_agents.train import parse, train
 
 FOLDER = Path(__file__).parent / "learning"
 #: Flags, time limit in minutes, target reward, and the largest possible reward if it is known.
+_ONE = "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]'"
+_CUES = "--env MysteryPath-Grid-v0 --environment.option show_origin=true show_goal=true reward_path_progress=0.1"
 TASKS = {
-    "one-command": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]'", 15, 0.097, 0.1),
-    "one-command-bf16": (
-        "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --bf16",
-        15,
-        0.097,
-        0.1,
-    ),
-    "one-command-pixels": (
-        "--env MortarMayhem-Grid-v0 --environment.option 'command_count=[1]' --environment.observation rgb",
-        30,
-        0.097,
-        0.1,
-    ),
+    "one-command": (_ONE, 15, 0.097, 0.1),
+    "one-command-bf16": (f"{_ONE} --bf16", 15, 0.097, 0.1),
+    "one-command-pixels": (f"{_ONE} --environment.observation rgb", 30, 0.097, 0.1),
     "two-commands": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[2]'", 30, 0.19, 0.2),
     "three-commands": ("--env MortarMayhem-Grid-v0 --environment.option 'command_count=[3]'", 30, 0.28, 0.3),
-    "mystery-path-grid-with-cues": (
-        "--env MysteryPath-Grid-v0 --environment.option show_origin=true show_goal=true reward_path_progress=0.1",
-        30,
-        1.6,
-        None,
-    ),
+    "mystery-path-grid-with-cues": (_CUES, 30, 1.6, None),
     "endless-mystery-path": ("--env Endless-MysteryPath-v0", 30, 2.0, None),
 }
 
@@ -126,23 +113,25 @@ def report() -> None:
         "training never uses, three episodes each. An agent without memory was trained for as many updates as the",
         "slowest earlier run with memory. The JSON files in this folder contain the exact numbers, the learning",
         "curves and the commands; `learning.py --plot` writes this page from them.",
+        "",
+        "| task | agent | seeds | steps | minutes | evaluation reward | at most |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for task in TASKS:
-        file = FOLDER / f"{task}.json"
-        if not file.exists():
-            continue
-        data = json.loads(file.read_text())
-        best = f", {data['best_reward']} at most" if data["best_reward"] else ""
-        lines += ["", f"## {task}", "", f"    {data['runs'][0]['command']}", ""]
-        lines += [f"| agent | seeds | steps | minutes | evaluation reward{best} |", "| --- | --- | --- | --- | --- |"]
+    commands, pictures = [], []
+    for task in (task for task in TASKS if (FOLDER / f"{task}.json").exists()):
+        data = json.loads((FOLDER / f"{task}.json").read_text())
+        commands.append(f"    {data['runs'][0]['command']}")
+        pictures.append(f"![curves of {task}]({task}.png)")
         for agent in sorted({row["agent"] for row in data["runs"]}, key=lambda agent: (agent == "none", agent)):
             rows = sorted((row for row in data["runs"] if row["agent"] == agent), key=lambda row: row["seed"])
             seeds = ", ".join(str(row["seed"]) for row in rows)
             steps = ", ".join(f"{row['steps'] / 1000:.0f}k" for row in rows)
             minutes = ", ".join(f"{row['minutes']:.1f}" for row in rows)
             rewards = ", ".join(f"{row['evaluation_reward']:.3f}" for row in rows)
-            lines.append(f"| {agent} | {seeds} | {steps} | {minutes} | {rewards} |")
-        lines += ["", f"![curves]({task}.png)"]
+            lines.append(
+                f"| {task} | {agent} | {seeds} | {steps} | {minutes} | {rewards} | {data['best_reward'] or ''} |"
+            )
+    lines += ["", "The first run of each task:", "", *commands, "", *pictures]
     (FOLDER / "README.md").write_text("\n".join(lines) + "\n")
 
 

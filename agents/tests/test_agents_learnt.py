@@ -9,7 +9,6 @@ from agents_helpers import settings
 
 from endless_gym import spec
 from endless_gym_agents.learnt import learnt
-from endless_gym_agents.settings import PRESETS
 from endless_gym_agents.train import train
 
 GRID = "MortarMayhem-Grid-v0"
@@ -37,10 +36,6 @@ def test_task_is_learnt_at_nine_tenths_of_its_best_result(
 ) -> None:
     given = {f"episode/{name}": value for name, value in means.items()}
     assert (learnt(spec(id), options, given) is not None) is is_learnt
-
-
-def test_only_the_preset_quick_stops_by_default() -> None:
-    assert [name for name, preset in PRESETS.items() if preset.stop_when_learnt] == ["quick"]
 
 
 @pytest.mark.slow

@@ -116,18 +116,6 @@ def test_rank_may_have_no_step_of_a_minibatch(name: str) -> None:
     assert sorted(torch.cat(indices).tolist()) == list(range(STEPS))
 
 
-def test_groups_are_concatenated_along_the_environments() -> None:
-    for kind in ("gru", "lstm", "trxl"):
-        agent, observed, done = make(kind), observations(STEPS, 4), ends(STEPS, 4)
-        memories = [agent.initial_memory(2) for _ in range(2)]
-        parts = [play(agent, memories[g], observed[:, 2 * g : 2 * g + 2], done[:, 2 * g : 2 * g + 2]) for g in range(2)]
-        reset_mask, value = (torch.cat([part[i] for part in parts], dim=1) for i in (0, 3))
-        states = [memory.state for memory in memories]
-        for minibatch in agent.memory.minibatches(states, reset_mask, 2, torch.Generator().manual_seed(0)):
-            output = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch)
-            assert_close(output.value, value.flatten()[minibatch.indices])
-
-
 @pytest.mark.parametrize("name", WITH_STATE)
 def test_act_does_not_leak(name: str) -> None:
     """An observation influences only the later steps of its own episode in its own environment."""

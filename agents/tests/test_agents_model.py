@@ -12,7 +12,6 @@ from endless_gym_agents import curves
 from endless_gym_agents.agent import Agent, make_agent
 from endless_gym_agents.encoders import FRAMES_PER_CHUNK, AtariEncoder
 from endless_gym_agents.heads import PolicyHead, ReconstructionHead
-from endless_gym_agents.memory import Minibatch
 from endless_gym_agents.settings import PRESETS, Recurrence, Transformer, from_dict, to_dict
 from endless_gym_agents.train import parse
 from endless_gym_agents.transformer import Block, TransformerMemory
@@ -283,15 +282,6 @@ def test_reconstruction_head_mirrors_the_encoder() -> None:
     assert shapes[2] == (64, 7, 7)
     assert [shapes[i] for i in (3, 5, 7)] == [(64, 9, 9), (32, 20, 20), (4, 84, 84)]
     assert [number for number, layer in enumerate(head.layers) if isinstance(layer, torch.nn.ReLU)] == [1, 4, 6]
-
-
-def test_ground_truth_head_takes_the_output_of_the_memory() -> None:
-    given = settings("trxl", ppo=replace(PAPER.ppo, ground_truth_coefficient=0.1))
-    agent = Agent(given, {"features": (6,)}, BRANCHES, ground_truth=2)
-    layers = agent.ground_truth.layers
-    assert (layers[0].in_features, layers[2].out_features) == (16, 2)
-    minibatch = Minibatch(torch.arange(3), torch.arange(3))
-    assert make("none")({"features": torch.randn(3, 6)}, minibatch).ground_truth is None
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from agents_helpers import settings
@@ -98,16 +97,6 @@ def test_frames_are_embedded_where_they_occur_first(monkeypatch: pytest.MonkeyPa
         assert embedded.first.tolist() == first_occurrences(frames) == [0, 1, 0, 0, 4, 1, 0, 7]
 
 
-def test_next_segment_starts_without_embeddings() -> None:
-    frames = frames_of([5, 6])
-    embedded = EmbeddedFrames(frames)
-    embedded.embed(range(2), embeddings)
-    frames.copy_(frames_of([6, 6]))
-    embedded.clear()
-    assert torch.equal(embedded.embed(range(2), lambda new: 2 * embeddings(new)), 2 * embeddings(frames))
-    assert embedded.first.tolist() == [0, 0]
-
-
 @pytest.mark.parametrize("agent", ["none", "gru", "lstm", "trxl"])
 def test_segment_equals_one_whose_frames_are_all_encoded(agent: str) -> None:
     made, segment, states, encoded = collected(small(agent), segments=2)
@@ -151,15 +140,6 @@ def test_losses_and_gradients_equal_those_of_encoding_each_frame(agent: str) -> 
         for name, gradient in plain_gradients.items():
             if gradient is not None:
                 torch.testing.assert_close(gradients[name], gradient, rtol=1e-4, atol=1e-5)
-
-
-def test_distinct_frames_and_rows_give_the_frames_of_steps() -> None:
-    _, segment, _, _ = collected(small())
-    flat, indices = segment.flat(), torch.tensor([7, 3, 3, 40, 0])
-    observation, rows = flat.distinct(indices)
-    assert rows is not None
-    np.testing.assert_array_equal(observation[FRAME][rows], flat.observation[FRAME][indices])
-    assert len(observation[FRAME]) == len(set(first_occurrences(flat.observation[FRAME][indices])))
 
 
 @pytest.mark.parametrize("given", [small(observation="features"), small("stack"), small(compile=True)])

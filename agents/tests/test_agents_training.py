@@ -18,7 +18,7 @@ import wandb
 from agents_helpers import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from endless_gym import make_vec, spec
+from endless_gym import make_vec
 from endless_gym_agents import checkpoint
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
@@ -77,17 +77,22 @@ def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: 
                 log_prob = output.log_prob(flat.action[minibatch.indices])
                 torch.testing.assert_close(log_prob, flat.log_prob[minibatch.indices], rtol=1e-5, atol=1e-5)
                 torch.testing.assert_close(output.value, flat.value[minibatch.indices], rtol=1e-5, atol=1e-5)
-            before = {name: weight.clone() for name, weight in made.named_parameters()}
             learn(made, optimizer, segment, states, 0, replace(given.ppo, learning_rate=0.01), shuffle)
-            assert all(not torch.equal(weight, before[name]) for name, weight in made.named_parameters())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["position", "stack", "gru", "lstm", "trxl"])
-def test_resumed_run_equals_an_uninterrupted_run(agent: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("agent", "first", "second"),
+    [
+        *((agent, "thread", "thread") for agent in ("position", "stack", "gru", "lstm", "trxl")),
+        *(("gru", "process", engine) for engine in ("process", "thread")),
+        ("gru", "thread", "process"),
+    ],
+)
+def test_resumed_run_equals_an_uninterrupted_run(agent: str, first: str, second: str, tmp_path: Path) -> None:
     through = train(small(agent, tmp_path / "through", 4))
-    halved = train(small(agent, tmp_path / "halved", 2))
-    train(replace(small(agent, tmp_path, 4), resume=str(halved)))
+    halved = train(small(agent, tmp_path / "halved", 2, engine=first))
+    train(replace(small(agent, tmp_path, 4, engine=second), resume=str(halved)))
     assert len(progress(through)) == 4
     assert progress(halved) == progress(through)
     one, two = (checkpoint.load(run).state for run in (through, halved))
@@ -114,29 +119,6 @@ def test_resumed_run_with_frames_and_all_heads(tmp_path: Path) -> None:
     assert same(checkpoint.load(through).state["model"], checkpoint.load(halved).state["model"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "flags",
-    [
-        "--env MortarMayhemB-Grid-v0 --agent gru --environment.observation rgb",
-        "--env MortarMayhemB-v0 --agent stack --environment.observation rgb --model.stack 2",
-        "--env MortarMayhemB-v0 --agent trxl",
-        "--env MysteryPath-Grid-v0 --agent gtrxl --transformer.gate-bias 2",
-        "--env Endless-SearingSpotlights-v0 --agent trxl --ppo.ground-truth-coefficient 0.1",
-        "--env Endless-MysteryPath-v0 --agent position",
-    ],
-)
-def test_update_changes_every_weight_with_each_kind_of_observation_and_action(flags: str, tmp_path: Path) -> None:
-    """Frames, features and vectors, with one and two action branches; an update changes every weight."""
-    small_run = "--preset quick --environment.num-envs 4 --ppo.steps 32 --ppo.updates 1 --threads 1"
-    given = parse([*flags.split(), *small_run.split(), "--run", str(tmp_path / "run"), "--ppo.learning-rate", "0.01"])
-    torch.manual_seed(given.seed)
-    before = make_agent(given, spec(given.env)).state_dict()
-    after = checkpoint.load(train(given)).agent.state_dict()
-    assert before.keys() == after.keys()
-    assert all(not torch.equal(before[name], after[name]) for name in before if name.endswith("weight"))
-
-
 def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:
     """A run that was killed between two checkpoints resumes from the last one."""
     run = train(small("gru", tmp_path / "run", 2))
@@ -148,23 +130,12 @@ def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:
 
 
 def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
-    """The number of threads and an engine process do not change the results."""
     runs = {
         "one": train(small("gru", tmp_path / "one", 3)),
         "threads": train(small("gru", tmp_path / "threads", 3, num_threads=3)),
         "process": train(small("gru", tmp_path / "process", 3, engine="process")),
     }
     assert progress(runs["one"]) == progress(runs["threads"]) == progress(runs["process"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engines", [("process", "process"), ("process", "thread"), ("thread", "process")])
-def test_run_resumes_exactly_with_another_engine(engines: tuple[str, str], tmp_path: Path) -> None:
-    through = train(small("gru", tmp_path / "through", 4))
-    run = train(small("gru", tmp_path / "run", 2, engine=engines[0]))
-    train(replace(small("gru", tmp_path, 4, engine=engines[1]), resume=str(run)))
-    assert progress(run) == progress(through)
-    assert same(checkpoint.load(run).state["player"], checkpoint.load(through).state["player"])
 
 
 @pytest.mark.slow
@@ -372,7 +343,6 @@ def test_weights_and_biases_logs_contain_the_metrics_under_one_id(
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["gru", "lstm", "trxl"])
 def test_bf16_changes_results_slightly_and_keeps_float32_weights(agent: str, tmp_path: Path) -> None:
-    """bfloat16 changes the numbers slightly; weights stay float32."""
     plain, coarse = (train(replace(small(agent, tmp_path / str(bf16), 1), bf16=bf16)) for bf16 in (False, True))
     one, two = progress(plain)[0]["value_loss"], progress(coarse)[0]["value_loss"]
     assert one != two
@@ -399,6 +369,5 @@ def one_command(agent: str, run: Path, **changes: Any) -> Settings:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("agent", ["gru", "trxl"])
 def test_agent_with_memory_learns_a_command_that_is_shown_and_hidden(agent: str, tmp_path: Path) -> None:
-    """One command that is shown and then hidden: an agent with memory learns to execute it."""
     trained = checkpoint.load(train(one_command(agent, tmp_path / agent)))
     assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085
