@@ -17,6 +17,7 @@ import json
 import math
 import platform
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,14 +26,13 @@ from typing import Any
 import torch
 
 from endless_gym_agents import losses
-from endless_gym_agents.agent import Agent, make_agent
-from endless_gym_agents.clock import Clock
+from endless_gym_agents.agent import Agent
 from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.environments import Environments
-from endless_gym_agents.ppo import learn, make_optimizer, minibatch_loss
-from endless_gym_agents.rollout import RolloutCollector, Segment
+from endless_gym_agents.logs import read_progress
+from endless_gym_agents.ppo import minibatch_loss
+from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer
-from endless_gym_agents.train import choose_device
+from endless_gym_agents.train import choose_device, train
 
 AGENTS = ("none", "stack", "position", "gru", "lstm", "trxl", "gtrxl")
 TOLERANCE = 1e-3
@@ -127,35 +127,21 @@ def copies(device: torch.device) -> list[dict[str, Any]]:
 
 def training(settings: Settings, device: torch.device, updates: int) -> dict[str, Any]:
     """Steps per second of some updates after the warm-up, with their breakdown and the peak memory."""
-    settings = settings.validated()
-    ppo, cuda = settings.ppo, device.type == "cuda"
-    torch.manual_seed(1)
+    cuda, num_envs, steps = device.type == "cuda", settings.environment.num_envs, settings.ppo.steps
     if cuda:
         torch.cuda.reset_peak_memory_stats(device)
-    with Environments(settings) as environments:
-        agent = make_agent(settings, environments.spec, device)
-        if settings.compile:
-            agent.compile_parts()
-        optimizer = make_optimizer(agent, ppo.learning_rate)
-        collector = RolloutCollector(agent, environments, ppo.steps, torch.Generator(device).manual_seed(1))
-        clock, shuffle = Clock(), torch.Generator()
-        start = time.perf_counter()
-        for update in range(updates + WARM_UPS):
-            if update == WARM_UPS:
-                clock.take()
-                start = time.perf_counter()
-            segment, _ = collector.collect(clock)
-            with clock.measure("learning"):
-                states = [memory.state for memory in collector.memories]
-                learn(agent, optimizer, segment, states, update, ppo, shuffle)
-        seconds = time.perf_counter() - start
+    with tempfile.TemporaryDirectory() as folder:
+        ppo = replace(settings.ppo, updates=updates + WARM_UPS)
+        rows = read_progress(train(replace(settings, run=f"{folder}/run", device=str(device), ppo=ppo)))[WARM_UPS:]
+    seconds = sum(num_envs * steps / row["steps_per_second"] for row in rows)
+    phases = [name for name in rows[0] if name.startswith("seconds/")]
     return {
         "agent": settings.agent,
-        "num_envs": settings.environment.num_envs,
-        "steps": ppo.steps,
+        "num_envs": num_envs,
+        "steps": steps,
         "compile": settings.compile,
-        "steps_per_second": updates * settings.environment.num_envs * ppo.steps / seconds,
-        "shares_of_time": {name: spent / seconds for name, spent in clock.take().items()},
+        "steps_per_second": updates * num_envs * steps / seconds,
+        "shares_of_time": {name.removeprefix("seconds/"): sum(row[name] for row in rows) / seconds for name in phases},
         "peak_gigabytes": torch.cuda.max_memory_allocated(device) / 1e9 if cuda else None,
     }
 
@@ -173,12 +159,8 @@ def markdown(report: dict[str, Any]) -> str:
         for row in report["copies"]:
             kind = "page-locked" if row["page_locked"] else "pageable"
             lines.append(f"| {kind} | {row['gigabytes_per_second']:.1f} |")
-    lines += [
-        "",
-        "## Training",
-        "",
-        "| agent | environments x steps | compiled | steps per second | share of time | peak memory |",
-    ]
+    lines += ["", "## Training", ""]
+    lines += ["| agent | environments x steps | compiled | steps per second | share of time | peak memory |"]
     lines += ["| --- | --- | --- | --- | --- | --- |"]
     for row in report["training"]:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in row["shares_of_time"].items())

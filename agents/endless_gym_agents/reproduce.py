@@ -13,6 +13,7 @@ endless-reproduce endless --ray auto           # on the machines of a Ray cluste
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from collections.abc import Callable
@@ -104,32 +105,6 @@ def machine_of(arguments: ReproduceArguments) -> running.Machine:
     return replace(here, device=arguments.device, gpus=(), job_cores=arguments.job_cpus)
 
 
-def run(
-    planned: list[Job],
-    machine: running.Machine,
-    runner: Callable[[running.Machine, Callable[[str], None], bool], running.Runner],
-    say: Callable[[str], None],
-    keep_checkpoints: bool,
-) -> running.Outcome:
-    """Run what is left of the jobs.
-
-    Args:
-        planned: The jobs.
-        machine: What they run on.
-        runner: Makes a runner.
-        say: Called with each line of progress.
-        keep_checkpoints: As for `Runner`.
-    """
-    # Speeds are measured one at a time.
-    alone = [job for job in planned if job.experiment.kind == "simulation-speed"]
-    outcome = runner(machine, say, keep_checkpoints).run([job for job in planned if job not in alone])
-    if alone and not outcome.stopped:
-        speeds = runner(replace(machine, jobs=1), say, keep_checkpoints).run(alone)
-        outcome.failed += speeds.failed
-        outcome.stopped = speeds.stopped
-    return outcome
-
-
 def execute(arguments: ReproduceArguments) -> None:
     """Do what the arguments say.
 
@@ -173,30 +148,36 @@ def execute(arguments: ReproduceArguments) -> None:
     console.print(f"{running.left(planned, machine.jobs)}, {side_by_side}", soft_wrap=True)
     if arguments.status:
         return
-    outcome = running.Outcome()
+    failed: list[Job] = []
     if not arguments.report:
-        say = lambda line: console.print(line, soft_wrap=True)  # noqa: E731
-        if arguments.ray and any(job.state() != "done" for job in planned):
-            with ray_session.connected(arguments.ray):
+        with contextlib.ExitStack() as stack:
+            make: Callable[..., running.Runner] = running.Runner
+            if arguments.ray and any(job.state() != "done" for job in planned):
+                stack.enter_context(ray_session.connected(arguments.ray))
                 gpus = ray_session.gpus(arguments.job_gpus, arguments.device)
                 machine = replace(machine, jobs=arguments.jobs or running_ray.jobs_that_fit(arguments.job_cpus, gpus))
-                outcome = run(
-                    planned, machine, partial(running_ray.RayRunner, gpus=gpus), say, arguments.keep_checkpoints
-                )
-        else:
-            outcome = run(planned, machine, running.Runner, say, arguments.keep_checkpoints)
-    if outcome.stopped:
-        console.print(f"{running.left(planned, machine.jobs)}; repeat the command to continue", soft_wrap=True)
-        raise KeyboardInterrupt
+                make = partial(running_ray.RayRunner, gpus=gpus)
+            # Speeds are measured one at a time.
+            alone = [job for job in planned if job.experiment.kind == "simulation-speed"]
+            others = [job for job in planned if job not in alone]
+            for jobs, on in ((others, machine), (alone, replace(machine, jobs=1))):
+                runner = make(on, partial(console.print, soft_wrap=True), arguments.keep_checkpoints)
+                runner.run(jobs)
+                failed += runner.failed
+                if runner.stopped:
+                    console.print(
+                        f"{running.left(planned, machine.jobs)}; repeat the command to continue", soft_wrap=True
+                    )
+                    raise KeyboardInterrupt
     from endless_gym_agents.experiments import report
 
     folder = planning.folder_of(out, scale)
     for experiment in experiments:
         written = report.write(parts[experiment.name], folder / experiment.name, scale)
         console.print(f"{written}, with its figures and tables", soft_wrap=True)
-    if outcome.failed:
-        failed = "; ".join(f"{job.title} (log {job.folder}.log)" for job, _ in outcome.failed)
-        raise ValueError(f"{len(outcome.failed)} runs failed: {failed}; repeat the command to continue")
+    if failed:
+        logs = "; ".join(f"{job.title} (log {job.folder}.log)" for job in failed)
+        raise ValueError(f"{len(failed)} runs failed: {logs}; repeat the command to continue")
 
 
 def main() -> int:

@@ -69,19 +69,20 @@ def run_trial(trial: Trial, settings: Settings) -> None:
         trial.complete()
 
 
-def run_trials(trials: Trials, given: search_workers.Share | None = None) -> None:
+def run_trials(trials: Trials, threads: int | None = None) -> None:
     """Run trials in this process, one after the other, until none is left to begin.
 
     Args:
         trials: The trials.
-        given: What this process may use of the machine; None for all of it.
+        threads: Threads of the agent and of the environments where the settings choose none. Several processes then run trials,
+            and the output of each goes to its log; None for one process.
     """
     while (trial := trials.begin()) is not None:
-        if given is None:
+        if threads is None:
             run_trial(trial, trial.settings)
         else:
             with search_workers.output_of(trial.settings):
-                run_trial(trial, given.limited(trial.settings))
+                run_trial(trial, search_workers.with_threads(trial.settings, threads))
 
 
 def execute(arguments: SearchArguments) -> None:

@@ -16,7 +16,7 @@ import torch
 
 from endless_gym_agents import ray_session
 from endless_gym_agents.search_study import Trial, Trials, resumable
-from endless_gym_agents.search_workers import Share, output_of
+from endless_gym_agents.search_workers import output_of, with_threads
 from endless_gym_agents.settings import from_dict, to_dict
 
 #: Trains a run, as `endless_gym_agents.train.train`.
@@ -133,7 +133,7 @@ def _trainable(trainer: Trainer, period: int, cpus: int) -> Callable[[dict[str, 
             exhausted = False
             try:
                 if done < last:
-                    trainer(Share(cpus).limited(settings), watch)
+                    trainer(with_threads(settings, cpus), watch)
             except torch.cuda.OutOfMemoryError:
                 exhausted = True
         tune.report({"update": done, "reward": reward, "end": "exhausted" if exhausted else "done"})

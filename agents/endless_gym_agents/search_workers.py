@@ -11,7 +11,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from multiprocessing import connection
 from types import FrameType
 from typing import Any
@@ -23,25 +22,15 @@ from endless_gym_agents.experiments import running
 from endless_gym_agents.search_study import SearchArguments, Trials
 from endless_gym_agents.settings import Settings
 
-#: Runs trials until none is left, with a share of the machine.
-Work = Callable[[Trials, "Share | None"], None]
+#: Runs trials until none is left, each with a number of threads.
+Work = Callable[[Trials, int | None], None]
 
 
-@dataclass(frozen=True)
-class Share:
-    """What one of several trials at a time may use of a machine.
-
-    Attributes:
-        threads: Threads of the agent, and threads that step the environments, unless the settings say otherwise.
-    """
-
-    threads: int
-
-    def limited(self, settings: Settings) -> Settings:
-        """The settings with these numbers of threads where they choose none."""
-        environment = settings.environment
-        environment = dataclasses.replace(environment, num_threads=environment.num_threads or self.threads)
-        return dataclasses.replace(settings, threads=settings.threads or self.threads, environment=environment)
+def with_threads(settings: Settings, threads: int) -> Settings:
+    """The settings with these threads of the agent, and as many that step the environments, where they choose none."""
+    environment = settings.environment
+    environment = dataclasses.replace(environment, num_threads=environment.num_threads or threads)
+    return dataclasses.replace(settings, threads=settings.threads or threads, environment=environment)
 
 
 @contextlib.contextmanager
@@ -130,4 +119,4 @@ def _worker(arguments: SearchArguments, end: float, machine: running.Machine, sl
     if machine.gpus and arguments.settings.device in ("auto", "cuda"):
         os.environ["CUDA_VISIBLE_DEVICES"] = machine.gpus[slot % len(machine.gpus)]
     trials = Trials(arguments, Console(highlight=False, file=sys.stdout), end)
-    sys.exit(command.run("endless-search", lambda: work(trials, Share(machine.engine_threads))))
+    sys.exit(command.run("endless-search", lambda: work(trials, machine.engine_threads)))

@@ -214,7 +214,7 @@ def test_trials_that_fall_behind_are_pruned(
     assert trials.study.best_params == {"ppo.epochs": 4}
 
 
-def killed_once(trials: Trials, share: search_workers.Share | None) -> None:
+def killed_once(trials: Trials, threads: int | None) -> None:
     """The work of a worker whose first two trials wait for each other; the process of the first trial is then killed, once."""
     folder = trials.folder
 
@@ -233,7 +233,7 @@ def killed_once(trials: Trials, share: search_workers.Share | None) -> None:
         return train(given, watched)
 
     search.train = trained
-    search.run_trials(trials, share)
+    search.run_trials(trials, threads)
 
 
 @pytest.mark.slow
@@ -260,7 +260,7 @@ def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -
     assert "resumed" not in (tmp_path / "shared/trial-0001.log").read_text()
 
 
-def killed_and_replaced(trials: Trials, share: search_workers.Share | None) -> None:
+def killed_and_replaced(trials: Trials, threads: int | None) -> None:
     """The work of a worker that is killed, once."""
     with (trials.folder / "ends").open("a") as ends:
         print(repr(trials.end), file=ends)
@@ -293,7 +293,7 @@ def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:
     assert (first, last) == ("before", "RuntimeError: the cause")
 
 
-def interrupted_or_late(trials: Trials, share: search_workers.Share | None) -> None:
+def interrupted_or_late(trials: Trials, threads: int | None) -> None:
     """The work of a worker that only a signal ends in time."""
     time.sleep(30)
     (trials.folder / "late").touch()

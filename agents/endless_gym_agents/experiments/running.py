@@ -116,25 +116,13 @@ class _Active:
     begun: float = field(default_factory=time.monotonic)
 
 
-@dataclass
-class Outcome:
-    """What became of the jobs.
+class Runner:
+    """Runs jobs; Ctrl-C (or SIGTERM) stops the running ones after their update, with checkpoints.
 
     Attributes:
-        done: Jobs that have been completed.
-        failed: Jobs whose command failed, with its exit status.
-        elsewhere: Jobs that another process was running.
+        failed: Jobs whose command failed.
         stopped: Whether the work was interrupted.
     """
-
-    done: list[Job] = field(default_factory=list)
-    failed: list[tuple[Job, int]] = field(default_factory=list)
-    elsewhere: list[Job] = field(default_factory=list)
-    stopped: bool = False
-
-
-class Runner:
-    """Runs jobs; Ctrl-C (or SIGTERM) stops the running ones after their update, with checkpoints."""
 
     def __init__(self, machine: Machine, say: Callable[[str], None], keep_checkpoints: bool = False) -> None:
         """Make a runner.
@@ -146,18 +134,19 @@ class Runner:
         """
         self.machine, self.say, self.keep_checkpoints = machine, say, keep_checkpoints
         self._active: list[_Active] = []
-        self._outcome = Outcome()
+        self.failed: list[Job] = []
+        self.stopped = False
 
-    def run(self, planned: Sequence[Job]) -> Outcome:
+    def run(self, planned: Sequence[Job]) -> None:
         """Run what is left of the jobs."""
         waiting = [job for job in planned if job.state() != "done"]
         before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
         said = time.monotonic()
         try:
-            while self._active or (waiting and not self._outcome.stopped):
+            while self._active or (waiting and not self.stopped):
                 taken = {active.slot for active in self._active}
                 for slot in sorted(set(range(self.machine.jobs)) - taken):
-                    while waiting and not self._outcome.stopped and not self._start(waiting.pop(0), slot):
+                    while waiting and not self.stopped and not self._start(waiting.pop(0), slot):
                         pass
                 time.sleep(_POLL)
                 for active in list(self._active):
@@ -170,7 +159,6 @@ class Runner:
                 active.process.send_signal(signal.SIGKILL)
             for number, handler in before.items():
                 signal.signal(number, handler)
-        return self._outcome
 
     def _start(self, job: Job, slot: int) -> bool:
         """Start the first command of a job; false if another process runs it."""
@@ -181,7 +169,6 @@ class Runner:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             lock.close()
-            self._outcome.elsewhere.append(job)
             self.say(f"{job.title}: another process is running it")
             return False
         resumed = job.state() == "interrupted"
@@ -212,7 +199,7 @@ class Runner:
         status = active.process.poll()
         if status is None:
             return
-        if status == 0 and active.commands and not self._outcome.stopped:
+        if status == 0 and active.commands and not self.stopped:
             active.process = self._spawn(active.commands.pop(0), active.slot, active.lock, active.log)
             return
         self._active.remove(active)
@@ -223,22 +210,21 @@ class Runner:
             if job.experiment.kind == "curves" and not self.keep_checkpoints:
                 for file in (job.folder / checkpoint.FOLDER).glob("update-*.pt"):
                     file.unlink()
-            self._outcome.done.append(job)
             self.say(f"{job.title}: done after {minutes:.1f} minutes")
-        elif self._outcome.stopped:
+        elif self.stopped:
             self.say(
                 f"{job.title}: stopped" + (f" at update {job.updates_done()} of {job.updates}" if job.updates else "")
             )
         else:
-            self._outcome.failed.append((job, status))
+            self.failed.append(job)
             self.say(f"{job.title}: failed with status {status}; the log is {job.folder}.log")
         active.log.close()
         active.lock.close()
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         del number, frame
-        again = ", now without waiting for the end of an update" if self._outcome.stopped else ""
-        self._outcome.stopped = True
+        again = ", now without waiting for the end of an update" if self.stopped else ""
+        self.stopped = True
         self.say(f"stopping {len(self._active)} jobs with checkpoints{again or '; press Ctrl-C again to stop at once'}")
         for active in self._active:
             active.process.send_signal(signal.SIGINT)

@@ -21,14 +21,7 @@ class RayRunner(running.Runner):
     def __init__(
         self, machine: running.Machine, say: Callable[[str], None], keep_checkpoints: bool = False, gpus: float = 0.0
     ) -> None:
-        """Make a runner.
-
-        Args:
-            machine: What the jobs run on; `job_cores` are the CPU cores that Ray reserves for each.
-            say: Called with each line of progress.
-            keep_checkpoints: Keep all checkpoints of runs that have been evaluated, and not only the last.
-            gpus: GPUs that Ray reserves for each job.
-        """
+        """Make a runner; as `Runner`, with `machine.job_cores` CPU cores and `gpus` GPUs that Ray reserves for each job."""
         super().__init__(machine, say, keep_checkpoints)
         self._gpus = gpus
 
