@@ -401,18 +401,14 @@ class Agent(nn.Module):
     def _embed(self, observed: Observation, weights: ActingWeights) -> Tensor:
         """As `embed`, with given weights."""
         with self.autocast():
-            encoded = self._encode(observed, weights)
+            if weights.vector is None:
+                encoded: Tensor = self.encoder(observed)
+            else:
+                vectors = [observed[key] for key in self.encoder.vectors]
+                encoded = linear_relu(vectors[0] if len(vectors) == 1 else torch.cat(vectors, dim=-1), weights.vector)
+                if self.encoder.frames is not None:
+                    encoded = torch.cat([self.encoder.frames(observed[FRAME]), encoded], dim=-1)
             return encoded if weights.embedding is None else linear_relu(encoded, weights.embedding)
-
-    def _encode(self, observed: Observation, weights: ActingWeights) -> Tensor:
-        """As `encoder`, with the weights for acting."""
-        if weights.vector is None:
-            encoded: Tensor = self.encoder(observed)
-            return encoded
-        vectors = self.encoder.vectors
-        joined = observed[vectors[0]] if len(vectors) == 1 else torch.cat([observed[key] for key in vectors], dim=-1)
-        vector = linear_relu(joined, weights.vector)
-        return vector if self.encoder.frames is None else torch.cat([self.encoder.frames(observed[FRAME]), vector], -1)
 
     def autocast(self) -> contextlib.AbstractContextManager[Any]:
         """The context of the type that the network computes in."""

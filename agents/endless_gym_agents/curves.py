@@ -32,6 +32,8 @@ FAMILIES: dict[Family, tuple[str, str, str]] = {
     "finite": ("MortarMayhem-v0", "MysteryPath-v0", "SearingSpotlights-v0"),
     "endless": ("Endless-MortarMayhem-v0", "Endless-MysteryPath-v0", "Endless-SearingSpotlights-v0"),
 }
+#: Labels of the score axis of the aggregated plots.
+AXES: dict[Family, str] = {"finite": "Task progress", "endless": "Normalised score"}
 #: In this environment all agents of the paper use observation reconstruction; there, `gru_rec` takes the place of `gru`.
 _WITH_RECONSTRUCTION = "Endless-SearingSpotlights-v0"
 

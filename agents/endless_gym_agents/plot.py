@@ -25,6 +25,7 @@ from rich.console import Console
 
 from endless_gym_agents import command, metrics
 from endless_gym_agents.curves import (
+    AXES,
     FAMILIES,
     Curve,
     Floats,
@@ -188,6 +189,13 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         if env not in known and env not in {curve.env for curve in own}:
             raise ValueError(f"no curves of environment `{env}`; the paper has curves of {', '.join(known)}")
     plots = []
+
+    def add(name: str, axis: str, curves: Sequence[Curve]) -> None:
+        steps = arguments.max_steps
+        curves = [curve.until(steps) if steps else curve for curve in curves]
+        if curves:
+            plots.append(draw(name, axis, curves, arguments.spread, arguments.out))
+
     if arguments.aggregate != "no":
         paper = [curve for env in FAMILIES[arguments.aggregate] for curve in published(env, arguments.published)]
         curves = aggregate(arguments.aggregate, [*own, *paper])
@@ -205,29 +213,17 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
                 f"nothing to plot: no agent among --published ({', '.join(arguments.published) or 'empty'}) has curves in all "
                 f"{arguments.aggregate} environments"
             )
-        axis = "Task progress" if arguments.aggregate == "finite" else "Normalised score"
-        plots.append(
-            draw(arguments.aggregate, axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out)
-        )
-    else:
-        # Training rewards are not comparable with evaluation metrics, and are drawn in separate plots.
-        trained = [curve for curve in own if curve.source == "training"]
-        measured = [curve for curve in own if curve.source != "training"]
-        for env in dict.fromkeys(curve.env for curve in trained):
-            curves = [curve for curve in trained if curve.env == env and env in (arguments.env or (env,))]
-            if curves:
-                axis = "Reward of training episodes"
-                plots.append(
-                    draw(f"{env}-training", axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out)
-                )
-        envs = (
-            arguments.env or tuple(dict.fromkeys(curve.env for curve in measured)) or (() if trained else tuple(known))
-        )
-        for env in envs:
-            curves = [curve for curve in measured if curve.env == env] + published(env, arguments.published)
-            if curves:
-                _, axis = metrics.metric(env)
-                plots.append(draw(env, axis, _cut(curves, arguments.max_steps), arguments.spread, arguments.out))
+        add(arguments.aggregate, AXES[arguments.aggregate], curves)
+        return plots
+    # Training rewards are not comparable with evaluation metrics, and are drawn in separate plots.
+    trained = [curve for curve in own if curve.source == "training"]
+    measured = [curve for curve in own if curve.source != "training"]
+    for env in dict.fromkeys(curve.env for curve in trained):
+        if env in (arguments.env or (env,)):
+            add(f"{env}-training", "Reward of training episodes", [curve for curve in trained if curve.env == env])
+    for env in arguments.env or dict.fromkeys(curve.env for curve in measured) or (() if trained else known):
+        curves = [curve for curve in measured if curve.env == env] + published(env, arguments.published)
+        add(env, metrics.metric(env)[1], curves)
     return plots
 
 
@@ -236,10 +232,6 @@ def execute(arguments: PlotArguments) -> None:
     console = Console()
     for plot in draw_all(arguments):
         console.print(f"{plot}, with its data in .csv and .json", soft_wrap=True)
-
-
-def _cut(curves: Sequence[Curve], steps: int) -> list[Curve]:
-    return [curve.until(steps) if steps else curve for curve in curves]
 
 
 def main() -> int:

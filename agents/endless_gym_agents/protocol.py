@@ -16,7 +16,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
@@ -177,17 +177,6 @@ def table(experiment: Experiment) -> Table:
     return result
 
 
-def protocol(arguments: EvalArguments) -> dict[str, Any]:
-    """The evaluation protocol, for the results file."""
-    return {
-        "first_seed": arguments.first_seed,
-        "seeds": arguments.seeds,
-        "repetitions": arguments.repetitions,
-        "action_seed": arguments.action_seed,
-        "greedy": arguments.greedy,
-    }
-
-
 def execute(arguments: EvalArguments) -> None:
     """Evaluate the checkpoints, and write or print the results."""
     if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
@@ -200,7 +189,8 @@ def execute(arguments: EvalArguments) -> None:
                 f"the {len(experiment.runs)} runs of {experiment.env}, {experiment.label}, have no checkpoints at a common "
                 "number of steps; evaluate them separately, or train with the same --checkpoint-interval and --keep-checkpoints"
             )
-    written = to_json(experiments, protocol(arguments), arguments.episodes)
+    names = ("first_seed", "seeds", "repetitions", "action_seed", "greedy")
+    written = to_json(experiments, {name: getattr(arguments, name) for name in names}, arguments.episodes)
     written["seconds"] = time.monotonic() - start
     if arguments.json == "-":
         print(json.dumps(written, indent=1))

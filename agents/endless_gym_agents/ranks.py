@@ -45,17 +45,11 @@ class Ranks:
 
     def __init__(self) -> None:
         """Read the environment variables that `torchrun` sets."""
-
-        def variable(name: str, default: int) -> int:
-            return int(os.environ.get(name, default))
-
         # Both are needed to find the other processes, so that a stray `RANK` of a cluster's scheduler does not count.
-        started = "RANK" in os.environ and "MASTER_ADDR" in os.environ
-        self.rank, self.size = (variable("RANK", 0), variable("WORLD_SIZE", 1)) if started else (0, 1)
-        self.local_rank, self.local_size = (
-            (variable("LOCAL_RANK", 0), variable("LOCAL_WORLD_SIZE", 1)) if started else (0, 1)
-        )
-        self.restarts = variable("TORCHELASTIC_RESTART_COUNT", 0) if started else 0
+        given = os.environ if "RANK" in os.environ and "MASTER_ADDR" in os.environ else {}
+        self.rank, self.size = int(given.get("RANK", 0)), int(given.get("WORLD_SIZE", 1))
+        self.local_rank, self.local_size = int(given.get("LOCAL_RANK", 0)), int(given.get("LOCAL_WORLD_SIZE", 1))
+        self.restarts = int(given.get("TORCHELASTIC_RESTART_COUNT", 0))
         self._cores = sorted(os.sched_getaffinity(0))
 
     @property

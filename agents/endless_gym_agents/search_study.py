@@ -95,19 +95,14 @@ class SearchArguments:
         settings = self.settings.validated()
         if not self.ray:  # The devices of other machines are not known here.
             choose_device(settings.device)
-        numbers = {
-            "trials": self.trials,
-            "warm-up": self.warm_up,
-            "startup-trials": self.startup_trials,
-            "workers": self.workers,
-            "max-failures": self.max_failures,
-        }
-        for name, number in numbers.items():
-            if number < 0:
-                raise ValueError(f"--{name} must be 0 or more, got {number}")
-        for name, number in {"period": self.period, "trial-cpus": self.trial_cpus}.items():
-            if number < 1:
-                raise ValueError(f"--{name} must be 1 or more, got {number}")
+        for least, names in {
+            0: ("trials", "warm-up", "startup-trials", "workers", "max-failures"),
+            1: ("period", "trial-cpus"),
+        }.items():
+            for name in names:
+                number = getattr(self, name.replace("-", "_"))
+                if number < least:
+                    raise ValueError(f"--{name} must be {least} or more, got {number}")
         if self.trial_gpus is not None and self.trial_gpus < 0:
             raise ValueError(f"--trial-gpus must be 0 or more, got {self.trial_gpus}")
         if not 0 < self.percentile <= 100:
@@ -119,10 +114,6 @@ class SearchArguments:
                 "--time-limit and --target-reward are not supported: trials are compared at the same updates"
             )
         return self
-
-    def shared(self) -> bool:
-        """Whether several trials run at a time."""
-        return bool(self.ray) or self.workers > 1
 
 
 @dataclass

@@ -76,20 +76,6 @@ def normalised(tokens: Tensor) -> Tensor:
     return functional.layer_norm(tokens, tokens.shape[-1:])
 
 
-def fused(x: Tensor, previous: Tensor, first: Tensor | None, layer: Affine) -> Tensor:
-    """The first block's input in a step of acting with `Transformer.query_previous`, float (n, width).
-
-    Args:
-        x: Embedded observations, float (n, width).
-        previous: The last block's input at the previous step, float32 (n, width).
-        first: Whether the step is the first of an episode, bool (n,); None if none is.
-        layer: The layer, for inputs of twice the width.
-    """
-    if first is not None:
-        previous = previous.masked_fill(first.unsqueeze(-1), 0.0)
-    return linear_relu(torch.cat([x, previous.to(x.dtype)], dim=-1), layer)
-
-
 @dataclass
 class Groups:
     """Where the queries of single steps lie in G groups of K places for each head. Some places are empty.
@@ -411,12 +397,7 @@ class TransformerState(MemoryState):
         self.fill = self.past
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "fill": self.fill,
-            "inputs": self.inputs,
-            "position": self.position,
-            "next_position": self.next_position,
-        }
+        return {name: getattr(self, name) for name in ("fill", "inputs", "position", "next_position")}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         device = self.inputs.device
@@ -426,17 +407,8 @@ class TransformerState(MemoryState):
         self.cache = None
 
 
-@dataclass
-class TransformerUpdate:
-    """The newest column of a `TransformerState`.
-
-    Attributes:
-        inputs: The input of each block, list of float (n, width).
-        position: int64 (n,).
-    """
-
-    inputs: list[Tensor]
-    position: Tensor
+#: The newest column of a `TransformerState`: the input of each block, float (n, width) each, and the position int64 (n,).
+TransformerUpdate: TypeAlias = tuple[list[Tensor], Tensor]
 
 
 @dataclass
@@ -539,7 +511,10 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         if reset_mask is not None:
             position = position.masked_fill(reset_mask, 0)
         if self.acting_fusion is not None:
-            x = fused(x, state.inputs[-1].select(1, state.fill - 1), reset_mask, self.acting_fusion)
+            previous = state.inputs[-1].select(1, state.fill - 1)
+            if reset_mask is not None:
+                previous = previous.masked_fill(reset_mask.unsqueeze(-1), 0.0)
+            x = linear_relu(torch.cat([x, previous.to(x.dtype)], dim=-1), self.acting_fusion)
         start, length = 0, cache.slots
         if self.spans:
             start, length = cache.span(min(self.past, max(1, int(position.numpy().max()))))
@@ -555,16 +530,16 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
             inputs.append(x)
             x = x if encoding is None else x + encoding
             x = block(x, keys[layer], values[layer], bias, first, None if distances is None else distances[layer])
-        return x, TransformerUpdate(inputs, position)
+        return x, (inputs, position)
 
     def update_state(self, state: TransformerState, update: TransformerUpdate) -> None:
         if state.fill == state.inputs.shape[2]:
             state.compact(SPARE_COLUMNS)
-        cache, inputs = self.cache(state), torch.stack(update.inputs).float()
+        cache, inputs, position = self.cache(state), torch.stack(update[0]).float(), update[1]
         state.inputs.select(2, state.fill).copy_(inputs)
-        state.position.select(1, state.fill).copy_(update.position)
-        state.next_position = update.position + 1
-        cache.append(self.encoded(inputs, update.position))
+        state.position.select(1, state.fill).copy_(position)
+        state.next_position = position + 1
+        cache.append(self.encoded(inputs, position))
         state.fill += 1
 
     def minibatches(

@@ -21,6 +21,7 @@ from endless_gym_agents.settings import PRESETS, Settings
 #: Value of a flag.
 Value = str | int | float | bool | list[str]
 Kind = Literal["curves", "ablation", "wall-time", "simulation-speed", "search"]
+Aggregate = Literal["", "finite", "endless"]
 
 #: Flags that the program sets itself.
 _RESERVED = ("env", "seed", "run", "resume", "device", "threads", "checkpoint-interval", "keep-checkpoints")
@@ -104,7 +105,7 @@ class Experiment:
     kind: Kind
     seeds: int
     runs: tuple[Run, ...]
-    aggregate: str = ""
+    aggregate: Aggregate = ""
     evaluation: Evaluation = Evaluation()
     search: Search = Search()
     episodes: int = 1000
@@ -221,6 +222,7 @@ def parse(name: str, text: str) -> Experiment:
 _TYPES: dict[str, tuple[type, ...]] = {
     "str": (str,),
     "Kind": (str,),
+    "Aggregate": (str,),
     "int": (int,),
     "tuple[Run, ...]": (list,),
     "tuple[str, ...]": (list,),

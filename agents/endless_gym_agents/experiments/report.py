@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from endless_gym_agents import metrics, results
-from endless_gym_agents.curves import FAMILIES, Curve, Family, aggregate, evaluated, published
+from endless_gym_agents.curves import AXES, FAMILIES, Curve, aggregate, evaluated, published
 from endless_gym_agents.experiments import planning
 from endless_gym_agents.experiments.definitions import Run
 from endless_gym_agents.experiments.planning import Job
@@ -128,15 +128,13 @@ def _curves(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
         if curves[0].steps[-1] < 0.1 * max((one.steps[-1] for one in published(env, labels)), default=0):
             # Beside the published curves these would be a dot.
             figures.append(draw(f"{name}-ours", axis, curves, "std", folder))
-    aggregated = jobs[0].experiment.aggregate if jobs else ""
-    families: tuple[Family, ...] = ("finite", "endless")
-    for family in (family for family in families if family == aggregated):
+    if jobs and jobs[0].experiment.aggregate:
+        family = jobs[0].experiment.aggregate
         labels = list(dict.fromkeys(run.published for run in jobs[0].experiment.runs))
         paper = [curve for env in FAMILIES[family] for curve in published(env, labels)]
         own_curves = [curve for _, curves, _ in panels.values() for curve in curves]
-        axis = "Task progress" if family == "finite" else "Normalised score"
         ours = [one for one in aggregate(family, own_curves) if one.source == "evaluated"]
-        figures.append(draw(family, axis, [*ours, *aggregate(family, paper)], "std", folder))
+        figures.append(draw(family, AXES[family], [*ours, *aggregate(family, paper)], "std", folder))
     return rows, figures
 
 
