@@ -90,7 +90,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
 
     Raises:
         FileNotFoundError: There is no such checkpoint.
-        ValueError: The checkpoint has another version.
+        ValueError: The file is not a checkpoint of this version.
     """
     file = Path(path)
     if file.is_dir():
@@ -99,17 +99,24 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise FileNotFoundError(
             f"no checkpoint {file}; expected the folder of a run, or a file of its folder `{FOLDER}`"
         )
-    # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
-    state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
-    version = state.get("version")
+    try:
+        # `weights_only` reads nothing but tensors and plain values, so an untrusted checkpoint cannot execute code.
+        state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
+        version = state.get("version")
+        if version == CHECKPOINT_VERSION:
+            settings = from_dict(state["settings"])
+            agent = make_agent(settings, spec(settings.env), device)
+            agent.load_state_dict(state["model"])
+    except (FileNotFoundError, IsADirectoryError, PermissionError):
+        raise
+    except Exception as error:  # `torch.load` and `load_state_dict` raise many types
+        message = f"{path} is not a checkpoint of this version of endless-train; expected a file of a run's folder `checkpoints`"
+        raise ValueError(message) from error
     if version != CHECKPOINT_VERSION:
         raise ValueError(
             f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
             "use the version of endless-gym that wrote it"
         )
-    settings = from_dict(state["settings"])
-    agent = make_agent(settings, spec(settings.env), device)
-    agent.load_state_dict(state["model"])
     agent.eval()
     return Checkpoint(settings, agent, state["update"], state["steps"], state)
 

@@ -22,7 +22,7 @@ from rich.console import Console
 from endless_gym.create import make_vec
 from endless_gym.specs import ObservationName, spec
 from endless_gym.vector import EndlessVectorEnv
-from endless_gym_agents import command, video
+from endless_gym_agents import checkpoint, command, video
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
@@ -115,7 +115,7 @@ def execute(arguments: EnjoyArguments) -> None:
     if not arguments.seeds:
         raise ValueError("--seeds must contain at least one seed, got none")
     video.check(arguments.out)
-    agent = command.load_checkpoint(arguments.checkpoint, choose_device(arguments.device)).agent
+    agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     recorder = EpisodeRecorder(agent, arguments.action_seed, arguments.greedy, arguments.max_steps)
     console = Console()
     with Console(stderr=True).status(f"playing {agent.settings.env}"):

@@ -36,7 +36,7 @@ from endless_gym.create import make_vec
 from endless_gym.specs import spec
 from endless_gym_agents import command
 from endless_gym_agents.agent import Agent, make_agent
-from endless_gym_agents.checkpoint import Checkpoint
+from endless_gym_agents.checkpoint import Checkpoint, load
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.metrics import TASK_PROGRESS
 from endless_gym_agents.settings import Settings, from_dict, to_dict
@@ -237,7 +237,7 @@ def execute(arguments: ExportArguments) -> None:
             raise ValueError(f"--out needs a checkpoint, got the exported file {arguments.source}")
         agent = read(arguments.source)[1]
     else:
-        checkpoint = command.load_checkpoint(arguments.source, "cpu")
+        checkpoint = load(arguments.source)
         agent = checkpoint.agent
         if arguments.out is not None:
             content = export(checkpoint)

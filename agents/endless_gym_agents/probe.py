@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from endless_gym.create import make_vec
 from endless_gym.specs import spec
-from endless_gym_agents import command
+from endless_gym_agents import checkpoint, command
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.evaluate import EVALUATION_SEEDS
 from endless_gym_agents.train import choose_device
@@ -219,7 +219,7 @@ def execute(arguments: ProbeArguments) -> None:
         )
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
-    agent = command.load_checkpoint(arguments.checkpoint, choose_device(arguments.device)).agent
+    agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.episodes)
     recording = record(agent, seeds, arguments.max_steps, arguments.action_seed)
     env_spec = spec(agent.settings.env)

@@ -130,7 +130,7 @@ def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment
             run: Run | None = None
             for file in files:
                 bar.reset(episodes, description=f"episodes of {file.name}")
-                loaded = command.load_checkpoint(file, device)
+                loaded = checkpoint.load(file, device)
                 settings = loaded.settings
                 if run is None:
                     run = Run(str(folder), settings.seed)

@@ -23,7 +23,7 @@ from endless_gym.recording import command as recording
 from endless_gym.recording import record
 from endless_gym.recording.players import Actor
 from endless_gym.specs import ObservationName, spec
-from endless_gym_agents import command
+from endless_gym_agents import checkpoint, command
 from endless_gym_agents.agent import Agent
 from endless_gym_agents.train import choose_device
 
@@ -99,7 +99,7 @@ class AgentPlayer:
 
 def execute(arguments: RecordArguments) -> None:
     """Record the episodes, and print what was recorded."""
-    agent = command.load_checkpoint(arguments.checkpoint, choose_device(arguments.device)).agent
+    agent = checkpoint.load(arguments.checkpoint, choose_device(arguments.device)).agent
     settings = agent.settings
     with recording.progress(arguments.episodes) as bar:
         recorded = record(

@@ -91,7 +91,7 @@ def train_rank(
     )
     run = Path(folder)
     if has_begun:
-        resumed = command.load_checkpoint(run, "cpu").state
+        resumed = checkpoint.load(run).state
         check_resumable(settings, checkpoint.read_settings(run))
         settings = dataclasses.replace(settings, resume="", run=str(run))
 

@@ -1,13 +1,16 @@
 """Small agents and their rollouts, for the tests of the agents."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 
-from endless_gym_agents.agent import Agent, AgentMemory
+from endless_gym.specs import spec
+from endless_gym_agents import checkpoint
+from endless_gym_agents.agent import Agent, AgentMemory, make_agent
 from endless_gym_agents.rollout import Segment
-from endless_gym_agents.settings import PRESETS, Model, Recurrence, Settings, Transformer
+from endless_gym_agents.settings import PRESETS, Model, Recurrence, Settings, Transformer, to_dict
 
 #: An experiment of `endless-reproduce`: one run of six updates, with checkpoints every second.
 EXPERIMENT: dict[str, Any] = {
@@ -38,18 +41,34 @@ FEATURES = {"features": (6,)}
 BRANCHES = (3, 2)
 
 
+def changed(given: Settings, **changes: Any) -> Settings:
+    """The settings with other values; a dict replaces fields of a group, such as `ppo={"steps": 8}`."""
+    groups = {name: replace(getattr(given, name), **new) for name, new in changes.items() if isinstance(new, dict)}
+    return replace(given, **(changes | groups))
+
+
 def settings(agent: str, **changes: Any) -> Settings:
-    """Settings of a small network; `changes` replace fields."""
+    """Settings of a small network, changed as by `changed`."""
     small = {
         "recurrence": Recurrence(hidden_size=16, sequence_length=8),
         "transformer": Transformer(layers=2, width=16, heads=2, window=6, sequence_length=8, positions=64),
         "model": Model(vector_width=12, head_width=10),
     }
-    return replace(PRESETS["quick"], agent=agent, **(small | changes))
+    return changed(replace(PRESETS["quick"], agent=agent, **small), **changes)
 
 
-def transformer(**changes: Any) -> dict[str, Transformer]:
-    return {"transformer": replace(settings("trxl").transformer, **changes)}
+def transformer(**changes: Any) -> dict[str, Any]:
+    return {"transformer": changes}
+
+
+def saved(run: Path, given: Settings, **state: Any) -> Agent:
+    """A new agent in evaluation mode, with a checkpoint of a run, as endless-train saves it."""
+    torch.manual_seed(0)
+    agent = make_agent(given, spec(given.env))
+    checkpoint.save(
+        run, {"settings": to_dict(given), "update": 1, "steps": 64, "model": agent.state_dict()} | state, False
+    )
+    return agent.eval()
 
 
 def make(agent: str, shapes: dict[str, tuple[int, ...]] = FEATURES, **changes: Any) -> Agent:

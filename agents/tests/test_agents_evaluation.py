@@ -9,12 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from agents_helpers import settings
+from agents_helpers import changed, settings
 from rich.console import Console
 
 import endless_gym_agents
 from endless_gym.specs import spec
-from endless_gym_agents import protocol
+from endless_gym_agents import checkpoint, protocol
+from endless_gym_agents.agent import make_agent
 from endless_gym_agents.evaluate import evaluate
 from endless_gym_agents.metrics import path_length, task_progress
 from endless_gym_agents.protocol import EvalArguments, evaluate_runs, find
@@ -34,9 +35,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     for name, agent, seed in (("a", "gru", 1), ("b", "gru", 2), ("c", "none", 1)):
         given = settings(agent, env=GRID, seed=seed, run=str(folder / name), checkpoint_interval=1, threads=1)
-        environment = replace(given.environment, num_envs=4, option=("command_count=[2]",))
-        ppo = replace(given.ppo, steps=8, minibatches=1, updates=2)
-        train(replace(given, environment=environment, ppo=ppo, keep_checkpoints=True))
+        environment = {"num_envs": 4, "option": ("command_count=[2]",)}
+        ppo = {"steps": 8, "minibatches": 1, "updates": 2}
+        train(changed(given, environment=environment, ppo=ppo, keep_checkpoints=True))
     return folder
 
 
@@ -78,11 +79,7 @@ def test_path_lengths_match_the_published_episodes() -> None:
 
 def test_task_progress_uses_the_path_length_of_each_seed() -> None:
     """An untrained agent reaches one or two tiles; each is a fraction of the path of its seed."""
-    agent = settings(
-        "none", env="MysteryPath-v0", environment=replace(settings("none").environment, option=("max_steps=60",))
-    )
-    from endless_gym_agents.agent import make_agent
-
+    agent = settings("none", env="MysteryPath-v0", environment={"option": ("max_steps=60",)})
     results = evaluate(make_agent(agent, spec("MysteryPath-v0")), range(200_000, 200_010), 2, num_threads=1)
     for result in results:
         path = PATHS[int(result["seed"]) - 200_000]
@@ -146,7 +143,7 @@ def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path
 
 def test_progress_callback_counts_every_episode(runs: Path) -> None:
     counts: list[int] = []
-    agent = protocol.command.load_checkpoint(runs / "a", "cpu").agent
+    agent = checkpoint.load(runs / "a").agent
     evaluate(agent, range(200_000, 200_004), 2, num_threads=1, ended=counts.append)
     assert sum(counts) == 8
     assert min(counts) > 0
@@ -159,8 +156,8 @@ def test_runs_of_an_experiment_differ_only_in_what_does_not_affect_learning() ->
     for name, value in apart.items():
         assert getattr(given, name) != value
         assert experiments.of(replace(given, **{name: value})) is experiments.of(given), name
-    environment = replace(given.environment, engine="process", num_threads=7)
-    assert experiments.of(replace(given, environment=environment)) is experiments.of(given)
+    threads = changed(given, environment={"engine": "process", "num_threads": 7})
+    assert experiments.of(threads) is experiments.of(given)
     for other in (replace(given, bf16=True), replace(given, agent="lstm"), replace(given, env="MortarMayhem-v0")):
         assert experiments.of(other) is not experiments.of(given)
 

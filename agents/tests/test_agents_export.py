@@ -2,32 +2,24 @@
 
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from agents_helpers import settings
+from agents_helpers import changed, saved, settings
 
-from endless_gym.specs import spec
 from endless_gym_agents import checkpoint, export
-from endless_gym_agents.agent import make_agent
-from endless_gym_agents.settings import to_dict
 
 ID = "MortarMayhem-Grid-v0"
 WEB = Path(__file__).resolve().parents[2] / "bindings" / "web"
 FILE = WEB.parents[1] / "engine" / "view" / "page" / "files" / f"{ID}.agent.bin"
 
 
-def trained(tmp_path: Path, **changes: object) -> Path:
-    """A run with a new agent, as a run would save it."""
-    torch.manual_seed(3)
-    given = replace(settings("gru"), env=ID, **changes)  # type: ignore[arg-type]
-    given = replace(given, environment=replace(given.environment, option=("command_count=[1,2]",)))
-    agent = make_agent(given, spec(ID))
-    state = {"settings": to_dict(given), "update": 7, "steps": 70, "model": agent.state_dict()}
-    checkpoint.save(tmp_path, state, keep=False)
+def trained(tmp_path: Path, **changes: Any) -> Path:
+    given = settings("gru", env=ID, environment={"option": ("command_count=[1,2]",)})
+    saved(tmp_path, changed(given, **changes), update=7, steps=70)
     return tmp_path
 
 
@@ -79,8 +71,8 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"agent": "lstm"}, "--agent must be gru, got lstm"),
-        ({"recurrence": replace(settings("gru").recurrence, layers=2)}, "--recurrence.layers must be 1, got 2"),
-        ({"recurrence": replace(settings("gru").recurrence, embedding=False)}, "--recurrence.embedding must be on"),
+        ({"recurrence": {"layers": 2}}, "--recurrence.layers must be 1, got 2"),
+        ({"recurrence": {"embedding": False}}, "--recurrence.embedding must be on"),
     ],
 )
 def test_an_agent_that_the_format_lacks_is_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:

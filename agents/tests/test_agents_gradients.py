@@ -61,9 +61,8 @@ def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
 
 @pytest.mark.parametrize("kind", ["gru", "trxl"])
 def test_every_weight_of_an_agent_with_all_heads_gets_a_gradient(kind: str) -> None:
-    given = settings(kind)
-    ppo = replace(given.ppo, reconstruction_coefficient=0.1, ground_truth_coefficient=1.0)
-    given = replace(given, ppo=ppo, environment=replace(given.environment, observation="rgb"))
+    ppo = {"reconstruction_coefficient": 0.1, "ground_truth_coefficient": 1.0}
+    given = settings(kind, ppo=ppo, environment={"observation": "rgb"})
     torch.manual_seed(3)
     agent = Agent(given, {FRAME: (84, 84, 3), "vector_observation": (5,)}, BRANCHES, ground_truth=2)
     memory, draws = agent.initial_memory(ENVS), torch.Generator().manual_seed(4)

@@ -1,7 +1,6 @@
 """When a task counts as learnt, and the runs that stop then."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,11 +44,14 @@ def test_task_is_learnt_at_nine_tenths_of_its_best_result(
 def test_a_run_stops_and_says_so(
     changes: dict[str, object], stops: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = settings("none", env=GRID, run=str(tmp_path / "run"), threads=1, **changes)
+    ppo = {"steps": 32, "minibatches": 1, "updates": 25}
     # Failures are rewarded like successes, so that every agent reaches the reward.
     options = ("command_count=[1]", "reward_command_failure=0.1")
-    environment = replace(given.environment, num_envs=8, option=options)
-    run = train(replace(given, environment=environment, ppo=replace(given.ppo, steps=32, minibatches=1, updates=25)))
+    environment = {"num_envs": 8, "option": options}
+    given = settings(
+        "none", env=GRID, run=str(tmp_path / "run"), threads=1, environment=environment, ppo=ppo, **changes
+    )
+    run = train(given)
     updates = len((run / "progress.jsonl").read_text().splitlines())
     output = " ".join(capsys.readouterr().out.split())
     assert ("the task is learnt: the last episodes have a mean reward of 0.1" in output) is stops

@@ -14,7 +14,7 @@ from endless_gym_agents.encoders import FRAME
 from endless_gym_agents.memory import MemoryState, Minibatch
 from endless_gym_agents.ppo import learn, linear_decay, minibatch_loss
 from endless_gym_agents.rollout import Segment
-from endless_gym_agents.settings import PPO, Environment
+from endless_gym_agents.settings import PPO
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -74,16 +74,15 @@ def played(kind: str) -> tuple[Agent, Segment, MemoryState]:
 @pytest.mark.parametrize("kind", ["none", "gru", "trxl"])
 def test_minibatch_loss_is_the_weighted_sum(kind: str, normalisation: str) -> None:
     """Computed in a loop over the steps from the outputs of the network."""
-    ppo = replace(
-        settings(kind).ppo, ground_truth_coefficient=0.3, advantage_normalisation=normalisation, clip_range=0.1
-    )
+    ppo = {"ground_truth_coefficient": 0.3, "advantage_normalisation": normalisation, "clip_range": 0.1}
+    given = settings(kind, ppo=ppo)
     torch.manual_seed(3)
-    agent = Agent(settings(kind, ppo=ppo), {"features": (6,)}, BRANCHES, ground_truth=2)
+    agent = Agent(given, {"features": (6,)}, BRANCHES, ground_truth=2)
     memory = agent.initial_memory(4)
     segment = segment_of(agent, memory, {"features": observations(16, 4)}, 16, 4)
     minibatch, *_ = agent.memory.minibatches([memory.state], segment.reset_mask, 3, torch.Generator().manual_seed(0))
     segment, advantages, returns = segment.flat(), torch.randn(64), torch.randn(64)
-    loss, parts = minibatch_loss(agent, segment, minibatch, advantages, returns, ppo, 0.05)
+    loss, parts = minibatch_loss(agent, segment, minibatch, advantages, returns, given.ppo, 0.05)
 
     chosen = minibatch.indices.tolist()
     mean = sum(float(advantages[i]) for i in chosen) / len(chosen)
@@ -113,10 +112,7 @@ def test_minibatch_loss_is_the_weighted_sum(kind: str, normalisation: str) -> No
 def test_reconstruction_is_a_term_of_the_loss() -> None:
     """The coefficient adds its multiple of the mean binary cross-entropy to the loss."""
     shapes, frames = {FRAME: (84, 84, 3)}, torch.randint(0, 256, (4, 84, 84, 3), dtype=torch.uint8)
-    given = settings("none")
-    given = replace(
-        given, ppo=replace(given.ppo, reconstruction_coefficient=0.1), environment=Environment(observation="rgb")
-    )
+    given = settings("none", ppo={"reconstruction_coefficient": 0.1}, environment={"observation": "rgb"})
     torch.manual_seed(3)
     agent, numbers = Agent(given, shapes, BRANCHES), torch.zeros(4)
     action, done = torch.zeros(4, 2, dtype=torch.long), torch.zeros(4, dtype=torch.bool)

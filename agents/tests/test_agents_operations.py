@@ -7,12 +7,11 @@ only make a view are not counted.
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from agents_helpers import settings
+from agents_helpers import changed, settings
 from operations import Operations
 
 from endless_gym_agents.agent import make_agent
@@ -41,12 +40,9 @@ def small(name: str) -> Settings:
     agent, _, single = name.partition(", ")
     given = settings(agent, env="Endless-MortarMayhem-v0", threads=1)
     if single:
-        given = replace(given, transformer=replace(given.transformer, sequence_length=1))
-    return replace(
-        given,
-        environment=replace(given.environment, num_envs=8, groups=GROUPS, num_threads=1),
-        ppo=replace(given.ppo, steps=STEPS, epochs=2, minibatches=2),
-    )
+        given = changed(given, transformer={"sequence_length": 1})
+    environment = {"num_envs": 8, "groups": GROUPS, "num_threads": 1}
+    return changed(given, environment=environment, ppo={"steps": STEPS, "epochs": 2, "minibatches": 2})
 
 
 def counted(agent: str, device: str = "cpu") -> dict[str, float]:

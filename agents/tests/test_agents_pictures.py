@@ -3,7 +3,6 @@
 import csv
 import json
 import stat
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +25,8 @@ GRID = "MortarMayhem-Grid-v0"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    given = settings("gru", env=GRID, run=str(folder), threads=1)
-    environment = replace(given.environment, num_envs=4, option=("command_count=[1]",))
-    return train(replace(given, environment=environment, ppo=replace(given.ppo, steps=16, minibatches=1, updates=2)))
+    environment, ppo = {"num_envs": 4, "option": ("command_count=[1]",)}, {"steps": 16, "minibatches": 1, "updates": 2}
+    return train(settings("gru", env=GRID, run=str(folder), threads=1, environment=environment, ppo=ppo))
 
 
 def rgb(image: Image.Image) -> np.ndarray:

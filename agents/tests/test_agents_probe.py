@@ -2,18 +2,14 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from agents_helpers import settings
+from agents_helpers import saved, settings
 
-from endless_gym.specs import spec
-from endless_gym_agents import checkpoint, probe
-from endless_gym_agents.agent import make_agent
+from endless_gym_agents import probe
 from endless_gym_agents.probe import Recording, Score
-from endless_gym_agents.settings import to_dict
 
 ID = "Endless-MysteryPath-v0"
 
@@ -55,12 +51,9 @@ def test_only_the_nonlinear_probe_reads_a_nonlinear_memory() -> None:
 
 
 @pytest.mark.parametrize("agent", ["gru", "trxl", "none"])
-def test_recording_has_what_the_heads_see(agent: str) -> None:
+def test_recording_has_what_the_heads_see(agent: str, tmp_path: Path) -> None:
     """The value head applied to the recorded memory gives the values of acting; recording does not change the agent."""
-    given = settings(agent)
-    torch.manual_seed(0)
-    made = make_agent(replace(given, env=ID), spec(ID))
-    made.eval()
+    made = saved(tmp_path, settings(agent, env=ID))
     before = {name: value.clone() for name, value in made.state_dict().items()}
     values, act = [], made.act
 
@@ -86,10 +79,7 @@ def test_the_command_and_its_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for env in (ID, "MortarMayhem-Grid-v0"):
-        given = replace(settings("gru"), env=env)
-        made = make_agent(given, spec(env))
-        state = {"settings": to_dict(given), "update": 1, "steps": 64, "model": made.state_dict()}
-        checkpoint.save(tmp_path / env, state, keep=False)
+        saved(tmp_path / env, settings("gru", env=env))
     command = ["endless-probe", str(tmp_path / ID), "--episodes", "5", "--max-steps", "20"]
     monkeypatch.setattr(sys, "argv", [*command, "--json"])
     assert probe.main() == 0

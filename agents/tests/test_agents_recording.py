@@ -3,22 +3,16 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from agents_helpers import settings
+from agents_helpers import saved, settings
 
 from endless_gym.recording import record
-from endless_gym.specs import spec
-from endless_gym_agents import checkpoint
-from endless_gym_agents.agent import make_agent
 from endless_gym_agents.evaluate import evaluate
 from endless_gym_agents.record import AgentPlayer
-from endless_gym_agents.settings import to_dict
 
 pytestmark = pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")
 
@@ -31,13 +25,8 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "datasets"
 
 
-def make(agent: str, **options: Any) -> Any:
-    given = settings(agent)
-    environment = replace(given.environment, option=tuple(f"{name}={value}" for name, value in options.items()))
-    torch.manual_seed(0)
-    made = make_agent(replace(given, env=ID, environment=environment), spec(ID))
-    made.eval()
-    return made
+def make(agent: str, run: Path) -> Any:
+    return saved(run, settings(agent, env=ID, environment={"option": ("max_steps=20",)}))
 
 
 def load(dataset: str) -> Any:
@@ -47,8 +36,8 @@ def load(dataset: str) -> Any:
 
 
 @pytest.mark.parametrize("agent", ["gru", "trxl", "stack"])
-def test_the_agent_plays_as_it_is_evaluated(agent: str) -> None:
-    made = make(agent, max_steps=20)
+def test_the_agent_plays_as_it_is_evaluated(agent: str, tmp_path: Path) -> None:
+    made = make(agent, tmp_path)
     recorded = record(
         ID,
         6,
@@ -65,8 +54,8 @@ def test_the_agent_plays_as_it_is_evaluated(agent: str) -> None:
     assert [episode.rewards.sum() for episode in episodes] == pytest.approx([result["reward"] for result in results])
 
 
-def test_sampled_actions_follow_from_the_seed_alone() -> None:
-    made = make("gru", max_steps=20)
+def test_sampled_actions_follow_from_the_seed_alone(tmp_path: Path) -> None:
+    made = make("gru", tmp_path)
 
     def actions(name: str, seed: int, threads: int) -> list[list[int]]:
         player = AgentPlayer(made, seed)
@@ -81,9 +70,7 @@ def test_sampled_actions_follow_from_the_seed_alone() -> None:
 
 @pytest.mark.slow
 def test_the_command_records_a_checkpoint(tmp_path: Path, root: Path) -> None:
-    made = make("gru", max_steps=20)
-    state = {"settings": to_dict(made.settings), "update": 1, "steps": 64, "model": made.state_dict()}
-    checkpoint.save(tmp_path / "run", state, keep=False)
+    make("gru", tmp_path / "run")
     command = [sys.executable, "-m", "endless_gym_agents.record", tmp_path / "run", "--episodes", "3", "--json"]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert ran.returncode == 0, ran.stderr

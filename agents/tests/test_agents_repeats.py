@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agents_helpers import settings
+from agents_helpers import changed, settings
 from torch import Tensor, nn
 
 from endless_gym_agents import repeats
@@ -26,12 +26,9 @@ ENVS, STEPS = 4, 12
 
 
 def small(agent: str = "gru", observation: str = "rgb", compile: bool = False, **ppo: float) -> Settings:
-    given = settings(agent, env="MysteryPath-Grid-v0", threads=1, compile=compile)
-    return replace(
-        given,
-        environment=replace(given.environment, num_envs=ENVS, groups=2, num_threads=1, observation=observation),
-        ppo=replace(given.ppo, steps=STEPS, minibatches=2, **ppo),
-    )
+    environment = {"num_envs": ENVS, "groups": 2, "num_threads": 1, "observation": observation}
+    given = settings(agent, env="MysteryPath-Grid-v0", threads=1, compile=compile, environment=environment)
+    return changed(given, ppo={"steps": STEPS, "minibatches": 2, **ppo})
 
 
 def collected(given: Settings, segments: int = 1) -> tuple[Agent, Segment, list[MemoryState], int]:

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from agents_helpers import EXPERIMENT
+from agents_helpers import EXPERIMENT, changed
 
 from endless_gym_agents import checkpoint
 from endless_gym_agents.curves import published
@@ -176,7 +175,7 @@ def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
     given = job.run.settings()
     (job.folder / "settings.json").write_text(json.dumps(to_dict(given)))
     planning.check_folders([job])
-    (job.folder / "settings.json").write_text(json.dumps(to_dict(replace(given, ppo=replace(given.ppo, gamma=0.9)))))
+    (job.folder / "settings.json").write_text(json.dumps(to_dict(changed(given, ppo={"gamma": 0.9}))))
     with pytest.raises(ValueError, match="has a run with another `ppo`"):
         planning.check_folders([job])
 

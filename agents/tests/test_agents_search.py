@@ -15,11 +15,10 @@ from typing import Any
 
 import psutil
 import pytest
-from agents_helpers import settings
+from agents_helpers import changed, settings
 from rich.console import Console
 
-from endless_gym_agents import search, search_ray, search_workers
-from endless_gym_agents.command import load_checkpoint
+from endless_gym_agents import checkpoint, search, search_ray, search_workers
 from endless_gym_agents.logs import read_progress
 from endless_gym_agents.search import parse
 from endless_gym_agents.search_space import single_changes, space, with_choices
@@ -31,10 +30,9 @@ QUIET = Console(quiet=True)
 
 
 def small(folder: Path, **changes: Any) -> SearchArguments:
-    given = settings("gru", env="MortarMayhem-Grid-v0", threads=1, checkpoint_interval=100)
-    environment = replace(given.environment, num_envs=4, option=("command_count=[1]",))
-    ppo = replace(given.ppo, steps=16, minibatches=1, updates=3)
-    start = replace(given, environment=environment, ppo=ppo)
+    environment, ppo = {"num_envs": 4, "option": ("command_count=[1]",)}, {"steps": 16, "minibatches": 1, "updates": 3}
+    given = {"env": "MortarMayhem-Grid-v0", "threads": 1, "checkpoint_interval": 100}
+    start = settings("gru", environment=environment, ppo=ppo, **given)
     return replace(
         SearchArguments(str(folder), parameters=("ppo.epochs",), trials=1, period=1, settings=start), **changes
     )
@@ -60,7 +58,7 @@ def test_search_space_is_the_table_of_the_paper() -> None:
     # The table has 8 parameters for all with 16 other choices; 4 with 5 for recurrence; 5 with 10 for the Transformer-XL.
     assert (len(gru), len(single_changes(gru))) == (12, 1 + 16 + 5)
     assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 16 + 10)
-    rebuilt = replace(PRESETS["paper"], ppo=replace(PRESETS["paper"].ppo, reconstruction_coefficient=0.1))
+    rebuilt = changed(PRESETS["paper"], ppo={"reconstruction_coefficient": 0.1})
     assert space(rebuilt)["ppo.reconstruction_coefficient"] == (0.1, 0.5, 1.0)
     # Every single change gives valid settings.
     for agent, choices in (("gru", gru), ("trxl", trxl)):
@@ -206,7 +204,7 @@ def test_trials_that_fall_behind_are_pruned(
 
     monkeypatch.setattr(search, "train", played)
     given = small(tmp_path, stage="single", period=2, **changes)
-    given = replace(given, settings=replace(given.settings, ppo=replace(given.settings.ppo, updates=10)))
+    given = replace(given, settings=changed(given.settings, ppo={"updates": 10}))
     trials = Trials(given, QUIET)
     search.run_trials(trials)
     assert watched == updates
@@ -240,8 +238,7 @@ def killed_once(trials: Trials, threads: int | None) -> None:
 def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -> None:
     def given(name: str) -> SearchArguments:
         given = small(tmp_path / name, stage="single", workers=2)
-        ppo = replace(given.settings.ppo, updates=4)
-        return replace(given, settings=replace(given.settings, ppo=ppo, checkpoint_interval=1))
+        return replace(given, settings=changed(given.settings, ppo={"updates": 4}, checkpoint_interval=1))
 
     through = Trials(given("through"), QUIET)
     search.run_trials(through)
@@ -339,7 +336,7 @@ def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) 
         finally:
             started.kill()  # its workers stop with it
     for run in runs:
-        assert load_checkpoint(run, "cpu").update == read_progress(run)[-1]["update"]
+        assert checkpoint.load(run).update == read_progress(run)[-1]["update"]
     given = parse([*command[3:], *sizes, *choice])
     left = Trials(given, QUIET)
     assert states(left) == ["FAIL", "FAIL", "WAITING"]
@@ -355,5 +352,4 @@ def test_command_line_includes_the_training_flags() -> None:
         "local",
         "auto",
     ]
-    expected = PRESETS["quick"]
-    assert given.settings == replace(expected, agent="trxl", ppo=replace(expected.ppo, updates=7))
+    assert given.settings == changed(PRESETS["quick"], agent="trxl", ppo={"updates": 7})

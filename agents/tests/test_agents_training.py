@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 import wandb
-from agents_helpers import settings
+from agents_helpers import changed, settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from endless_gym import make_vec
@@ -35,11 +35,7 @@ GRID = "MortarMayhem-Grid-v0"
 def small(agent: str, run: Path, updates: int = 4, **environment: Any) -> Settings:
     given = settings(agent, env=GRID, run=str(run), checkpoint_interval=2, threads=1)
     changes = {"num_envs": 8, "groups": 2, "option": ("command_count=[1, 2]",), **environment}
-    return replace(
-        given,
-        environment=replace(given.environment, **changes),
-        ppo=replace(given.ppo, steps=16, minibatches=2, updates=updates),
-    )
+    return changed(given, environment=changes, ppo={"steps": 16, "minibatches": 2, "updates": updates})
 
 
 def progress(run: Path) -> list[dict[str, Any]]:
@@ -103,13 +99,9 @@ def test_resumed_run_equals_an_uninterrupted_run(agent: str, first: str, second:
 @pytest.mark.slow
 def test_resumed_run_with_frames_and_all_heads(tmp_path: Path) -> None:
     def given(run: Path, updates: int) -> Settings:
-        made = small("gru", run, updates)
-        return replace(
-            made,
-            env="Endless-MortarMayhem-v0",
-            environment=replace(made.environment, option=(), observation="rgb"),
-            ppo=replace(made.ppo, reconstruction_coefficient=0.1, ground_truth_coefficient=0.1),
-        )
+        made = small("gru", run, updates, option=(), observation="rgb")
+        heads = {"reconstruction_coefficient": 0.1, "ground_truth_coefficient": 0.1}
+        return changed(made, env="Endless-MortarMayhem-v0", ppo=heads)
 
     through = train(given(tmp_path / "through", 2))
     halved = train(given(tmp_path / "halved", 1))
@@ -256,9 +248,8 @@ def test_target_reward_needs_a_hundred_episodes(tmp_path: Path) -> None:
 def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: Path) -> None:
     """Eight segments, against environments with the same seeds that are stepped in a plain loop."""
     torch.manual_seed(1)
-    given = small("none", tmp_path, engine=engine)
-    ppo = replace(given.ppo, ground_truth_coefficient=0.1)
-    given = replace(given, env="Endless-MortarMayhem-v0", ppo=ppo, environment=replace(given.environment, option=()))
+    given = small("none", tmp_path, engine=engine, option=())
+    given = changed(given, env="Endless-MortarMayhem-v0", ppo={"ground_truth_coefficient": 0.1})
     plain = make_vec(
         given.env, 4, 1, seed=1, seeds=range(100_000), groups=2, autoreset="same_step", observation="features"
     )
@@ -297,10 +288,10 @@ def test_resumed_run_keeps_its_settings(tmp_path: Path) -> None:
     # Changed settings persist; the step count continues.
     again = parse(["--resume", str(run)])
     assert again.ppo == resumed.ppo
-    train(replace(again, ppo=replace(again.ppo, updates=4, steps=32)))
+    train(changed(again, ppo={"updates": 4, "steps": 32}))
     assert [row["steps"] for row in progress(run)] == [128, 256, 384, 384 + 256]
     with pytest.raises(ValueError, match=r"reconstruction-coefficient must stay positive \(it was 0\.1\), got 0;"):
-        check_resumable(again, replace(again, ppo=replace(again.ppo, reconstruction_coefficient=0.1)))
+        check_resumable(again, changed(again, ppo={"reconstruction_coefficient": 0.1}))
     with pytest.raises(ValueError, match="must keep its agent: expected gru, got lstm"):
         train(parse(["--resume", str(run), "--agent", "lstm"]))
     with pytest.raises(ValueError, match="must keep its seed: expected 1, got 2"):
@@ -350,24 +341,11 @@ def test_bf16_changes_results_slightly_and_keeps_float32_weights(agent: str, tmp
     assert all(tensor.dtype == torch.float32 for tensor in checkpoint.load(coarse).agent.state_dict().values())
 
 
-def one_command(agent: str, run: Path, **changes: Any) -> Settings:
-    quick = PRESETS["quick"]
-    return replace(
-        quick,
-        env=GRID,
-        agent=agent,
-        run=str(run),
-        threads=1,
-        target_reward=0.097,
-        environment=replace(quick.environment, option=("command_count=[1]",)),
-        ppo=replace(quick.ppo, updates=200),
-        **changes,
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("agent", ["gru", "trxl"])
 def test_agent_with_memory_learns_a_command_that_is_shown_and_hidden(agent: str, tmp_path: Path) -> None:
-    trained = checkpoint.load(train(one_command(agent, tmp_path / agent)))
+    given = replace(PRESETS["quick"], env=GRID, agent=agent, run=str(tmp_path / agent), threads=1, target_reward=0.097)
+    given = changed(given, environment={"option": ("command_count=[1]",)}, ppo={"updates": 200})
+    trained = checkpoint.load(train(given))
     assert mean(evaluate(trained.agent, num_threads=1)) >= 0.085
