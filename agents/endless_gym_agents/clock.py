@@ -19,7 +19,6 @@ class Clock:
     """
 
     def __init__(self) -> None:
-        """Make a clock without seconds."""
         self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager

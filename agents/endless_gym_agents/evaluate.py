@@ -10,7 +10,7 @@ import torch
 from endless_gym.create import make_vec
 from endless_gym.specs import spec
 from endless_gym_agents.agent import Agent
-from endless_gym_agents.metrics import TASK_PROGRESS, needs_path_length, path_length, task_progress
+from endless_gym_agents.metrics import TASK_PROGRESS, path_length, task_progress
 
 #: The paper's protocol: seeds that training never uses, and episodes per seed. Actions are sampled, so the episodes of a seed
 #: differ.
@@ -49,7 +49,7 @@ def evaluate(
     num_envs = len(episode_seeds)
     memory, generator = agent.initial_memory(num_envs), torch.Generator(agent.device).manual_seed(action_seed)
     results: list[dict[str, float]] = [{} for _ in episode_seeds]
-    paths = {seed: path_length(env_spec.id, options, seed) if needs_path_length(env_spec.id) else 0 for seed in seeds}
+    paths = {seed: path_length(env_spec.id, options, seed) for seed in seeds}
     with make_vec(
         settings.env,
         num_envs,

@@ -42,22 +42,19 @@ def counts_failures(env: str) -> tuple[str, ...]:
 
 
 def path_length(env: str, options: Mapping[str, Any], seed: int) -> int:
-    """Number of tiles of the path of Mystery Path, with its goal and without its origin.
+    """Number of tiles of the path of Mystery Path, with its goal and without its origin; 0 in other environments.
 
     Args:
         env: Environment id.
         options: Reset parameters that differ from the defaults.
         seed: Seed of the episode.
     """
+    if not env.startswith("MysteryPath"):
+        return 0
     game = Env(env, options=dict(options), observation="features")
     game.reset(seed=seed)
     _, tiles = game.progress()["tiles"]
     return int(tiles or 0)
-
-
-def needs_path_length(env: str) -> bool:
-    """Whether `task_progress` needs the length of the path in this environment."""
-    return env.startswith("MysteryPath")
 
 
 def task_progress(spec: Spec, options: Mapping[str, Any], final: Mapping[str, float], path: int = 0) -> float | None:

@@ -186,8 +186,9 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
                 sizes, weights = minibatch.batch_sizes.tolist(), self.recurrent.all_weights
                 y = packed_layers(x, weights, minibatch.initial_hidden, sizes)
             else:
+                hidden = minibatch.initial_hidden
                 sequences = PackedSequence(x, minibatch.batch_sizes)
-                output, _ = self.recurrent(sequences, self._split(minibatch.initial_hidden))
+                output, _ = self.recurrent(sequences, hidden[0] if self.parts == 1 else tuple(hidden))
                 y = output.data
         return y + x if self.settings.residual else y
 
@@ -196,10 +197,6 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         if not torch.is_autocast_enabled(self.device.type):
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, enabled=False)
-
-    def _split(self, hidden: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """Convert (parts, layers, n, hidden size) to what `nn.GRU` or `nn.LSTM` takes."""
-        return hidden[0] if self.parts == 1 else (hidden[0], hidden[1])
 
 
 def packed(time: Tensor, env: Tensor, lengths: Tensor, envs: int) -> tuple[Tensor, Tensor]:

@@ -110,7 +110,6 @@ class Experiments:
     """Groups runs into experiments by their settings."""
 
     def __init__(self) -> None:
-        """Start without experiments."""
         self._found: dict[Hashable, Experiment] = {}
 
     def of(self, settings: Settings) -> Experiment:

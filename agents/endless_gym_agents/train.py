@@ -232,7 +232,6 @@ class Interrupt:
     """
 
     def __init__(self, ranks: Ranks) -> None:
-        """Make the handler; it is installed on entry."""
         self.requested = False
         self._ranks = ranks
         self._before: dict[int, Any] = {}

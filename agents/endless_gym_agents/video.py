@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,23 +79,22 @@ def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
         OSError: ffmpeg has failed; the message contains its error.
     """
     check(file)
-    writers = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}
-    partial = file.with_name(f".{file.name}.partial{file.suffix.lower()}")
+    suffix, images = file.suffix.lower(), map(Image.fromarray, frames)
+    partial = file.with_name(f".{file.name}.partial{suffix}")
     try:
-        writers[file.suffix.lower()](partial, iter(frames), fps)
+        if suffix == ".gif":
+            _animation(partial, (image.convert("P", palette=Image.Palette.ADAPTIVE) for image in images), fps)
+        elif suffix == ".webp":
+            _animation(partial, images, fps, lossless=True)
+        else:
+            _mp4(partial, iter(frames), fps)
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _gif(file: Path, frames: Iterator[Frame], fps: int) -> None:
-    images = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames)
-    next(images).save(file, save_all=True, append_images=images, duration=round(1000 / fps), loop=0)
-
-
-def _webp(file: Path, frames: Iterator[Frame], fps: int) -> None:
-    images = (Image.fromarray(frame) for frame in frames)
-    next(images).save(file, save_all=True, append_images=images, duration=round(1000 / fps), loop=0, lossless=True)
+def _animation(file: Path, images: Iterator[Image.Image], fps: int, **options: Any) -> None:
+    next(images).save(file, save_all=True, append_images=images, duration=round(1000 / fps), loop=0, **options)
 
 
 def _mp4(file: Path, frames: Iterator[Frame], fps: int) -> None:

@@ -89,47 +89,32 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def lstm_cell(x: Any, h: Any, cell: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
-    """The fused LSTM cell, which PyTorch calls on devices other than the CPU."""
+    """The fused LSTM cell, which PyTorch calls on devices other than the CPU; what it keeps for the gradients are the gates."""
     gates = x + h if bias_x is None else x + h + bias_x + bias_h
     into, forget, new, out = gates.chunk(4, 1)
-    into, forget, new, out = into.sigmoid(), forget.sigmoid(), new.tanh(), out.sigmoid()
-    after = forget * cell + into * new
-    return out * after.tanh(), after, torch.cat([into, forget, new, out], 1)
+    after = forget.sigmoid() * cell + into.sigmoid() * new.tanh()
+    return out.sigmoid() * after.tanh(), after, gates
 
 
-def lstm_cell_backward(grad_h: Any, grad_c: Any, before: Any, after: Any, kept: Any, has_bias: bool) -> Any:
-    into, forget, new, out = kept.chunk(4, 1)
-    to_h = torch.zeros_like(before) if grad_h is None else grad_h
-    to_c = to_h * out * (1 - after.tanh() ** 2) + (0 if grad_c is None else grad_c)
-    gates = torch.cat(
-        [
-            to_c * new * into * (1 - into),
-            to_c * before * forget * (1 - forget),
-            to_c * into * (1 - new * new),
-            to_h * after.tanh() * out * (1 - out),
-        ],
-        1,
-    )
-    return gates, to_c * forget, gates.sum(0) if has_bias else None
+def lstm_cell_backward(grad_h: Any, grad_c: Any, before: Any, after: Any, gates: Any, has_bias: bool) -> Any:
+    given = (grad_h, grad_c, gates, torch.zeros_like(gates), None, None, before, after)
+    to_gates, _, to_cell, *_ = torch.ops.aten._thnn_differentiable_lstm_cell_backward(*given)
+    return to_gates, to_cell, to_gates.sum(0) if has_bias else None
 
 
 def gru_cell(x: Any, h: Any, hidden: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
-    """The fused GRU cell."""
+    """The fused GRU cell; what it keeps for the gradients are the gates and the hidden state."""
     x, h = (x, h) if bias_x is None else (x + bias_x, h + bias_h)
     (reset_x, update_x, new_x), (reset_h, update_h, new_h) = x.chunk(3, 1), h.chunk(3, 1)
-    reset, update = (reset_x + reset_h).sigmoid(), (update_x + update_h).sigmoid()
-    new = (new_x + reset * new_h).tanh()
-    return new + update * (hidden - new), torch.cat([reset, update, new, hidden, new_h], 1)
+    new = (new_x + (reset_x + reset_h).sigmoid() * new_h).tanh()
+    return new + (update_x + update_h).sigmoid() * (hidden - new), torch.cat([x, h, hidden], 1)
 
 
 def gru_cell_backward(grad: Any, kept: Any, has_bias: bool) -> Any:
-    reset, update, new, hidden, new_h = kept.chunk(5, 1)
-    to_new = grad * (1 - update) * (1 - new * new)
-    to_update = grad * (hidden - new) * update * (1 - update)
-    to_reset = to_new * new_h * reset * (1 - reset)
-    to_x = torch.cat([to_reset, to_update, to_new], 1)
-    to_h = torch.cat([to_reset, to_update, to_new * reset], 1)
-    return to_x, to_h, grad * update, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
+    width = grad.shape[1]
+    x, h, hidden = kept.split([3 * width, 3 * width, width], 1)
+    to_x, to_h, to_hidden, *_ = torch.ops.aten._thnn_differentiable_gru_cell_backward(grad, x, h, hidden, None, None)
+    return to_x, to_h, to_hidden, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
 
 
 #: Operations that PyTorch calls on devices other than the CPU only.

@@ -116,25 +116,6 @@ def test_rank_may_have_no_step_of_a_minibatch(name: str) -> None:
     assert sorted(torch.cat(indices).tolist()) == list(range(STEPS))
 
 
-@pytest.mark.parametrize("name", WITH_STATE)
-def test_act_does_not_leak(name: str) -> None:
-    """An observation influences only the later steps of its own episode in its own environment."""
-    agent = agent_of(name)
-    done = torch.zeros(STEPS, ENVS, dtype=torch.bool)
-    done[9, 1] = True  # the changed step belongs to the episode of steps 0 to 9
-    observed = observations(STEPS, ENVS)
-    changed = observed.clone()
-    changed[6, 1] += 1.0
-    _, _, _, before = play(agent, agent.initial_memory(ENVS), observed, done)
-    _, _, _, after = play(agent, agent.initial_memory(ENVS), changed, done)
-    differs = before != after
-    allowed = torch.zeros_like(differs)
-    allowed[6:10, 1] = True
-    assert not differs[~allowed].any()
-    # All later steps of the episode are influenced, also with the stack of four observations.
-    assert differs[6:10, 1].all()
-
-
 # Frame stacks are made in `act`; `forward` takes the stacked observations.
 @pytest.mark.parametrize("name", [name for name in WITH_STATE if KINDS[name][0] != "stack"])
 def test_forward_does_not_leak(name: str) -> None:
@@ -158,33 +139,6 @@ def test_forward_does_not_leak(name: str) -> None:
         # Truncated BPTT: back to the start of the episode or of the sequence.
         length = changes.get("recurrence", settings(kind).recurrence).sequence_length
         assert reached == {(t, 1) for t in range(max(10, 15 - 15 % length), 16)}
-
-
-@pytest.mark.parametrize("name", TRANSFORMERS)
-def test_cached_token_influences_the_next_window_of_its_episode(name: str) -> None:
-    """A cached token influences exactly the next `window - 1` steps of its own episode."""
-    agent = agent_of(name)
-    window = agent.memory.settings.window
-    memory, done = agent.initial_memory(ENVS), torch.zeros(STEPS, ENVS, dtype=torch.bool)
-    done[13, 1] = True
-    observed = observations(STEPS, ENVS)
-    reset_mask, *_ = play(agent, memory, observed, done)
-
-    def values() -> torch.Tensor:
-        (minibatch,) = agent.memory.minibatches([memory.state], reset_mask, 1, torch.Generator().manual_seed(0))
-        value = agent({"features": observed.flatten(0, 1)[minibatch.indices]}, minibatch).value
-        return torch.zeros(STEPS * ENVS).index_copy(0, minibatch.indices, value.detach()).view(STEPS, ENVS)
-
-    for step, last in ((6, 6 + window - 1), (11, 13)):
-        before = values()
-        token = memory.state.inputs[:, 1, window - 1 + step]
-        kept = token.clone()
-        token += torch.randn(token.shape)
-        differs = values() != before
-        token.copy_(kept)
-        expected = torch.zeros_like(differs)
-        expected[step + 1 : last + 1, 1] = True
-        assert torch.equal(differs, expected)
 
 
 @pytest.mark.parametrize("name", TRANSFORMERS)

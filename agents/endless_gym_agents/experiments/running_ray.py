@@ -47,25 +47,17 @@ class _RayProcess:
     def __init__(self, command: Sequence[str], machine: running.Machine, gpus: float, log: Path) -> None:
         import ray
 
-        self._given = (list(command), machine.nice, machine.environment(0), str(log.resolve()))
         # One call waits for the end of the process, another sends signals.
         made = ray.remote(num_cpus=machine.job_cores, num_gpus=gpus, max_concurrency=2)(_Host)  # type: ignore[call-overload]
         self._host: Any = made.remote()
         self._ready: Any = self._host.ready.remote()
-        self._end: Any = None
+        self._end: Any = self._host.run.remote(list(command), machine.nice, machine.environment(0), str(log.resolve()))
         self._status: int | None = None
 
     def poll(self) -> int | None:
         import ray
 
-        if self._status is None and self._end is None and _is_there(self._ready):
-            try:
-                ray.get(self._ready)
-            except ray.exceptions.RayError:
-                self._status = -signal.SIGKILL
-            else:
-                self._end = self._host.run.remote(*self._given)
-        if self._status is None and self._end is not None and _is_there(self._end):
+        if self._status is None and _is_there(self._end):
             try:
                 self._status = int(ray.get(self._end))
             except ray.exceptions.RayError:  # The machine, or the actor, is lost.
@@ -78,11 +70,11 @@ class _RayProcess:
 
         if self._status is not None:
             return
-        if self._end is None:  # It waits for resources.
+        if _is_there(self._ready):
+            self._host.send_signal.remote(int(sig))
+        else:  # It waits for resources.
             ray.kill(self._host)
             self._status = -sig
-        else:
-            self._host.send_signal.remote(int(sig))
 
 
 def _is_there(reference: Any) -> bool:
