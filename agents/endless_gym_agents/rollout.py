@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,7 +24,7 @@ from endless_gym_agents.encoders import FRAME, Observation
 from endless_gym_agents.environments import Environments, StepResult
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.repeats import EmbeddedFrames
-from endless_gym_agents.transfers import HostCopy, Outcome, Upload
+from endless_gym_agents.transfers import HostCopy, Upload
 from endless_gym_agents.transforms import Identity, TransformState
 
 
@@ -151,7 +152,6 @@ class RolloutCollector:
             self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
         self._actions = [HostCopy((per_group, branches), torch.long, device) for _ in range(groups)]
-        self._outcomes = [Outcome(per_group, device) for _ in range(groups)]
         self._uploads = [Upload(device) for _ in range(groups)]
 
     def collect(self, clock: Clock) -> tuple[Segment, list[dict[str, float]]]:
@@ -255,7 +255,8 @@ class RolloutCollector:
         result = self.environments.receive(group)
         self.current[group] = result
         outcome = self._parts[group].outcome[step + 1]
-        self._outcomes[group].copy_to(outcome, result.reward, result.done)
+        # In one copy.
+        self._uploads[group].copy("outcome", np.array([result.reward, result.done], np.float32), outcome)
         memory = self.memories[group]
         memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
         return result.episodes

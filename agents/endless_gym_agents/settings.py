@@ -417,14 +417,8 @@ def from_dict(values: dict[str, Any]) -> Settings:
         KeyError: A group is missing.
     """
     values = dict(values)
-    groups = {
-        "environment": Environment,
-        "recurrence": Recurrence,
-        "transformer": Transformer,
-        "model": Model,
-        "ppo": PPO,
-    }
-    for name, kind in groups.items():
-        values[name] = kind(**values[name])
+    for part in dataclasses.fields(Settings):
+        if dataclasses.is_dataclass(kind := part.default_factory):
+            values[part.name] = kind(**values[part.name])
     values["environment"] = dataclasses.replace(values["environment"], option=tuple(values["environment"].option))
     return Settings(**values)

@@ -24,9 +24,7 @@ def interquartile_mean(scores: ArrayLike) -> float:
     The floor(n / 4) lowest and the floor(n / 4) highest of n scores are discarded. The interquartile mean is more robust to
     outliers than the mean, and has less variance than the median.
     """
-    ordered = np.sort(np.asarray(scores, dtype=np.float64), axis=None)
-    cut = int(TRIMMED * ordered.size)
-    return float(ordered[cut : ordered.size - cut].mean())
+    return float(_interquartile_means(np.asarray(scores, dtype=np.float64).reshape(1, -1))[0])
 
 
 def _interquartile_means(samples: Scores) -> Scores:

@@ -43,26 +43,6 @@ class HostCopy:
             self._done.synchronize()
 
 
-class Outcome:
-    """Rewards and ends of episodes of n environments, which go to the device in one copy."""
-
-    def __init__(self, num_envs: int, device: torch.device) -> None:
-        """Allocate the memory on the host, page-locked for CUDA."""
-        self._on_host = device.type == "cpu"
-        self._tensor = torch.empty(2, num_envs, pin_memory=device.type == "cuda")
-        self._array: NDArray[np.float32] = self._tensor.numpy()
-
-    def copy_to(self, target: Tensor, reward: NDArray[np.float64], done: NDArray[np.bool_]) -> None:
-        """Copy rewards and ends of episodes, (n,) each, to float32 (2, n) on the device.
-
-        The copy before must be complete; it is when the actions of a later step have arrived, since copies are in order.
-        """
-        array = target.numpy() if self._on_host else self._array
-        array[0], array[1] = reward, done
-        if not self._on_host:
-            target.copy_(self._tensor, non_blocking=True)
-
-
 class Upload:
     """Copies arrays of the host, by name, to tensors of the device.
 
@@ -78,7 +58,8 @@ class Upload:
     def copy(self, name: str, array: NDArray[Any], target: Tensor) -> None:
         """Begin to copy `array` to `target`, of equal shape; the array may change afterwards.
 
-        The copy before under this name must be complete; see `Outcome.copy_to`.
+        The copy before under this name must be complete; it is when the actions of a later step have arrived, since copies are
+        in order.
         """
         if self._on_host:
             np.copyto(target.numpy(), array)

@@ -7,10 +7,12 @@ from typing import Any
 import torch
 
 from endless_gym.specs import spec
-from endless_gym_agents import checkpoint
+from endless_gym_agents import checkpoint, losses
 from endless_gym_agents.agent import Agent, AgentMemory, make_agent
+from endless_gym_agents.memory import MemoryState
+from endless_gym_agents.ppo import minibatch_loss
 from endless_gym_agents.rollout import Segment
-from endless_gym_agents.settings import PRESETS, Model, Recurrence, Settings, Transformer, to_dict
+from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer, to_dict
 
 #: An experiment of `endless-reproduce`: one run of six updates, with checkpoints every second.
 EXPERIMENT: dict[str, Any] = {
@@ -132,3 +134,14 @@ def segment_of(agent: Agent, memory: AgentMemory, observed: dict[str, torch.Tens
         ground_truth=torch.randn(steps, envs, 2, generator=draws) if agent.ground_truth else None,
         last_value=torch.randn(envs, generator=draws),
     )
+
+
+def loss_of(agent: Agent, segment: Segment, state: MemoryState, ppo: PPO, entropy_coefficient: float) -> torch.Tensor:
+    """The total loss of a segment as one minibatch."""
+    advantages = losses.generalised_advantages(
+        segment.reward, segment.value, segment.done, segment.last_value, ppo.gamma, ppo.gae_lambda
+    )
+    (minibatch,) = agent.memory.minibatches([state], segment.reset_mask, 1, torch.Generator().manual_seed(0))
+    returns = (advantages + segment.value).flatten()
+    flat = segment.flat()
+    return minibatch_loss(agent, flat, minibatch, advantages.flatten(), returns, ppo, entropy_coefficient)[0]

@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agents_helpers import BRANCHES, ends, make, observations, play, segment_of, settings
+from agents_helpers import BRANCHES, ends, loss_of, make, observations, play, segment_of, settings
 from test_agents_memory import KINDS, TRANSFORMERS, agent_of
 
-from endless_gym_agents import losses
 from endless_gym_agents.agent import Agent, AgentMemory
 from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.ppo import minibatch_loss
 from endless_gym_agents.rollout import Segment
 
 STEPS, ENVS = 12, 3
@@ -18,14 +16,7 @@ STEPS, ENVS = 12, 3
 
 def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> list[str]:
     """Names of the weights that no gradient of the total loss reaches; of the others some entry has a gradient."""
-    given = agent.settings.ppo
-    advantages = losses.generalised_advantages(
-        segment.reward, segment.value, segment.done, segment.last_value, given.gamma, given.gae_lambda
-    )
-    (minibatch,) = agent.memory.minibatches([memory.state], segment.reset_mask, 1, torch.Generator().manual_seed(0))
-    returns = (advantages + segment.value).flatten()
-    loss, _ = minibatch_loss(agent, segment.flat(), minibatch, advantages.flatten(), returns, given, 0.01)
-    loss.backward()
+    loss_of(agent, segment, memory.state, agent.settings.ppo, 0.01).backward()
     return [name for name, weight in agent.named_parameters() if weight.grad is None or not weight.grad.any()]
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agents_helpers import BRANCHES, ends, make, observations, segment_of, settings
+from agents_helpers import BRANCHES, ends, loss_of, make, observations, segment_of, settings
 from operations import Operations
 
 from endless_gym_agents import losses
@@ -143,15 +143,7 @@ def test_learning_is_adamw_on_clipped_gradients() -> None:
     assert measures["learning_rate"] == pytest.approx((2.75e-4 + 1e-5) / 2)
     assert measures["gradient_norm"] > 0.01
 
-    advantages = losses.generalised_advantages(
-        segment.reward, segment.value, segment.done, segment.last_value, ppo.gamma, ppo.gae_lambda
-    )
-    (minibatch,) = other.memory.minibatches([state], segment.reset_mask, 1, torch.Generator().manual_seed(0))
-    returns = (advantages + segment.value).flatten()
-    loss, _ = minibatch_loss(
-        other, segment.flat(), minibatch, advantages.flatten(), returns, ppo, measures["entropy_coefficient"]
-    )
-    loss.backward()
+    loss_of(other, segment, state, ppo, measures["entropy_coefficient"]).backward()
     norm = math.sqrt(sum(float(p.grad.square().sum()) for p in other.parameters() if p.grad is not None))
     assert measures["gradient_norm"] == pytest.approx(norm, rel=1e-4)
     rate = measures["learning_rate"]

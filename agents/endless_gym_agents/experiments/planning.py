@@ -249,12 +249,6 @@ def update_seconds(job: Job) -> list[float]:
     return [sum(value for name, value in row.items() if name.startswith("seconds/")) for row in rows]
 
 
-def seconds_per_update(job: Job) -> float | None:
-    """Median time of an update in the log of a job's run; None before its first update."""
-    times = update_seconds(job)
-    return statistics.median(times) if times else None
-
-
 def evaluation_seconds(job: Job) -> float | None:
     """Time of a job's evaluation; None if it has none, or before it is done."""
     file = job.folder / EVALUATION
@@ -295,7 +289,12 @@ def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None
         planned: The jobs.
         side_by_side: Number of jobs that run at a time.
     """
-    training, evaluation = _estimate(planned, seconds_per_update), _estimate(planned, evaluation_seconds)
+
+    def median(job: Job) -> float | None:
+        times = update_seconds(job)
+        return statistics.median(times) if times else None
+
+    training, evaluation = _estimate(planned, median), _estimate(planned, evaluation_seconds)
     if training is None:
         return None
     left = [max(0, job.updates - job.updates_done()) * training(job) for job in planned]

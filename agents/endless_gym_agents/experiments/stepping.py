@@ -37,21 +37,21 @@ def measure(env_id: str, episodes: int) -> list[float]:
     return rates
 
 
-def execute(arguments: argparse.Namespace) -> None:
-    """Measure, and write mean and standard deviation over the episodes to a file."""
-    rates = measure(arguments.env, arguments.episodes)
-    result = {"mean": float(np.mean(rates)), "std": float(np.std(rates)), "episodes": len(rates)}
-    result["load_average"] = os.getloadavg()[0]
-    Path(arguments.json).write_text(json.dumps(result) + "\n")
-
-
 def main() -> int:
     """Entry point of the measurement; returns the exit status."""
     parser = argparse.ArgumentParser(prog="endless-speed", description=__doc__)
     parser.add_argument("--env", required=True)
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--json", required=True)
-    return command.run("endless-speed", lambda: execute(parser.parse_args()))
+    given = parser.parse_args()
+
+    def execute() -> None:
+        rates = measure(given.env, given.episodes)
+        result = {"mean": float(np.mean(rates)), "std": float(np.std(rates)), "episodes": len(rates)}
+        result["load_average"] = os.getloadavg()[0]
+        Path(given.json).write_text(json.dumps(result) + "\n")
+
+    return command.run("endless-speed", execute)
 
 
 if __name__ == "__main__":
