@@ -139,13 +139,8 @@ def main() -> None:
             sequences += [(env, a, b) for a, b in zip(starts, [*starts[1:], steps], strict=True)]
         longest = max(b - a for _, a, b in sequences)
 
-        batch = {
-            "frames": frames,
-            "actions": actions,
-            "log_probs": log_probs,
-            "values": values,
-            "advantages": advantages,
-        }
+        batch = {"frames": frames, "actions": actions, "log_probs": log_probs, "values": values}
+        batch["advantages"] = advantages
         batch = {name: padded(data, sequences) for name, data in batch.items()}
         mask = padded(torch.ones(n, steps, dtype=torch.bool), sequences)
         start = torch.stack([states[env, a] for env, a, _ in sequences])

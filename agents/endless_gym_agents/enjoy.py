@@ -87,18 +87,19 @@ class EpisodeRecorder:
         settings, memory = self.agent.settings, self.agent.initial_memory(1)
         env_spec = spec(settings.env)
         observation, _ = envs.reset(seed=[seed])
-        reward, length, done = 0.0, 0, False
+        done = False
         self.rewards.append(0.0)
         self.lengths.append(0)
         frame = self._frame(envs, observation, f"{settings.env}  seed {seed}  step 0")
         yield frame
-        while not done and not (self.max_steps and length >= self.max_steps):
+        while not done and not (self.max_steps and self.lengths[-1] >= self.max_steps):
             action = self.agent.act(observation, memory, generator, self.greedy).action.cpu().numpy()
-            observation, rewards, terminated, truncated, _ = envs.step(env_spec.batched_actions(action))
-            reward, length = reward + float(rewards[0]), length + 1
+            observation, reward, terminated, truncated, _ = envs.step(env_spec.batched_actions(action))
             done = bool(terminated[0] or truncated[0])
-            self.rewards[-1], self.lengths[-1] = reward, length
-            text = f"{settings.env}  seed {seed}  step {length}  action {'-'.join(map(str, action[0]))}  reward {reward:.2f}"
+            self.rewards[-1] += float(reward[0])
+            self.lengths[-1] += 1
+            text = f"{settings.env}  seed {seed}  step {self.lengths[-1]}  action {'-'.join(map(str, action[0]))}"
+            text += f"  reward {self.rewards[-1]:.2f}"
             frame = self._frame(envs, observation, text + ("  end" if done else ""))
             yield frame
         for _ in range(env_spec.render_fps):

@@ -214,13 +214,8 @@ def record_vectors(agent: Agent, steps: int) -> dict[str, Any]:
             logits = agent.acting_weights().logits(decision.outputs)[0]
             recorded["reset"].append(bool(memory.reset_mask[0]))
             recorded["features"].append(observed["features"][0].tolist())
-            recorded["logits"].append(
-                [
-                    number
-                    for row, choices in zip(logits.tolist(), agent.branches, strict=True)
-                    for number in row[:choices]
-                ]
-            )
+            rows = [row[:choices] for row, choices in zip(logits, agent.branches, strict=True)]
+            recorded["logits"].append(torch.cat(rows).tolist())
             recorded["action"].append(decision.action[0].tolist())
             agent.remember(memory, decision, transform_update)
             observation, _, terminated, truncated, _ = envs.step(env_spec.batched_actions(decision.action.numpy()))

@@ -15,29 +15,11 @@ from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer, to_dict
 
 #: An experiment of `endless-reproduce`: one run of six updates, with checkpoints every second.
-EXPERIMENT: dict[str, Any] = {
-    "title": "Mine",
-    "section": "-",
-    "about": "A test.",
-    "kind": "curves",
-    "seeds": 1,
-    "evaluation": {"interval": 2, "seeds": 2, "repetitions": 1},
-    "runs": [
-        {
-            "name": "gru",
-            "env": "MortarMayhem-Grid-v0",
-            "flags": {
-                "preset": "quick",
-                "agent": "gru",
-                "environment.option": ["command_count=[1, 2]"],
-                "environment.num-envs": 8,
-                "ppo.updates": 6,
-                "ppo.steps": 256,
-                "recurrence.hidden-size": 16,
-            },
-        }
-    ],
-}
+EXPERIMENT: dict[str, Any] = {"title": "Mine", "section": "-", "about": "A test.", "kind": "curves", "seeds": 1}
+EXPERIMENT["evaluation"] = {"interval": 2, "seeds": 2, "repetitions": 1}
+_FLAGS = {"preset": "quick", "agent": "gru", "environment.option": ["command_count=[1, 2]"], "environment.num-envs": 8}
+_FLAGS |= {"ppo.updates": 6, "ppo.steps": 256, "recurrence.hidden-size": 16}
+EXPERIMENT["runs"] = [{"name": "gru", "env": "MortarMayhem-Grid-v0", "flags": _FLAGS}]
 
 FEATURES = {"features": (6,)}
 BRANCHES = (3, 2)

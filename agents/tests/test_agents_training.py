@@ -31,6 +31,13 @@ from endless_gym_agents.train import check_resumable, choose_device, parse, rest
 
 GRID = "MortarMayhem-Grid-v0"
 
+#: Frames, and the heads that need them and a ground truth.
+ALL_HEADS = {
+    "env": "Endless-MortarMayhem-v0",
+    "environment": {"option": (), "observation": "rgb"},
+    "ppo": {"reconstruction_coefficient": 0.1, "ground_truth_coefficient": 0.1},
+}
+
 
 def small(agent: str, run: Path, updates: int = 4, **environment: Any) -> Settings:
     given = settings(agent, env=GRID, run=str(run), checkpoint_interval=2, threads=1)
@@ -78,37 +85,28 @@ def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("agent", "first", "second"),
+    ("agent", "first", "second", "changes"),
     [
-        *((agent, "thread", "thread") for agent in ("position", "stack", "gru", "lstm", "trxl")),
-        *(("gru", "process", engine) for engine in ("process", "thread")),
-        ("gru", "thread", "process"),
+        *((agent, "thread", "thread", {}) for agent in ("position", "stack", "gru", "lstm", "trxl")),
+        *(("gru", "process", engine, {}) for engine in ("process", "thread")),
+        ("gru", "thread", "process", {}),
+        ("gru", "thread", "thread", ALL_HEADS),
     ],
 )
-def test_resumed_run_equals_an_uninterrupted_run(agent: str, first: str, second: str, tmp_path: Path) -> None:
-    through = train(small(agent, tmp_path / "through", 4))
-    halved = train(small(agent, tmp_path / "halved", 2, engine=first))
-    train(replace(small(agent, tmp_path, 4, engine=second), resume=str(halved)))
+def test_resumed_run_equals_an_uninterrupted_run(
+    agent: str, first: str, second: str, changes: dict[str, Any], tmp_path: Path
+) -> None:
+    def given(run: Path, updates: int, engine: str) -> Settings:
+        return changed(small(agent, run, updates, engine=engine), **changes)
+
+    through = train(given(tmp_path / "through", 4, "thread"))
+    halved = train(given(tmp_path / "halved", 2, first))
+    train(replace(given(tmp_path, 4, second), resume=str(halved)))
     assert len(progress(through)) == 4
     assert progress(halved) == progress(through)
     one, two = (checkpoint.load(run).state for run in (through, halved))
     for part in ("update", "model", "optimizer", "generators", "player", "episodes"):
         assert same(one[part], two[part]), part
-
-
-@pytest.mark.slow
-def test_resumed_run_with_frames_and_all_heads(tmp_path: Path) -> None:
-    def given(run: Path, updates: int) -> Settings:
-        made = small("gru", run, updates, option=(), observation="rgb")
-        heads = {"reconstruction_coefficient": 0.1, "ground_truth_coefficient": 0.1}
-        return changed(made, env="Endless-MortarMayhem-v0", ppo=heads)
-
-    through = train(given(tmp_path / "through", 2))
-    halved = train(given(tmp_path / "halved", 1))
-    train(replace(given(tmp_path, 2), resume=str(halved)))
-    assert progress(halved) == progress(through)
-    assert {"reconstruction_loss", "ground_truth_loss"} <= progress(through)[0].keys()
-    assert same(checkpoint.load(through).state["model"], checkpoint.load(halved).state["model"])
 
 
 def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:

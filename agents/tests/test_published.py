@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gzip
 import json
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+
+from endless_gym_agents.curves import _published
 
 RESULTS = Path(__file__).parents[2] / "tests/reference/published_results.json.gz"
 
@@ -26,11 +27,6 @@ METRICS = [
 ]
 
 
-def package() -> dict[str, dict[str, list[list[float]]]]:
-    text = (resources.files("endless_gym_agents") / "published.json").read_text()
-    return dict(json.loads(text)["curves"])
-
-
 def results() -> dict[str, Any]:
     return dict(json.loads(gzip.decompress(RESULTS.read_bytes())))
 
@@ -42,14 +38,14 @@ def test_published_curves_are_read_unchanged(env: str, name: str, metric: str, s
         for key, value in results().items()
         if key.startswith(f"{name}/")
     }
-    curves = package()[env]
+    curves = _published()["curves"][env]
     assert published == {agent: curves[agent] for agent in curves if agent.endswith("_cues") == bool(suffix)}
 
 
 def test_task_progress_of_mystery_path_fits_the_published_rewards() -> None:
     """A tile gives 0.1, the goal 1.0. The paths have 9.2 tiles in the mean; the shorter ones are finished more often."""
     published = results()
-    curves = package()["MysteryPath-v0"]
+    curves = _published()["curves"]["MysteryPath-v0"]
     assert len(curves) == 7
     for agent, scores in curves.items():
         metrics = published[f"mp_off_dense/{agent}"]["metrics"]
@@ -60,7 +56,7 @@ def test_task_progress_of_mystery_path_fits_the_published_rewards() -> None:
 
 def test_searing_spotlights_is_half_coins_and_half_success() -> None:
     published = results()
-    curves = package()["SearingSpotlights-v0"]
+    curves = _published()["curves"]["SearingSpotlights-v0"]
     assert len(curves) == 11
     for agent, scores in curves.items():
         # Where an agent was evaluated twice, the figures of the paper show the runs with the suffix.
