@@ -43,7 +43,7 @@ from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemor
 from endless_gym_agents.recurrent import RecurrentMemory
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.transformer import TransformerMemory
-from endless_gym_agents.transforms import TransformState, make_observation_transform
+from endless_gym_agents.transforms import FrameStack, Identity, ObservationTransform, PositionalEncoding, TransformState
 
 #: An array or tensor of n environments, (n, ...).
 Array: TypeAlias = NDArray[Any] | Tensor
@@ -163,7 +163,7 @@ class Agent(nn.Module):
 
         Args:
             settings: Settings of the network and its memory.
-            shapes: Shapes of one environment's observation, as `observation_shapes` returns them.
+            shapes: Shapes of one environment's observation, by key.
             branches: Number of choices of each branch of the action.
             ground_truth: Entries of the environment's ground truth; 0 if it has none.
             device: Device of the weights and the memories.
@@ -176,7 +176,11 @@ class Agent(nn.Module):
         self.branches = tuple(branches)
         #: Shapes of one environment's observation, by key.
         self.observation_shapes = {key: tuple(shape) for key, shape in shapes.items()}
-        self.transform = make_observation_transform(settings, shapes, self.device)
+        self.transform: ObservationTransform = Identity(shapes)
+        if settings.agent == "stack":
+            self.transform = FrameStack(shapes, settings.model.stack, self.device)
+        elif settings.agent == "position":
+            self.transform = PositionalEncoding(shapes, self.device)
         self.encoder = Encoder(self.transform.shapes, settings.model.vector_width)
         self.memory: AnyMemory
         if settings.agent == "gru" or settings.agent == "lstm":
@@ -424,19 +428,6 @@ class Agent(nn.Module):
         return self
 
 
-def observation_shapes(spec: Spec, observation: str) -> dict[str, tuple[int, ...]]:
-    """Shapes of one environment's observation by key.
-
-    Args:
-        spec: The environment's specification.
-        observation: Kind of the observation, `rgb` or `features`.
-    """
-    space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
-    if not isinstance(space, spaces.Dict):
-        space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
-    return {key: tuple(part.shape or ()) for key, part in space.items()}
-
-
 def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu") -> Agent:
     """Make an agent with newly initialised weights for an environment.
 
@@ -448,5 +439,9 @@ def make_agent(settings: Settings, spec: Spec, device: torch.device | str = "cpu
     Raises:
         ValueError: The settings need frames or a ground truth that the environment does not have.
     """
-    shapes = observation_shapes(spec, settings.environment.observation)
+    observation = settings.environment.observation
+    space = spec.observation_space(Frames() if observation == "rgb" else None, observation == "features")
+    if not isinstance(space, spaces.Dict):
+        space = spaces.Dict({FRAME if observation == "rgb" else "features": space})
+    shapes = {key: tuple(part.shape or ()) for key, part in space.items()}
     return Agent(settings, shapes, spec.branches, spec.ground_truth, device)

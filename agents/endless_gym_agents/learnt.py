@@ -25,15 +25,11 @@ def learnt(spec: Spec, options: Mapping[str, Any], means: Mapping[str, float]) -
     name, best = "success", 1.0
     if counts_failures(spec.id):
         # The rewards show what the infos do not.
-        name, best = "reward", _best_reward({**spec.reset_parameters, **options})
+        parameters = {**spec.reset_parameters, **options}
+        counts = [int(count) for count in parameters["command_count"]]
+        commands = sum(counts) / len(counts)
+        name, best = "reward", commands * parameters["reward_command_success"] + parameters["reward_episode_success"]
     reached = means.get(f"episode/{name}")
     if reached is None or best <= 0 or reached < SHARE * best:
         return None
     return f"the last episodes have a mean {name} of {reached:.3f}, and at most {best:.3f} is possible"
-
-
-def _best_reward(parameters: Mapping[str, Any]) -> float:
-    """Largest expected reward of an episode of Mortar Mayhem."""
-    counts = [int(count) for count in parameters["command_count"]]
-    commands = sum(counts) / len(counts)
-    return float(commands * parameters["reward_command_success"] + parameters["reward_episode_success"])

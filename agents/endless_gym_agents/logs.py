@@ -52,7 +52,8 @@ class Logger:
             seconds: Seconds by phase.
         """
         row = metrics | {f"seconds/{name}": value for name, value in seconds.items()}
-        self._progress.write(json.dumps({k: None if _is_nan(v) else v for k, v in row.items()}) + "\n")
+        numbers = {name: None if math.isnan(value) else value for name, value in row.items()}
+        self._progress.write(json.dumps(numbers) + "\n")
         self._progress.flush()
         step = metrics["update"]
         for name, value in row.items():
@@ -126,10 +127,6 @@ def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]
             yield from _flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 def _weights_and_biases(run: Path, settings: Settings, console: Console) -> Any:

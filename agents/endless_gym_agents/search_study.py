@@ -310,12 +310,6 @@ class Trials:
             return None
         return file
 
-    def _is_left_behind(self, number: int) -> bool:
-        lock = self._lock_of(number)
-        if lock is not None:
-            lock.close()
-        return lock is not None
-
     def _in_states(self, *states: str) -> list[Any]:
         from optuna.trial import TrialState
 
@@ -339,7 +333,9 @@ class Trials:
         from optuna.trial import TrialState
 
         for trial in self._in_states("RUNNING"):
-            if self._is_left_behind(trial.number):
+            # Its process has ended.
+            if (lock := self._lock_of(trial.number)) is not None:
+                lock.close()
                 self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
                 (self.folder / LOCKS / f"trial-{trial.number:04d}").unlink(missing_ok=True)
         resumed = {trial.user_attrs.get(_RESUMES) for trial in self.study.trials}

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from endless_gym_agents.encoders import FRAME, Observation, Shapes
-from endless_gym_agents.settings import Settings
 
 #: Entries of the encoded step number, and the number of steps with an encoding of their own.
 POSITION_WIDTH, POSITIONS = 16, 512
@@ -137,18 +136,3 @@ def grey(frames: Tensor) -> Tensor:
     """Luminance (ITU-R BT.601) of frames uint8 (..., 3) as uint8 (..., 1), in integer arithmetic."""
     red, green, blue = frames.int().unbind(-1)
     return ((4899 * red + 9617 * green + 1868 * blue + 8192) >> 14).to(torch.uint8).unsqueeze(-1)
-
-
-def make_observation_transform(settings: Settings, shapes: Shapes, device: torch.device) -> ObservationTransform:
-    """The observation transform of the agent that the settings name.
-
-    Args:
-        settings: Settings of the agent.
-        shapes: Shapes of one environment's observation.
-        device: Device of the state.
-    """
-    if settings.agent == "stack":
-        return FrameStack(shapes, settings.model.stack, device)
-    if settings.agent == "position":
-        return PositionalEncoding(shapes, device)
-    return Identity(shapes)

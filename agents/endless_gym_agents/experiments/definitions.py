@@ -218,19 +218,9 @@ def parse(name: str, text: str) -> Experiment:
     return made
 
 
-#: What JSON has for the annotations of the classes above.
-_TYPES: dict[str, tuple[type, ...]] = {
-    "str": (str,),
-    "Kind": (str,),
-    "Aggregate": (str,),
-    "int": (int,),
-    "tuple[Run, ...]": (list,),
-    "tuple[str, ...]": (list,),
-    "Evaluation": (dict,),
-    "Search": (dict,),
-    "Mapping[str, Value]": (dict,),
-    "Mapping[str, float]": (dict,),
-}
+#: What JSON has for the annotations of the classes above, without what follows in brackets.
+_TYPES: dict[str, type] = {"str": str, "Kind": str, "Aggregate": str, "int": int, "tuple": list}
+_TYPES |= dict.fromkeys(("Evaluation", "Search", "Mapping"), dict)
 
 
 def _checked(kind: Any, given: object, where: str, without: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -246,8 +236,9 @@ def _checked(kind: Any, given: object, where: str, without: tuple[str, ...] = ()
         optional = one.default is not dataclasses.MISSING or one.default_factory is not dataclasses.MISSING
         if key not in given and not optional:
             raise ValueError(f"{where}: `{key}` is missing; allowed: {allowed}")
-        if key in given and type(given[key]) not in _TYPES[str(one.type)]:
-            raise ValueError(f"{where}: `{key}` must be {_TYPES[str(one.type)][0].__name__}, got {given[key]!r}")
+        expected = _TYPES[str(one.type).partition("[")[0]]
+        if key in given and type(given[key]) is not expected:
+            raise ValueError(f"{where}: `{key}` must be {expected.__name__}, got {given[key]!r}")
     return {
         fields[key].name: tuple(value) if str(fields[key].type) == "tuple[str, ...]" else value
         for key, value in given.items()

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 
 from endless_gym_agents import checkpoint
-from endless_gym_agents.experiments.definitions import Evaluation, Experiment, Run, Value, settings_of
+from endless_gym_agents.experiments.definitions import Evaluation, Experiment, Run, Value
 from endless_gym_agents.logs import PROGRESS, read_progress
 from endless_gym_agents.search_space import space
 
@@ -187,8 +187,7 @@ def check_folders(planned: Sequence[Job]) -> None:
         if not job.updates or not (job.folder / checkpoint.SETTINGS).exists():
             continue
         found, wanted = checkpoint.read_settings(job.folder), job.run.settings()
-        own = ("env", "agent", "preset", "transformer", "recurrence", "model", "ppo")
-        for name in own:
+        for name in ("env", "agent", "preset", "transformer", "recurrence", "model", "ppo"):
             if getattr(found, name) != getattr(wanted, name):
                 raise ValueError(
                     f"{job.folder} has a run with another `{name}`: {getattr(found, name)}, and the experiment has "
@@ -310,8 +309,7 @@ def as_json(experiment: Experiment, scale: float) -> dict[str, Any]:
     small = scaled(experiment, scale)
     values = json.loads(json.dumps(dataclasses.asdict(small)))
     for row, run in zip(values["runs"], small.runs, strict=True):
-        settings = settings_of(run.env, run.flags).validated()
-        trains = small.kind != "simulation-speed"
-        row["updates"] = settings.ppo.updates if trains else 0
+        settings = run.settings()
+        row["updates"] = settings.ppo.updates if small.kind != "simulation-speed" else 0
         row["steps"] = row["updates"] * settings.environment.num_envs * settings.ppo.steps
     return dict(values)
