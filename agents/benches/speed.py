@@ -74,9 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--original", required=True, help="Python interpreter with the original")
     parser.add_argument(
-        "--cleanrl",
-        default="",
-        help="CleanRL's folder ppo_trxl; without it, only the GRU agent is measured",
+        "--cleanrl", default="", help="CleanRL's folder ppo_trxl; without it, only the GRU agent is measured"
     )
     parser.add_argument("--env", default="Endless-MortarMayhem-v0", help="environment id (default: %(default)s)")
     parser.add_argument("--num-envs", type=int, default=8, help="number of environments (default: %(default)s)")

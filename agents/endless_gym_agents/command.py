@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import TypeVar
+
+import tyro
+
+T = TypeVar("T")
 
 #: Exit status after SIGINT, by the convention of shells: 128 + 2.
 INTERRUPTED = 130
@@ -31,6 +36,12 @@ def run(name: str, work: Callable[[], object]) -> int:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     return 0
+
+
+def main(name: str, arguments: type[T], execute: Callable[[T], object], text: str | None) -> int:
+    """Parse the arguments of a command, and `run` it; `text` is the docstring of its module."""
+    given = tyro.cli(arguments, prog=name, description=description(text), args=sys.argv[1:])
+    return run(name, lambda: execute(given))
 
 
 def description(text: str | None) -> str:

@@ -130,10 +130,7 @@ def execute(arguments: EnjoyArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-enjoy`; returns the exit status."""
-    arguments = tyro.cli(
-        EnjoyArguments, prog="endless-enjoy", description=command.description(__doc__), args=sys.argv[1:]
-    )
-    return command.run("endless-enjoy", lambda: execute(arguments))
+    return command.main("endless-enjoy", EnjoyArguments, execute, __doc__)
 
 
 if __name__ == "__main__":

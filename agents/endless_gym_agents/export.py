@@ -119,11 +119,7 @@ def evaluations(agent: Agent) -> list[dict[str, Any]]:
             results = evaluate(agent, num_threads=1)
         finally:
             agent.settings = trained
-        measured: dict[str, Any] = {
-            "options": chosen,
-            "episodes": len(results),
-            "mean_reward": round(mean(results), 6),
-        }
+        measured: dict[str, Any] = {"options": chosen, "episodes": len(results), "mean_reward": round(mean(results), 6)}
         if TASK_PROGRESS in results[0]:
             successes = sum(result[TASK_PROGRESS] > 1.0 - 1e-6 for result in results)
             measured["success"] = round(successes / len(results), 6)

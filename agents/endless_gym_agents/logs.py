@@ -95,10 +95,10 @@ class SilentLogger(Logger):
         """Open nothing."""
 
     def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
-        del metrics, seconds
+        pass
 
     def print(self, text: str) -> None:
-        del text
+        pass
 
     def close(self) -> None:
         pass

@@ -188,18 +188,16 @@ class NoMemory(Memory[MemoryState, None, Minibatch]):
         self.device = device
 
     def initial_state(self, num_envs: int) -> MemoryState:
-        del num_envs
         return MemoryState()
 
     def begin_segment(self, state: MemoryState, steps: int) -> None:
-        del state, steps
+        pass
 
     def step(self, x: Tensor, state: MemoryState, reset_mask: Tensor | None) -> tuple[Tensor, None]:
-        del state, reset_mask
         return x, None
 
     def update_state(self, state: MemoryState, update: None) -> None:
-        del state, update
+        pass
 
     def minibatches(
         self,
@@ -210,7 +208,6 @@ class NoMemory(Memory[MemoryState, None, Minibatch]):
         own: range | None = None,
         epochs: int = 1,
     ) -> Minibatches[Minibatch]:
-        del states
         envs = reset_mask.shape[1]
         own = range(envs) if own is None else own
 
@@ -226,5 +223,4 @@ class NoMemory(Memory[MemoryState, None, Minibatch]):
         return Minibatches(parts, minibatch)
 
     def forward(self, x: Tensor, minibatch: Minibatch) -> Tensor:
-        del minibatch
         return x

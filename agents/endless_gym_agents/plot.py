@@ -236,10 +236,7 @@ def execute(arguments: PlotArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-plot`; returns the exit status."""
-    arguments = tyro.cli(
-        PlotArguments, prog="endless-plot", description=command.description(__doc__), args=sys.argv[1:]
-    )
-    return command.run("endless-plot", lambda: execute(arguments))
+    return command.main("endless-plot", PlotArguments, execute, __doc__)
 
 
 if __name__ == "__main__":

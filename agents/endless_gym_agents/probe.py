@@ -240,10 +240,7 @@ def execute(arguments: ProbeArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-probe`; returns the exit status."""
-    arguments = tyro.cli(
-        ProbeArguments, prog="endless-probe", description=command.description(__doc__), args=sys.argv[1:]
-    )
-    return command.run("endless-probe", lambda: execute(arguments))
+    return command.main("endless-probe", ProbeArguments, execute, __doc__)
 
 
 if __name__ == "__main__":

@@ -204,10 +204,7 @@ def execute(arguments: EvalArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-eval`; returns the exit status."""
-    arguments = tyro.cli(
-        EvalArguments, prog="endless-eval", description=command.description(__doc__), args=sys.argv[1:]
-    )
-    return command.run("endless-eval", lambda: execute(arguments))
+    return command.main("endless-eval", EvalArguments, execute, __doc__)
 
 
 if __name__ == "__main__":

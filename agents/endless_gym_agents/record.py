@@ -89,7 +89,6 @@ class AgentPlayer:
         def act(
             observation: Mapping[str, NDArray[Any]], episode_start: NDArray[np.bool_], active: NDArray[np.bool_]
         ) -> NDArray[np.int64]:
-            del active
             memory.reset(episode_start)
             action = agent.act(observation, memory, generator, self._greedy).action
             return self._spec.batched_actions(action.cpu().numpy())

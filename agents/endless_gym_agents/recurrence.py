@@ -137,11 +137,7 @@ class PackedLSTM(torch.autograd.Function):
         entry, forget, candidate, exit_ = gates.unflatten(1, (4, before.shape[1])).unbind(1)
         # What the gradient of a cell state, and that of a hidden state, is multiplied by.
         factors = torch.stack(
-            [
-                candidate * entry * (1 - entry),
-                cells_before * forget * (1 - forget),
-                entry * (1 - candidate.square()),
-            ],
+            [candidate * entry * (1 - entry), cells_before * forget * (1 - forget), entry * (1 - candidate.square())],
             dim=1,
         )
         to_exit, to_cell = squashed * exit_ * (1 - exit_), exit_ * (1 - squashed.square())

@@ -109,7 +109,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         state.stored, state.time, state.steps = [], 0, steps
 
     def refresh(self, dtype: torch.dtype) -> None:
-        del dtype  # The recurrent layers compute in float32.
+        # The recurrent layers compute in float32, whatever `dtype` is.
         self._cells = [[weight.detach() for weight in layer] for layer in self.recurrent.all_weights]
 
     def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -94,10 +94,7 @@ def _tune(study: _Study, trainer: Trainer, gpus: float) -> None:
             _trainable(trainer, arguments.period, arguments.trial_cpus), {"cpu": arguments.trial_cpus, "gpu": gpus}
         ),
         tune_config=tune.TuneConfig(
-            search_alg=Proposals(),
-            scheduler=Pruning(),
-            num_samples=-1,
-            max_concurrent_trials=arguments.workers or None,
+            search_alg=Proposals(), scheduler=Pruning(), num_samples=-1, max_concurrent_trials=arguments.workers or None
         ),
         run_config=tune.RunConfig(
             name=time.strftime("%Y%m%d-%H%M%S"),

@@ -74,7 +74,6 @@ def run_workers(trials: Trials, work: Work) -> None:
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
-        del number, frame
         stopped = True
         for process in alive.values():
             with contextlib.suppress(ProcessLookupError):

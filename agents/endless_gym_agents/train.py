@@ -251,7 +251,6 @@ class Interrupt:
             signal.signal(number, signal.SIG_IGN if number == signal.SIGTERM else handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
         if self._first:
             if self._ranks.size > 1 and time.monotonic() < self._first + 2.0:
                 return

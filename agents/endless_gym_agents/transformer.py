@@ -628,7 +628,6 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         A sequence of one step would need a copy of `past` tokens for each step. The parts are about as long as the past, so that
         a query attends to half of its group's tokens.
         """
-        del length
         parts = math.ceil(steps / max(past, SHORTEST_PART))
         part = math.ceil(steps / parts)
         padding = parts * part - steps

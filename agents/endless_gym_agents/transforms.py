@@ -58,13 +58,11 @@ class Identity(ObservationTransform):
         self.shapes = shapes
 
     def initial_state(self, num_envs: int) -> TransformState:
-        del num_envs
         return {}
 
     def apply(
         self, observation: Observation, state: TransformState, reset_mask: Tensor
     ) -> tuple[Observation, TransformState]:
-        del state, reset_mask
         return observation, {}
 
 

@@ -1,5 +1,7 @@
 """Small agents and their rollouts, for the tests of the agents."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,9 +11,10 @@ import torch
 from endless_gym.specs import spec
 from endless_gym_agents import checkpoint, losses
 from endless_gym_agents.agent import Agent, AgentMemory, make_agent
+from endless_gym_agents.environments import Environments
 from endless_gym_agents.memory import MemoryState
 from endless_gym_agents.ppo import minibatch_loss
-from endless_gym_agents.rollout import Segment
+from endless_gym_agents.rollout import RolloutCollector, Segment
 from endless_gym_agents.settings import PPO, PRESETS, Model, Recurrence, Settings, Transformer, to_dict
 
 #: An experiment of `endless-reproduce`: one run of six updates, with checkpoints every second.
@@ -116,6 +119,15 @@ def segment_of(agent: Agent, memory: AgentMemory, observed: dict[str, torch.Tens
         ground_truth=torch.randn(steps, envs, 2, generator=draws) if agent.ground_truth else None,
         last_value=torch.randn(envs, generator=draws),
     )
+
+
+@contextmanager
+def collecting(given: Settings, device: str = "cpu") -> Iterator[RolloutCollector]:
+    """A collector of segments with a new agent."""
+    with Environments(given) as environments:
+        torch.manual_seed(1)
+        agent = make_agent(given, environments.spec, device)
+        yield RolloutCollector(agent, environments, given.ppo.steps, torch.Generator(device).manual_seed(1))
 
 
 def loss_of(agent: Agent, segment: Segment, state: MemoryState, ppo: PPO, entropy_coefficient: float) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,37 +19,35 @@ RECORDED = json.loads(gzip.decompress((Path(__file__).parent / "authors.json.gz"
 CPU = torch.device("cpu")
 WINDOW, LONGEST = 5, 12
 
-#: Our names of the authors' parts of a block.
-PARTS = {"norm1": "norm_query", "norm_kv": "norm_tokens", "norm2": "norm_fc", "fc.0": "fc"}
-#: The authors' matrices that ours stack.
-GATES = {"from_y.weight": ("Wr", "Wz", "Wg"), "from_x.weight": ("Ur", "Uz"), "from_reset.weight": ("Ug",)}
+#: Our names of the authors' weights, in the place of regular expressions.
+NAMES = {
+    "^pos_embedding$": "table",
+    "^linear_(embedding|transform)": "embedding.0",
+    "^fusion": "fusion.0",
+    "^recurrent_layer": "recurrent",
+    "^transformer_blocks": "layers",
+    ".norm1.": ".norm_query.",
+    ".norm_kv.": ".norm_tokens.",
+    ".norm2.": ".norm_fc.",
+    ".fc.0.": ".fc.",
+    ".gate1.": ".gate_attention.",
+    ".gate2.": ".gate_fc.",
+    ".bg$": ".bias",
+}
+#: The authors' matrices that those of our gates stack.
+GATES = {"from_y": ("Wr", "Wz", "Wg"), "from_x": ("Ur", "Uz"), "from_reset": ("Ug",)}
 
 
 def ours(theirs: dict[str, Tensor]) -> dict[str, Tensor]:
     """Weights or gradients by the authors' names, by our names."""
     found: dict[str, Tensor] = {}
     for name, tensor in theirs.items():
-        if name == "pos_embedding":
-            found["table"] = tensor
-        elif name.startswith("linear_embedding.") or name.startswith("linear_transform."):
-            found["embedding.0." + name.split(".")[1]] = tensor
-        elif name.startswith("fusion."):
-            found["fusion.0." + name.split(".")[1]] = tensor
-        elif name.startswith("recurrent_layer."):
-            found["recurrent." + name.split(".")[1]] = tensor
-        else:
-            _, number, part = name.split(".", 2)
-            if not part.startswith("gate"):
-                for one, two in PARTS.items():
-                    part = two + part[len(one) :] if part.startswith(one + ".") else part
-                found[f"layers.{number}.{part}"] = tensor
-    blocks = {name.split(".")[1] for name in theirs if ".gate1." in name}
-    for number in blocks:
-        for gate, our_gate in (("gate1", "gate_attention"), ("gate2", "gate_fc")):
-            theirs_gate, prefix = f"transformer_blocks.{number}.{gate}", f"layers.{number}.{our_gate}"
-            found[f"{prefix}.bias"] = theirs[f"{theirs_gate}.bg"]
-            for stacked, parts in GATES.items():
-                found[f"{prefix}.{stacked}"] = torch.cat([theirs[f"{theirs_gate}.{part}.weight"] for part in parts])
+        for pattern, new in NAMES.items():
+            name = re.sub(pattern.replace(".", r"\."), new, name)
+        found[name] = tensor
+    for gate in [name.removesuffix(".bias") for name in found if re.search(r"gate_\w+\.bias$", name)]:
+        for stacked, parts in GATES.items():
+            found[f"{gate}.{stacked}.weight"] = torch.cat([found.pop(f"{gate}.{part}.weight") for part in parts])
     return found
 
 

@@ -163,6 +163,7 @@ def test_settings_of_earlier_versions_have_the_defaults_of_later_ones() -> None:
         ({"ppo": {"epochs": 0}}, "--ppo.epochs must be 1 or more, got 0"),
         ({"ppo": {"decay_updates": 0}}, "--ppo.decay-updates must be 1 or more, got 0"),
         ({"transformer": {"width": 0}}, "--transformer.width must be 1 or more, got 0"),
+        ({"view": True}, r"add --environment\.engine process"),
         ({"threads": -1}, "--threads must be 0 or more, got -1"),
         ({"env": "Nothing-v0"}, r"id must be one of .*, got 'Nothing-v0'"),
         (
@@ -284,8 +285,7 @@ def test_reconstruction_head_mirrors_the_encoder() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "bound"),
-    [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))],
+    ("kind", "bound"), [("xavier", math.sqrt(6 / 128)), ("kaiming", math.sqrt(6 / 64)), ("tfixup", math.sqrt(6 / 128))]
 )
 def test_uniform_weights_are_within_their_bound_and_close_to_it(kind: str, bound: float) -> None:
     """The weights of a block are within the bound and close to it; T-Fixup scales the output projection."""

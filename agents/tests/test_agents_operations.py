@@ -11,14 +11,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from agents_helpers import changed, settings
+from agents_helpers import changed, collecting, settings
 from operations import Operations
 
-from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
-from endless_gym_agents.environments import Environments
 from endless_gym_agents.ppo import learn, make_optimizer
-from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.settings import Settings
 
 STEPS, GROUPS = 16, 2
@@ -48,18 +45,15 @@ def small(name: str) -> Settings:
 def counted(agent: str, device: str = "cpu") -> dict[str, float]:
     """Operations of the second segment and update; the first one makes what is made once."""
     given = small(agent)
-    with Environments(given) as environments:
-        torch.manual_seed(1)
-        made = make_agent(given, environments.spec, device)
-        collector = RolloutCollector(made, environments, STEPS, torch.Generator(device).manual_seed(1))
-        optimizer = make_optimizer(made, 1e-3)
+    with collecting(given, device) as collector:
+        optimizer = make_optimizer(collector.agent, 1e-3)
         counts = {}
         for _ in range(2):
             with Operations() as rollout:
                 segment, _ = collector.collect(Clock())
             with Operations() as update:
                 states = [memory.state for memory in collector.memories]
-                learn(made, optimizer, segment, states, 1, given.ppo, torch.Generator().manual_seed(0))
+                learn(collector.agent, optimizer, segment, states, 1, given.ppo, torch.Generator().manual_seed(0))
             minibatches = given.ppo.epochs * given.ppo.minibatches
             counts = {
                 "act": rollout.computed / (STEPS * GROUPS),

@@ -99,10 +99,7 @@ def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], s
 
 
 def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
-    tmp_path: Path,
-    ray_folder: str,
-    segments: Callable[[], set[str]],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C in a terminal, which all processes of its group receive."""
     given = [*SEARCH, "--folder", str(tmp_path / "search"), "--ppo.updates", "100000"]

@@ -104,11 +104,7 @@ def test_restarts_are_counted_anew_in_each_update(
 
 @pytest.mark.parametrize("policy", ["restart", "save"])
 def test_a_run_without_an_engine_saves_its_checkpoint(
-    policy: str,
-    undisturbed: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    policy: str, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # From the second update on, and not in an update whose end is an interval of checkpoints.
     given = replace(

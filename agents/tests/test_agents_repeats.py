@@ -8,18 +8,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agents_helpers import changed, settings
+from agents_helpers import changed, collecting, settings
 from torch import Tensor, nn
 
 from endless_gym_agents import repeats
-from endless_gym_agents.agent import Agent, make_agent
+from endless_gym_agents.agent import Agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.encoders import FRAME
-from endless_gym_agents.environments import Environments
 from endless_gym_agents.memory import MemoryState
 from endless_gym_agents.ppo import minibatch_loss
 from endless_gym_agents.repeats import EmbeddedFrames
-from endless_gym_agents.rollout import RolloutCollector, Segment
+from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import Settings
 
 ENVS, STEPS = 4, 12
@@ -33,10 +32,8 @@ def small(agent: str = "gru", observation: str = "rgb", compile: bool = False, *
 
 def collected(given: Settings, segments: int = 1) -> tuple[Agent, Segment, list[MemoryState], int]:
     """The last of some segments, and the number of frames that were encoded for it."""
-    with Environments(given) as environments:
-        torch.manual_seed(1)
-        agent = make_agent(given, environments.spec)
-        collector = RolloutCollector(agent, environments, STEPS, torch.Generator().manual_seed(1))
+    with collecting(given) as collector:
+        agent = collector.agent
         for _ in range(segments):
             with encoded_frames(agent) as counts:
                 segment, _ = collector.collect(Clock())
@@ -136,9 +133,7 @@ def test_losses_and_gradients_equal_those_of_encoding_each_frame(agent: str) -> 
 @pytest.mark.parametrize("given", [small(observation="features"), small("stack"), small(compile=True)])
 def test_other_observations_are_encoded_one_by_one(given: Settings) -> None:
     """Features, frames with a history, and all where the encoder is compiled for a number of frames."""
-    with Environments(given) as environments:
-        agent = make_agent(given, environments.spec)
-        collector = RolloutCollector(agent, environments, STEPS, torch.Generator().manual_seed(1))
+    with collecting(given) as collector:
         segment, _ = collector.collect(Clock())
     assert segment.first_occurrence is None
     observation, rows = segment.flat().distinct(torch.tensor([5, 3]))

@@ -15,17 +15,15 @@ import numpy as np
 import pytest
 import torch
 import wandb
-from agents_helpers import changed, settings
+from agents_helpers import changed, collecting, settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from endless_gym import make_vec
 from endless_gym_agents import checkpoint
-from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.ppo import learn, make_optimizer
-from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.settings import PRESETS, Settings
 from endless_gym_agents.train import check_resumable, choose_device, parse, restore_generator, train
 
@@ -67,10 +65,8 @@ def same(one: Any, two: Any) -> bool:
 def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: Path) -> None:
     """Log-probabilities and values of two segments are those of the rollout; between them the agent learns."""
     given = small(agent, tmp_path)
-    with Environments(given) as environments:
-        torch.manual_seed(1)
-        made = make_agent(given, environments.spec)
-        collector = RolloutCollector(made, environments, given.ppo.steps, torch.Generator().manual_seed(1))
+    with collecting(given) as collector:
+        made = collector.agent
         optimizer, shuffle = make_optimizer(made, 0.01), torch.Generator().manual_seed(1)
         for _ in range(2):
             segment, _ = collector.collect(Clock())
@@ -245,7 +241,6 @@ def test_target_reward_needs_a_hundred_episodes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("engine", ["thread", "process"])
 def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: Path) -> None:
     """Eight segments, against environments with the same seeds that are stepped in a plain loop."""
-    torch.manual_seed(1)
     given = small("none", tmp_path, engine=engine, option=())
     given = changed(given, env="Endless-MortarMayhem-v0", ppo={"ground_truth_coefficient": 0.1})
     plain = make_vec(
@@ -253,10 +248,7 @@ def test_segment_contains_the_steps_of_the_environments(engine: str, tmp_path: P
     )
     now = [plain.reset(group=group) for group in range(2)]
     reset_mask = [np.ones(4, np.bool_) for _ in range(2)]
-    with Environments(given) as environments:
-        collector = RolloutCollector(
-            make_agent(given, environments.spec), environments, 16, torch.Generator().manual_seed(1)
-        )
+    with collecting(given) as collector:
         for _ in range(8):
             segment, episodes = collector.collect(Clock())
             ended = []

@@ -27,8 +27,3 @@ def test_the_page_shows_the_runs_engine(tmp_path: Path, capsys: pytest.CaptureFi
             assert f'"service":"{engine.service}"'.encode() in engines.read()
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(url)
-
-
-def test_environments_in_this_process_cannot_be_viewed(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"add --environment\.engine process"):
-        replace(small("gru", tmp_path / "run", 1, engine="thread"), view=True).validated()

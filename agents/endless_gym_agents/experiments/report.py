@@ -220,7 +220,6 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
 
 
 def _speed(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
-    del folder
     rows = []
     for run, (job, *_) in _by_run(jobs):
         measured = json.loads((job.folder / planning.SPEED).read_text())
@@ -229,7 +228,6 @@ def _speed(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
 
 
 def _search(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
-    del folder
     rows: list[Row] = []
     for run, (job, *_) in _by_run(jobs):
         if not (job.folder / "best.json").exists():

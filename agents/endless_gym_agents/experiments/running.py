@@ -222,7 +222,6 @@ class Runner:
         active.lock.close()
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
         again = ", now without waiting for the end of an update" if self.stopped else ""
         self.stopped = True
         self.say(f"stopping {len(self._active)} jobs with checkpoints{again or '; press Ctrl-C again to stop at once'}")

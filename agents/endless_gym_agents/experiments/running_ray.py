@@ -26,7 +26,6 @@ class RayRunner(running.Runner):
         self._gpus = gpus
 
     def _begin(self, command: list[str], slot: int, lock: IO[str], log: IO[str]) -> running.Process:
-        del slot, lock
         return _RayProcess(command, self.machine, self._gpus, Path(log.name))
 
 
