@@ -67,20 +67,18 @@ def evaluate(
             )
             done = terminated | truncated
             memory.reset(done)
-            before = sum(map(bool, results))
-            for env in np.flatnonzero(done):
-                # After its first episode an environment continues with another one, which is ignored.
-                if not results[env]:
-                    final = info["final_info"]
-                    names = [name for name in final if not name.startswith("_") and name != "ground_truth"]
-                    result = {name: float(final[name][env]) for name in names}
-                    progress = task_progress(env_spec, options, result, paths[episode_seeds[env]])
-                    results[env] = result | {"seed": float(episode_seeds[env])}
-                    if progress is not None:
-                        results[env][TASK_PROGRESS] = progress
-            after = sum(map(bool, results))
-            if ended is not None and after > before:
-                ended(after - before)
+            # After its first episode an environment continues with another one, which is ignored.
+            first = [env for env in np.flatnonzero(done) if not results[env]]
+            for env in first:
+                final = info["final_info"]
+                names = [name for name in final if not name.startswith("_") and name != "ground_truth"]
+                result = {name: float(final[name][env]) for name in names}
+                progress = task_progress(env_spec, options, result, paths[episode_seeds[env]])
+                results[env] = result | {"seed": float(episode_seeds[env])}
+                if progress is not None:
+                    results[env][TASK_PROGRESS] = progress
+            if ended is not None and first:
+                ended(len(first))
     return results
 
 

@@ -10,6 +10,7 @@ torchrun --nproc-per-node=4 -m endless_gym_agents.train -- --env MortarMayhem-v0
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import signal
@@ -238,11 +239,10 @@ class Interrupt:
         self._first = 0.0
 
     def __enter__(self) -> Interrupt:
-        try:
+        # Only the main thread can install handlers, and only it is interrupted.
+        with contextlib.suppress(ValueError):
             for number in (signal.SIGINT, signal.SIGTERM) if self._ranks.size > 1 else (signal.SIGINT,):
                 self._before[number] = signal.signal(number, self._on_signal)
-        except ValueError:  # Only the main thread can install handlers, and only it is interrupted.
-            pass
         return self
 
     def __exit__(self, *exception: object) -> None:

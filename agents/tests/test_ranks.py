@@ -46,8 +46,7 @@ def finished(process: subprocess.Popen[str], run: Path, expected: int = 0) -> Pa
 
 
 def last(run: Path) -> dict[str, Any]:
-    state: dict[str, Any] = torch.load(run / checkpoint.FOLDER / checkpoint.LAST, weights_only=True)
-    return state
+    return torch.load(run / checkpoint.FOLDER / checkpoint.LAST, weights_only=True)
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
@@ -62,16 +61,12 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], ru
         time.sleep(0.05)
 
 
-def children(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
 def ranks_of(process: subprocess.Popen[str]) -> dict[int, int]:
     """The process of each rank, by its number."""
     found = {}
-    for child in children(process.pid):
+    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
         variables = Path(f"/proc/{child}/environ").read_bytes().split(b"\0")
-        found |= {int(value[5:]): child for value in variables if value.startswith(b"RANK=")}
+        found |= {int(value[5:]): int(child) for value in variables if value.startswith(b"RANK=")}
     return found
 
 

@@ -152,10 +152,8 @@ def known_flags() -> dict[str, type]:
 
 def names() -> list[str]:
     """Names of the paper's experiments, in the order of its sections."""
-    found = {
-        Path(str(file)).stem: file for file in resources.files(__package__).iterdir() if str(file).endswith(".json")
-    }
-    return sorted(found, key=lambda name: (json.loads(found[name].read_text())["section"], name))
+    files = [Path(str(file)) for file in resources.files(__package__).iterdir() if str(file).endswith(".json")]
+    return [file.stem for file in sorted(files, key=lambda file: (json.loads(file.read_text())["section"], file.stem))]
 
 
 def load(name: str) -> Experiment:

@@ -87,11 +87,8 @@ def _table(rows: Sequence[Row], file: Path) -> list[str]:
 
 def _by_run(jobs: Sequence[Job]) -> list[tuple[Run, list[Job]]]:
     """The runs in their order, with their jobs."""
-    found: dict[tuple[str, str], list[Job]] = {}
-    for job in jobs:
-        found.setdefault((job.run.env, job.run.name), []).append(job)
-    order = {(run.env, run.name): run for run in (jobs[0].experiment.runs if jobs else ())}
-    return [(run, found[key]) for key, run in order.items() if key in found]
+    runs = jobs[0].experiment.runs if jobs else ()
+    return [(run, own) for run in runs if (own := [job for job in jobs if job.run is run])]
 
 
 def _beside(run: Run, own: Mapping[str, float]) -> Row:
