@@ -38,10 +38,12 @@ def run(name: str, work: Callable[[], object]) -> int:
     return 0
 
 
-def main(name: str, arguments: type[T], execute: Callable[[T], object], text: str | None) -> int:
-    """Parse the arguments of a command, and `run` it; `text` is the docstring of its module."""
-    given = tyro.cli(arguments, prog=name, description=description(text), args=sys.argv[1:])
-    return run(name, lambda: execute(given))
+def main(
+    name: str, arguments: type[T], execute: Callable[[T], object], text: str | None, given: list[str] | None = None
+) -> int:
+    """Parse the arguments `given` to a command, by default those of the process, and `run` it; `text` is its docstring."""
+    parsed = tyro.cli(arguments, prog=name, description=description(text), args=given)
+    return run(name, lambda: execute(parsed))
 
 
 def description(text: str | None) -> str:

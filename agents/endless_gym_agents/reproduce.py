@@ -183,10 +183,7 @@ def execute(arguments: ReproduceArguments) -> None:
 def main() -> int:
     """Entry point of the command `endless-reproduce`; returns the exit status."""
     given = ray_session.with_address(sys.argv[1:])
-    arguments = tyro.cli(
-        ReproduceArguments, prog="endless-reproduce", description=command.description(__doc__), args=given
-    )
-    return command.run("endless-reproduce", lambda: execute(arguments))
+    return command.main("endless-reproduce", ReproduceArguments, execute, __doc__, given)
 
 
 if __name__ == "__main__":

@@ -82,10 +82,6 @@ class SearchArguments:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     """initial settings of the trials"""
 
-    def directory(self) -> Path:
-        """Folder of the search, with the default resolved."""
-        return Path(self.folder or f"searches/{self.settings.env}/{self.settings.agent}")
-
     def validated(self) -> SearchArguments:
         """These arguments, validated.
 
@@ -221,7 +217,8 @@ class Trials:
         import optuna
 
         optuna.logging.set_verbosity(logging.ERROR)
-        self.arguments, self.console, self.folder = arguments, console, arguments.directory()
+        self.arguments, self.console, base = arguments, console, arguments.settings
+        self.folder = Path(arguments.folder or f"searches/{base.env}/{base.agent}")
         limit = 60 * arguments.minutes if arguments.minutes else float("inf")
         self.end = time.monotonic() + limit if end is None else end
         self.postponed: set[int] = set()

@@ -20,8 +20,6 @@ PresetName = Literal["paper", "old", "throughput", "throughput-512", "quick"]
 
 #: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
 TRAINING_SEEDS = range(100_000)
-
-
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
 
@@ -313,13 +311,10 @@ class Settings:
                 "--transformer.query-encoding needs --transformer.positional-encoding absolute or learned, got "
                 f"{transformer.positional_encoding}"
             )
-        settings = dataclasses.replace(self, env=env_spec.id)
-        return _replace(settings, ppo={"updates": ppo.updates or settings.paper_updates()})
-
-    def paper_updates(self) -> int:
-        """Updates with as many environment steps as the paper's run of this agent in this environment."""
-        steps = paper_run_length(self.env, self.agent) * PAPER_STEPS_PER_UPDATE
-        return -(-steps // (self.environment.num_envs * self.ppo.steps))
+        # As many environment steps as the paper's run of this agent in this environment.
+        steps = paper_run_length(env_spec.id, self.agent) * PAPER_STEPS_PER_UPDATE
+        updates = ppo.updates or -(-steps // (environment.num_envs * ppo.steps))
+        return _replace(dataclasses.replace(self, env=env_spec.id), ppo={"updates": updates})
 
     def positions(self) -> int:
         """Rows of the table of positional encodings, with the default resolved."""

@@ -116,12 +116,9 @@ def test_log_rows_after_the_checkpoint_are_replaced(tmp_path: Path) -> None:
 
 
 def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
-    runs = {
-        "one": train(small("gru", tmp_path / "one", 3)),
-        "threads": train(small("gru", tmp_path / "threads", 3, num_threads=3)),
-        "process": train(small("gru", tmp_path / "process", 3, engine="process")),
-    }
-    assert progress(runs["one"]) == progress(runs["threads"]) == progress(runs["process"])
+    given = ({}, {"num_threads": 3}, {"engine": "process"})
+    one, *others = (train(small("gru", tmp_path / str(n), 3, **changes)) for n, changes in enumerate(given))
+    assert [progress(other) for other in others] == [progress(one)] * 2
 
 
 @pytest.mark.slow
