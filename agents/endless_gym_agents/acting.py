@@ -15,7 +15,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor, nn
 
-from endless_gym_agents.heads import Perceptron, PolicyHead
+from endless_gym_agents.heads import PolicyHead, ValueHead
 
 #: Bias (outputs,) and transposed weight (inputs, outputs) of a linear layer.
 Affine: TypeAlias = tuple[Tensor, Tensor]
@@ -88,7 +88,7 @@ def acting_weights(
     embedding: nn.Sequential | None,
     body: nn.Sequential,
     policy: PolicyHead,
-    value: Perceptron,
+    value: ValueHead,
 ) -> ActingWeights:
     """Make `ActingWeights` of the agent's layers; `dtype` is the type to compute in."""
     (policy_bias, policy_weight), (value_bias, value_weight) = (

@@ -38,7 +38,7 @@ from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
 from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
 from endless_gym_agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
-from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead
+from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
 from endless_gym_agents.recurrent import RecurrentMemory
 from endless_gym_agents.settings import Settings
@@ -195,7 +195,7 @@ class Agent(nn.Module):
         width = settings.model.body_width or (self.memory.width if has_memory else settings.recurrence.hidden_size)
         self.body = nn.Sequential(orthogonal(nn.Linear(self.memory.width, width)), nn.ReLU())
         self.policy = PolicyHead(width, settings.model.head_width, branches)
-        self.value = Perceptron(width, settings.model.head_width, 1, settings.model.value_gain)
+        self.value = ValueHead(width, settings.model.head_width, settings.model.value_gain)
         self.reconstruction: ReconstructionHead | None = None
         if settings.ppo.reconstruction_coefficient:
             if FRAME not in shapes:
@@ -353,7 +353,7 @@ class Agent(nn.Module):
             embedded = self.memory.embed(self.encoder(observation))
             memory_output = self.memory(embedded if rows is None else embedded.index_select(0, rows), minibatch)
             hidden = self.body(memory_output)
-            logits, value = self.policy(hidden), self.value(hidden).squeeze(-1)
+            logits, value = self.policy(hidden), self.value(hidden)
             frame = self.reconstruction(memory_output) if self.reconstruction is not None else None
             truth = self.ground_truth(memory_output) if self.ground_truth is not None else None
         return AgentOutput([branch.log_softmax(-1) for branch in logits], value, frame, truth)

@@ -33,7 +33,7 @@ class PolicyHead(nn.Module):
 
 
 class Perceptron(nn.Module):
-    """Two fully connected layers: the state value, or an estimate of `info["ground_truth"]`."""
+    """Two fully connected layers, such as for an estimate of `info["ground_truth"]`."""
 
     def __init__(self, input_width: int, width: int, outputs: int, gain: float = math.sqrt(2)) -> None:
         """Make the head with `width` hidden units; `gain` scales the initial weights of the output layer."""
@@ -46,6 +46,18 @@ class Perceptron(nn.Module):
         """float32 (n, outputs), for inputs float (n, input width)."""
         outputs: Tensor = self.layers(x)
         return outputs.float()
+
+
+class ValueHead(Perceptron):
+    """The state value: an estimate of the discounted return."""
+
+    def __init__(self, input_width: int, width: int, gain: float) -> None:
+        """Make the head with `width` hidden units; `gain` scales the initial weights of the output layer."""
+        super().__init__(input_width, width, 1, gain)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The values, float32 (n,), for inputs float (n, input width)."""
+        return super().forward(x).squeeze(-1)
 
 
 class ReconstructionHead(nn.Module):

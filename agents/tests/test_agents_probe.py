@@ -68,7 +68,7 @@ def test_recording_has_what_the_heads_see(agent: str, tmp_path: Path) -> None:
     steps = len(values) if len(recorded.episode) == 4 * len(values) else int((recorded.episode.bincount()).min())
     assert steps > 1
     with torch.no_grad():
-        again = made.value(made.body(recorded.memory[: 4 * steps])).squeeze(-1)
+        again = made.value(made.body(recorded.memory[: 4 * steps]))
     torch.testing.assert_close(again, torch.cat(values[:steps]), rtol=1e-4, atol=1e-5)
     assert recorded.truth.shape == (len(recorded.episode), 3)
     assert set(recorded.truth.unique().tolist()) <= {0.0, 1.0}
