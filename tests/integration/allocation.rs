@@ -3,13 +3,14 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use endless_gym::batch::{Block, zeroed};
+use endless_gym::batch::zeroed;
 use endless_gym::envs;
-use endless_gym::pool::{Autoreset, NextOptions, Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, ResetRequest, Seeding};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
-use crate::support::alone;
+use crate::support::player::Player;
+use crate::support::process::alone;
 
 /// The system's allocator, with a count of the allocations and of the bytes in use.
 struct Counting;
@@ -52,21 +53,21 @@ fn steps_and_resets_allocate_nothing() {
                 features: true,
                 ..PoolConfig::new(spec.id, num_envs)
             };
-            let mut pool = Pool::new(&config, &Threads::new(threads).unwrap()).unwrap();
-            let mut buffers = [zeroed(pool.layout().blocks()), zeroed(pool.layout().blocks())];
+            let mut player = Player::with_threads(&config, threads);
+            let mut other = zeroed(player.blocks.len());
             let mut random = SmallRng::seed_from_u64(1);
             let branches = spec.action_space.branches();
             let mut actions = vec![0; num_envs * branches.len()];
             let mut play = |steps: usize| {
                 for step in 0..steps {
-                    let buffer = &mut buffers[step % 2];
+                    std::mem::swap(&mut player.blocks, &mut other);
                     if step % 500 == 0 {
-                        pool.reset(ResetRequest::All, buffer).unwrap();
+                        player.reset(ResetRequest::All);
                     }
                     for action in actions.chunks_exact_mut(branches.len()) {
                         action.iter_mut().zip(branches).for_each(|(action, n)| *action = random.random_range(0..*n));
                     }
-                    pool.step(&actions, buffer).unwrap();
+                    player.step(&actions);
                 }
             };
             // Long enough for every list to have been as long as it gets.
@@ -89,14 +90,11 @@ fn options(round: usize, env: usize) -> NextOptions {
 }
 
 /// Gives each environment options of its own and plays long enough to use what is made on first use, such as darker pictures.
-fn play(pool: &mut Pool, round: usize, buffer: &mut [Block]) {
+fn play(player: &mut Player, round: usize) {
     let sets: Vec<_> = (0..4).map(|env| options(round, env)).collect();
-    pool.set_options(&sets).unwrap();
-    pool.reset(ResetRequest::All, buffer).unwrap();
-    let actions = vec![0; 4 * pool.spec().action_space.branches().len()];
-    for _ in 0..40 {
-        pool.step(&actions, buffer).unwrap();
-    }
+    player.pool.set_options(&sets).unwrap();
+    player.reset(ResetRequest::All);
+    (0..40).for_each(|_| player.step_all(0));
 }
 
 #[test]
@@ -105,11 +103,10 @@ fn replaced_options_leave_no_memory_behind() {
         return;
     }
     for spec in envs::specs() {
-        let mut pool = Pool::new(&PoolConfig::new(spec.id, 4), &Threads::new(1).unwrap()).unwrap();
-        let mut buffer = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::Seed(1), &mut buffer).unwrap();
+        let mut player = Player::new(&PoolConfig::new(spec.id, 4));
+        player.reset(ResetRequest::Seed(1));
         let mut used = |rounds: std::ops::Range<usize>| {
-            rounds.clone().for_each(|round| play(&mut pool, round, &mut buffer));
+            rounds.clone().for_each(|round| play(&mut player, round));
             BYTES.load(Ordering::Relaxed)
         };
         let (first, last) = (used(0..16), used(16..128));

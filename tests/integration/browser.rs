@@ -8,7 +8,8 @@ use std::time::Duration;
 
 use crate::support::chromium::{Chromium, REBOUND};
 use crate::support::page::Server;
-use crate::support::program::{Engine, Room};
+use crate::support::place::Place;
+use crate::support::process::Process;
 use endless_gym::pool::ResetRequest;
 use serde_json::Value as Json;
 
@@ -26,8 +27,8 @@ fn start(name: &str) -> Chromium {
     Chromium::start(&PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("browser").join(name), (1400, 900))
 }
 
-fn serve(room: &Room) -> Engine {
-    Engine::start(room, &["--env", ID, "--num-envs", &NUM_ENVS.to_string(), "--seed", "1"])
+fn serve(place: &Place) -> Process {
+    place.serve(&["--env", ID, "--num-envs", &NUM_ENVS.to_string(), "--seed", "1"])
 }
 
 /// A trainer that steps until it is stopped, or until the engine ends.
@@ -37,8 +38,8 @@ struct Training {
 }
 
 impl Training {
-    fn start(room: &Room) -> Self {
-        let (stop, mut trainer) = (Arc::new(AtomicBool::new(false)), room.connect("endless"));
+    fn start(place: &Place) -> Self {
+        let (stop, mut trainer) = (Arc::new(AtomicBool::new(false)), place.trainer("endless").unwrap());
         let flag = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             let timeout = Duration::from_secs(60);
@@ -86,11 +87,11 @@ fn grid(place: usize) -> String {
 #[test]
 #[ignore = "needs Chromium"]
 fn a_running_engine_is_shown_lost_and_found() {
-    let room = Room::new("browser");
-    let mut engine = serve(&room);
-    let server = Server::start(room.endless(&["view", "endless"]));
+    let place = Place::new();
+    let mut engine = serve(&place);
+    let server = Server::start(place.endless(&["view", "endless"]));
     let mut browser = start("view");
-    let training = Training::start(&room);
+    let training = Training::start(&place);
     browser.load(&server.url);
     browser.wait(SHOWN);
     assert_eq!(browser.value("document.querySelectorAll('#grid canvas').length"), 16);
@@ -121,14 +122,12 @@ fn a_running_engine_is_shown_lost_and_found() {
     assert_eq!(browser.value("document.getElementById('enlarged').checkVisibility()"), false);
 
     // Killed, without a chance to say so.
-    engine.0.kill().unwrap();
-    engine.0.wait().unwrap();
+    engine.kill();
     browser.wait("document.getElementById('state').dataset.state === 'lost'");
     assert_eq!(browser.value("document.getElementById('state').textContent"), "lost: waiting for the engine");
-    drop(engine);
-    let _engine = serve(&room);
+    let _engine = serve(&place);
     browser.wait("document.getElementById('state').dataset.state === 'live'");
-    let training = Training::start(&room);
+    let training = Training::start(&place);
     browser.value("globalThis.shown = endless.frames; 0");
     browser.wait("endless.frames > shown + 3");
     training.end();
@@ -138,11 +137,11 @@ fn a_running_engine_is_shown_lost_and_found() {
 #[test]
 #[ignore = "needs Chromium"]
 fn a_page_in_the_background_gets_no_frames() {
-    let room = Room::new("background");
-    let _engine = serve(&room);
-    let server = Server::start(room.endless(&["view", "endless"]));
+    let place = Place::new();
+    let _engine = serve(&place);
+    let server = Server::start(place.endless(&["view", "endless"]));
     let mut browser = start("background");
-    let training = Training::start(&room);
+    let training = Training::start(&place);
     browser.load(&server.url);
     browser.wait(SHOWN);
     let hide = |hidden| {
@@ -167,9 +166,9 @@ fn a_page_in_the_background_gets_no_frames() {
 #[test]
 #[ignore = "needs Chromium"]
 fn other_sites_and_addresses_without_the_token_are_refused() {
-    let room = Room::new("refused");
-    let _engine = serve(&room);
-    let server = Server::start(room.endless(&["view", "endless"]));
+    let place = Place::new();
+    let _engine = serve(&place);
+    let server = Server::start(place.endless(&["view", "endless"]));
     let mut browser = start("refused");
     let (port, token) = (server.address().port(), server.token().to_owned());
     for address in [format!("http://127.0.0.1:{port}/"), format!("http://127.0.0.1:{port}/?token={}", "0".repeat(32))] {
@@ -199,12 +198,12 @@ fn other_sites_and_addresses_without_the_token_are_refused() {
 #[test]
 #[ignore = "needs Chromium"]
 fn nothing_jumps_and_nothing_is_cut_off() {
-    let room = Room::new("layout");
-    let _engine = serve(&room);
-    let list = Server::start(room.endless(&["view"]));
-    let server = Server::start(room.endless(&["view", "endless"]));
+    let place = Place::new();
+    let _engine = serve(&place);
+    let list = Server::start(place.endless(&["view"]));
+    let server = Server::start(place.endless(&["view", "endless"]));
     let mut browser = start("view-layout");
-    let training = Training::start(&room);
+    let training = Training::start(&place);
     // Less than nothing where there is a place for a scroll bar.
     let cut = "Math.max(0, document.documentElement.scrollWidth - document.documentElement.clientWidth)";
     // The sum of what moved, as browsers measure it.
@@ -230,55 +229,4 @@ fn nothing_jumps_and_nothing_is_cut_off() {
     }
     training.end();
     assert_eq!(browser.complaints, Vec::<String>::new());
-}
-
-/// Not a test: pictures of the page in target/tmp/view-*.png.b64, to look at.
-#[test]
-#[ignore = "pictures to look at"]
-fn measure_by_eye() {
-    let room = Room::new("eye");
-    let mut engine = serve(&room);
-    let server = Server::start(room.endless(&["view", "endless"]));
-    let list = Server::start(room.endless(&["view"]));
-    let mut browser = start("view-eye");
-    let training = Training::start(&room);
-    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let picture = |browser: &mut Chromium, name: &str| {
-        std::fs::write(folder.join(format!("view-{name}.png.b64")), browser.screenshot()).unwrap();
-    };
-    for (name, size, phone, theme, large) in [
-        ("wide-light", (1400, 900), false, "light", false),
-        ("wide-dark", (1400, 900), false, "dark", true),
-        ("narrow-light", (390, 844), true, "light", true),
-        ("narrow-dark", (390, 844), true, "dark", false),
-    ] {
-        browser.resize(size.0, size.1, phone);
-        browser.load("about:blank");
-        browser.load(&server.url);
-        browser.wait(SHOWN);
-        browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
-        if large {
-            browser.value("document.querySelectorAll('#grid button')[3].click()");
-        }
-        // Points of its own, and buttons with their colours.
-        browser.value("globalThis.points = endless.curves.points.length; 0");
-        browser.wait("endless.curves.points.length > points + 1");
-        picture(&mut browser, name);
-        browser.value("scrollTo(0, 1e6)");
-        picture(&mut browser, &format!("{name}-end"));
-        browser.load("about:blank");
-        browser.load(&list.url);
-        browser.wait("document.querySelectorAll('#engines tr').length === 1");
-        browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
-        browser.value("new Promise((done) => setTimeout(done, 2500))");
-        picture(&mut browser, &format!("{name}-list"));
-    }
-    browser.resize(1400, 900, false);
-    browser.load("about:blank");
-    browser.load(&server.url);
-    browser.wait(SHOWN);
-    training.end();
-    engine.end();
-    browser.wait("document.getElementById('state').dataset.state === 'lost'");
-    picture(&mut browser, "lost");
 }

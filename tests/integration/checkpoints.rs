@@ -1,18 +1,18 @@
 //! Environments that are saved and resumed continue bit for bit, whatever their id, options, format, auto-reset and seeding.
 
-use endless_gym::batch::{Batch, Frames, zeroed};
+use crate::support::player::{Player, random_actions};
+use crate::support::recorded::{options, pixel_format, property_cases};
+use endless_gym::batch::Frames;
 use endless_gym::envs::{EnvSpec, specs};
-use endless_gym::pool::{
-    Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, ResumeError, Seeding, SnapshotError, Threads,
-};
+use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest, ResumeError, Seeding, SnapshotError};
 use proptest::prelude::*;
+use rand::SeedableRng;
 use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
 
 const NUM_ENVS: usize = 3;
 
 fn config(spec: &'static EnvSpec) -> impl Strategy<Value = PoolConfig> {
-    let options = prop::collection::vec(crate::support::recorded::options(spec), NUM_ENVS).prop_map(ResetOptions::Each);
+    let options = prop::collection::vec(options(spec), NUM_ENVS).prop_map(ResetOptions::Each);
     let seeding = prop_oneof![
         Just(Seeding::Continue { seed: None }),
         Just(Seeding::Continue { seed: Some(5) }),
@@ -20,7 +20,7 @@ fn config(spec: &'static EnvSpec) -> impl Strategy<Value = PoolConfig> {
         Just(Seeding::List(vec![9, 3, 27, 4])),
     ];
     let autoreset = prop::sample::select(Autoreset::ALL.to_vec());
-    let frames = (crate::support::recorded::pixel_format(), prop::sample::select(vec![1, 1, 2, 4]));
+    let frames = (pixel_format(), prop::sample::select(vec![1, 1, 2, 4]));
     let frames = prop::option::weighted(0.8, frames.prop_map(|(format, stack)| Frames { format, stack }));
     (options, seeding, autoreset, frames, any::<bool>()).prop_map(|(options, seeding, autoreset, frames, features)| {
         PoolConfig {
@@ -38,41 +38,32 @@ fn config(spec: &'static EnvSpec) -> impl Strategy<Value = PoolConfig> {
 
 /// A pool and a successor that resumes what it saved after `before` steps play the same `after` steps.
 fn compare(config: &PoolConfig, before: usize, after: usize) {
-    let threads = Threads::new(1).unwrap();
-    let mut pool = Pool::new(config, &threads).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
-    assert_eq!(pool.save().unwrap(), None);
-    pool.reset(ResetRequest::All, &mut blocks).unwrap();
+    let mut player = Player::new(config);
+    assert_eq!(player.pool.save().unwrap(), None);
+    player.reset(ResetRequest::All);
     let mut random = SmallRng::seed_from_u64(1);
-    let branches = pool.spec().action_space.branches();
-    let mut actions =
-        || -> Vec<i32> { (0..NUM_ENVS).flat_map(|_| branches).map(|n| random.random_range(0..*n)).collect() };
-    for _ in 0..before {
-        pool.step(&actions(), &mut blocks).unwrap();
-    }
-    let saved = pool.save().unwrap().unwrap();
-    let mut successor = Pool::new(config, &threads).unwrap();
-    successor.resume(&saved).unwrap();
-    assert_eq!(successor.save().unwrap().unwrap(), saved);
+    (0..before).for_each(|_| player.step_at_random(&mut random));
+    let saved = player.pool.save().unwrap().unwrap();
+    let mut successor = Player::new(config);
+    successor.pool.resume(&saved).unwrap();
+    assert_eq!(successor.pool.save().unwrap().unwrap(), saved);
     // Final observations are written at the end of an episode only: both start with a new buffer.
-    let mut others = zeroed(pool.layout().blocks());
-    blocks.clone_from(&others);
-    pool.observe(&mut blocks).unwrap();
-    successor.observe(&mut others).unwrap();
-    let bytes = |pool: &Pool, blocks: &[_]| Batch::new(pool.layout(), blocks).bytes().to_vec();
-    assert!(bytes(&pool, &blocks) == bytes(&successor, &others), "after {before} steps");
+    player.blocks.clone_from(&successor.blocks);
+    player.observe();
+    successor.observe();
+    assert!(player.bytes() == successor.bytes(), "after {before} steps");
     for step in 0..after {
-        let actions = actions();
-        pool.step(&actions, &mut blocks).unwrap();
-        successor.step(&actions, &mut others).unwrap();
-        assert!(bytes(&pool, &blocks) == bytes(&successor, &others), "step {step} after {before}");
+        let actions = random_actions(player.pool.spec(), NUM_ENVS, &mut random);
+        player.step(&actions);
+        successor.step(&actions);
+        assert!(player.bytes() == successor.bytes(), "step {step} after {before}");
     }
 }
 
 #[test]
 fn resumed_environments_continue_identically() {
     for spec in specs() {
-        let mut runner = proptest::test_runner::TestRunner::new(crate::support::recorded::property_cases(4));
+        let mut runner = proptest::test_runner::TestRunner::new(property_cases(4));
         let run = runner.run(&(config(spec), 0..90usize), |(config, before)| {
             compare(&config, before, 60);
             Ok(())
@@ -96,19 +87,15 @@ fn a_pending_reset_of_next_step_autoreset_is_part_of_the_state() {
 
 #[test]
 fn what_does_not_fit_is_an_error() {
-    let threads = Threads::new(1).unwrap();
     let frames = |stack| Some(Frames { stack, ..Frames::default() });
-    let pool = |num_envs, frames| {
-        Pool::new(&PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", num_envs) }, &threads).unwrap()
-    };
+    let pool = |num_envs, frames| Player::new(&PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", num_envs) });
     let mut saving = pool(2, frames(3));
-    saving.reset(ResetRequest::All, &mut zeroed(saving.layout().blocks())).unwrap();
-    let mut saved = saving.save().unwrap().unwrap();
-    assert_eq!(pool(1, frames(3)).resume(&saved), Err(ResumeError::Count { given: 2, num_envs: 1 }));
-    let refused = pool(2, frames(1)).resume(&saved).unwrap_err();
+    saving.reset(ResetRequest::All);
+    let mut saved = saving.pool.save().unwrap().unwrap();
+    let resume = |num_envs, stack, saved: &[_]| pool(num_envs, frames(stack)).pool.resume(saved).unwrap_err();
+    assert_eq!(resume(1, 3, &saved), ResumeError::Count { given: 2, num_envs: 1 });
     let source = SnapshotError::EarlierFrames { given: 2 * 84 * 84 * 3, expected: 0 };
-    assert_eq!(refused, ResumeError::Environment { env: 0, source });
+    assert_eq!(resume(2, 1, &saved), ResumeError::Environment { env: 0, source });
     saved[1].snapshot.pop();
-    let refused = pool(2, frames(3)).resume(&saved).unwrap_err();
-    assert_eq!(refused, ResumeError::Environment { env: 1, source: SnapshotError::Damaged });
+    assert_eq!(resume(2, 3, &saved), ResumeError::Environment { env: 1, source: SnapshotError::Damaged });
 }

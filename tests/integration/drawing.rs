@@ -3,6 +3,8 @@
 //! Every pool here checks what it draws, so that a step fails if a frame is wrong. The replay of the recorded
 //! traces checks the same.
 
+use crate::support::player::random_actions;
+use crate::support::recorded::{options, pixel_format, property_cases};
 use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
 use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, SCREEN};
 use endless_gym::pool::{
@@ -22,11 +24,6 @@ fn config(spec: &EnvSpec) -> PoolConfig {
 
 fn pool(config: &PoolConfig) -> Pool {
     Pool::new(config, &Threads::new(1).unwrap()).unwrap()
-}
-
-fn random_actions(spec: &EnvSpec, random: &mut SmallRng) -> Vec<i32> {
-    let branches = spec.action_space.branches();
-    (0..NUM_ENVS).flat_map(|_| branches).map(|choices| random.random_range(0..*choices)).collect()
 }
 
 /// Plays with several buffers, to which happens what can happen to buffers, and with everything that changes environments.
@@ -57,11 +54,11 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
             }
             6 => pool.reset(ResetRequest::Seed(random.random()), &mut buffers[used])?,
             7 => pool.ground_truth_view(0, &mut vec![0; envs::view::VIEW_BYTES])?,
-            8 => other.step(&random_actions(spec, random), &mut buffers[used])?,
+            8 => other.step(&random_actions(spec, NUM_ENVS, random), &mut buffers[used])?,
             // Most of the time a few of them in turn, as a trainer holds them.
             _ => {
                 for buffer in &mut buffers[used..] {
-                    pool.step(&random_actions(spec, random), buffer)?;
+                    pool.step(&random_actions(spec, NUM_ENVS, random), buffer)?;
                 }
             }
         }
@@ -97,15 +94,15 @@ fn many_circles_of_light_are_drawn_alike_in_irregular_buffers() {
 }
 
 proptest! {
-    #![proptest_config(crate::support::recorded::property_cases(100))]
+    #![proptest_config(property_cases(100))]
 
     #[test]
     #[ignore = "slow"]
     fn environments_of_any_options_are_drawn_alike_in_irregular_buffers(
         (spec, given, others) in prop::sample::select(envs::specs().collect::<Vec<_>>())
-            .prop_flat_map(|spec| (Just(spec), crate::support::recorded::options(spec), crate::support::recorded::options(spec))),
+            .prop_flat_map(|spec| (Just(spec), options(spec), options(spec))),
         same_step: bool,
-        format in crate::support::recorded::pixel_format(),
+        format in pixel_format(),
         stack in prop::sample::select(vec![1, 1, 2, 3]),
         seed: u64,
     ) {

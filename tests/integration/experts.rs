@@ -1,8 +1,8 @@
 //! Scripted experts solve what can be solved, from what a frame shows and what they remember.
 
-use endless_gym::batch::{Batch, zeroed};
-use endless_gym::envs::{self, Expert};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use crate::support::player::Player;
+use endless_gym::envs;
+use endless_gym::pool::{Experts, PoolConfig, Seeding};
 
 /// Plays `num_envs` environments with the seeds from 0 on, for `steps` steps or until all first episodes have ended. The info
 /// of each first episode that ended.
@@ -10,23 +10,14 @@ fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
     let spec = envs::spec(id).unwrap();
     let config =
         PoolConfig { features: true, seeding: Seeding::Continue { seed: Some(0) }, ..PoolConfig::new(id, num_envs) };
-    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
-    pool.reset(ResetRequest::All, &mut blocks).unwrap();
-    let mut experts: Vec<Box<dyn Expert>> = (0..num_envs).map(|_| envs::expert(spec)).collect();
+    let mut player = Player::started(&config);
+    let mut experts = Experts::new(spec, num_envs, config.autoreset);
     let mut ended = vec![None; num_envs];
-    let branches = spec.action_space.branches().len();
-    let mut actions = vec![0; num_envs * branches];
+    let mut actions = vec![0; num_envs * spec.action_space.branches().len()];
     for _ in 0..steps {
-        let batch = Batch::new(pool.layout(), &blocks);
-        let (features, vectors) = (batch.features(), batch.vector_observation());
-        for (env, (expert, action)) in experts.iter_mut().zip(actions.chunks_exact_mut(branches)).enumerate() {
-            let features = &features[env * spec.features.len()..][..spec.features.len()];
-            let vector = &vectors[env * spec.vector_observation..][..spec.vector_observation];
-            expert.act(features, vector, action);
-        }
-        pool.step(&actions, &mut blocks).unwrap();
-        let batch = Batch::new(pool.layout(), &blocks);
+        experts.act(&player.batch(), &mut actions).unwrap();
+        player.step(&actions);
+        let batch = player.batch();
         for (env, ended) in ended.iter_mut().enumerate().filter(|(env, _)| batch.terminated()[*env] == 1) {
             let info = &batch.info()[env * spec.info.len()..][..spec.info.len()];
             ended.get_or_insert_with(|| info.to_vec());

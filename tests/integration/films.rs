@@ -2,13 +2,14 @@
 
 use std::fs::File;
 use std::io::BufReader;
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use crate::support::program::{Room, text};
-use endless_gym::batch::{Batch, Frames, PixelFormat, zeroed};
+use crate::support::place::Place;
+use crate::support::player::Player;
+use crate::support::process::text;
+use endless_gym::batch::{Frames, PixelFormat};
 use endless_gym::envs::{self, view::VIEW_BYTES};
-use endless_gym::pool::{Autoreset, Experts, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{Autoreset, Experts, PoolConfig, ResetRequest};
 
 const SIDE: usize = 84;
 const GAP: usize = 2;
@@ -24,26 +25,26 @@ fn frames(id: &str, seed: u64, max_steps: usize) -> Vec<(Picture, Picture)> {
         autoreset: Autoreset::Disabled,
         ..PoolConfig::new(id, 1)
     };
-    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
-    pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-    let mut experts = Experts::new(pool.spec(), 1, config.autoreset);
-    let mut action = vec![0; pool.spec().action_space.branches().len()];
+    let mut player = Player::new(&config);
+    player.reset(ResetRequest::Seed(seed));
+    let spec = player.pool.spec();
+    let mut experts = Experts::new(spec, 1, config.autoreset);
+    let mut action = vec![0; spec.action_space.branches().len()];
     let mut frames = Vec::new();
     loop {
         let mut view = vec![0; VIEW_BYTES];
-        pool.ground_truth_view(0, &mut view).unwrap();
+        player.pool.ground_truth_view(0, &mut view).unwrap();
         let view = (0..SIDE * SIDE).map(|place| {
             let at = (place / SIDE * 4 * SIDE * 4 + place % SIDE * 4) * 3;
             [view[at], view[at + 1], view[at + 2]]
         });
-        let batch = Batch::new(pool.layout(), &blocks);
+        let batch = player.batch();
         frames.push((batch.observation().as_chunks::<3>().0.to_vec(), view.collect()));
         if batch.terminated()[0] == 1 || frames.len() > max_steps {
             return frames;
         }
         experts.act(&batch, &mut action).unwrap();
-        pool.step(&action, &mut blocks).unwrap();
+        player.step(&action);
     }
 }
 
@@ -60,8 +61,8 @@ fn both((agent, view): &(Picture, Picture), scale: usize) -> Picture {
         .collect()
 }
 
-fn record(room: &Room, arguments: &[&str], file: &Path) -> String {
-    let output = room.run(&[&["record"], arguments, &["--film", file.to_str().unwrap()]].concat());
+fn record(place: &Place, arguments: &[&str], file: &Path) -> String {
+    let output = place.run(&[&["record"], arguments, &["--film", file.to_str().unwrap()]].concat());
     assert!(output.status.success(), "{}", text(&output.stderr));
     text(&output.stdout).to_owned()
 }
@@ -98,9 +99,9 @@ fn decode_gif(file: &Path) -> Vec<(Picture, f64)> {
 
 #[test]
 fn png_films_have_every_pixel_of_every_episode() {
-    let room = Room::new("film-png");
-    let (id, file) = ("MysteryPath-Grid-v0", room.root.join("film.png"));
-    let said = record(&room, &[id, "--seed", "3", "--episodes", "2", "--scale", "2"], &file);
+    let place = Place::new();
+    let (id, file) = ("MysteryPath-Grid-v0", place.root().join("film.png"));
+    let said = record(&place, &[id, "--seed", "3", "--episodes", "2", "--scale", "2"], &file);
     let episodes = [frames(id, 3, 1000), frames(id, 4, 1000)];
     for (seed, episode) in (3..).zip(&episodes) {
         assert!(said.contains(&format!("seed {seed}: return 1.000 in {} steps\n", episode.len() - 1)), "{said}");
@@ -113,7 +114,7 @@ fn png_films_have_every_pixel_of_every_episode() {
         let is_last = number == episodes[0].len() - 1 || number == decoded.len() - 1;
         assert_eq!(*delay, 1.0 / fps + f64::from(u8::from(is_last)), "picture {number}");
     }
-    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "only the film is left");
+    assert_eq!(std::fs::read_dir(place.root()).unwrap().count(), 1, "only the film is left");
 }
 
 /// Pictures and delays in seconds of an animated WebP.
@@ -131,8 +132,8 @@ fn decode_webp(file: &Path) -> Vec<(Picture, f64)> {
 
 #[test]
 fn webp_films_have_every_pixel_of_every_episode() {
-    let room = Room::new("film-webp");
-    let file = room.root.join("film.webp");
+    let place = Place::new();
+    let file = place.root().join("film.webp");
     for (id, scale, steps, options) in [
         ("MysteryPath-Grid-v0", 2, 1000, &[][..]),
         ("SearingSpotlights-v0", 1, 20, &[][..]),
@@ -140,7 +141,7 @@ fn webp_films_have_every_pixel_of_every_episode() {
     ] {
         let (scale_text, steps_text) = (scale.to_string(), steps.to_string());
         let arguments = [id, "--seed", "3", "--episodes", "2", "--scale", &scale_text, "--max-steps", &steps_text];
-        record(&room, &[&arguments, options].concat(), &file);
+        record(&place, &[&arguments, options].concat(), &file);
         let episodes = [frames(id, 3, steps), frames(id, 4, steps)];
         let decoded = decode_webp(&file);
         assert_eq!(decoded.len(), episodes[0].len() + episodes[1].len(), "{id}");
@@ -156,16 +157,16 @@ fn webp_films_have_every_pixel_of_every_episode() {
         let bytes = std::fs::read(&file).unwrap();
         assert_eq!(u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize + 8, bytes.len());
     }
-    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "only the film is left");
+    assert_eq!(std::fs::read_dir(place.root()).unwrap().count(), 1, "only the film is left");
 }
 
 #[test]
 fn films_show_one_view_or_both() {
-    let room = Room::new("film-view");
-    let (id, file) = ("MortarMayhem-Grid-v0", room.root.join("film.PNG"));
+    let place = Place::new();
+    let (id, file) = ("MortarMayhem-Grid-v0", place.root().join("film.PNG"));
     let frames = frames(id, 0, 5);
     for view in ["agent", "ground-truth"] {
-        record(&room, &[id, "--view", view, "--scale", "1", "--max-steps", "5", "--fps", "10"], &file);
+        record(&place, &[id, "--view", view, "--scale", "1", "--max-steps", "5", "--fps", "10"], &file);
         let decoded = decode_png(&file);
         assert_eq!(decoded.len(), 6);
         for ((picture, _), (agent, ground_truth)) in decoded.iter().zip(&frames) {
@@ -180,11 +181,11 @@ fn films_show_one_view_or_both() {
 /// A palette has 256 colours. A picture with no more of them is exact, and others are near.
 #[test]
 fn gif_films_are_as_exact_as_their_palettes() {
-    let room = Room::new("film-gif");
-    let file = room.root.join("film.gif");
+    let place = Place::new();
+    let file = place.root().join("film.gif");
     let (mut exact, mut near) = (0, 0);
     for (id, steps) in [("MortarMayhem-Grid-v0", 30), ("SearingSpotlights-v0", 10)] {
-        record(&room, &[id, "--max-steps", &steps.to_string(), "--scale", "1", "--seed", "1"], &file);
+        record(&place, &[id, "--max-steps", &steps.to_string(), "--scale", "1", "--seed", "1"], &file);
         let (decoded, frames) = (decode_gif(&file), frames(id, 1, steps));
         assert_eq!(decoded.len(), frames.len());
         for (number, ((picture, _), frame)) in decoded.iter().zip(&frames).enumerate() {
@@ -212,15 +213,11 @@ fn gif_films_are_as_exact_as_their_palettes() {
 /// What ffmpeg is given. A stand-in writes its input to the file, its last argument.
 #[test]
 fn mp4_films_are_encoded_by_ffmpeg() {
-    let room = Room::new("film-mp4");
-    let (id, file, ffmpeg) = ("MysteryPath-Grid-v0", room.root.join("film.mp4"), room.root.join("ffmpeg"));
-    let install = |script: &str| {
-        std::fs::write(&ffmpeg, format!("#!/bin/sh\n{script}\n")).unwrap();
-        std::fs::set_permissions(&ffmpeg, std::fs::Permissions::from_mode(0o700)).unwrap();
-    };
+    let place = Place::new();
+    let (id, file, ffmpeg) = ("MysteryPath-Grid-v0", place.root().join("film.mp4"), place.root().join("ffmpeg"));
     let run = || {
         let arguments = ["record", id, "--max-steps", "4", "--scale", "2", "--film", file.to_str().unwrap()];
-        room.endless(&arguments).env("IMAGEIO_FFMPEG_EXE", &ffmpeg).output().unwrap()
+        place.endless(&arguments).env("IMAGEIO_FFMPEG_EXE", &ffmpeg).output().unwrap()
     };
     let missing = run();
     assert_eq!(missing.status.code(), Some(1));
@@ -230,14 +227,14 @@ fn mp4_films_are_encoded_by_ffmpeg() {
         text(&missing.stderr)
     );
 
-    install("echo no such codec >&2; exit 3");
+    place.script("ffmpeg", "echo no such codec >&2; exit 3");
     let failed = run();
     assert_eq!(failed.status.code(), Some(1));
     let message = text(&failed.stderr);
     assert!(message.contains("ffmpeg failed to write") && message.contains("no such codec"), "{message}");
-    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 1, "nothing half-written is left");
+    assert_eq!(std::fs::read_dir(place.root()).unwrap().count(), 1, "nothing half-written is left");
 
-    install("echo \"$@\" > \"$0.arguments\"; while [ $# -gt 1 ]; do shift; done; cat > \"$1\"");
+    place.script("ffmpeg", "echo \"$@\" > \"$0.arguments\"; while [ $# -gt 1 ]; do shift; done; cat > \"$1\"");
     let written = run();
     assert!(written.status.success(), "{}", text(&written.stderr));
     let fps = envs::spec(id).unwrap().render_fps as usize;
@@ -245,18 +242,18 @@ fn mp4_films_are_encoded_by_ffmpeg() {
     let last = expected[4].clone();
     expected.extend(std::iter::repeat_n(last, fps));
     assert!(std::fs::read(&file).unwrap() == expected.concat().into_flattened());
-    let arguments = std::fs::read_to_string(room.root.join("ffmpeg.arguments")).unwrap();
+    let arguments = std::fs::read_to_string(place.root().join("ffmpeg.arguments")).unwrap();
     assert!(arguments.contains(&format!("-pix_fmt rgb24 -s 340x168 -r {fps} -i -")), "{arguments}");
 }
 
 #[test]
 fn random_play_follows_from_its_seeds() {
-    let room = Room::new("film-random");
-    let file = room.root.join("film.png");
+    let place = Place::new();
+    let file = place.root().join("film.png");
     let film = |seed: &str, policy: &str| {
         let arguments =
             ["MysteryPath-v0", "--max-steps", "20", "--scale", "1", "--policy", policy, "--action-seed", seed];
-        record(&room, &arguments, &file);
+        record(&place, &arguments, &file);
         std::fs::read(&file).unwrap()
     };
     let first = film("1", "random");
@@ -267,9 +264,9 @@ fn random_play_follows_from_its_seeds() {
 
 #[test]
 fn what_cannot_be_recorded_is_an_error_and_leaves_no_file() {
-    let room = Room::new("film-errors");
+    let place = Place::new();
     let run = |arguments: &[&str]| {
-        let output = room.endless(&[&["record"], arguments].concat()).current_dir(&room.root).output().unwrap();
+        let output = place.endless(&[&["record"], arguments].concat()).current_dir(place.root()).output().unwrap();
         (output.status.code(), text(&output.stderr).to_owned())
     };
     for (arguments, status, message) in [
@@ -286,8 +283,8 @@ fn what_cannot_be_recorded_is_an_error_and_leaves_no_file() {
         assert_eq!(code, Some(status), "{arguments:?}: {said}");
         assert!(said.contains(message), "{arguments:?}: {said}");
     }
-    assert_eq!(std::fs::read_dir(&room.root).unwrap().count(), 0);
-    let help = room.run(&["record", "--help"]);
+    assert_eq!(std::fs::read_dir(place.root()).unwrap().count(), 0);
+    let help = place.run(&["record", "--help"]);
     assert!(help.status.success());
     assert!(text(&help.stdout).contains("[default: 4]"), "{}", text(&help.stdout));
 }

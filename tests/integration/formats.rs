@@ -2,19 +2,16 @@
 
 use std::collections::VecDeque;
 
-use endless_gym::batch::PixelFormat;
-use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
+use crate::support::player::{Player, random_actions};
+use crate::support::recorded::pixel_formats;
+use endless_gym::batch::{BatchSection, Frames, PixelFormat};
 use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, Parameter, SCREEN};
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym::pool::{Autoreset, PoolConfig, PoolError, ResetOptions, Seeding};
+use rand::SeedableRng;
 use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
 use serde_json::Value as Json;
 
 const NUM_ENVS: usize = 3;
-
-fn formats() -> impl Iterator<Item = PixelFormat> {
-    (0..8).map(|bits| PixelFormat { grayscale: bits & 1 != 0, channels_first: bits & 2 != 0, row_major: bits & 4 != 0 })
-}
 
 /// The frame with its numbers in another order, one after the other.
 fn convert(frame: &[u8], format: PixelFormat) -> Vec<u8> {
@@ -36,77 +33,61 @@ fn convert(frame: &[u8], format: PixelFormat) -> Vec<u8> {
     }
 }
 
-/// One pool and what its last batch was.
-struct Player {
-    pool: Pool,
-    batch: Vec<Block>,
+/// A pool with short episodes, where a reset parameter makes them so.
+fn started(spec: &EnvSpec, frames: Frames) -> Player {
+    let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
+    let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
+    Player::started(&PoolConfig {
+        options: ResetOptions::Shared(options.into_iter().collect()),
+        frames: Some(frames),
+        seeding: Seeding::Continue { seed: Some(5) },
+        autoreset: Autoreset::SameStep,
+        final_observation: true,
+        ..PoolConfig::new(spec.id, NUM_ENVS)
+    })
 }
 
-impl Player {
-    fn new(spec: &EnvSpec, frames: Frames) -> Self {
-        // Short episodes, where a reset parameter makes them so.
-        let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
-        let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
-        let config = PoolConfig {
-            options: ResetOptions::Shared(options.into_iter().collect()),
-            frames: Some(frames),
-            seeding: Seeding::Continue { seed: Some(5) },
-            autoreset: Autoreset::SameStep,
-            final_observation: true,
-            ..PoolConfig::new(spec.id, NUM_ENVS)
-        };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-        let mut batch = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::All, &mut batch).unwrap();
-        Player { pool, batch }
-    }
-
-    fn row(&self, section: BatchSection, env: usize) -> &[u8] {
-        let rows = Batch::new(self.pool.layout(), &self.batch).section::<u8>(section);
-        let width = rows.len() / NUM_ENVS;
-        &rows[env * width..(env + 1) * width]
-    }
+fn row(player: &Player, section: BatchSection, env: usize) -> &[u8] {
+    let rows = player.batch().section::<u8>(section);
+    let width = rows.len() / NUM_ENVS;
+    &rows[env * width..(env + 1) * width]
 }
 
 /// Plays both pools alike, and compares every observation with the conversion of the last standard ones.
 fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
-    let mut standard = Player::new(spec, Frames::default());
-    let mut other = Player::new(spec, frames);
+    let mut standard = started(spec, Frames::default());
+    let mut other = started(spec, frames);
     let what = format!("{}: {frames:?}", spec.id);
     let section = other.pool.layout().section(BatchSection::Observation).unwrap();
     assert_eq!(section.shape(), frames.shape(), "{what}");
     let mut past: Vec<VecDeque<Vec<u8>>> = Vec::new();
     for env in 0..NUM_ENVS {
-        past.push(vec![convert(standard.row(BatchSection::Observation, env), frames.format); frames.stack].into());
+        past.push(vec![convert(row(&standard, BatchSection::Observation, env), frames.format); frames.stack].into());
     }
     let mut random = SmallRng::seed_from_u64(2);
     let mut episodes = 0;
     for step in 0..steps {
         for (env, past) in past.iter().enumerate() {
             let expected: Vec<u8> = past.iter().flatten().copied().collect();
-            assert!(other.row(BatchSection::Observation, env) == expected, "{what} step {step} environment {env}");
+            assert!(row(&other, BatchSection::Observation, env) == expected, "{what} step {step} environment {env}");
         }
-        let actions: Vec<i32> = (0..NUM_ENVS)
-            .flat_map(|_| spec.action_space.branches())
-            .map(|choices| random.random_range(0..*choices))
-            .collect();
-        standard.pool.step(&actions, &mut standard.batch).unwrap();
-        other.pool.step(&actions, &mut other.batch).unwrap();
-        let terminated = Batch::new(standard.pool.layout(), &standard.batch).terminated().to_vec();
+        let actions = random_actions(spec, NUM_ENVS, &mut random);
+        standard.step(&actions);
+        other.step(&actions);
         for (env, past) in past.iter_mut().enumerate() {
-            if terminated[env] == 1 {
+            let newest = |section| convert(row(&standard, section, env), frames.format);
+            past.pop_front();
+            if standard.batch().terminated()[env] == 1 {
                 episodes += 1;
-                past.pop_front();
-                past.push_back(convert(standard.row(BatchSection::FinalObservation, env), frames.format));
+                past.push_back(newest(BatchSection::FinalObservation));
                 let expected: Vec<u8> = past.iter().flatten().copied().collect();
                 assert!(
-                    other.row(BatchSection::FinalObservation, env) == expected,
+                    row(&other, BatchSection::FinalObservation, env) == expected,
                     "{what} step {step} environment {env}"
                 );
-                *past = vec![convert(standard.row(BatchSection::Observation, env), frames.format); frames.stack].into();
+                *past = vec![newest(BatchSection::Observation); frames.stack].into();
             } else {
-                past.pop_front();
-                past.push_back(convert(standard.row(BatchSection::Observation, env), frames.format));
+                past.push_back(newest(BatchSection::Observation));
             }
         }
     }
@@ -118,30 +99,22 @@ fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
 fn every_format_is_a_plain_conversion() {
     for (number, spec) in envs::specs().enumerate() {
         // Each environment takes its turn with some of the formats; all with the paper's grey stacks.
-        for format in formats().filter(|format| usize::from(format.row_major) == number % 2) {
+        for format in pixel_formats().filter(|format| usize::from(format.row_major) == number % 2) {
             compare(spec, Frames { format, stack: 1 }, 300);
         }
         let format = PixelFormat { grayscale: true, ..PixelFormat::default() };
         compare(spec, Frames { format, stack: 4 }, 300);
     }
-    for format in formats() {
+    for format in pixel_formats() {
         compare(envs::spec("Endless-MysteryPath-v0").unwrap(), Frames { format, stack: 3 }, 300);
     }
-}
-
-#[test]
-fn one_format_is_the_originals() {
-    assert_eq!(Frames::default().shape(), [SCREEN, SCREEN, 3]);
-    let player = Player::new(envs::specs().next().unwrap(), Frames::default());
-    assert_eq!(player.row(BatchSection::Observation, 0).len(), FRAME_BYTES);
 }
 
 #[test]
 fn a_stack_has_its_limits() {
     for given in [0, 65] {
         let frames = Some(Frames { stack: given, ..Frames::default() });
-        let config = PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", 1) };
-        let error = Pool::new(&config, &Threads::new(1).unwrap()).map(|_| ()).unwrap_err();
+        let error = PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", 1) }.validate().unwrap_err();
         assert!(matches!(error, PoolError::Stack { given: found } if found == given), "{error}");
     }
 }
@@ -150,13 +123,11 @@ fn a_stack_has_its_limits() {
 #[test]
 fn a_restored_stack_starts_anew() {
     let format = PixelFormat { channels_first: true, ..PixelFormat::default() };
-    let mut player = Player::new(envs::spec("MysteryPath-v0").unwrap(), Frames { format, stack: 2 });
+    let mut player = started(envs::spec("MysteryPath-v0").unwrap(), Frames { format, stack: 2 });
     let snapshot = player.pool.snapshot(0).unwrap();
-    for _ in 0..3 {
-        player.pool.step(&[1; 2 * NUM_ENVS], &mut player.batch).unwrap();
-    }
+    (0..3).for_each(|_| player.step_all(1));
     player.pool.restore(1, &snapshot).unwrap();
-    player.pool.observe(&mut player.batch).unwrap();
-    let (first, second) = player.row(BatchSection::Observation, 1).split_at(FRAME_BYTES);
+    player.observe();
+    let (first, second) = row(&player, BatchSection::Observation, 1).split_at(FRAME_BYTES);
     assert!(first == second);
 }

@@ -6,11 +6,12 @@
 //! compare for each id, as `cargo xtask live` sets it, every run is another one; without, all runs are the same.
 
 use std::io::{BufRead, BufReader, Write};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
-use endless_gym::batch::{Batch, Block, zeroed};
+use crate::support::player::Player;
+use crate::support::process::Process;
 use endless_gym::envs::{self, EnvSpec};
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Trace, replay};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
@@ -23,7 +24,7 @@ const MAX_STEPS: usize = 400;
 
 /// The original in a separate process.
 struct Original {
-    child: Child,
+    _process: Process,
     requests: ChildStdin,
     answers: BufReader<ChildStdout>,
 }
@@ -34,14 +35,10 @@ impl Original {
             "run `cargo xtask test --all`, or set ENDLESS_ORIGINAL_PYTHON to a Python 3.11 with memory-gym==1.0.2 and numpy<2",
         );
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/reference/play.py");
-        let mut child = Command::new(python)
-            .arg(script)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("the original's Python starts");
-        let (requests, answers) = (child.stdin.take().unwrap(), child.stdout.take().unwrap());
-        Original { child, requests, answers: BufReader::new(answers) }
+        let mut command = Command::new(python);
+        let mut process = Process::spawn(command.arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()));
+        let (requests, answers) = (process.0.stdin.take().unwrap(), process.0.stdout.take().unwrap());
+        Original { _process: process, requests, answers: BufReader::new(answers) }
     }
 
     fn play(&mut self, request: &Json) -> Json {
@@ -49,13 +46,6 @@ impl Original {
         let mut line = String::new();
         self.answers.read_line(&mut line).unwrap();
         serde_json::from_str(&line).unwrap_or_else(|error| panic!("the original answers `{line:.300}`: {error}"))
-    }
-}
-
-impl Drop for Original {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -97,28 +87,24 @@ fn play(spec: &'static EnvSpec, case: &Case) -> Json {
         features: true,
         ..PoolConfig::new(spec.id, 1)
     };
-    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-    let mut blocks: Vec<Block> = zeroed(pool.layout().blocks());
+    let mut player = Player::new(&config);
     let mut random = SmallRng::seed_from_u64(case.action_seed);
     let branches = spec.action_space.branches();
     let mut episodes = Vec::new();
     for seed in std::iter::once(Some(case.first_seed)).chain(case.seeds.iter().copied()) {
-        match seed {
-            Some(seed) => pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap(),
-            None => pool.reset(ResetRequest::All, &mut blocks).unwrap(),
-        }
+        player.reset(seed.map_or(ResetRequest::All, ResetRequest::Seed));
         let mut expert = envs::expert(spec);
         let mut actions = Vec::new();
         for _ in 0..MAX_STEPS {
-            let batch = Batch::new(pool.layout(), &blocks);
+            let batch = player.batch();
             let mut action = vec![0; branches.len()];
             expert.act(batch.features(), batch.vector_observation(), &mut action);
             if random.random::<f64>() < case.error_rate {
                 action.iter_mut().zip(branches).for_each(|(number, n)| *number = random.random_range(0..*n));
             }
-            pool.step(&action, &mut blocks).unwrap();
+            player.step(&action);
             actions.push(action);
-            if Batch::new(pool.layout(), &blocks).terminated()[0] == 1 {
+            if player.batch().terminated()[0] == 1 {
                 break;
             }
         }

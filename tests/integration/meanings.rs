@@ -1,16 +1,15 @@
 //! What the registry says about actions and ground truth is what the rules do.
 
-use endless_gym::batch::{Batch, Block, zeroed};
+use crate::support::player::Player;
+use endless_gym::batch::Batch;
 use endless_gym::envs::{self, EnvSpec};
-use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::pool::{PoolConfig, ResetOptions, ResetRequest};
 use serde_json::json;
 
-struct Player {
-    pool: Pool,
-    blocks: Vec<Block>,
-}
+/// One environment, with its features and its ground truth by name.
+struct Named(Player);
 
-impl Player {
+impl Named {
     /// One environment at the start of an episode. In Mortar Mayhem the commands have been shown, so that the agent may move.
     fn new(spec: &EnvSpec, seed: u64, options: serde_json::Value) -> Self {
         let mut options = options.as_object().unwrap().clone();
@@ -20,10 +19,8 @@ impl Player {
         }
         let options = ResetOptions::Shared(options);
         let config = PoolConfig { options, features: true, ..PoolConfig::new(spec.id, 1) };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-        let mut blocks = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-        let mut player = Player { pool, blocks };
+        let mut player = Named(Player::new(&config));
+        player.0.reset(ResetRequest::Seed(seed));
         while player.any_feature("command_") {
             player.step(&vec![0; spec.actions.len()]);
         }
@@ -31,25 +28,25 @@ impl Player {
     }
 
     fn step(&mut self, action: &[i32]) {
-        self.pool.step(action, &mut self.blocks).unwrap();
+        self.0.step(action);
     }
 
     fn batch(&self) -> Batch<'_> {
-        Batch::new(self.pool.layout(), &self.blocks)
+        self.0.batch()
     }
 
     fn feature(&self, name: &str) -> f32 {
-        let place = self.pool.spec().features.iter().position(|column| column.name == name);
+        let place = self.0.pool.spec().features.iter().position(|column| column.name == name);
         self.batch().features()[place.unwrap_or_else(|| panic!("no feature {name}"))]
     }
 
     fn any_feature(&self, prefix: &str) -> bool {
-        let columns = self.pool.spec().features.iter().zip(self.batch().features());
+        let columns = self.0.pool.spec().features.iter().zip(self.batch().features());
         columns.into_iter().any(|(column, value)| column.name.starts_with(prefix) && *value > 0.0)
     }
 
     fn truth(&self, name: &str) -> f64 {
-        let place = self.pool.spec().ground_truth.iter().position(|column| column.name == name);
+        let place = self.0.pool.spec().ground_truth.iter().position(|column| column.name == name);
         self.batch().ground_truth()[place.unwrap_or_else(|| panic!("no ground truth {name}"))]
     }
 
@@ -79,7 +76,7 @@ fn every_number_has_a_meaning() {
     for spec in envs::specs() {
         let choices: Vec<_> = spec.actions.iter().map(|branch| branch.choices.len() as i32).collect();
         assert_eq!(choices, spec.action_space.branches(), "{}", spec.id);
-        let player = Player::new(spec, 1, json!({}));
+        let player = Named::new(spec, 1, json!({}));
         assert_eq!(spec.ground_truth.len(), player.batch().ground_truth().len(), "{}", spec.id);
         assert_eq!(spec.features.len(), player.batch().features().len(), "{}", spec.id);
         let columns = spec.ground_truth.iter().chain(spec.features).map(|column| (column.name, column.description));
@@ -99,7 +96,7 @@ fn actions_move_the_agent_as_their_names_say() {
         for (number, branch) in spec.actions.iter().enumerate().filter(|_| !is_grid) {
             for (value, choice) in branch.choices.iter().enumerate() {
                 for seed in 0..20 {
-                    let mut player = Player::new(spec, seed, json!({}));
+                    let mut player = Named::new(spec, seed, json!({}));
                     let mut action = vec![0; spec.actions.len()];
                     // The first frame may show the agent a pixel beside its place, as the original's does.
                     player.step(&action);
@@ -132,7 +129,7 @@ fn on_a_grid_actions_turn_and_walk() {
         assert_eq!(names, ["nothing", "left", "right", "ahead"]);
         for seed in 0..20 {
             for turns in 0..4 {
-                let mut player = Player::new(spec, seed, json!({}));
+                let mut player = Named::new(spec, seed, json!({}));
                 let start = player.place();
                 let mut heading = player.heading();
                 for turn in 0..turns {
@@ -166,7 +163,7 @@ fn the_ground_truth_of_endless_mortar_mayhem_is_the_tile_that_does_not_burn() {
     let spec = envs::spec("Endless-MortarMayhem-v0").unwrap();
     let mut burnt = 0;
     for seed in 0..20 {
-        let mut player = Player::new(spec, seed, json!({}));
+        let mut player = Named::new(spec, seed, json!({}));
         for _ in 0..60 {
             player.step(&[0, 0]);
             if player.feature("burning") == 1.0 {
@@ -184,14 +181,14 @@ fn the_ground_truth_of_endless_mortar_mayhem_is_the_tile_that_does_not_burn() {
 fn the_ground_truth_of_endless_searing_spotlights_is_where_agent_and_coin_are() {
     let spec = envs::spec("Endless-SearingSpotlights-v0").unwrap();
     let pairs = [("agent_x", "agent_x"), ("agent_y", "agent_y"), ("coin_x", "coin_0_x"), ("coin_y", "coin_0_y")];
-    let mut player = Player::new(spec, 3, json!({"agent_visible": true, "coins_visible": true}));
+    let mut player = Named::new(spec, 3, json!({"agent_visible": true, "coins_visible": true}));
     for step in 0..40 {
         player.step(&[step % 3, (step / 3) % 3]);
         for (truth, feature) in pairs {
             assert!((player.truth(truth) - f64::from(player.feature(feature))).abs() < 1e-6, "{truth}, step {step}");
         }
     }
-    let without_coin = Player::new(spec, 3, json!({"coin_enabled": false}));
+    let without_coin = Named::new(spec, 3, json!({"coin_enabled": false}));
     assert_eq!(["coin_x", "coin_y"].map(|name| without_coin.truth(name)), [0.0, 0.0]);
 }
 
@@ -200,7 +197,7 @@ fn the_ground_truth_of_endless_mystery_path_leads_along_it() {
     let spec = envs::spec("Endless-MysteryPath-v0").unwrap();
     let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
     for seed in 0..10 {
-        let mut player = Player::new(spec, seed, json!({"agent_speed": 12.0}));
+        let mut player = Named::new(spec, seed, json!({"agent_speed": 12.0}));
         let mut turns = 0;
         for step in 0..30 {
             let ones: Vec<_> = spec.ground_truth.iter().filter(|column| player.truth(column.name) == 1.0).collect();

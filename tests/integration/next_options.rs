@@ -1,7 +1,7 @@
 //! Reset parameters of next episodes, and what running episodes follow from, in a pool.
 
-use endless_gym::batch::{Batch, Block, zeroed};
-use endless_gym::pool::{Autoreset, NextOptions, Pool, PoolConfig, PoolError, ResetRequest, Seeding, Threads};
+use crate::support::player::Player;
+use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, PoolError, ResetRequest, Seeding};
 use serde_json::{Map, Value as Json, json};
 
 /// An agent that does nothing ends an episode within some dozens of steps.
@@ -15,37 +15,15 @@ fn next(value: &Json, envs: &[usize]) -> NextOptions {
     NextOptions { options: options(value), envs: envs.to_vec() }
 }
 
-struct Player {
-    pool: Pool,
-    blocks: Vec<Block>,
+/// Steps without moving, and returns the environments whose episodes ended.
+fn step(player: &mut Player) -> Vec<usize> {
+    player.step_all(0);
+    let ended = player.batch().terminated();
+    (0..ended.len()).filter(|env| ended[*env] != 0).collect()
 }
 
-impl Player {
-    fn new(config: &PoolConfig) -> Self {
-        let pool = Pool::new(config, &Threads::new(1).unwrap()).unwrap();
-        let blocks = zeroed(pool.layout().blocks());
-        Player { pool, blocks }
-    }
-
-    fn reset(&mut self, request: ResetRequest<'_>) {
-        self.pool.reset(request, &mut self.blocks).unwrap();
-    }
-
-    /// Steps without moving, and returns the environments whose episodes ended.
-    fn step(&mut self) -> Vec<usize> {
-        let num_envs = self.pool.layout().num_envs();
-        self.pool.step(&vec![0; num_envs], &mut self.blocks).unwrap();
-        let ended = Batch::new(self.pool.layout(), &self.blocks).terminated().to_vec();
-        (0..num_envs).filter(|env| ended[*env] != 0).collect()
-    }
-
-    fn bytes(&self) -> Vec<u8> {
-        Batch::new(self.pool.layout(), &self.blocks).bytes().to_vec()
-    }
-
-    fn options(&self, env: usize) -> Json {
-        self.pool.running_episode(env).unwrap().options.into()
-    }
+fn running(player: &Player, env: usize) -> Json {
+    player.pool.running_episode(env).unwrap().options.into()
 }
 
 fn config(num_envs: usize, autoreset: Autoreset) -> PoolConfig {
@@ -60,17 +38,17 @@ fn they_apply_from_the_next_episode_on_however_it_begins() {
         // Before the first episodes.
         player.pool.set_options(&[next(&three, &[0, 2])]).unwrap();
         player.reset(ResetRequest::All);
-        assert_eq!([0, 1, 2].map(|env| player.options(env)), [three.clone(), json!({}), three.clone()]);
-        player.step();
+        assert_eq!([0, 1, 2].map(|env| running(&player, env)), [three.clone(), json!({}), three.clone()]);
+        step(&mut player);
         player.pool.set_options(&[next(&one, &[2]), next(&three, &[1])]).unwrap();
         let mut ended = [false; 3];
         for _ in 0..200 {
             let expected = [three.clone(), json!({}), three.clone()];
             for env in 0..3 {
-                assert!(ended[env] || player.options(env) == expected[env], "the running episode does not change");
+                assert!(ended[env] || running(&player, env) == expected[env], "the running episode does not change");
             }
             let before = ended;
-            player.step().into_iter().for_each(|env| ended[env] = true);
+            step(&mut player).into_iter().for_each(|env| ended[env] = true);
             let began = match autoreset {
                 Autoreset::NextStep => before,
                 Autoreset::SameStep => ended,
@@ -79,7 +57,7 @@ fn they_apply_from_the_next_episode_on_however_it_begins() {
             let later = [three.clone(), three.clone(), one.clone()];
             for env in 0..3 {
                 if began[env] {
-                    assert_eq!(player.options(env), later[env], "{autoreset}");
+                    assert_eq!(running(&player, env), later[env], "{autoreset}");
                 }
             }
             if before == [true; 3] {
@@ -88,12 +66,12 @@ fn they_apply_from_the_next_episode_on_however_it_begins() {
         }
         assert_eq!(ended, [true; 3]);
         player.reset(ResetRequest::Each { reset: &[0, 0, 1], seed: &[0; 3] });
-        assert_eq!(player.options(2), one);
+        assert_eq!(running(&player, 2), one);
         // A reset with options replaces them.
         player.pool.set_options(&[next(&three, &[2])]).unwrap();
         let two = json!({"command_count": [2]});
         player.pool.reset_with(ResetRequest::All, Some(&options(&two)), &mut player.blocks).unwrap();
-        assert_eq!([0, 1, 2].map(|env| player.options(env)), [two.clone(), two.clone(), two]);
+        assert_eq!([0, 1, 2].map(|env| running(&player, env)), [two.clone(), two.clone(), two]);
     }
 }
 
@@ -111,8 +89,8 @@ fn an_episode_with_them_is_that_of_a_pool_made_with_them() {
     }
     for _ in 0..300 {
         assert!(made.bytes() == set.bytes());
-        made.step();
-        set.step();
+        step(&mut made);
+        step(&mut set);
     }
 }
 
@@ -121,7 +99,7 @@ fn they_survive_snapshots_and_checkpoints() {
     let one = json!({"command_count": [1], "arena_size": 6});
     let mut player = Player::new(&config(2, Autoreset::NextStep));
     player.reset(ResetRequest::All);
-    player.step();
+    step(&mut player);
     player.pool.set_options(&[next(&one, &[0])]).unwrap();
     let snapshot = player.pool.snapshot(0).unwrap();
     let saved = player.pool.save().unwrap().unwrap();
@@ -134,17 +112,17 @@ fn they_survive_snapshots_and_checkpoints() {
     let mut resumed = Player::new(&config(2, Autoreset::NextStep));
     resumed.pool.resume(&saved).unwrap();
     for player in [&mut player, &mut resumed] {
-        player.pool.observe(&mut player.blocks).unwrap();
+        player.observe();
     }
     for _ in 0..200 {
         assert!(player.bytes() == resumed.bytes());
         for player in [&mut player, &mut resumed, &mut restored] {
-            player.step();
+            step(player);
         }
     }
     for player in [&player, &resumed, &restored] {
-        assert_eq!(player.options(0), one);
-        assert_eq!(player.options(1), json!({}));
+        assert_eq!(running(player, 0), one);
+        assert_eq!(running(player, 1), json!({}));
     }
 }
 
@@ -170,7 +148,7 @@ fn a_running_episode_names_the_seed_that_it_follows_from() {
         player.reset(ResetRequest::All);
         let mut seen = vec![player.pool.running_episode(0).unwrap().seed];
         while seen.len() < 4 {
-            if player.step().contains(&0) {
+            if step(&mut player).contains(&0) {
                 seen.push(player.pool.running_episode(0).unwrap().seed);
             }
         }

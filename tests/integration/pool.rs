@@ -2,14 +2,15 @@
 
 use std::collections::HashSet;
 
-use endless_gym::batch::{Batch, Block, zeroed};
+use crate::support::player::{Player, random_actions};
+use crate::support::recorded::{options as any_options, property_cases};
 use endless_gym::envs::{self, ActionError};
 use endless_gym::pool::{
     Autoreset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
 use proptest::prelude::*;
+use rand::SeedableRng;
 use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
 use serde_json::{Map, Value as Json, json};
 
 const ID: &str = "Endless-MortarMayhem-v0";
@@ -23,46 +24,15 @@ fn config(num_envs: usize) -> PoolConfig {
     PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new(ID, num_envs) }
 }
 
-/// A pool with the memory of its batch.
-struct Player {
-    pool: Pool,
-    blocks: Vec<Block>,
-    random: SmallRng,
-}
-
-impl Player {
-    fn new(config: &PoolConfig, threads: usize) -> Self {
-        let mut pool = Pool::new(config, &Threads::new(threads).unwrap()).unwrap();
-        let mut blocks = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::All, &mut blocks).unwrap();
-        Player { pool, blocks, random: SmallRng::seed_from_u64(5) }
-    }
-
-    fn batch(&self) -> Batch<'_> {
-        Batch::new(self.pool.layout(), &self.blocks)
-    }
-
-    fn step(&mut self, actions: &[i32]) {
-        self.pool.step(actions, &mut self.blocks).unwrap();
-    }
-
-    fn step_at_random(&mut self) {
-        let branches = self.pool.spec().action_space.branches();
-        let num_envs = self.pool.layout().num_envs();
-        let actions: Vec<i32> = (0..num_envs)
-            .flat_map(|_| branches.iter().map(|n| self.random.random_range(0..*n)).collect::<Vec<_>>())
-            .collect();
-        self.step(&actions);
-    }
-
-    fn frame(&self, env: usize) -> Vec<u8> {
-        self.batch().observation()[env * envs::FRAME_BYTES..][..envs::FRAME_BYTES].to_vec()
-    }
+/// The observation of an environment.
+fn frame(player: &Player, env: usize) -> Vec<u8> {
+    player.batch().observation()[env * envs::FRAME_BYTES..][..envs::FRAME_BYTES].to_vec()
 }
 
 /// The first observation of the environment with that seed.
 fn first_frame(seed: u64) -> Vec<u8> {
-    Player::new(&PoolConfig { seeding: Seeding::Continue { seed: Some(seed) }, ..PoolConfig::new(ID, 1) }, 1).frame(0)
+    let seeding = Seeding::Continue { seed: Some(seed) };
+    frame(&Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 1) }), 0)
 }
 
 #[test]
@@ -73,14 +43,15 @@ fn results_do_not_depend_on_the_number_of_threads() {
             features: true,
             ..PoolConfig::new(spec.id, 331)
         };
-        let mut players: Vec<Player> = [1, 2, 3, 64].map(|threads| Player::new(&config, threads)).into();
+        let mut players = [1, 2, 3, 64].map(|threads| Player::with_threads(&config, threads));
+        players.iter_mut().for_each(|player| player.reset(ResetRequest::All));
+        let mut random = SmallRng::seed_from_u64(5);
         for step in 0..80 {
-            for player in &mut players {
-                player.step_at_random();
-            }
+            let actions = random_actions(spec, 331, &mut random);
+            players.iter_mut().for_each(|player| player.step(&actions));
             let (first, others) = players.split_first().unwrap();
             for other in others {
-                assert!(first.batch().bytes() == other.batch().bytes(), "{}, step {step}", spec.id);
+                assert!(first.bytes() == other.bytes(), "{}, step {step}", spec.id);
             }
         }
     }
@@ -88,18 +59,18 @@ fn results_do_not_depend_on_the_number_of_threads() {
 
 #[test]
 fn a_group_is_a_slice_of_all_environments() {
-    let whole = Player::new(&config(6), 1);
-    let half = Player::new(&PoolConfig { first_env: 3, total_envs: 6, ..config(3) }, 1);
-    assert_eq!(half.frame(0), whole.frame(3));
+    let whole = Player::started(&config(6));
+    let half = Player::started(&PoolConfig { first_env: 3, total_envs: 6, ..config(3) });
+    assert_eq!(frame(&half, 0), frame(&whole, 3));
 }
 
 #[test]
 fn next_step_autoreset_starts_an_episode_in_the_step_after_its_end() {
-    let mut player = Player::new(&config(64), 1);
+    let (mut player, mut random) = (Player::started(&config(64)), SmallRng::seed_from_u64(5));
     let mut ended = [false; 64];
     let mut starts = 0;
     for _ in 0..200 {
-        player.step_at_random();
+        player.step_at_random(&mut random);
         let batch = player.batch();
         for (env, ended) in ended.iter_mut().enumerate() {
             if *ended {
@@ -119,7 +90,7 @@ fn next_step_autoreset_starts_an_episode_in_the_step_after_its_end() {
 fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
     let next = PoolConfig { autoreset: Autoreset::NextStep, features: true, ..config(1) };
     let same = PoolConfig { autoreset: Autoreset::SameStep, final_observation: true, ..next.clone() };
-    let (mut next, mut same) = (Player::new(&next, 1), Player::new(&same, 1));
+    let (mut next, mut same) = (Player::started(&next), Player::started(&same));
     let mut ends = 0;
     for _ in 0..300 {
         next.step(&[0, 0]);
@@ -129,7 +100,7 @@ fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
         assert_eq!(next.batch().episode_length(), same.batch().episode_length());
         assert_eq!(next.batch().info(), same.batch().info());
         if next.batch().terminated()[0] == 0 {
-            assert_eq!(next.frame(0), same.frame(0));
+            assert_eq!(frame(&next, 0), frame(&same, 0));
             continue;
         }
         ends += 1;
@@ -138,7 +109,7 @@ fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
         assert_eq!(next.batch().features(), same.batch().final_features());
         assert_eq!(next.batch().observation(), same.batch().final_observation());
         next.step(&[0, 0]);
-        assert_eq!(next.frame(0), same.frame(0), "the new episode's first observation");
+        assert_eq!(frame(&next, 0), frame(&same, 0), "the new episode's first observation");
         assert_eq!(next.batch().ground_truth(), same.batch().ground_truth());
     }
     assert!(ends > 5, "{ends} episodes");
@@ -151,7 +122,7 @@ fn the_vector_observation_is_kept_too() {
         final_observation: true,
         ..PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new("MortarMayhemB-Grid-v0", 1) }
     };
-    let mut player = Player::new(&config, 1);
+    let mut player = Player::started(&config);
     let commands = player.batch().vector_observation().to_vec();
     while player.batch().terminated()[0] == 0 {
         player.step(&[1]);
@@ -162,26 +133,27 @@ fn the_vector_observation_is_kept_too() {
 
 #[test]
 fn disabled_autoreset_leaves_resets_to_the_trainer() {
-    let mut player = Player::new(&PoolConfig { autoreset: Autoreset::Disabled, ..config(3) }, 2);
+    let mut player = Player::started(&PoolConfig { autoreset: Autoreset::Disabled, ..config(3) });
+    let mut random = SmallRng::seed_from_u64(5);
     for _ in 0..30 {
-        player.step_at_random();
+        player.step_at_random(&mut random);
     }
     assert_eq!(player.batch().episode_length(), [30; 3], "no environment resets");
-    let before = player.frame(0);
-    player.pool.reset(ResetRequest::Each { reset: &[0, 1, 2], seed: &[0, 0, 77] }, &mut player.blocks).unwrap();
+    let before = frame(&player, 0);
+    player.reset(ResetRequest::Each { reset: &[0, 1, 2], seed: &[0, 0, 77] });
     assert_eq!(player.batch().episode_length(), [30, 0, 0]);
-    assert_eq!(player.frame(0), before);
-    assert_eq!(player.frame(2), first_frame(77));
+    assert_eq!(frame(&player, 0), before);
+    assert_eq!(frame(&player, 2), first_frame(77));
 }
 
 #[test]
 fn seeds_follow_the_seeding() {
     let first_frames = |seeding: Seeding, episodes: usize| -> Vec<Vec<u8>> {
-        let mut player = Player::new(&PoolConfig { seeding, ..PoolConfig::new(ID, 2) }, 1);
-        let mut frames = vec![player.frame(0), player.frame(1)];
+        let mut player = Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 2) });
+        let mut frames = vec![frame(&player, 0), frame(&player, 1)];
         for _ in 1..episodes {
-            player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
-            frames.extend([player.frame(0), player.frame(1)]);
+            player.reset(ResetRequest::All);
+            frames.extend([frame(&player, 0), frame(&player, 1)]);
         }
         frames
     };
@@ -198,9 +170,9 @@ fn seeds_follow_the_seeding() {
 #[test]
 fn ranges_of_seeds_may_have_a_step() {
     let seeding = Seeding::Range { start: 4, end: 12, step: 3, seed: Some(1) };
-    let player = Player::new(&PoolConfig { seeding, ..PoolConfig::new(ID, 64) }, 1);
+    let player = Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 64) });
     let expected: HashSet<Vec<u8>> = [4, 7, 10].map(first_frame).into();
-    assert_eq!((0..64).map(|env| player.frame(env)).collect::<HashSet<_>>(), expected);
+    assert_eq!((0..64).map(|env| frame(&player, env)).collect::<HashSet<_>>(), expected);
 }
 
 #[test]
@@ -215,15 +187,15 @@ fn all_episodes_after_a_seeded_reset_follow_from_its_seed() {
         // One reset by the seed of all, the other one environment at a time and after another number of episodes.
         let each = [ResetRequest::Seed(50), ResetRequest::Each { reset: &[2, 2], seed: &[50, 51] }];
         let shown = pair.clone().into_iter().zip(each).enumerate().map(|(before, (seeding, request))| {
-            let mut player = Player::new(&PoolConfig { seeding, ..config(2) }, 1);
+            let mut player = Player::started(&PoolConfig { seeding, ..config(2) });
             for _ in 0..before {
-                player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
+                player.reset(ResetRequest::All);
             }
-            player.pool.reset(request, &mut player.blocks).unwrap();
-            let mut frames = vec![player.frame(0), player.frame(1)];
+            player.reset(request);
+            let mut frames = vec![frame(&player, 0), frame(&player, 1)];
             for _ in 0..4 {
-                player.pool.reset(ResetRequest::All, &mut player.blocks).unwrap();
-                frames.extend([player.frame(0), player.frame(1)]);
+                player.reset(ResetRequest::All);
+                frames.extend([frame(&player, 0), frame(&player, 1)]);
             }
             frames
         });
@@ -233,9 +205,9 @@ fn all_episodes_after_a_seeded_reset_follow_from_its_seed() {
         match pair[0] {
             Seeding::Continue { .. } => {
                 let mut twin =
-                    Player::new(&PoolConfig { seeding: Seeding::Continue { seed: Some(50) }, ..config(2) }, 1);
+                    Player::started(&PoolConfig { seeding: Seeding::Continue { seed: Some(50) }, ..config(2) });
                 twin.pool.reset(ResetRequest::All, &mut twin.blocks).unwrap();
-                assert!(one[2..4] == [twin.frame(0), twin.frame(1)], "the generator of the seed continues");
+                assert!(one[2..4] == [frame(&twin, 0), frame(&twin, 1)], "the generator of the seed continues");
             }
             Seeding::Range { .. } => assert_ne!(one[2], one[3], "environments draw independently"),
             Seeding::List(_) => assert!(one == seeds(&[50, 51, 5, 6, 7, 5, 6, 7, 5, 6]), "the list starts again"),
@@ -252,27 +224,24 @@ fn the_number_of_threads_is_limited() {
 #[test]
 fn each_environment_may_have_its_own_options() {
     let each = vec![options(json!({})), options(json!({"agent_scale": 0.4})), options(json!({}))];
-    let seeding = Seeding::List(vec![8]);
-    let player = Player::new(
-        &PoolConfig { options: ResetOptions::Each(each), seeding: seeding.clone(), ..PoolConfig::new(ID, 3) },
-        1,
-    );
-    assert_eq!(player.frame(0), first_frame(8));
-    assert_ne!(player.frame(1), first_frame(8));
-    assert_eq!(player.frame(2), first_frame(8));
+    let (options, seeding) = (ResetOptions::Each(each), Seeding::List(vec![8]));
+    let player = Player::started(&PoolConfig { options, seeding, ..PoolConfig::new(ID, 3) });
+    assert_eq!(frame(&player, 0), first_frame(8));
+    assert_ne!(frame(&player, 1), first_frame(8));
+    assert_eq!(frame(&player, 2), first_frame(8));
 }
 
 #[test]
 fn a_reset_may_change_the_options() {
     let other = options(json!({"initial_command_count": 4, "agent_scale": 0.5}));
-    let mut fresh = Player::new(&PoolConfig { options: ResetOptions::Shared(other.clone()), ..config(2) }, 1);
-    let mut player = Player::new(&config(2), 1);
-    let before = player.frame(1);
+    let mut fresh = Player::started(&PoolConfig { options: ResetOptions::Shared(other.clone()), ..config(2) });
+    let mut player = Player::started(&config(2));
+    let before = frame(&player, 1);
     let request = ResetRequest::Each { reset: &[2, 0], seed: &[3, 0] };
     player.pool.reset_with(request, Some(&other), &mut player.blocks).unwrap();
-    assert_eq!(player.frame(1), before, "an environment that is not reset keeps its options");
+    assert_eq!(frame(&player, 1), before, "an environment that is not reset keeps its options");
     for _ in 0..200 {
-        assert_eq!(player.frame(0), fresh.frame(0));
+        assert_eq!(frame(&player, 0), frame(&fresh, 0));
         fresh.step(&[0, 0, 1, 1]);
         player.step(&[0, 0, 1, 1]);
     }
@@ -285,11 +254,13 @@ fn a_reset_may_change_the_options() {
 
 #[test]
 fn without_frames_nothing_else_changes() {
-    let mut with = Player::new(&PoolConfig { features: true, ..config(3) }, 1);
-    let mut without = Player::new(&PoolConfig { features: true, frames: None, ..config(3) }, 1);
+    let mut with = Player::started(&PoolConfig { features: true, ..config(3) });
+    let mut random = SmallRng::seed_from_u64(5);
+    let mut without = Player::started(&PoolConfig { features: true, frames: None, ..config(3) });
     for _ in 0..100 {
-        with.step_at_random();
-        without.step_at_random();
+        let actions = random_actions(with.pool.spec(), 3, &mut random);
+        with.step(&actions);
+        without.step(&actions);
         assert!(without.batch().observation().is_empty());
         assert_eq!(with.batch().reward(), without.batch().reward());
         assert_eq!(with.batch().features(), without.batch().features());
@@ -329,8 +300,7 @@ fn wrong_configurations_are_refused() {
 
 #[test]
 fn wrong_calls_are_refused_and_change_nothing() {
-    let mut pool = Pool::new(&config(2), &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
+    let Player { mut pool, mut blocks } = Player::new(&config(2));
     assert!(matches!(pool.step(&[0; 4], &mut blocks), Err(PoolError::NotReset)));
     pool.reset(ResetRequest::All, &mut blocks).unwrap();
     let before = blocks.clone();
@@ -347,13 +317,13 @@ fn wrong_calls_are_refused_and_change_nothing() {
 }
 
 proptest! {
-    #![proptest_config(crate::support::recorded::property_cases(64))]
+    #![proptest_config(property_cases(64))]
 
     /// Any options within the limits, any seed, any actions: nothing panics, and two pools agree.
     #[test]
     fn any_options_within_the_limits_can_be_played(
         (spec, given) in prop::sample::select(envs::specs().collect::<Vec<_>>())
-            .prop_flat_map(|spec| (Just(spec), crate::support::recorded::options(spec))),
+            .prop_flat_map(|spec| (Just(spec), any_options(spec))),
         seed: u64,
     ) {
         let config = PoolConfig {
@@ -362,11 +332,13 @@ proptest! {
             features: true,
             ..PoolConfig::new(spec.id, 3)
         };
-        let (mut one, mut other) = (Player::new(&config, 1), Player::new(&config, 2));
+        let mut players = [1, 2].map(|threads| Player::with_threads(&config, threads));
+        players.iter_mut().for_each(|player| player.reset(ResetRequest::All));
+        let mut random = SmallRng::seed_from_u64(5);
         for _ in 0..60 {
-            one.step_at_random();
-            other.step_at_random();
-            prop_assert!(one.batch().bytes() == other.batch().bytes());
+            let actions = random_actions(spec, 3, &mut random);
+            players.iter_mut().for_each(|player| player.step(&actions));
+            prop_assert!(players[0].bytes() == players[1].bytes());
         }
     }
 }

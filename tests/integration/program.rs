@@ -6,27 +6,28 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::support::program::{Room, signal, text, wait};
+use crate::support::place::Place;
+use crate::support::process::{Process, pseudo_terminal, text};
+use crate::support::recorded::traces;
+use crate::support::service::reset;
 use rustix::process::Signal;
-use rustix::pty::OpenptFlags;
-use rustix::termios::Winsize;
 use serde_json::Value as Json;
 
 #[test]
 fn list_shows_environments_and_parameters() {
-    let room = Room::new("list");
-    let all = room.run(&["list"]);
+    let place = Place::new();
+    let all = place.run(&["list"]);
     assert!(all.status.success());
     assert!(text(&all.stdout).contains("Endless-MortarMayhem-v0"));
-    let one = room.run(&["list", "MortarMayhem-v0"]);
+    let one = place.run(&["list", "MortarMayhem-v0"]);
     for part in ["command_show_duration", "[3]", "integer, 2 to 6", "commands_completed"] {
         assert!(text(&one.stdout).contains(part), "{part}");
     }
-    let json: Json = serde_json::from_slice(&room.run(&["list", "--json"]).stdout).unwrap();
+    let json: Json = serde_json::from_slice(&place.run(&["list", "--json"]).stdout).unwrap();
     assert_eq!(json[0]["id"], "MortarMayhem-v0");
     assert_eq!(json[0]["parameters"][2]["name"], "arena_size");
     assert_eq!(json[0]["parameters"][2]["max"], 6);
-    let unknown = room.run(&["list", "MortarMayhem-v1"]);
+    let unknown = place.run(&["list", "MortarMayhem-v1"]);
     assert_eq!(unknown.status.code(), Some(1));
     assert!(text(&unknown.stderr).starts_with("endless: no environment `MortarMayhem-v1`; there are MortarMayhem-v0"));
     assert_eq!(text(&unknown.stderr).lines().count(), 1);
@@ -34,28 +35,22 @@ fn list_shows_environments_and_parameters() {
 
 /// Standard output of a program that runs in a terminal with this number of columns.
 fn in_terminal(columns: u16, command: &mut Command) -> String {
-    let terminal = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
-    rustix::pty::grantpt(&terminal).unwrap();
-    rustix::pty::unlockpt(&terminal).unwrap();
-    let size = Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 };
-    rustix::termios::tcsetwinsize(&terminal, size).unwrap();
-    let name = rustix::pty::ptsname(&terminal, Vec::new()).unwrap().into_string().unwrap();
-    let program_side = File::options().read(true).write(true).open(name).unwrap();
-    let mut child = command.stdout(program_side).spawn().unwrap();
+    let (mut emulator, program_side) = pseudo_terminal(columns, 24);
+    let mut process = Process::spawn(command.stdout(program_side));
     // The command holds the program's side too; without it, reading ends when the program has ended.
     command.stdout(Stdio::null());
     let mut output = Vec::new();
     // The end of a terminal's other side is the error EIO.
-    let _ = File::from(terminal).read_to_end(&mut output);
-    assert!(wait(&mut child).success());
+    let _ = emulator.read_to_end(&mut output);
+    assert!(process.wait().success());
     text(&output).to_owned()
 }
 
 #[test]
 fn list_shows_pictures_in_terminals_with_colours() {
-    let room = Room::new("picture");
+    let place = Place::new();
     let list = |arguments: &[&str]| {
-        let mut command = room.endless(&[&["list", "MysteryPath-v0"], arguments].concat());
+        let mut command = place.endless(&[&["list", "MysteryPath-v0"], arguments].concat());
         command.env("COLORTERM", "truecolor").env_remove("NO_COLOR");
         command
     };
@@ -81,8 +76,8 @@ fn list_shows_pictures_in_terminals_with_colours() {
 
 #[test]
 fn frames_are_those_of_an_episode() {
-    let room = Room::new("frames");
-    let frames = |steps: &str| room.run(&["frames", "--env", "MysteryPath-Grid-v0", "--seed", "1", "--steps", steps]);
+    let place = Place::new();
+    let frames = |steps: &str| place.run(&["frames", "--env", "MysteryPath-Grid-v0", "--seed", "1", "--steps", steps]);
     let bytes = 84 * 84 * 3 + 336 * 336 * 3;
     let whole = frames("1000").stdout;
     assert_eq!(whole.len(), 19 * bytes); // the expert needs 18 steps
@@ -102,11 +97,11 @@ fn frames_are_those_of_an_episode() {
 
 #[test]
 fn verify_counts_and_exits_by_differences() {
-    let room = Room::new("verify");
-    let files = crate::support::recorded::traces("MortarMayhem-Grid-v0");
+    let place = Place::new();
+    let files = traces("MortarMayhem-Grid-v0");
     let verify = |files: &[&Path]| {
         let files: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
-        room.run(&[&["verify"], &files[..]].concat())
+        place.run(&[&["verify"], &files[..]].concat())
     };
     let same = verify(&[&files[0], &files[1]]);
     assert_eq!(same.status.code(), Some(0));
@@ -115,19 +110,15 @@ fn verify_counts_and_exits_by_differences() {
     assert!(lines[0].ends_with("6 episodes, 276 steps, no difference"), "{}", lines[0]);
     assert_eq!(lines[2], "verified 2 traces: 12 episodes, 552 steps, 0 differences");
 
-    let mut recorded = String::new();
-    std::io::Read::read_to_string(
-        &mut flate2::read::GzDecoder::new(std::fs::File::open(&files[0]).unwrap()),
-        &mut recorded,
-    )
-    .unwrap();
+    let recorded = flate2::read::GzDecoder::new(File::open(&files[0]).unwrap());
+    let mut trace: Json = serde_json::from_reader(recorded).unwrap();
     let write = |name: &str, trace: &Json| {
-        let path = room.root.join(name);
-        let mut file = flate2::write::GzEncoder::new(std::fs::File::create(&path).unwrap(), Default::default());
-        std::io::Write::write_all(&mut file, trace.to_string().as_bytes()).unwrap();
+        let path = place.root().join(name);
+        let file = flate2::write::GzEncoder::new(File::create(&path).unwrap(), Default::default());
+        serde_json::to_writer(file, trace).unwrap();
         path
     };
-    let mut trace: Json = serde_json::from_str(&recorded).unwrap();
+    let mut truncated = trace.clone();
     trace["episodes"][2]["steps"][4][1] = 0.5.into();
     let other = verify(&[&write("other.json.gz", &trace)]);
     assert_eq!(other.status.code(), Some(1));
@@ -136,7 +127,6 @@ fn verify_counts_and_exits_by_differences() {
         "{}",
         text(&other.stdout)
     );
-    let mut truncated: Json = serde_json::from_str(&recorded).unwrap();
     truncated["episodes"][5]["steps"].as_array_mut().unwrap().pop();
     let truncated = verify(&[&write("truncated.json.gz", &truncated)]);
     assert_eq!(truncated.status.code(), Some(1));
@@ -151,100 +141,93 @@ fn verify_counts_and_exits_by_differences() {
 
 #[test]
 fn the_demo_plays_through_shared_memory_and_leaves_nothing() {
-    let room = Room::new("demo");
-    let demo = room.run(&["demo", "--env", "MortarMayhem-Grid-v0", "--num-envs", "8", "--seconds", "2", "--json"]);
+    let place = Place::new();
+    let demo = place.run(&["demo", "--env", "MortarMayhem-Grid-v0", "--num-envs", "8", "--seconds", "2", "--json"]);
     assert!(demo.status.success(), "{}", text(&demo.stderr));
     let json: Json = serde_json::from_slice(&demo.stdout).unwrap();
     assert!(json["episodes"].as_u64().unwrap() >= 16, "{json}");
     assert_eq!(json["mean_length"], 118.0);
     assert_eq!(json["mean_info"]["commands_completed"], 1.0);
-    let random = room.run(&["demo", "--policy", "random", "--num-envs", "8", "--seconds", "0.5"]);
+    let random = place.run(&["demo", "--policy", "random", "--num-envs", "8", "--seconds", "0.5"]);
     assert!(text(&random.stdout).contains("steps per second"), "{}", text(&random.stderr));
-    assert_eq!(room.segments(), [""; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
 fn ctrl_c_ends_the_demo_with_its_summary() {
-    let room = Room::new("ctrlc");
-    let mut demo =
-        room.endless(&["demo", "--num-envs", "8", "--seconds", "60"]).stdout(Stdio::piped()).spawn().unwrap();
-    room.wait_for_engine();
-    signal(&demo, Signal::INT);
-    assert!(wait(&mut demo).success());
-    assert!(text(&demo.wait_with_output().unwrap().stdout).contains("steps per second"));
-    assert_eq!(room.segments(), [""; 0]);
+    let place = Place::new();
+    let mut demo = place.endless(&["demo", "--num-envs", "8", "--seconds", "60"]);
+    let mut demo = Process::spawn(demo.stdout(Stdio::piped()));
+    place.wait_for_engine();
+    demo.interrupt();
+    assert!(demo.output().contains("steps per second"));
+    place.assert_nothing_left();
 }
 
 #[test]
 fn an_engine_does_not_outlive_a_killed_demo() {
-    let room = Room::new("orphan");
-    let mut demo = room.endless(&["demo", "--num-envs", "8"]).stdout(Stdio::null()).spawn().unwrap();
-    room.wait_for_engine();
-    signal(&demo, Signal::KILL);
-    wait(&mut demo);
+    let place = Place::new();
+    let mut demo = Process::spawn(place.endless(&["demo", "--num-envs", "8"]).stdout(Stdio::null()));
+    place.wait_for_engine();
+    demo.kill();
     let start = Instant::now();
     // The engine goes by itself and takes its own segments along; the next process clears up after the killed trainer.
-    while start.elapsed() < Duration::from_secs(10) && !room.segments().is_empty() {
+    while start.elapsed() < Duration::from_secs(10) && !place.segments().is_empty() {
         std::thread::sleep(Duration::from_millis(500));
-        room.run(&["demo", "--num-envs", "1", "--seconds", "0.1"]);
+        place.run(&["demo", "--num-envs", "1", "--seconds", "0.1"]);
     }
-    assert_eq!(room.segments(), [""; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
 fn serve_serves_until_a_signal_and_leaves_nothing() {
-    let room = Room::new("serve");
+    let place = Place::new();
     for end in [Signal::INT, Signal::TERM] {
         let arguments = ["serve", "--num-envs", "4", "--groups", "2", "--service", "one", "--option", "max_steps=50"];
-        let mut engine = room.endless(&arguments).stdout(Stdio::piped()).spawn().unwrap();
-        let mut trainer = room.connect("one");
+        let mut engine = Process::spawn(place.endless(&arguments).stdout(Stdio::piped()));
+        let mut trainer = place.trainer("one").unwrap();
         assert_eq!(trainer.specification().groups, 2);
         assert_eq!(trainer.specification().options[0]["max_steps"], 50);
-        trainer.reset(1, endless_gym::pool::ResetRequest::All).unwrap();
-        trainer.receive(1, Duration::from_secs(5)).unwrap();
+        reset(&mut trainer, 1);
         drop(trainer);
-        signal(&engine, end);
-        assert!(wait(&mut engine).success());
-        assert!(
-            text(&engine.wait_with_output().unwrap().stdout).starts_with("serving Endless-MortarMayhem-v0 as `one`")
-        );
-        assert_eq!(room.segments(), [""; 0]);
+        engine.signal(end);
+        assert!(engine.wait().success());
+        assert!(engine.output().starts_with("serving Endless-MortarMayhem-v0 as `one`"));
+        place.assert_nothing_left();
     }
 }
 
 #[test]
 fn serve_reads_its_configuration_as_json_from_a_file_or_standard_input() {
-    let room = Room::new("config");
+    let place = Place::new();
     let config =
         r#"{"service": "one", "pool": {"id": "MysteryPath-Grid-v0", "num_envs": 3}, "groups": 2, "threads": 1}"#;
-    let file = room.config("one").namespace.root().with_extension("json");
+    let file = place.root().with_extension("json");
     std::fs::write(&file, config).unwrap();
     let path = file.to_str().unwrap();
     for arguments in [vec!["serve", "--child", "--config", path], vec!["serve", "--child", "--config=-"]] {
-        let mut engine = room.endless(&arguments).stdin(Stdio::piped()).spawn().unwrap();
-        let mut stdin = engine.stdin.take().unwrap();
+        let mut engine = Process::spawn(place.endless(&arguments).stdin(Stdio::piped()));
         if arguments.contains(&"--config=-") {
-            stdin.write_all(config.as_bytes()).unwrap();
+            engine.0.stdin.as_mut().unwrap().write_all(config.as_bytes()).unwrap();
         }
-        let trainer = room.connect("one");
+        let trainer = place.trainer("one").unwrap();
         let served = trainer.specification();
         assert_eq!((&*served.id, served.num_envs, served.groups), ("MysteryPath-Grid-v0", 3, 2));
         drop(trainer);
-        drop(stdin);
-        assert!(wait(&mut engine).success());
+        engine.end();
     }
     std::fs::write(&file, config.replace("threads", "thread")).unwrap();
-    let error = text(&room.run(&["serve", "--config", path]).stderr).to_owned();
+    let error = text(&place.run(&["serve", "--config", path]).stderr).to_owned();
     assert!(error.starts_with(&format!("endless: --config {path}: unknown field `thread`")), "{error}");
     for option in ["--num-envs=3", "--seed=1", "--no-frames"] {
-        assert_eq!(room.run(&["serve", "--config", path, option]).status.code(), Some(2), "{option}");
+        assert_eq!(place.run(&["serve", "--config", path, option]).status.code(), Some(2), "{option}");
     }
     std::fs::remove_file(file).unwrap();
 }
 
 #[test]
 fn wrong_arguments_are_one_clear_line() {
-    let room = Room::new("wrong");
+    let place = Place::new();
     for (arguments, part) in [
         (vec!["serve", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["serve", "--option", "arena_sise=3"], "no reset parameter `arena_sise`"),
@@ -267,19 +250,19 @@ fn wrong_arguments_are_one_clear_line() {
         (vec!["bench", "--env", "Chess-v0"], "no environment `Chess-v0`"),
         (vec!["bench", "--original", "/no/python", "--seconds", "0.01", "--rounds", "1"], "cannot run /no/python: "),
     ] {
-        let output = room.run(&arguments);
+        let output = place.run(&arguments);
         let stderr = text(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
         assert!(stderr.starts_with("endless: ") && stderr.contains(part), "{arguments:?}: {stderr}");
         assert_eq!(stderr.lines().count(), 1, "{stderr}");
     }
-    assert_eq!(room.segments(), [""; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
 fn bench_measures_every_method() {
-    let room = Room::new("bench");
-    let output = room.run(&["bench", "--num-envs", "16", "--seconds", "0.05", "--rounds", "1", "--json"]);
+    let place = Place::new();
+    let output = place.run(&["bench", "--num-envs", "16", "--seconds", "0.05", "--rounds", "1", "--json"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     let json: Json = serde_json::from_slice(&output.stdout).unwrap();
     let measurements = json[0]["measurements"].as_array().unwrap();
@@ -295,10 +278,10 @@ fn bench_measures_every_method() {
 
 #[test]
 fn output_that_cannot_be_written_is_a_failure() {
-    let room = Room::new("full");
-    let traces = crate::support::recorded::traces("MortarMayhem-Grid-v0");
-    let trace = traces[0].to_str().unwrap();
-    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let place = Place::new();
+    let trace = &traces("MortarMayhem-Grid-v0")[0];
+    let trace = trace.to_str().unwrap();
+    let full = || File::options().write(true).open("/dev/full").unwrap();
     for arguments in [
         vec!["--help"],
         vec!["--version"],
@@ -315,7 +298,7 @@ fn output_that_cannot_be_written_is_a_failure() {
         vec!["verify", trace],
         vec!["verify", "--json", trace],
     ] {
-        let output = room.endless(&arguments).stdout(full()).output().unwrap();
+        let output = place.endless(&arguments).stdout(full()).output().unwrap();
         let stderr = text(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{arguments:?}: {stderr}");
         assert!(
@@ -325,16 +308,16 @@ fn output_that_cannot_be_written_is_a_failure() {
         assert_eq!(stderr.lines().count(), 1, "{arguments:?}: {stderr}");
     }
     for (arguments, code) in [(["list", "Chess-v0"], 1), (["list", "--chess"], 2)] {
-        assert_eq!(room.endless(&arguments).stderr(full()).output().unwrap().status.code(), Some(code));
+        assert_eq!(place.endless(&arguments).stderr(full()).output().unwrap().status.code(), Some(code));
     }
-    assert_eq!(room.segments(), [""; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
 fn a_closed_pipe_is_no_failure() {
-    let room = Room::new("pipe");
-    let traces = crate::support::recorded::traces("MortarMayhem-Grid-v0");
-    let trace = traces[0].to_str().unwrap();
+    let place = Place::new();
+    let trace = &traces("MortarMayhem-Grid-v0")[0];
+    let trace = trace.to_str().unwrap();
     let closed = || std::io::pipe().unwrap().1;
     for (arguments, code) in [
         (vec!["--help"], 0),
@@ -345,32 +328,12 @@ fn a_closed_pipe_is_no_failure() {
         (vec!["verify", trace], 0),
         (vec!["verify", trace, "/nowhere.json.gz"], 1),
     ] {
-        let output = room.endless(&arguments).stdout(closed()).output().unwrap();
+        let output = place.endless(&arguments).stdout(closed()).output().unwrap();
         assert_eq!(output.status.code(), Some(code), "{arguments:?}");
         assert_eq!(text(&output.stderr), "", "{arguments:?}");
     }
-    let mut engine = room.endless(&["serve", "--num-envs", "1"]).stdout(closed()).spawn().unwrap();
-    room.wait_for_engine();
-    signal(&engine, Signal::INT);
-    assert!(wait(&mut engine).success());
-    assert_eq!(room.segments(), [""; 0]);
-}
-
-#[test]
-fn every_command_explains_itself() {
-    let room = Room::new("help");
-    for (command, part) in [
-        ("list", "--json"),
-        ("demo", "--seconds"),
-        ("serve", "--checkpoint"),
-        ("status", "--watch"),
-        ("view", "--terminal"),
-        ("play", "--option"),
-        ("bench", "--rounds"),
-        ("verify", "FILES"),
-    ] {
-        let help = room.run(&[command, "--help"]);
-        assert!(help.status.success() && text(&help.stdout).contains(part), "{command}");
-    }
-    assert!(text(&room.run(&["demo", "--help"]).stdout).contains("[default: 10"), "defaults are shown");
+    let mut engine = Process::spawn(place.endless(&["serve", "--num-envs", "1"]).stdout(closed()));
+    place.wait_for_engine();
+    engine.interrupt();
+    place.assert_nothing_left();
 }

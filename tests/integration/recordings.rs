@@ -1,8 +1,9 @@
 //! Recordings of this engine in the format of the original's traces, and the progress that a viewer is shown.
 
-use endless_gym::batch::{Batch, zeroed};
+use crate::support::player::{Player, random_actions};
+use endless_gym::batch::Batch;
 use endless_gym::envs::{self, specs};
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Recorder, Trace, replay};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -30,14 +31,10 @@ fn a_recording_equals_the_originals() {
             autoreset: Autoreset::Disabled,
             ..PoolConfig::new(spec.id, 1)
         };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-        let mut blocks = zeroed(pool.layout().blocks());
+        let Player { mut pool, mut blocks } = Player::new(&config);
         let mut recorder = Recorder::new(spec.id, &expected.options);
         for episode in &expected.episodes {
-            match episode.seed {
-                Some(seed) => pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap(),
-                None => pool.reset(ResetRequest::All, &mut blocks).unwrap(),
-            }
+            pool.reset(episode.seed.map_or(ResetRequest::All, ResetRequest::Seed), &mut blocks).unwrap();
             recorder.reset(episode.seed, &pool, &blocks);
             for step in &episode.steps {
                 pool.step(&step.action, &mut blocks).unwrap();
@@ -59,14 +56,12 @@ fn unfinished_recordings_are_replayed() {
     for spec in specs() {
         for steps in [0, 1, 25] {
             let config = PoolConfig { autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
-            let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-            let mut blocks = zeroed(pool.layout().blocks());
+            let Player { mut pool, mut blocks } = Player::new(&config);
             let mut recorder = Recorder::new(spec.id, &Default::default());
             pool.reset(ResetRequest::Seed(steps), &mut blocks).unwrap();
             recorder.reset(Some(steps), &pool, &blocks);
             for _ in 0..steps {
-                let branches = spec.action_space.branches().iter();
-                let action: Vec<i32> = branches.map(|choices| random.random_range(0..*choices)).collect();
+                let action = random_actions(spec, 1, &mut random);
                 pool.step(&action, &mut blocks).unwrap();
                 recorder.step(&action, &pool, &blocks);
                 if Batch::new(pool.layout(), &blocks).terminated()[0] == 1 {
@@ -91,9 +86,8 @@ fn unfinished_recordings_are_replayed() {
 fn progress_ends_at_the_final_info() {
     for spec in specs() {
         let config = PoolConfig { features: true, autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let Player { mut pool, mut blocks } = Player::new(&config);
         pool.progress(0).unwrap_err();
-        let mut blocks = zeroed(pool.layout().blocks());
         let mut expert = envs::expert(spec);
         let mut random = SmallRng::seed_from_u64(2);
         // The expert is interrupted by random actions, so that episodes end in all ways.

@@ -1,35 +1,22 @@
 //! The service between real processes: engines and trainers that are started, killed and restarted.
-//!
-//! The test program starts itself as a child process for them: the ignored test `role` runs the role that the environment names.
 
-use std::process::Command;
+use std::fs::File;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use crate::support::foreign::{Foreign, RequestHeader};
-use crate::support::service::{ID, Place, ROLE_ARGUMENTS, engine_config};
+use crate::support::foreign::{self, Foreign, RequestHeader};
+use crate::support::place::Place;
+use crate::support::player::Player;
+use crate::support::process::{TIMEOUT, unshare};
+use crate::support::service::{ID, assert_error, assert_rejected, play, send, set_role, step, try_step};
+use endless_gym::batch::Block;
 use endless_gym::envs::{ActionError, ActionSpace, spec};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
-    ConnectConfig, Engine, EngineStatus, Namespace, Observer, Rejection, ServiceError, ServiceSpecification, Trainer,
-    running_engines,
+    ConnectConfig, Engine, EngineStatus, Namespace, Observer, ROOT_VARIABLE, Rejection, ServiceError,
+    ServiceSpecification, Trainer, running_engines,
 };
-use endless_gym_core::batch::{ActionSection, Batch, Contents, action_layout, batch_layout, zeroed};
-use rustix::process::{Pid, Signal, kill_process};
-
-const SECONDS: Duration = Duration::from_secs(5);
-
-/// Resets a group and steps it.
-fn play(trainer: &mut Trainer, group: usize, steps: u64) {
-    trainer.reset(group, ResetRequest::Seed(3)).unwrap();
-    let first = trainer.receive(group, SECONDS).unwrap().step();
-    for step in 1..=steps {
-        trainer.send_with(group, |actions| actions.fill(1)).unwrap();
-        let received = trainer.receive(group, SECONDS).unwrap();
-        assert_eq!(received.step(), first + step);
-        assert_eq!(received.batch().reward().len(), trainer.specification().num_envs);
-    }
-}
+use endless_gym_core::batch::{ActionSection, Contents, action_layout, batch_layout};
 
 #[test]
 fn groups_are_reset_and_stepped_independently() {
@@ -42,16 +29,14 @@ fn groups_are_reset_and_stepped_independently() {
 
     trainer.reset(0, ResetRequest::Seed(7)).unwrap();
     trainer.reset(1, ResetRequest::Seed(7)).unwrap();
-    let second = trainer.receive(1, SECONDS).unwrap();
-    let first = trainer.receive(0, SECONDS).unwrap();
+    let second = trainer.receive(1, TIMEOUT).unwrap();
+    let first = trainer.receive(0, TIMEOUT).unwrap();
     assert_eq!((first.group(), second.group()), (0, 1));
     // Seeds are counted over the groups: environment i of group g is seeded with 7 + 4 g + i, as in one pool of all of them.
-    let pool_config = PoolConfig::new(ID, 8);
-    let mut pool = Pool::new(&pool_config, &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
-    pool.reset(ResetRequest::Seed(7), &mut blocks).unwrap();
-    let expected = Batch::new(pool.layout(), &blocks);
-    let (expected_first, expected_second) = expected.observation().split_at(expected.observation().len() / 2);
+    let mut pool = Player::new(&PoolConfig::new(ID, 8));
+    pool.reset(ResetRequest::Seed(7));
+    let expected = pool.batch().observation();
+    let (expected_first, expected_second) = expected.split_at(expected.len() / 2);
     assert!(first.batch().observation() == expected_first);
     assert!(second.batch().observation() == expected_second);
     assert!(expected_first != expected_second);
@@ -59,27 +44,25 @@ fn groups_are_reset_and_stepped_independently() {
 
     let actions = vec![1; 4 * specification.action_space.branches().len()];
     trainer.send(0, &actions).unwrap();
-    let stepped = trainer.receive_any(SECONDS).unwrap();
+    let stepped = trainer.receive_any(TIMEOUT).unwrap();
     assert_eq!((stepped.group(), stepped.step()), (0, 2));
     assert_eq!(stepped.batch().episode_length(), [1; 4]);
     assert_eq!(first.batch().episode_length(), [0; 4], "a held batch does not change");
 
     trainer.reset(0, ResetRequest::Each { reset: &[0, 2, 0, 1], seed: &[0, 7, 0, 0] }).unwrap();
-    let again = trainer.receive(0, SECONDS).unwrap();
+    let again = trainer.receive(0, TIMEOUT).unwrap();
     assert_eq!(again.batch().episode_length(), [1, 0, 1, 0]);
     drop((first, stepped));
 
     let options = serde_json::from_str(r#"{"arena_size": 3}"#).unwrap();
     trainer.reset_with(1, ResetRequest::Seed(7), Some(&options)).unwrap();
-    let smaller = trainer.receive(1, SECONDS).unwrap();
+    let smaller = trainer.receive(1, TIMEOUT).unwrap();
     assert!(smaller.batch().observation() != second.batch().observation());
     let wrong = serde_json::from_str(r#"{"agent_size": 1}"#).unwrap();
     trainer.reset_with(1, ResetRequest::All, Some(&wrong)).unwrap();
-    let refused = trainer.receive(1, SECONDS).unwrap_err();
-    assert!(refused.to_string().contains("agent_size"), "{refused}");
+    assert_rejected(trainer.receive(1, TIMEOUT), Rejection::Pool, "agent_size");
     let long = serde_json::from_value(serde_json::json!({"command_show_delay": vec![1; 20_000]})).unwrap();
-    let refused = trainer.reset_with(1, ResetRequest::All, Some(&long)).unwrap_err();
-    assert!(matches!(refused, ServiceError::OptionsTooLong { .. }));
+    assert_error!(trainer.reset_with(1, ResetRequest::All, Some(&long)), ServiceError::OptionsTooLong { .. });
 }
 
 #[test]
@@ -87,54 +70,43 @@ fn mistakes_of_a_trainer_are_typed_errors() {
     let place = Place::new();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
-        let mut engine = Engine::new(&engine_config(place.namespace(), "gym", 2, 1)).unwrap();
+        let mut engine = Engine::new(&place.engine_config("gym", 2, 1)).unwrap();
         let stop = &stop;
         let running = scope.spawn(move || engine.run(stop).unwrap());
         let mut trainer = place.trainer("gym").unwrap();
         let width = trainer.specification().action_space.branches().len();
 
-        assert!(matches!(trainer.reset(1, ResetRequest::All), Err(ServiceError::NoSuchGroup { given: 1, .. })));
-        assert!(matches!(trainer.receive(0, SECONDS), Err(ServiceError::NothingSent { group: 0 })));
-        assert!(matches!(trainer.receive_any(SECONDS), Err(ServiceError::NothingPending)));
-        assert!(matches!(
-            trainer.reset(0, ResetRequest::Each { reset: &[1, 1], seed: &[1] }),
-            Err(ServiceError::ResetCount { given: 1, num_envs: 2 })
-        ));
-        assert!(matches!(
-            trainer.send(0, &[0]),
-            Err(ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }))
-        ));
+        assert_error!(trainer.reset(1, ResetRequest::All), ServiceError::NoSuchGroup { given: 1, .. });
+        assert_error!(trainer.receive(0, TIMEOUT), ServiceError::NothingSent { group: 0 });
+        assert_error!(trainer.receive_any(TIMEOUT), ServiceError::NothingPending);
+        let reset = ResetRequest::Each { reset: &[1, 1], seed: &[1] };
+        assert_error!(trainer.reset(0, reset), ServiceError::ResetCount { given: 1, num_envs: 2 });
+        let wrong = trainer.send(0, &[0]);
+        assert_error!(wrong, ServiceError::Action(ActionError::Count { given: 1, num_envs: 2, .. }));
 
         // The environments must be reset before the first step.
         trainer.send(0, &vec![0; 2 * width]).unwrap();
-        let rejected = trainer.receive(0, SECONDS).unwrap_err();
-        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+        assert_rejected(trainer.receive(0, TIMEOUT), Rejection::NotReset, "");
 
         trainer.reset(0, ResetRequest::All).unwrap();
-        assert!(matches!(trainer.reset(0, ResetRequest::All), Err(ServiceError::AnswerPending { group: 0 })));
+        assert_error!(trainer.reset(0, ResetRequest::All), ServiceError::AnswerPending { group: 0 });
         // The number of actions is checked before the pending answer, and their range after it.
-        assert!(matches!(trainer.send(0, &[0]), Err(ServiceError::Action(ActionError::Count { .. }))));
-        assert!(matches!(trainer.send(0, &vec![99; 2 * width]), Err(ServiceError::AnswerPending { group: 0 })));
-        trainer.receive(0, SECONDS).unwrap();
+        assert_error!(trainer.send(0, &[0]), ServiceError::Action(ActionError::Count { .. }));
+        assert_error!(trainer.send(0, &vec![99; 2 * width]), ServiceError::AnswerPending { group: 0 });
+        trainer.receive(0, TIMEOUT).unwrap();
 
         let mut actions = vec![0; 2 * width];
         actions[width] = 99;
-        let error = trainer.send(0, &actions).unwrap_err();
-        assert!(
-            matches!(&error, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given[0] == 99),
-            "{error}"
-        );
+        let wrong = trainer.send(0, &actions);
+        assert_error!(wrong, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given[0] == 99);
 
         let mut held = Vec::new();
         for _ in 0..trainer.specification().batches_held {
-            trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-            held.push(trainer.receive(0, SECONDS).unwrap());
+            held.push(step(&mut trainer, 0));
         }
-        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-        let error = trainer.receive(0, SECONDS).unwrap_err();
-        assert!(matches!(error, ServiceError::TooManyBatchesHeld { group: 0, limit: 3 }), "{error}");
+        assert_error!(try_step(&mut trainer, 0), ServiceError::TooManyBatchesHeld { group: 0, limit: 3 });
         held.remove(0);
-        held.push(trainer.receive(0, SECONDS).unwrap());
+        held.push(trainer.receive(0, TIMEOUT).unwrap());
         assert!(held.windows(2).all(|pair| pair[0].step() + 1 == pair[1].step()));
 
         stop.store(true, Ordering::Relaxed);
@@ -148,12 +120,11 @@ fn a_second_trainer_and_a_second_engine_are_refused() {
     let place = Place::new();
     let engine = place.engine("gym", 1, 1);
     let _trainer = place.trainer("gym").unwrap();
-    let refused = place.trainer("gym").map(drop).unwrap_err();
     let own = std::process::id();
-    assert!(matches!(refused, ServiceError::TrainerExists { pid: Some(pid), .. } if pid == own), "{refused}");
-    let refused = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).map(drop).unwrap_err();
-    assert!(matches!(refused, ServiceError::EngineExists { pid: Some(pid), .. } if pid == engine.id()), "{refused}");
-    assert!(refused.to_string().contains("gym"));
+    assert_error!(place.trainer("gym"), ServiceError::TrainerExists { pid: Some(pid), .. } if *pid == own);
+    let second = Engine::new(&place.engine_config("gym", 1, 1));
+    let error = assert_error!(second, ServiceError::EngineExists { pid: Some(pid), .. } if *pid == engine.id());
+    assert!(error.to_string().contains("gym"));
 }
 
 #[test]
@@ -163,12 +134,12 @@ fn an_unknown_engine_is_named_among_those_that_exist() {
     assert!(alone.to_string().contains("running engines: none"), "{alone}");
     let _engine = place.engine("other", 1, 1);
     place.trainer("other").unwrap();
-    let error = place.trainer_now("gym").map(drop).unwrap_err();
-    assert!(matches!(&error, ServiceError::UnknownEngine { service, .. } if service == "gym"), "{error}");
+    let error =
+        assert_error!(place.trainer_now("gym"), ServiceError::UnknownEngine { service, .. } if service == "gym");
     assert!(error.to_string().contains("running engines: other"), "{error}");
     assert_eq!(running_engines(place.namespace()).unwrap(), ["other"]);
     let config = ConnectConfig { namespace: place.namespace().clone(), ..ConnectConfig::new("a/b") };
-    assert!(matches!(Trainer::connect(&config), Err(ServiceError::InvalidName { .. })));
+    assert_error!(Trainer::connect(&config), ServiceError::InvalidName { .. });
 }
 
 #[test]
@@ -186,14 +157,13 @@ fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
     let mut held = vec![seen];
     while held.len() < 3 {
         play(&mut trainer, 0, 1);
-        held.push(observer.next(SECONDS).unwrap());
+        held.push(observer.next(TIMEOUT).unwrap());
     }
     play(&mut trainer, 0, 10);
-    assert!(matches!(observer.newest(), Err(ServiceError::TooManyBatchesHeld { .. })));
-    assert!(matches!(Observer::connect(&config, 1), Err(ServiceError::NoSuchGroup { .. })));
+    assert_error!(observer.newest(), ServiceError::TooManyBatchesHeld { .. });
+    assert_error!(Observer::connect(&config, 1), ServiceError::NoSuchGroup { .. });
     let others: Vec<_> = (0..2).map(|_| Observer::connect(&config, 0).unwrap()).collect();
-    let error = Observer::connect(&config, 0).map(drop).unwrap_err();
-    assert!(matches!(error, ServiceError::TooManyObservers { limit: 3, .. }), "{error}");
+    assert_error!(Observer::connect(&config, 0), ServiceError::TooManyObservers { limit: 3, .. });
     drop(others);
     play(&mut trainer, 0, 1);
 }
@@ -203,16 +173,14 @@ fn after_a_killed_trainer_the_next_one_plays_on() {
     let place = Place::new();
     let _engine = place.engine("gym", 2, 2);
     for _ in 0..2 {
-        let mut killed = place.role("trainer", "gym", &[]);
+        let mut killed = place.role("trainer gym");
         // The observer shows that the trainer steps.
         let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
-        observer.next(SECONDS).unwrap();
+        observer.next(TIMEOUT).unwrap();
         killed.kill();
         let mut trainer = place.trainer("gym").unwrap();
         // The environments are in the episodes of the dead trainer.
-        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-        let rejected = trainer.receive(0, SECONDS).unwrap_err();
-        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+        assert_rejected(try_step(&mut trainer, 0), Rejection::NotReset, "");
         play(&mut trainer, 0, 5);
         play(&mut trainer, 1, 5);
     }
@@ -224,23 +192,17 @@ fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
     let mut engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 3);
-    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-    let held = trainer.receive(0, SECONDS).unwrap();
+    let held = step(&mut trainer, 0);
     let frame = held.batch().observation().to_vec();
 
     engine.kill();
     let start = Instant::now();
-    let error = trainer
-        .send_with(0, |actions| actions.fill(0))
-        .and_then(|()| trainer.receive(0, Duration::from_secs(60)).map(drop))
-        .unwrap_err();
-    assert!(matches!(error, ServiceError::EngineLost { pid, .. } if pid == engine.id()), "{error}");
+    assert_error!(try_step(&mut trainer, 0), ServiceError::EngineLost { pid, .. } if *pid == engine.id());
     assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
-    let error = trainer.reconnect(Duration::ZERO).unwrap_err();
-    assert!(matches!(error, ServiceError::UnknownEngine { .. }), "{error}");
+    assert_error!(trainer.reconnect(Duration::ZERO), ServiceError::UnknownEngine { .. });
 
     let mut engine = place.engine("gym", 2, 1);
-    trainer.reconnect(SECONDS).unwrap();
+    trainer.reconnect(TIMEOUT).unwrap();
     play(&mut trainer, 0, 3);
     assert_eq!(held.batch().observation(), frame, "a batch of a dead engine remains readable");
 
@@ -248,19 +210,17 @@ fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
     engine.kill();
     let mut engine = place.engine("gym", 2, 1);
     Observer::connect(&place.connect_config("gym"), 0).unwrap();
-    let error = trainer
-        .send_with(0, |actions| actions.fill(0))
-        .and_then(|()| trainer.receive(0, SECONDS).map(drop))
-        .unwrap_err();
-    assert!(matches!(error, ServiceError::EngineRestarted { .. }), "{error}");
-    trainer.reconnect(SECONDS).unwrap();
+    assert_error!(try_step(&mut trainer, 0), ServiceError::EngineRestarted { .. });
+    trainer.reconnect(TIMEOUT).unwrap();
     play(&mut trainer, 0, 3);
 
     // An engine that serves something else is not a successor.
     engine.kill();
     let _engine = place.engine("gym", 3, 1);
-    let error = trainer.reconnect(SECONDS).unwrap_err();
-    assert!(matches!(error, ServiceError::SpecificationChanged { what: "number of environments", .. }), "{error}");
+    assert_error!(
+        trainer.reconnect(TIMEOUT),
+        ServiceError::SpecificationChanged { what: "number of environments", .. }
+    );
     drop(trainer);
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
@@ -280,7 +240,7 @@ fn deaths_at_any_moment_are_survived() {
             engine.kill();
             engine = place.engine("gym", 3, 2);
         }
-        let mut killed = place.role("trainer", "gym", &[]);
+        let mut killed = place.role("trainer gym");
         std::thread::sleep(moment(6007));
         killed.kill();
         let mut trainer = place.trainer("gym").unwrap_or_else(|e| panic!("round {round}: {e}"));
@@ -288,14 +248,14 @@ fn deaths_at_any_moment_are_survived() {
         play(&mut trainer, 1, 3);
     }
     assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
-    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
 fn an_engine_that_ends_gives_up_its_name_without_the_lock() {
     let place = Place::new();
-    let engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
-    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    let engine = Engine::new(&place.engine_config("gym", 1, 1)).unwrap();
+    let lock = File::open(place.root()).unwrap();
     lock.lock().unwrap();
     std::thread::scope(|scope| {
         let ending = scope.spawn(|| drop(engine));
@@ -304,7 +264,7 @@ fn an_engine_that_ends_gives_up_its_name_without_the_lock() {
         lock.unlock().unwrap();
         ending.join().unwrap();
     });
-    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
@@ -314,11 +274,7 @@ fn a_trainer_notices_that_its_engine_has_ended() {
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 1);
     engine.end();
-    let error = trainer
-        .send_with(0, |actions| actions.fill(0))
-        .and_then(|()| trainer.receive(0, SECONDS).map(drop))
-        .unwrap_err();
-    assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+    assert_error!(try_step(&mut trainer, 0), ServiceError::EngineLost { .. });
 }
 
 #[test]
@@ -327,22 +283,19 @@ fn a_trainer_reports_a_lost_engine_while_the_namespace_is_locked() {
     let mut engine = place.engine("gym", 1, 1);
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 1);
-    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-    trainer.receive(0, SECONDS).unwrap();
+    step(&mut trainer, 0);
     engine.kill();
-    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    let lock = File::open(place.root()).unwrap();
     lock.lock().unwrap();
     let (report, reported) = std::sync::mpsc::channel();
     std::thread::scope(|scope| {
         scope.spawn(move || {
-            let sent = trainer.send_with(0, |actions| actions.fill(0));
-            report.send(sent.and_then(|()| trainer.receive(0, Duration::from_secs(60)).map(drop))).unwrap();
+            report.send(try_step(&mut trainer, 0).map(drop)).unwrap();
         });
         // Waiting for the lock to the end takes 5 seconds.
         let result = reported.recv_timeout(Duration::from_secs(4));
         lock.unlock().unwrap();
-        let error = result.expect("the trainer waits for the lock").unwrap_err();
-        assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+        assert_error!(result.expect("the trainer waits for the lock"), ServiceError::EngineLost { .. });
     });
 }
 
@@ -354,8 +307,8 @@ fn a_waiting_observer_notices_that_its_engine_has_died() {
     engine.kill();
     let (report, reported) = std::sync::mpsc::channel();
     std::thread::spawn(move || report.send(observer.next(Duration::MAX).map(drop)));
-    let error = reported.recv_timeout(Duration::from_secs(60)).expect("the observer still waits").unwrap_err();
-    assert!(matches!(error, ServiceError::EngineLost { pid, .. } if pid == engine.id()), "{error}");
+    let seen = reported.recv_timeout(Duration::from_secs(60)).expect("the observer still waits");
+    assert_error!(seen, ServiceError::EngineLost { pid, .. } if *pid == engine.id());
 }
 
 #[test]
@@ -364,15 +317,12 @@ fn a_late_answer_can_be_received_after_a_timeout() {
     let engine = place.engine("gym", 1, 1);
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 1);
-    let pid = Pid::from_raw(engine.id() as i32).unwrap();
-    kill_process(pid, Signal::STOP).unwrap();
-    std::thread::sleep(Duration::from_millis(50));
-    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-    let error = trainer.receive(0, Duration::from_millis(700)).unwrap_err();
-    assert!(matches!(error, ServiceError::TimedOut { .. }), "{error}");
-    assert!(matches!(trainer.receive(0, Duration::ZERO), Err(ServiceError::TimedOut { .. })));
-    kill_process(pid, Signal::CONT).unwrap();
-    assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), 3);
+    engine.stop();
+    send(&mut trainer, 0);
+    assert_error!(trainer.receive(0, Duration::from_millis(700)), ServiceError::TimedOut { .. });
+    assert_error!(trainer.receive(0, Duration::ZERO), ServiceError::TimedOut { .. });
+    engine.resume();
+    assert_eq!(trainer.receive(0, TIMEOUT).unwrap().step(), 3);
 }
 
 #[test]
@@ -383,11 +333,11 @@ fn nothing_is_left_behind() {
     play(&mut trainer, 1, 2);
     assert!(!place.leftovers().is_empty());
     trainer.reset(0, ResetRequest::All).unwrap();
-    let held = trainer.receive(0, SECONDS).unwrap();
+    let held = trainer.receive(0, TIMEOUT).unwrap();
     engine.end();
     drop(trainer);
     drop(held);
-    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+    place.assert_nothing_left();
 
     // After a crash, the next process that joins removes everything.
     let mut engine = place.engine("gym", 2, 2);
@@ -395,7 +345,7 @@ fn nothing_is_left_behind() {
     engine.kill();
     assert!(!place.leftovers().is_empty());
     assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
-    assert_eq!(place.leftovers(), [] as [std::path::PathBuf; 0]);
+    place.assert_nothing_left();
 }
 
 #[test]
@@ -408,26 +358,26 @@ fn bad_messages_are_answered_with_rejections() {
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
 
     let version = RequestHeader { layout_version: 77, ..good };
-    let (status, text) = foreign.ask(version, foreign.blocks(), |_| {}).unwrap();
-    assert!(status != 0 && text.contains("77"), "{text}");
-    let (status, text) = foreign.ask(RequestHeader { kind: 55, ..good }, foreign.blocks(), |_| {}).unwrap();
-    assert!(status != 0 && text.contains("55"), "{text}");
     let step = RequestHeader { kind: 1, ..good };
-    let (status, text) = foreign.ask(step, 1, |_| {}).unwrap();
-    assert!(status != 0 && text.contains("got 1"), "{text}");
-    let out_of_range = |blocks: &mut [endless_gym::batch::Block]| {
-        specification.action.write::<i32>(blocks, ActionSection::Action).fill(-1);
+    let actions_of = |number: i32| {
+        let layout = &specification.action;
+        move |blocks: &mut [Block]| layout.write::<i32>(blocks, ActionSection::Action).fill(number)
     };
-    let (status, text) = foreign.ask(step, foreign.blocks(), out_of_range).unwrap();
-    assert!(status != 0 && text.contains("-1"), "{text}");
+    let whole = foreign.blocks();
+    for (answer, part) in [
+        (foreign.ask(version, whole, |_| {}), "77"),
+        (foreign.ask(RequestHeader { kind: 55, ..good }, whole, |_| {}), "55"),
+        (foreign.ask(step, 1, |_| {}), "got 1"),
+        (foreign.ask(step, whole, actions_of(-1)), "-1"),
+    ] {
+        let (status, text) = answer.unwrap();
+        assert!(status != 0 && text.contains(part), "{text}");
+    }
     let earlier = RequestHeader { incarnation: specification.incarnation.wrapping_sub(1), ..good };
     assert_eq!(foreign.ask(earlier, foreign.blocks(), |_| {}), None, "a request for another incarnation is dropped");
 
     // The engine still answers.
-    let fine = |blocks: &mut [endless_gym::batch::Block]| {
-        specification.action.write::<i32>(blocks, ActionSection::Action).fill(0);
-    };
-    assert_eq!(foreign.ask(step, foreign.blocks(), fine).unwrap().0, 0);
+    assert_eq!(foreign.ask(step, whole, actions_of(0)).unwrap().0, 0);
     drop(foreign);
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
@@ -435,9 +385,8 @@ fn bad_messages_are_answered_with_rejections() {
 #[test]
 fn another_version_is_refused_with_both_numbers() {
     let place = Place::new();
-    let _old = crate::support::foreign::engine_of_version(place.namespace(), "old", 999);
-    let error = place.trainer_now("old").map(drop).unwrap_err();
-    assert!(matches!(&error, ServiceError::Version { layout, .. } if layout == "999"), "{error}");
+    let _old = foreign::engine_of_version(place.namespace(), "old", 999);
+    let error = assert_error!(place.trainer_now("old"), ServiceError::Version { layout, .. } if layout == "999");
     assert!(error.to_string().contains("install the same version"), "{error}");
 }
 
@@ -465,9 +414,9 @@ fn a_malformed_specification_is_an_error_and_not_a_panic() {
         ("service must be `malformed`, got `gym`", published),
     ];
     for (part, specification) in malformed {
-        let _published = crate::support::foreign::specification(place.namespace(), "malformed", &specification);
-        let error = place.trainer_now("malformed").map(drop).unwrap_err();
-        assert!(matches!(&error, ServiceError::Specification { reason, .. } if reason.contains(part)), "{error}");
+        let _published = foreign::specification(place.namespace(), "malformed", &specification);
+        let found = place.trainer_now("malformed");
+        assert_error!(found, ServiceError::Specification { reason, .. } if reason.contains(part));
     }
 }
 
@@ -476,9 +425,8 @@ fn messages_of_another_type_are_refused() {
     let place = Place::new();
     let _engine = place.engine("gym", 1, 1);
     let specification = place.trainer("gym").unwrap().specification().clone();
-    let _other = crate::support::foreign::engine_of_other_type(place.namespace(), "other", &specification);
-    let error = place.trainer_now("other").map(drop).unwrap_err();
-    assert!(matches!(error, ServiceError::IncompatibleTypes { .. }), "{error}");
+    let _other = foreign::engine_of_other_type(place.namespace(), "other", &specification);
+    assert_error!(place.trainer_now("other"), ServiceError::IncompatibleTypes { .. });
 }
 
 /// Leaves what a killed engine leaves.
@@ -489,32 +437,20 @@ fn remains(place: &Place, service: &str) {
 }
 
 #[test]
-fn remains_of_a_dead_engine_do_not_block_its_name() {
-    let place = Place::new();
-    remains(&place, "gym");
-    let _engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
-    assert_eq!(running_engines(place.namespace()).unwrap(), ["gym"]);
-}
-
-#[test]
 fn a_late_engine_finds_the_successor_of_a_dead_one() {
     let place = Place::new();
     remains(&place, "gym");
-    let lock = std::fs::File::open(place.namespace().root()).unwrap();
+    let lock = File::open(place.root()).unwrap();
     lock.lock().unwrap();
     std::thread::scope(|scope| {
-        let late = scope.spawn(|| Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).map(drop));
+        let late = scope.spawn(|| Engine::new(&place.engine_config("gym", 1, 1)).map(drop));
         std::thread::sleep(Duration::from_millis(500));
         // A successor takes the name while the other engine waits.
-        let _successor = crate::support::foreign::engine_of_version(place.namespace(), "gym", 999);
+        let _successor = foreign::engine_of_version(place.namespace(), "gym", 999);
         lock.unlock().unwrap();
-        let refused = late.join().unwrap().unwrap_err();
-        assert!(matches!(refused, ServiceError::EngineExists { .. }), "{refused}");
-        let error = place.trainer_now("gym").map(drop).unwrap_err();
-        assert!(
-            matches!(&error, ServiceError::Version { layout, .. } if layout == "999"),
-            "the successor is gone: {error}"
-        );
+        assert_error!(late.join().unwrap(), ServiceError::EngineExists { .. });
+        // The successor is still there.
+        assert_error!(place.trainer_now("gym"), ServiceError::Version { layout, .. } if layout == "999");
     });
 }
 
@@ -523,7 +459,7 @@ fn of_several_engines_one_takes_the_name_of_a_dead_one() {
     let place = Place::new();
     remains(&place, "gym");
     std::thread::scope(|scope| {
-        let start = || Engine::new(&engine_config(place.namespace(), "gym", 1, 1));
+        let start = || Engine::new(&place.engine_config("gym", 1, 1));
         let threads: Vec<_> = (0..4).map(|_| scope.spawn(start)).collect();
         let started: Vec<_> = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
         assert_eq!(started.iter().filter(|engine| engine.is_ok()).count(), 1);
@@ -539,7 +475,7 @@ fn a_header_that_changes_after_its_check_is_not_read_again() {
     let place = Place::new();
     let engine = place.engine("model", 1, 1);
     let specification = place.trainer("model").unwrap().specification().clone();
-    let mut foreign = crate::support::foreign::Engine::new(place.namespace(), "foreign", &specification);
+    let mut foreign = foreign::Engine::new(place.namespace(), "foreign", &specification);
     let mut observer = Observer::connect(&place.connect_config("foreign"), 0).unwrap();
     let mut header = foreign.send(5);
     let received = observer.newest().unwrap().unwrap();
@@ -558,15 +494,10 @@ fn a_header_that_changes_after_its_check_is_not_read_again() {
 #[ignore = "needs permission to create mount namespaces (unshare --mount --map-root-user)"]
 fn too_little_shared_memory_is_an_error_and_not_a_signal() {
     let place = Place::new();
-    let script = "mount -t tmpfs -o size=4M tmpfs /dev/shm && exec \"$0\" \"$@\"";
-    let output = Command::new("unshare")
-        .args(["--mount", "--map-root-user", "sh", "-c", script])
-        .arg(std::env::current_exe().unwrap())
-        .args(ROLE_ARGUMENTS)
-        .envs(place.role_environment("engine", "gym", &["64", "1"]))
-        .stdin(std::process::Stdio::null())
-        .output()
-        .unwrap();
+    let mut engine = unshare("mount -t tmpfs -o size=4M tmpfs /dev/shm");
+    engine.arg(std::env::current_exe().unwrap()).env(ROOT_VARIABLE, place.root());
+    set_role(&mut engine, "engine gym 64 1");
+    let output = engine.output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
     assert!(text.contains("running 1 test"), "the engine was not started: {text}");
     assert!(text.contains("SharedMemoryTooSmall") && text.contains("/dev/shm"), "{text}");

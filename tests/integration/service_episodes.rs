@@ -1,15 +1,14 @@
 //! Reset parameters of next episodes, and what running episodes follow from, through the service: as in a pool.
 
-use std::time::Duration;
-
 use crate::support::foreign::{Foreign, RequestHeader};
-use crate::support::service::{ID, Place};
-use endless_gym::batch::{Batch, zeroed};
-use endless_gym::pool::{NextOptions, Pool, PoolConfig, ResetRequest, Threads};
+use crate::support::place::Place;
+use crate::support::player::Player;
+use crate::support::process::TIMEOUT;
+use crate::support::service::{ID, assert_error, assert_rejected, reset, send, step};
+use endless_gym::pool::{NextOptions, PoolConfig, ResetRequest};
 use endless_gym::service::{Rejection, ServiceError};
 use serde_json::json;
 
-const SECONDS: Duration = Duration::from_secs(5);
 const NUM_ENVS: usize = 40;
 
 fn next(value: &serde_json::Value, envs: &[usize]) -> NextOptions {
@@ -21,38 +20,34 @@ fn options_of_next_episodes_are_those_of_a_pool() {
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
     let mut trainer = place.trainer("gym").unwrap();
-    let mut pool = Pool::new(&PoolConfig::new(ID, NUM_ENVS), &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
+    let mut player = Player::new(&PoolConfig::new(ID, NUM_ENVS));
     // Long texts, so that the answers need several messages.
     let long = |count: u32, length: usize| json!({"command_count": [count], "explosion_delay": vec![4; length]});
     let first: Vec<_> = (0..NUM_ENVS).map(|env| next(&long(1, 4_000 + env), &[env])).collect();
-    trainer.set_options(0, &first, SECONDS).unwrap();
-    pool.set_options(&first).unwrap();
-    trainer.reset(0, ResetRequest::Seed(7)).unwrap();
-    trainer.receive(0, SECONDS).unwrap();
-    pool.reset(ResetRequest::Seed(7), &mut blocks).unwrap();
+    trainer.set_options(0, &first, TIMEOUT).unwrap();
+    player.pool.set_options(&first).unwrap();
+    reset(&mut trainer, 0);
+    player.reset(ResetRequest::Seed(3));
 
     let later = [next(&json!({"command_count": [2]}), &[0, 5]), next(&json!({}), &[9])];
-    let width = trainer.specification().action_space.branches().len();
-    for step in 0..120 {
-        if step == 10 {
-            trainer.set_options(0, &later, SECONDS).unwrap();
-            pool.set_options(&later).unwrap();
+    for number in 0..120 {
+        if number == 10 {
+            trainer.set_options(0, &later, TIMEOUT).unwrap();
+            player.pool.set_options(&later).unwrap();
         }
-        trainer.send(0, &vec![0; NUM_ENVS * width]).unwrap();
-        let received = trainer.receive(0, SECONDS).unwrap();
-        pool.step(&vec![0; NUM_ENVS * width], &mut blocks).unwrap();
-        assert!(received.batch().observation() == Batch::new(pool.layout(), &blocks).observation());
+        let received = step(&mut trainer, 0);
+        player.step_all(1);
+        assert!(received.batch().observation() == player.batch().observation());
     }
     let envs: Vec<usize> = (0..NUM_ENVS).rev().collect();
-    let expected: Vec<_> = (0..NUM_ENVS).map(|env| pool.running_episode(env).unwrap()).collect();
-    assert!(trainer.running_episodes(0, &envs, SECONDS).unwrap() == expected);
+    let expected: Vec<_> = (0..NUM_ENVS).map(|env| player.pool.running_episode(env).unwrap()).collect();
+    assert!(trainer.running_episodes(0, &envs, TIMEOUT).unwrap() == expected);
     assert_eq!(expected[5].options, later[0].options);
     assert!(expected[9].options.is_empty());
-    assert_eq!(trainer.running_episodes(0, &[9, 3, 9], SECONDS).unwrap(), [expected[3].clone(), expected[9].clone()]);
-    assert!(trainer.running_episodes(0, &[], SECONDS).unwrap().is_empty());
+    assert_eq!(trainer.running_episodes(0, &[9, 3, 9], TIMEOUT).unwrap(), [expected[3].clone(), expected[9].clone()]);
+    assert!(trainer.running_episodes(0, &[], TIMEOUT).unwrap().is_empty());
     for env in 0..NUM_ENVS {
-        assert_eq!(trainer.snapshot(0, env, SECONDS).unwrap(), pool.snapshot(env).unwrap());
+        assert_eq!(trainer.snapshot(0, env, TIMEOUT).unwrap(), player.pool.snapshot(env).unwrap());
     }
 }
 
@@ -61,29 +56,24 @@ fn mistakes_are_typed_errors() {
     let place = Place::new();
     let _engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
-    let rejected = |error: ServiceError, part: &str, expected: Rejection| {
-        assert!(matches!(error, ServiceError::Rejected { reason, .. } if reason == expected), "{error}");
-        assert!(error.to_string().contains(part), "{error}");
-    };
-    rejected(trainer.running_episodes(0, &[0], SECONDS).unwrap_err(), "reset", Rejection::NotReset);
-    trainer.reset(0, ResetRequest::Seed(1)).unwrap();
-    trainer.receive(0, SECONDS).unwrap();
-    let before = trainer.snapshot(0, 0, SECONDS).unwrap();
+    assert_rejected(trainer.running_episodes(0, &[0], TIMEOUT), Rejection::NotReset, "reset");
+    reset(&mut trainer, 0);
+    let before = trainer.snapshot(0, 0, TIMEOUT).unwrap();
     let (good, wrong) = (json!({"arena_size": 3}), json!({"agent_size": 1}));
-    let refused = trainer.set_options(0, &[next(&good, &[0]), next(&wrong, &[1])], SECONDS).unwrap_err();
-    rejected(refused, "agent_size", Rejection::Pool);
-    let refused = trainer.set_options(0, &[next(&good, &[0, 2])], SECONDS).unwrap_err();
-    rejected(refused, "env must be 0 to 1, got 2", Rejection::Pool);
+    let refused = trainer.set_options(0, &[next(&good, &[0]), next(&wrong, &[1])], TIMEOUT);
+    assert_rejected(refused, Rejection::Pool, "agent_size");
+    let refused = trainer.set_options(0, &[next(&good, &[0, 2])], TIMEOUT);
+    assert_rejected(refused, Rejection::Pool, "env must be 0 to 1, got 2");
     let long = json!({"command_show_delay": vec![1; 20_000]});
-    let refused = trainer.set_options(0, &[next(&good, &[0]), next(&long, &[1])], SECONDS).unwrap_err();
-    assert!(matches!(refused, ServiceError::OptionsTooLong { .. }));
-    assert!(matches!(trainer.running_episodes(0, &[2], SECONDS), Err(ServiceError::Pool(_))));
-    assert!(matches!(trainer.set_options(1, &[next(&good, &[0])], SECONDS), Err(ServiceError::NoSuchGroup { .. })));
-    assert_eq!(trainer.snapshot(0, 0, SECONDS).unwrap(), before);
-    trainer.send(0, &[0, 0]).unwrap();
-    let pending = trainer.set_options(0, &[next(&good, &[0])], SECONDS).unwrap_err();
-    assert!(matches!(pending, ServiceError::AnswerPending { group: 0 }));
-    trainer.receive(0, SECONDS).unwrap();
+    let refused = trainer.set_options(0, &[next(&good, &[0]), next(&long, &[1])], TIMEOUT);
+    assert_error!(refused, ServiceError::OptionsTooLong { .. });
+    assert_error!(trainer.running_episodes(0, &[2], TIMEOUT), ServiceError::Pool(_));
+    assert_error!(trainer.set_options(1, &[next(&good, &[0])], TIMEOUT), ServiceError::NoSuchGroup { .. });
+    assert_eq!(trainer.snapshot(0, 0, TIMEOUT).unwrap(), before);
+    send(&mut trainer, 0);
+    let pending = trainer.set_options(0, &[next(&good, &[0])], TIMEOUT);
+    assert_error!(pending, ServiceError::AnswerPending { group: 0 });
+    trainer.receive(0, TIMEOUT).unwrap();
 
     // Texts that are no lists of options, and lengths beyond the payload.
     let specification = trainer.specification().clone();

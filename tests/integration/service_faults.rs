@@ -8,83 +8,25 @@ use std::io::Write;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::support::service::{Place, engine_config};
+use crate::support::foreign;
+use crate::support::place::Place;
+use crate::support::process::{Process, TIMEOUT, inside_namespace, unshare, wait_until};
+use crate::support::service::{ID, assert_error, play, reset, step};
 use endless_gym::pool::ResetRequest;
-use endless_gym::service::{Engine, LockHolder, Namespace, Observer, ServiceError, Trainer, running_engines};
-use rustix::process::{Pid, Signal, kill_process};
+use endless_gym::service::{Engine, LockHolder, Namespace, Observer, ServiceError, running_engines};
+use rustix::process::Signal;
 
-const SECONDS: Duration = Duration::from_secs(5);
 const SEGMENTS: &str = "/dev/shm";
-
-/// Resets a group and steps it.
-fn play(trainer: &mut Trainer, group: usize, steps: usize) {
-    trainer.reset(group, ResetRequest::Seed(3)).unwrap();
-    trainer.receive(group, SECONDS).unwrap();
-    for _ in 0..steps {
-        trainer.send_with(group, |actions| actions.fill(1)).unwrap();
-        trainer.receive(group, SECONDS).unwrap();
-    }
-}
-
-fn signal(process: u32, signal: Signal) {
-    kill_process(Pid::from_raw(process as i32).unwrap(), signal).unwrap();
-}
-
-fn segments(prefix: &str) -> Vec<PathBuf> {
-    let entries = fs::read_dir(SEGMENTS).unwrap().map(|entry| entry.unwrap().path());
-    entries.filter(|path| path.file_name().unwrap().to_string_lossy().starts_with(prefix)).collect()
-}
-
-/// Waits until `condition` holds.
-fn wait_for(what: &str, condition: impl Fn() -> bool) {
-    let start = Instant::now();
-    while !condition() {
-        assert!(start.elapsed() < Duration::from_secs(20), "{what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
-
-/// Set inside a mount namespace.
-const INSIDE: &str = "ENDLESS_TEST_INSIDE";
-
-/// Runs the test `name` of this program in a mount namespace of its own, after the shell commands `mounts`. Returns true inside.
-fn inside_namespace(name: &str, mounts: &str) -> bool {
-    if std::env::var_os(INSIDE).is_some() {
-        return true;
-    }
-    let output = Command::new("unshare")
-        .args(["--mount", "--map-root-user", "sh", "-c", &format!("{mounts} && exec \"$0\" \"$@\"")])
-        .arg(std::env::current_exe().unwrap())
-        .args([name, "--exact", "--ignored", "--nocapture"])
-        .env(INSIDE, "1")
-        .stdin(Stdio::null())
-        .output()
-        .unwrap();
-    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && text.contains("1 passed"), "{}: {text}", output.status);
-    false
-}
 
 /// The program `endless serve`.
 fn serve(place: &Place, service: &str) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_endless"));
-    command.args(["serve", "--env", crate::support::service::ID, "--num-envs", "2", "--service", service]);
-    command.env("ENDLESS_GYM_ROOT", place.namespace().root()).stdin(Stdio::null()).stdout(Stdio::null());
+    let mut command = place.endless(&["serve", "--env", ID, "--num-envs", "2", "--service", service]);
+    command.stdout(Stdio::null());
     command
-}
-
-/// A child process that is killed at the end of the test.
-struct Killed(Child);
-
-impl Drop for Killed {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
 }
 
 #[test]
@@ -101,7 +43,7 @@ fn inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing() {
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!((output.status.code(), output.status.signal()), (Some(1), None), "{text}");
     assert!(text.contains("/dev/shm has 0 MB free"), "{text}");
-    assert_eq!(segments(place.namespace().prefix()), [] as [PathBuf; 0]);
+    assert_eq!(place.segments(), [] as [PathBuf; 0]);
     // As soon as there is room, an engine starts.
     fs::remove_file(filler).unwrap();
     let _engine = place.engine("gym", 2, 1);
@@ -120,9 +62,8 @@ fn inside_memory_that_dead_processes_fill_an_engine_starts() {
     play(&mut place.trainer("gym").unwrap(), 0, 1);
     engine.kill();
     // A segment of the dead engine takes what is left.
-    let segment =
-        segments(place.namespace().prefix()).into_iter().find(|path| path.extension().unwrap() == "data").unwrap();
-    let mut file = fs::File::options().append(true).open(segment).unwrap();
+    let segment = place.segments().into_iter().find(|path| path.extension().unwrap() == "data").unwrap();
+    let mut file = File::options().append(true).open(segment).unwrap();
     file.write_all(&vec![1; 9 << 20]).unwrap_err();
     drop(file);
     let _engine = place.engine("gym", 2, 1);
@@ -133,9 +74,8 @@ fn inside_memory_that_dead_processes_fill_an_engine_starts() {
 fn an_unusable_counter_of_a_dead_process_is_replaced() {
     let place = Place::new();
     // A process of iceoryx2 itself leaves its counter; one that dies on it leaves it like this.
-    let _foreign = crate::support::foreign::engine_of_version(place.namespace(), "old", 999);
-    let counters =
-        || segments(place.namespace().prefix()).into_iter().filter(|path| path.extension().unwrap() == "global_mgmt");
+    let _foreign = foreign::engine_of_version(place.namespace(), "old", 999);
+    let counters = || place.segments().into_iter().filter(|path| path.extension().unwrap() == "global_mgmt");
     let left: Vec<_> = counters().collect();
     assert_eq!(left.len(), 1);
     fs::set_permissions(&left[0], Permissions::from_mode(0o200)).unwrap();
@@ -151,7 +91,7 @@ fn no_segment_is_open_to_other_users() {
     let _engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 1);
-    let segments = segments(place.namespace().prefix());
+    let segments = place.segments();
     assert!(!segments.is_empty());
     for segment in segments {
         assert_eq!(fs::metadata(&segment).unwrap().mode() & 0o077, 0, "{}", segment.display());
@@ -164,18 +104,17 @@ fn as_root_a_segment_of_another_user_is_reported_or_avoided() {
     let place = Place::new();
     let engine = place.engine("gym", 2, 1);
     drop(place.trainer("gym").unwrap());
-    let prefix = fs::read_to_string(place.namespace().root().join("prefix")).unwrap();
+    let prefix = fs::read_to_string(place.root().join("prefix")).unwrap();
     let planted = Path::new(SEGMENTS).join(format!("{prefix}planted"));
     File::create(&planted).unwrap();
     std::os::unix::fs::chown(&planted, Some(65534), Some(65534)).unwrap();
-    let error = place.trainer("gym").map(drop).unwrap_err();
-    assert!(matches!(&error, ServiceError::ForeignSegment { owner: 65534, .. }), "{error}");
+    let error = assert_error!(place.trainer("gym"), ServiceError::ForeignSegment { owner: 65534, .. });
     assert!(error.to_string().contains("65534") && error.to_string().contains("ENDLESS_GYM_ROOT"), "{error}");
     // Without engines and trainers, the namespace gets another prefix.
     engine.end();
     let _engine = place.engine("gym", 2, 1);
     play(&mut place.trainer("gym").unwrap(), 0, 1);
-    assert_ne!(fs::read_to_string(place.namespace().root().join("prefix")).unwrap(), prefix);
+    assert_ne!(fs::read_to_string(place.root().join("prefix")).unwrap(), prefix);
 }
 
 #[test]
@@ -186,22 +125,19 @@ fn two_directories_of_one_path_share_nothing() {
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 1);
     // Older than anything that a clock could call fresh.
-    for segment in segments(place.namespace().prefix()) {
+    for segment in place.segments() {
         File::open(segment).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
     }
-    let before = segments(place.namespace().prefix());
-    let root = place.namespace().root().display().to_string();
-    let output = Command::new("unshare")
-        .args(["--mount", "--map-root-user", "sh", "-c"])
-        .arg(format!("mount -t tmpfs -o mode=700 tmpfs {root} && exec \"$0\" \"$@\""))
+    let before = place.segments();
+    let root = place.root().display().to_string();
+    let output = unshare(&format!("mount -t tmpfs -o mode=700 tmpfs {root}"))
         .arg(env!("CARGO_BIN_EXE_endless"))
         .args(["serve", "--num-envs", "2", "--threads", "1", "--service", "gym", "--child"])
         .env("ENDLESS_GYM_ROOT", &root)
-        .stdin(Stdio::null())
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    assert_eq!(segments(place.namespace().prefix()), before);
+    assert_eq!(place.segments(), before);
     play(&mut trainer, 0, 1);
     drop(trainer);
     play(&mut place.trainer("gym").unwrap(), 0, 1);
@@ -210,42 +146,40 @@ fn two_directories_of_one_path_share_nothing() {
 #[test]
 fn an_engine_whose_directory_is_removed_comes_back() {
     let place = Place::new();
-    let mut engine = Killed(serve(&place, "gym").stderr(Stdio::null()).spawn().unwrap());
+    let mut engine = Process::spawn(serve(&place, "gym").stderr(Stdio::null()));
     let mut trainer = place.trainer("gym").unwrap();
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
     play(&mut trainer, 0, 1);
-    fs::remove_dir_all(place.namespace().root()).unwrap();
+    fs::remove_dir_all(place.root()).unwrap();
     // A visitor creates the directory again.
     running_engines(place.namespace()).unwrap();
     let start = Instant::now();
     let error = loop {
         let sent = trainer.reset(0, ResetRequest::Seed(3));
-        match sent.and_then(|()| trainer.receive(0, SECONDS).map(drop)) {
-            Ok(()) => assert!(start.elapsed() < SECONDS, "the engine does not notice"),
+        match sent.and_then(|()| trainer.receive(0, TIMEOUT).map(drop)) {
+            Ok(()) => assert!(start.elapsed() < TIMEOUT, "the engine does not notice"),
             Err(error) => break error,
         }
     };
     assert!(matches!(error, ServiceError::RootRemoved { .. }), "{error}");
-    let error = observer.next(SECONDS).and_then(|_| observer.next(SECONDS)).map(drop).unwrap_err();
-    assert!(matches!(error, ServiceError::RootRemoved { .. }), "{error}");
-    trainer.reconnect(SECONDS).unwrap();
+    assert_error!(observer.next(TIMEOUT).and_then(|_| observer.next(TIMEOUT)), ServiceError::RootRemoved { .. });
+    trainer.reconnect(TIMEOUT).unwrap();
     play(&mut trainer, 0, 3);
-    assert_eq!(trainer.specification().engine_pid, engine.0.id());
+    assert_eq!(trainer.specification().engine_pid, engine.id());
     assert!(start.elapsed() < Duration::from_secs(4), "{:?}", start.elapsed());
     drop((trainer, observer));
-    signal(engine.0.id(), Signal::TERM);
-    assert!(engine.0.wait().unwrap().success());
-    assert_eq!(place.leftovers(), [] as [PathBuf; 0]);
+    engine.signal(Signal::TERM);
+    assert!(engine.wait().success());
+    place.assert_nothing_left();
 }
 
 #[test]
 fn an_engine_ends_with_an_error_when_its_directory_is_removed() {
     let place = Place::new();
-    let mut engine = Engine::new(&engine_config(place.namespace(), "gym", 1, 1)).unwrap();
-    fs::remove_dir_all(place.namespace().root()).unwrap();
+    let mut engine = Engine::new(&place.engine_config("gym", 1, 1)).unwrap();
+    fs::remove_dir_all(place.root()).unwrap();
     let start = Instant::now();
-    let error = engine.run(&AtomicBool::new(false)).unwrap_err();
-    assert!(matches!(error, ServiceError::RootRemoved { .. }), "{error}");
+    assert_error!(engine.run(&AtomicBool::new(false)), ServiceError::RootRemoved { .. });
     assert!(start.elapsed() < Duration::from_secs(2));
 }
 
@@ -273,12 +207,12 @@ fn an_engine_that_is_stopped_while_it_starts_can_be_found() {
             .map(|(name, number)| {
                 let engine = place.engine(name, 1, 1);
                 std::thread::sleep(Duration::from_millis(3 * number));
-                signal(engine.id(), Signal::STOP);
+                engine.signal(Signal::STOP);
                 engine
             })
             .collect();
         std::thread::sleep(Duration::from_millis(1200));
-        engines.iter().for_each(|engine| signal(engine.id(), Signal::CONT));
+        engines.iter().for_each(Process::resume);
         for name in &names {
             play(&mut place.trainer(name).unwrap_or_else(|e| panic!("{name}: {e}")), 0, 1);
         }
@@ -291,24 +225,18 @@ fn a_stopped_holder_of_the_lock_is_waited_for_and_named() {
     let place = Place::new();
     let _engine = place.engine("gym", 1, 1);
     drop(place.trainer("gym").unwrap());
-    let root = place.namespace().root().to_owned();
-    let mut holder = Killed(
-        Command::new("flock").arg("--no-fork").arg(&root).args(["sleep", "60"]).stdin(Stdio::null()).spawn().unwrap(),
-    );
-    wait_for("flock holds the lock", || File::open(&root).unwrap().try_lock().is_err());
-    signal(holder.0.id(), Signal::STOP);
+    let root = place.root().to_owned();
+    let mut flock = Command::new("flock");
+    let mut holder = Process::spawn(flock.arg("--no-fork").arg(&root).args(["sleep", "60"]).stdin(Stdio::null()));
+    wait_until("flock holds the lock", || File::open(&root).unwrap().try_lock().is_err());
+    holder.stop();
     std::thread::scope(|scope| {
         let waiting = scope.spawn(|| place.trainer("gym").map(drop));
-        let error = running_engines(place.namespace()).unwrap_err();
-        let expected = Some(LockHolder { pid: holder.0.id(), stopped: true });
-        assert!(
-            matches!(&error, ServiceError::NamespaceLocked { holder, .. } if *holder == expected),
-            "{error}, expected {expected:?}"
-        );
+        let (found, expected) = (running_engines(place.namespace()), LockHolder { pid: holder.id(), stopped: true });
+        let error = assert_error!(found, ServiceError::NamespaceLocked { holder: Some(it), .. } if *it == expected);
         assert!(error.to_string().contains("kill -CONT"), "{error}");
         // A caller with more patience continues as soon as the lock is free.
-        holder.0.kill().unwrap();
-        holder.0.wait().unwrap();
+        holder.kill();
         waiting.join().unwrap().unwrap();
     });
 }
@@ -326,22 +254,19 @@ fn inside_small_shared_memory_observers_get_what_is_left() {
     let mut trainer = place.trainer("gym").unwrap();
     let config = place.connect_config("gym");
     let mut observer = Observer::connect(&config, 0).unwrap();
-    let error = Observer::connect(&config, 0).map(drop).unwrap_err();
-    assert!(matches!(error, ServiceError::SharedMemoryTooSmall { .. }), "{error}");
+    assert_error!(Observer::connect(&config, 0), ServiceError::SharedMemoryTooSmall { .. });
     // Something else takes the rest.
     fs::write(Path::new(SEGMENTS).join("filler"), vec![1; 14 << 20]).unwrap_err();
     let (mut seen, mut held) = (Vec::new(), Vec::new());
-    trainer.reset(0, ResetRequest::All).unwrap();
-    held.push(trainer.receive(0, SECONDS).unwrap());
+    held.push(reset(&mut trainer, 0));
     for _ in 0..10 {
         if seen.len() < 3 {
-            seen.push(observer.next(SECONDS).unwrap());
+            seen.push(observer.next(TIMEOUT).unwrap());
         }
         if held.len() == 3 {
             held.remove(0);
         }
-        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-        held.push(trainer.receive(0, SECONDS).unwrap());
+        held.push(step(&mut trainer, 0));
     }
     assert_eq!(seen.len(), 3);
     engine.kill();
@@ -353,55 +278,28 @@ fn few_descriptors_are_an_error_or_enough() {
     // Without the descriptors that this process has opened for other tests.
     let closed = "for fd in /proc/$$/fd/*; do fd=${fd##*/}; if ((fd > 2)); then eval \"exec $fd>&-\"; fi; done";
     let limited = |limit: u64| {
-        Command::new("bash")
-            .args(["-c", &format!("{closed}; ulimit -n {limit} && exec \"$0\" \"$@\"")])
-            .arg(env!("CARGO_BIN_EXE_endless"))
-            .args([
-                "serve",
-                "--env",
-                crate::support::service::ID,
-                "--num-envs",
-                "2",
-                "--groups",
-                "2",
-                "--service",
-                "gym",
-            ])
-            .env("ENDLESS_GYM_ROOT", place.namespace().root())
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap()
+        let mut command = place.command("bash");
+        command.args(["-c", &format!("{closed}; ulimit -n {limit} && exec \"$0\" \"$@\"")]);
+        command.arg(env!("CARGO_BIN_EXE_endless")).args(["serve", "--env", ID, "--num-envs=2", "--groups=2"]);
+        Process::spawn(command.arg("--service=gym").stdout(Stdio::null()).stderr(Stdio::piped()))
     };
     let mut needed = 0;
     for limit in [20, 40, 60] {
-        let output = limited(limit).wait_with_output().unwrap();
-        let text = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(1), "{text}");
+        let mut engine = limited(limit);
+        let text = engine.errors();
+        assert_eq!(engine.wait().code(), Some(1), "{text}");
         assert!(text.contains(&format!("the limit of this process is {limit}")), "{text}");
         needed = text.split_whitespace().nth(1).unwrap().parse().unwrap();
     }
     // The number in the message is enough for a trainer and all observers.
-    let _engine = Killed(limited(needed));
+    let _engine = limited(needed);
     let mut trainer = place.trainer("gym").unwrap();
     let config = place.connect_config("gym");
     let mut observers: Vec<_> = (0..6).map(|number| Observer::connect(&config, number % 2).unwrap()).collect();
     for group in 0..2 {
         play(&mut trainer, group, 2);
     }
-    observers.iter_mut().for_each(|observer| drop(observer.next(SECONDS).unwrap()));
-}
-
-#[test]
-fn a_dead_engine_is_neither_listed_nor_found() {
-    let place = Place::new();
-    let mut engine = place.engine("h7", 1, 1);
-    drop(place.trainer("h7").unwrap());
-    engine.kill();
-    assert_eq!(running_engines(place.namespace()).unwrap(), [] as [String; 0]);
-    let error = place.trainer_now("h7").map(drop).unwrap_err();
-    assert!(matches!(&error, ServiceError::UnknownEngine { running, .. } if running.is_empty()), "{error}");
+    observers.iter_mut().for_each(|observer| drop(observer.next(TIMEOUT).unwrap()));
 }
 
 #[test]
@@ -419,5 +317,5 @@ fn an_engine_reports_wrong_numbers_of_threads_and_a_full_output() {
     let full = File::options().write(true).open("/dev/full").unwrap();
     let status = serve(&place, "gym").stdout(full).stderr(Stdio::null()).status().unwrap();
     assert_eq!(status.code(), Some(1));
-    assert_eq!(place.leftovers(), [] as [PathBuf; 0]);
+    place.assert_nothing_left();
 }

@@ -5,29 +5,15 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::support::foreign::{self, Foreign, RequestHeader};
+use crate::support::place::Place;
 use crate::support::recorded::property_cases;
-use crate::support::service::Place;
+use crate::support::service::{assert_error, play};
 use endless_gym::batch::LAYOUT_VERSION;
-use endless_gym::pool::ResetRequest;
 use endless_gym::service::{ConnectConfig, Observer, ServiceError};
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
-
-/// How long a message is waited for.
-const SECONDS: Duration = Duration::from_secs(30);
-
-/// Plays some steps with the library.
-fn plays(place: &Place) {
-    let mut trainer = place.trainer("gym").unwrap();
-    trainer.reset(0, ResetRequest::All).unwrap();
-    for _ in 0..3 {
-        drop(trainer.receive(0, SECONDS).unwrap());
-        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
-    }
-    trainer.receive(0, SECONDS).unwrap();
-}
 
 /// A number that a forger would try.
 fn numbers() -> impl Strategy<Value = u64> {
@@ -72,7 +58,7 @@ fn any_text_can_be_a_specification() {
             Ok(())
         })
         .unwrap();
-    plays(&place);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
 #[test]
@@ -101,7 +87,7 @@ fn any_request_is_answered() {
         })
         .unwrap();
     drop(foreign);
-    plays(&place);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
 #[test]
@@ -118,7 +104,7 @@ fn requests_may_change_while_the_engine_reads_them() {
             .ask_while_changing(header, || if random.random() { random.random_range(0..8) } else { random.random() });
     }
     drop(foreign);
-    plays(&place);
+    play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
 #[test]
@@ -183,5 +169,5 @@ fn a_forged_length_is_cut() {
         assert_eq!(received.batch().reward(), [0.0]);
     }
     foreign.send(5).overwrite(0, 5, 0);
-    assert!(matches!(observer.newest(), Err(ServiceError::IncompatibleTypes { .. })));
+    assert_error!(observer.newest(), ServiceError::IncompatibleTypes { .. });
 }

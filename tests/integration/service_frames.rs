@@ -2,16 +2,16 @@
 //!
 //! The engines check their incremental drawing; the received frames are compared with those of a pool that draws in full.
 
-use std::time::Duration;
-
-use crate::support::service::{ID, Place};
-use endless_gym::batch::{Batch, zeroed};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use crate::support::place::Place;
+use crate::support::player::{Player, random_actions};
+use crate::support::process::TIMEOUT;
+use crate::support::service::ID;
+use endless_gym::batch::zeroed;
+use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{BatchLease, Observer, Trainer};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
-const SECONDS: Duration = Duration::from_secs(5);
 const NUM_ENVS: usize = 4;
 
 /// Batches that are held, with a copy of their frames from when they were received.
@@ -37,17 +37,14 @@ impl Held {
 
 /// Steps the engine and a pool that draws in full, and compares the frames. Observers receive batches at random.
 fn play(trainer: &mut Trainer, observers: &mut [Observer], steps: u64, random: &mut SmallRng) {
-    let mut pool = Pool::new(&PoolConfig::new(ID, NUM_ENVS), &Threads::new(1).unwrap()).unwrap();
+    let mut player = Player::new(&PoolConfig::new(ID, NUM_ENVS));
     let mut held: Vec<Held> = (0..=observers.len()).map(|_| Held::default()).collect();
     let seed = random.random_range(0..1000);
     trainer.reset(0, ResetRequest::Seed(seed)).unwrap();
-    // A new buffer is drawn in full.
-    let mut expected = zeroed(pool.layout().blocks());
-    pool.reset(ResetRequest::Seed(seed), &mut expected).unwrap();
+    player.reset(ResetRequest::Seed(seed));
     for step in 0..=steps {
-        let received = trainer.receive(0, SECONDS).unwrap();
-        let frames = Batch::new(pool.layout(), &expected).observation();
-        assert!(received.batch().observation() == frames, "step {step}");
+        let received = trainer.receive(0, TIMEOUT).unwrap();
+        assert!(received.batch().observation() == player.batch().observation(), "step {step}");
         held[0].keep(received);
         for (observer, held) in observers.iter_mut().zip(&mut held[1..]) {
             if random.random_bool(0.5) {
@@ -58,13 +55,13 @@ fn play(trainer: &mut Trainer, observers: &mut [Observer], steps: u64, random: &
             }
         }
         held.iter_mut().for_each(|held| held.release(random));
-        let mut actions = vec![0; trainer.specification().action_space.branches().len() * NUM_ENVS];
-        actions.fill_with(|| random.random_range(0..4));
-        expected = zeroed(pool.layout().blocks());
-        pool.step(&actions, &mut expected).unwrap();
+        let actions = random_actions(player.pool.spec(), NUM_ENVS, random);
+        // A new buffer is drawn in full.
+        player.blocks = zeroed(player.blocks.len());
+        player.step(&actions);
         trainer.send(0, &actions).unwrap();
     }
-    trainer.receive(0, SECONDS).unwrap();
+    trainer.receive(0, TIMEOUT).unwrap();
 }
 
 #[test]
@@ -78,16 +75,13 @@ fn frames_are_correct_while_batches_are_held_and_processes_restart() {
         let mut observers = [Observer::connect(&config, 0).unwrap(), Observer::connect(&config, 0).unwrap()];
         play(&mut trainer, &mut observers, 150, &mut random);
         drop(observers);
-        if round % 2 == 0 {
-            // The next trainer receives chunks that the last one returned.
-            drop(trainer);
-            trainer = place.trainer("gym").unwrap();
-        } else {
+        if round % 2 == 1 {
             engine.kill();
             engine = place.engine("gym", NUM_ENVS, 1);
-            drop(trainer);
-            trainer = place.trainer("gym").unwrap();
         }
+        // The next trainer receives chunks that the last one returned.
+        drop(trainer);
+        trainer = place.trainer("gym").unwrap();
     }
     drop(trainer);
     engine.end();

@@ -1,30 +1,27 @@
 //! An observer that is paused costs the engine nothing, keeps its place, and gets the newest batch when it resumes.
 
 use std::collections::HashSet;
-use std::time::{Duration, Instant};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
-use crate::support::service::{ID, Place, engine_config};
-use endless_gym::batch::{Batch, zeroed};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
-use endless_gym::service::{BatchLease, EngineConfig, EngineStatus, Observer, ServiceError, Trainer};
+use crate::support::place::Place;
+use crate::support::player::Player;
+use crate::support::process::TIMEOUT;
+use crate::support::service::{ID, reset, step};
+use endless_gym::pool::{PoolConfig, ResetRequest};
+use endless_gym::service::{Engine, EngineConfig, EngineStatus, Observer, ServiceError, Trainer};
 
-const SECONDS: Duration = Duration::from_secs(10);
 const NUM_ENVS: usize = 4;
-
-fn step(trainer: &mut Trainer) -> BatchLease {
-    trainer.send_with(0, |actions| actions.fill(1)).unwrap();
-    trainer.receive(0, SECONDS).unwrap()
-}
 
 /// The addresses at which this many batches arrive, of which the trainer holds none.
 fn buffers(trainer: &mut Trainer, batches: usize) -> HashSet<usize> {
-    (0..batches).map(|_| step(trainer).blocks().as_ptr().addr()).collect()
+    (0..batches).map(|_| step(trainer, 0).blocks().as_ptr().addr()).collect()
 }
 
-fn reset(place: &Place) -> Trainer {
+/// A trainer that has reset the environments.
+fn started(place: &Place) -> Trainer {
     let mut trainer = place.trainer("gym").unwrap();
-    trainer.reset(0, ResetRequest::Seed(3)).unwrap();
-    trainer.receive(0, SECONDS).unwrap();
+    reset(&mut trainer, 0);
     trainer
 }
 
@@ -32,7 +29,7 @@ fn reset(place: &Place) -> Trainer {
 fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = reset(&place);
+    let mut trainer = started(&place);
     assert_eq!(buffers(&mut trainer, 20).len(), 1);
     let mut observers = [(); 2].map(|()| Observer::connect(&place.connect_config("gym"), 0).unwrap());
     assert_eq!(buffers(&mut trainer, 20).len(), 2, "the queue of an observer has the newest batch");
@@ -40,13 +37,13 @@ fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
         observers.iter_mut().for_each(Observer::pause);
         assert!(observers.iter().all(Observer::is_paused));
         // The engine learns of it when it sends the next batch.
-        step(&mut trainer);
+        step(&mut trainer, 0);
         assert_eq!(buffers(&mut trainer, 20).len(), 1, "round {round}");
         for observer in &mut observers {
             assert!(!observer.has_newer() && observer.newest().unwrap().is_none());
             assert!(!observer.is_paused());
         }
-        let expected = step(&mut trainer);
+        let expected = step(&mut trainer, 0);
         for observer in &mut observers {
             let seen = observer.newest().unwrap().unwrap();
             assert_eq!((seen.step(), observer.step()), (expected.step(), Some(expected.step())));
@@ -59,29 +56,29 @@ fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
 fn a_lease_is_valid_while_its_observer_is_paused() {
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
-    let mut trainer = reset(&place);
+    let mut trainer = started(&place);
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
-    step(&mut trainer);
+    step(&mut trainer, 0);
     let lease = observer.newest().unwrap().unwrap();
     let observation = lease.batch().observation().to_vec();
     observer.pause();
     assert!(!observer.is_paused(), "the pause begins with the end of the lease");
-    let newest = (0..20).map(|_| step(&mut trainer).step()).last();
+    let newest = (0..20).map(|_| step(&mut trainer, 0).step()).last();
     assert!(lease.batch().observation() == observation);
     assert_eq!(observer.newest().unwrap().map(|lease| lease.step()), newest);
     observer.pause();
     drop(lease);
     assert!(observer.is_paused());
-    step(&mut trainer);
+    step(&mut trainer, 0);
     assert_eq!(buffers(&mut trainer, 20).len(), 1);
 }
 
 #[test]
 fn a_paused_observer_keeps_its_place() {
     let place = Place::new();
-    let config = EngineConfig { observers: 2, ..engine_config(place.namespace(), "gym", NUM_ENVS, 1) };
-    let mut engine = endless_gym::service::Engine::new(&config).unwrap();
-    let stop = std::sync::atomic::AtomicBool::new(false);
+    let config = EngineConfig { observers: 2, ..place.engine_config("gym", NUM_ENVS, 1) };
+    let mut engine = Engine::new(&config).unwrap();
+    let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         scope.spawn(|| engine.run(&stop).unwrap());
         let connect = || Observer::connect(&place.connect_config("gym"), 0);
@@ -101,12 +98,12 @@ fn a_paused_observer_keeps_its_place() {
         drop(second);
         let third = connect().unwrap();
         assert!(refused(connect()));
-        let mut trainer = reset(&place);
+        let mut trainer = started(&place);
         assert!(first.newest().unwrap().is_none());
-        let sent = step(&mut trainer).step();
+        let sent = step(&mut trainer, 0).step();
         assert_eq!(first.newest().unwrap().map(|lease| lease.step()), Some(sent));
         drop(third);
-        stop.store(true, std::sync::atomic::Ordering::Relaxed);
+        stop.store(true, Ordering::Relaxed);
     });
 }
 
@@ -115,28 +112,26 @@ fn the_last_batch_is_sent_again_for_an_observer_that_resumes_while_the_trainer_p
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
     let mut trainer = place.trainer("gym").unwrap();
-    let mut pool = Pool::new(&PoolConfig::new(ID, NUM_ENVS), &Threads::new(1).unwrap()).unwrap();
-    let mut expected = zeroed(pool.layout().blocks());
+    let mut expected = Player::new(&PoolConfig::new(ID, NUM_ENVS));
     let connect = || Observer::connect(&place.connect_config("gym"), 0).unwrap();
     let (mut observer, mut other) = (connect(), connect());
-    trainer.reset(0, ResetRequest::Seed(3)).unwrap();
-    pool.reset(ResetRequest::Seed(3), &mut expected).unwrap();
-    trainer.receive(0, SECONDS).unwrap();
+    reset(&mut trainer, 0);
+    expected.reset(ResetRequest::Seed(3));
     for round in 0..4 {
         observer.pause();
         let mut last = None;
         for _ in 0..5 {
-            last = Some(step(&mut trainer));
-            pool.step(&[1; NUM_ENVS], &mut expected).unwrap();
+            last = Some(step(&mut trainer, 0));
+            expected.step_all(1);
         }
         let sent = last.as_ref().unwrap().step();
         assert_eq!(other.newest().unwrap().map(|lease| lease.step()), Some(sent));
         // The same chunk is sent again, unless the trainer holds it.
         let held = last.filter(|_| round % 2 == 0);
         let begin = Instant::now();
-        let seen = observer.next(SECONDS).unwrap();
+        let seen = observer.next(TIMEOUT).unwrap();
         assert_eq!(seen.step(), sent, "after {:?}", begin.elapsed());
-        assert!(seen.batch().observation() == Batch::new(pool.layout(), &expected).observation());
+        assert!(seen.batch().observation() == expected.batch().observation());
         assert!(held.is_none_or(|held| held.batch().observation() == seen.batch().observation()));
         assert!(other.newest().unwrap().is_none(), "no observer gets a batch twice");
         drop(seen);
@@ -144,8 +139,8 @@ fn the_last_batch_is_sent_again_for_an_observer_that_resumes_while_the_trainer_p
     }
     // The trainer goes on, whatever its queue has.
     for _ in 0..5 {
-        let last = step(&mut trainer);
-        pool.step(&[1; NUM_ENVS], &mut expected).unwrap();
-        assert!(last.batch().observation() == Batch::new(pool.layout(), &expected).observation());
+        let last = step(&mut trainer, 0);
+        expected.step_all(1);
+        assert!(last.batch().observation() == expected.batch().observation());
     }
 }

@@ -1,36 +1,15 @@
 //! Whether a request was executed never, once, or cannot be known: each row of the table in the documentation of
 //! `endless-gym-service`, with real processes.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use crate::support::service::{Place, Running};
+use crate::support::place::Place;
+use crate::support::process::{Process, TIMEOUT, wait_until};
+use crate::support::service::{assert_error, assert_rejected, send, step, try_step};
 use endless_gym::pool::ResetRequest;
 use endless_gym::service::{EngineActivity, EngineStatus, LastRequest, Observer, Rejection, ServiceError, Trainer};
-use rustix::process::{Pid, Signal, kill_process};
 
-const SECONDS: Duration = Duration::from_secs(10);
 const SHORT: Duration = Duration::from_millis(50);
-
-fn signal(process: &Running, signal: Signal) {
-    kill_process(Pid::from_raw(process.id() as i32).unwrap(), signal).unwrap();
-}
-
-/// Stops an engine, and waits until it is.
-fn stop(engine: &Running) {
-    signal(engine, Signal::STOP);
-    wait_until("the process stops", || {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", engine.id())).unwrap();
-        stat.rsplit(") ").next().unwrap().starts_with('T')
-    });
-}
-
-fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !is_so() {
-        assert!(start.elapsed() < SECONDS, "{what}: not within {SECONDS:?}");
-        std::thread::sleep(Duration::from_micros(100));
-    }
-}
 
 fn status(place: &Place) -> EngineStatus {
     EngineStatus::of(place.namespace(), "gym").unwrap()
@@ -39,11 +18,7 @@ fn status(place: &Place) -> EngineStatus {
 /// Resets group 0 of an engine, which then has returned one batch.
 fn start(trainer: &mut Trainer) {
     trainer.reset(0, ResetRequest::Seed(1)).unwrap();
-    assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), 1);
-}
-
-fn send(trainer: &mut Trainer) {
-    trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+    assert_eq!(trainer.receive(0, TIMEOUT).unwrap().step(), 1);
 }
 
 #[test]
@@ -51,32 +26,30 @@ fn after_a_timeout_and_a_reconnection_a_step_is_played_once() {
     let place = Place::new();
     let engine = place.engine("gym", 2, 2);
     let mut trainer = place.trainer("gym").unwrap();
-    assert_eq!(trainer.reconnect(SECONDS).unwrap().groups[0].last_request, LastRequest::None);
+    assert_eq!(trainer.reconnect(TIMEOUT).unwrap().groups[0].last_request, LastRequest::None);
     start(&mut trainer);
-    stop(&engine);
-    send(&mut trainer);
+    engine.stop();
+    send(&mut trainer, 0);
     let error = trainer.receive(0, SHORT).unwrap_err();
     let not_taken = EngineActivity::NotTaken { process: engine.id() };
     assert!(matches!(error, ServiceError::TimedOut { activity, .. } if activity == not_taken), "{error}");
     assert!(error.to_string().contains("has not taken the request"), "{error}");
 
-    let found = trainer.reconnect(SECONDS).unwrap();
+    let found = trainer.reconnect(TIMEOUT).unwrap();
     assert!(!found.restarted);
     assert_eq!(found.incarnation, trainer.specification().incarnation);
     let first = found.groups[0];
     assert_eq!((first.step, first.lost_step, first.last_request), (Some(1), None, LastRequest::Pending));
     assert_eq!(found.groups[1].last_request, LastRequest::None);
-    let refused = trainer.send_with(0, |actions| actions.fill(0)).unwrap_err();
-    assert!(matches!(refused, ServiceError::AnswerPending { group: 0 }), "{refused}");
+    assert_error!(trainer.send_with(0, |actions| actions.fill(1)), ServiceError::AnswerPending { group: 0 });
 
-    signal(&engine, Signal::CONT);
-    let received = trainer.receive(0, SECONDS).unwrap();
+    engine.resume();
+    let received = trainer.receive(0, TIMEOUT).unwrap();
     assert_eq!((received.step(), received.batch().episode_length()), (2, &[1, 1][..]));
     drop(received);
-    let found = trainer.reconnect(SECONDS).unwrap().groups[0];
+    let found = trainer.reconnect(TIMEOUT).unwrap().groups[0];
     assert_eq!((found.step, found.last_request), (Some(2), LastRequest::Played));
-    send(&mut trainer);
-    assert_eq!(trainer.receive(0, SECONDS).unwrap().batch().episode_length(), [2, 2]);
+    assert_eq!(step(&mut trainer, 0).batch().episode_length(), [2, 2]);
     assert_eq!(status(&place).groups[0].env_steps, 4);
 }
 
@@ -94,7 +67,7 @@ fn a_step_that_takes_long_is_named_with_its_duration() {
     // The engine draws every frame twice, which takes some tens of milliseconds.
     trainer.reset(1, ResetRequest::All).unwrap();
     wait_until("the reset runs", || status(&place).groups[1].busy.is_some());
-    stop(&engine);
+    engine.stop();
     trainer.reset(0, ResetRequest::All).unwrap();
     std::thread::sleep(SHORT);
     for group in [1, 0] {
@@ -108,19 +81,19 @@ fn a_step_that_takes_long_is_named_with_its_duration() {
         assert!(error.to_string().contains("the reset of group 1 has been running for 0."), "{error}");
     }
     assert!(matches!(activity(), EngineActivity::Busy { group: 1, kind: "reset", .. }));
-    signal(&engine, Signal::CONT);
-    trainer.receive(0, SECONDS).unwrap();
-    trainer.receive(1, SECONDS).unwrap();
+    engine.resume();
+    trainer.receive(0, TIMEOUT).unwrap();
+    trainer.receive(1, TIMEOUT).unwrap();
     assert_eq!(status(&place).groups[1].busy, None);
-    observer.next(SECONDS).unwrap();
+    observer.next(TIMEOUT).unwrap();
     let error = observer.next(SHORT).unwrap_err();
     assert!(error.to_string().contains("the trainer has requested nothing of group 1 for "), "{error}");
 }
 
 /// Starts an engine of the same kind, connects the trainer to it, and returns what became of its last request.
-fn replaced(place: &Place, trainer: &mut Trainer, num_envs: usize) -> (Running, LastRequest, Option<u64>) {
+fn replaced(place: &Place, trainer: &mut Trainer, num_envs: usize) -> (Process, LastRequest, Option<u64>) {
     let successor = place.engine("gym", num_envs, 1);
-    let found = trainer.reconnect(SECONDS).unwrap();
+    let found = trainer.reconnect(TIMEOUT).unwrap();
     assert!(found.restarted);
     assert_eq!((found.incarnation, found.groups[0].step), (trainer.specification().incarnation, Some(0)));
     (successor, found.groups[0].last_request, found.groups[0].lost_step)
@@ -134,17 +107,16 @@ fn a_dead_engine_tells_what_became_of_the_last_request() {
 
     // It dies before it takes the request.
     start(&mut trainer);
-    stop(&engine);
-    send(&mut trainer);
+    engine.stop();
+    send(&mut trainer, 0);
     engine.kill();
-    let error = trainer.receive(0, SECONDS).unwrap_err();
-    assert!(matches!(error, ServiceError::EngineLost { .. }), "{error}");
+    assert_error!(trainer.receive(0, TIMEOUT), ServiceError::EngineLost { .. });
     let (mut engine, last, lost_step) = replaced(&place, &mut trainer, 2);
     assert_eq!((last, lost_step), (LastRequest::NotPlayed, Some(1)));
 
     // It dies after it has answered, and the answer has not been received.
     start(&mut trainer);
-    send(&mut trainer);
+    send(&mut trainer, 0);
     wait_until("the engine answers", || status(&place).groups[0].step == 2);
     engine.kill();
     let (mut engine, last, lost_step) = replaced(&place, &mut trainer, 2);
@@ -159,10 +131,10 @@ fn a_dead_engine_tells_what_became_of_the_last_request() {
     // An answer that arrived before its death can still be received. An observer receives it after the trainer.
     start(&mut trainer);
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
-    send(&mut trainer);
-    assert_eq!(observer.next(SECONDS).unwrap().step(), 2);
+    send(&mut trainer, 0);
+    assert_eq!(observer.next(TIMEOUT).unwrap().step(), 2);
     engine.kill();
-    assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), 2);
+    assert_eq!(trainer.receive(0, TIMEOUT).unwrap().step(), 2);
 }
 
 #[test]
@@ -183,25 +155,23 @@ fn a_request_of_a_trainer_that_dies_or_is_dropped_is_played_at_most_once() {
     let engine = place.engine("gym", 2, 1);
     for dies in [false, true] {
         let before = if dies {
-            let mut sender = place.role("sender", "gym", &[]);
-            wait_until("the sender steps", || {
-                status(&place).groups[0].trainer_process == Some(sender.id()) && status(&place).groups[0].env_steps >= 2
+            let mut killed = place.role("trainer gym");
+            wait_until("the trainer steps", || {
+                status(&place).groups[0].trainer_process == Some(killed.id()) && status(&place).groups[0].env_steps >= 2
             });
-            stop(&engine);
-            sender.kill();
+            engine.stop();
+            killed.kill();
             status(&place).groups[0].clone()
         } else {
             let mut trainer = place.trainer("gym").unwrap();
             start(&mut trainer);
-            stop(&engine);
-            send(&mut trainer);
+            engine.stop();
+            send(&mut trainer, 0);
             status(&place).groups[0].clone()
         };
-        signal(&engine, Signal::CONT);
+        engine.resume();
         let mut next = place.trainer("gym").unwrap();
-        send(&mut next);
-        let rejected = next.receive(0, SECONDS).unwrap_err();
-        assert!(matches!(rejected, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{rejected}");
+        assert_rejected(try_step(&mut next, 0), Rejection::NotReset, "");
         let after = status(&place).groups[0].clone();
         assert!((before.step..=before.step + 1).contains(&after.step), "{before:?} {after:?}");
         assert_eq!(after.rejected, before.rejected + 1);
@@ -217,18 +187,16 @@ fn a_rejected_request_changes_nothing_and_its_whole_explanation_arrives() {
     let name = "ä".repeat(4000);
     let options = serde_json::json!({ name.clone(): 1 });
     trainer.reset_with(0, ResetRequest::All, options.as_object()).unwrap();
-    let rejected = trainer.receive(0, SECONDS).unwrap_err();
-    assert!(matches!(&rejected, ServiceError::Rejected { message, .. } if message.contains(&name)), "{rejected}");
-    let found = trainer.reconnect(SECONDS).unwrap().groups[0];
+    assert_error!(trainer.receive(0, TIMEOUT), ServiceError::Rejected { message, .. } if message.contains(&name));
+    let found = trainer.reconnect(TIMEOUT).unwrap().groups[0];
     assert_eq!((found.step, found.last_request), (Some(1), LastRequest::NotPlayed));
     // The batch that was overwritten by the explanation is drawn in full; the engine checks every frame.
-    for step in 2..8 {
-        send(&mut trainer);
-        assert_eq!(trainer.receive(0, SECONDS).unwrap().step(), step);
+    for number in 2..8 {
+        assert_eq!(step(&mut trainer, 0).step(), number);
     }
-    trainer.restore(0, 0, &[], SECONDS).unwrap_err();
-    assert_eq!(trainer.reconnect(SECONDS).unwrap().groups[0].last_request, LastRequest::NotPlayed);
-    let snapshot = trainer.snapshot(0, 0, SECONDS).unwrap();
-    trainer.restore(0, 1, &snapshot, SECONDS).unwrap();
-    assert_eq!(trainer.reconnect(SECONDS).unwrap().groups[0].last_request, LastRequest::Played);
+    trainer.restore(0, 0, &[], TIMEOUT).unwrap_err();
+    assert_eq!(trainer.reconnect(TIMEOUT).unwrap().groups[0].last_request, LastRequest::NotPlayed);
+    let snapshot = trainer.snapshot(0, 0, TIMEOUT).unwrap();
+    trainer.restore(0, 1, &snapshot, TIMEOUT).unwrap();
+    assert_eq!(trainer.reconnect(TIMEOUT).unwrap().groups[0].last_request, LastRequest::Played);
 }

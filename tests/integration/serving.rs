@@ -2,40 +2,21 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::support::program::{Room, signal, text, wait};
-use endless_gym::batch::{Batch, Block, zeroed};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
-use endless_gym::service::{Observer, Rejection, ServiceError, Trainer};
+use crate::support::place::Place;
+use crate::support::player::Player;
+use crate::support::process::{Process, TIMEOUT, text, wait_until};
+use crate::support::service::{assert_rejected, reset, send, step, try_step};
+use endless_gym::pool::{PoolConfig, ResetRequest, Seeding};
+use endless_gym::service::{Observer, Rejection, Trainer};
 use rustix::process::Signal;
 use serde_json::Value as Json;
 
-const SECONDS: Duration = Duration::from_secs(10);
 const NUM_ENVS: usize = 3;
 const GROUPS: usize = 2;
-
-/// A running `endless serve`, killed at the end of the test.
-struct Served(Child);
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-impl Served {
-    fn end(mut self, by: Signal) -> String {
-        signal(&self.0, by);
-        assert!(wait(&mut self.0).success());
-        let mut output = String::new();
-        self.0.stdout.take().unwrap().read_to_string(&mut output).unwrap();
-        output
-    }
-}
 
 /// Environments of which the engine has a twin in this process.
 const ENVIRONMENTS: [&str; 7] = [
@@ -48,22 +29,21 @@ const ENVIRONMENTS: [&str; 7] = [
     "--frame-stack=3",
 ];
 
-fn serve(room: &Room, more: &[&str]) -> Served {
+fn serve(place: &Place, more: &[&str]) -> Process {
     let arguments = [&["serve"], &ENVIRONMENTS[..], more].concat();
-    Served(room.endless(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap())
+    Process::spawn(place.endless(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()))
 }
 
-fn wait_for(file: &Path) {
-    let start = Instant::now();
-    while !file.exists() {
-        assert!(start.elapsed() < SECONDS, "{} does not appear", file.display());
-        std::thread::sleep(Duration::from_millis(5));
-    }
+/// Ends an engine by a signal, and returns what it printed.
+fn ended(mut engine: Process, by: Signal) -> String {
+    engine.signal(by);
+    assert!(engine.wait().success());
+    engine.output()
 }
 
 /// The engine's environments in this process.
 struct Twin {
-    groups: Vec<(Pool, Vec<Block>)>,
+    groups: Vec<Player>,
 }
 
 impl Twin {
@@ -76,44 +56,39 @@ impl Twin {
                 total_envs: GROUPS * NUM_ENVS,
                 ..PoolConfig::new("Endless-MysteryPath-v0", NUM_ENVS)
             };
-            let pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-            let blocks = zeroed(pool.layout().blocks());
-            (pool, blocks)
+            Player::new(&config)
         };
         Twin { groups: (0..GROUPS).map(group).collect() }
     }
 
     fn reset(&mut self, trainer: &mut Trainer) {
-        for (group, (pool, blocks)) in self.groups.iter_mut().enumerate() {
+        for (group, twin) in self.groups.iter_mut().enumerate() {
             trainer.reset(group, ResetRequest::All).unwrap();
-            pool.reset(ResetRequest::All, blocks).unwrap();
-            let received = trainer.receive(group, SECONDS).unwrap();
-            assert!(received.batch().bytes() == Batch::new(pool.layout(), blocks).bytes());
+            twin.reset(ResetRequest::All);
+            let received = trainer.receive(group, TIMEOUT).unwrap();
+            assert!(received.batch().bytes() == twin.bytes());
         }
     }
 
     /// Adopts the engine's episodes.
     fn adopt(&mut self, trainer: &mut Trainer) {
-        for (group, (pool, blocks)) in self.groups.iter_mut().enumerate() {
+        for (group, twin) in self.groups.iter_mut().enumerate() {
             trainer.reset(group, ResetRequest::Each { reset: &[0; NUM_ENVS], seed: &[0; NUM_ENVS] }).unwrap();
-            pool.observe(blocks).unwrap();
-            let received = trainer.receive(group, SECONDS).unwrap();
-            assert!(received.batch().bytes() == Batch::new(pool.layout(), blocks).bytes());
+            twin.observe();
+            let received = trainer.receive(group, TIMEOUT).unwrap();
+            assert!(received.batch().bytes() == twin.bytes());
         }
     }
 
     /// Plays steps whose actions depend on their numbers.
-    fn play(&mut self, trainer: Option<&mut Trainer>, steps: std::ops::Range<usize>) {
-        let mut trainer = trainer;
+    fn play(&mut self, trainer: &mut Trainer, steps: std::ops::Range<usize>) {
         for step in steps {
-            for (group, (pool, blocks)) in self.groups.iter_mut().enumerate() {
+            for (group, twin) in self.groups.iter_mut().enumerate() {
                 let actions: Vec<i32> = (0..NUM_ENVS).map(|env| ((step * 7 + env + group) % 5 % 4) as i32).collect();
-                pool.step(&actions, blocks).unwrap();
-                if let Some(trainer) = &mut trainer {
-                    trainer.send(group, &actions).unwrap();
-                    let received = trainer.receive(group, SECONDS).unwrap();
-                    assert!(received.batch().bytes() == Batch::new(pool.layout(), blocks).bytes(), "step {step}");
-                }
+                twin.step(&actions);
+                trainer.send(group, &actions).unwrap();
+                let received = trainer.receive(group, TIMEOUT).unwrap();
+                assert!(received.batch().bytes() == twin.bytes(), "step {step}");
             }
         }
     }
@@ -121,148 +96,126 @@ impl Twin {
 
 #[test]
 fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
-    let room = Room::new("resume");
-    let file = room.root.join("state");
+    let place = Place::new();
+    let file = place.root().join("state");
     let checkpoint = format!("--checkpoint={}", file.display());
     let mut twin = Twin::new();
 
     // On request; then the engine is killed, and everything after the checkpoint is lost.
-    let mut engine = serve(&room, &[&checkpoint]);
-    let mut trainer = room.connect("gym");
-    let refused = trainer.checkpoint(SECONDS).unwrap_err();
-    assert!(matches!(refused, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{refused}");
+    let mut engine = serve(&place, &[&checkpoint]);
+    let mut trainer = place.trainer("gym").unwrap();
+    assert_rejected(trainer.checkpoint(TIMEOUT), Rejection::NotReset, "");
     twin.reset(&mut trainer);
-    twin.play(Some(&mut trainer), 0..70);
-    assert_eq!(trainer.checkpoint(SECONDS).unwrap(), [71, 71]);
+    twin.play(&mut trainer, 0..70);
+    assert_eq!(trainer.checkpoint(TIMEOUT).unwrap(), [71, 71]);
     for group in 0..GROUPS {
-        trainer.send(group, &[1; NUM_ENVS]).unwrap();
-        trainer.receive(group, SECONDS).unwrap();
+        step(&mut trainer, group);
     }
-    engine.0.kill().unwrap();
-    engine.0.wait().unwrap();
+    engine.kill();
 
     // Two engines do not save to one file, whatever their names are.
-    let first = serve(&room, &[&checkpoint, "--resume"]);
-    drop(room.connect("gym"));
+    let first = serve(&place, &[&checkpoint, "--resume"]);
+    drop(place.trainer("gym").unwrap());
     let named = ENVIRONMENTS.map(|argument| if argument == "--service=gym" { "--service=second" } else { argument });
-    let second = room.run(&[&["serve"], &named[..], &[&checkpoint, "--resume"]].concat());
-    let message = format!("is in use by another engine (process {}); stop it, or choose another file", first.0.id());
+    let second = place.run(&[&["serve"], &named[..], &[&checkpoint, "--resume"]].concat());
+    let message = format!("is in use by another engine (process {}); stop it, or choose another file", first.id());
     assert_eq!(second.status.code(), Some(1));
     assert!(text(&second.stderr).contains(&message), "{}", text(&second.stderr));
     drop(first);
 
     // Without `--resume`, the file is not overwritten.
-    let refused = room.run(&[&["serve"], &ENVIRONMENTS[..], &[&checkpoint]].concat());
+    let refused = place.run(&[&["serve"], &ENVIRONMENTS[..], &[&checkpoint]].concat());
     assert_eq!(refused.status.code(), Some(1));
     assert!(text(&refused.stderr).contains("state exists; resume from it (`--resume`)"), "{}", text(&refused.stderr));
-    let other = room.run(&["serve", "--env=MysteryPath-v0", &checkpoint, "--resume"]);
+    let other = place.run(&["serve", "--env=MysteryPath-v0", &checkpoint, "--resume"]);
     assert!(text(&other.stderr).contains("the environment Endless-MysteryPath-v0, and the engine has MysteryPath-v0"));
 
     // The same trainer adopts the episodes, and continues from the checkpoint's step.
-    let engine = serve(&room, &[&checkpoint, "--resume"]);
-    let found = trainer.reconnect(SECONDS).unwrap();
+    let engine = serve(&place, &[&checkpoint, "--resume"]);
+    let found = trainer.reconnect(TIMEOUT).unwrap();
     assert!(found.restarted);
     assert_eq!(
         found.groups.iter().map(|group| (group.step, group.lost_step)).collect::<Vec<_>>(),
         [(Some(71), Some(72)); 2]
     );
-    trainer.send(0, &[1; NUM_ENVS]).unwrap();
-    let refused = trainer.receive(0, SECONDS).unwrap_err();
-    assert!(matches!(refused, ServiceError::Rejected { reason: Rejection::NotReset, .. }), "{refused}");
+    assert_rejected(try_step(&mut trainer, 0), Rejection::NotReset, "");
     twin.adopt(&mut trainer);
-    twin.play(Some(&mut trainer), 70..140);
+    twin.play(&mut trainer, 70..140);
 
     // On SIGTERM; a new trainer adopts the episodes.
     drop(trainer);
-    let output = engine.end(Signal::TERM);
+    let output = ended(engine, Signal::TERM);
     assert!(output.contains("resumed from") && output.contains("after 71, 71 batches"), "{output}");
-    let engine = serve(&room, &[&checkpoint, "--resume", "--every=20ms"]);
-    let mut trainer = room.connect("gym");
+    let engine = serve(&place, &[&checkpoint, "--resume", "--every=20ms"]);
+    let mut trainer = place.trainer("gym").unwrap();
     twin.adopt(&mut trainer);
-    twin.play(Some(&mut trainer), 140..160);
+    twin.play(&mut trainer, 140..160);
 
     // Periodically, until nothing changes.
-    let saved = || room.status("gym")["checkpoints"].as_u64().unwrap();
-    let start = Instant::now();
-    loop {
+    let saved = || place.status("gym")["checkpoints"].as_u64().unwrap();
+    wait_until("nothing is saved any more", || {
         let before = saved();
         std::thread::sleep(Duration::from_millis(200));
-        if before > 0 && saved() == before {
-            break;
-        }
-        assert!(start.elapsed() < SECONDS);
-    }
+        before > 0 && saved() == before
+    });
     drop(trainer);
     drop(engine);
-    let _engine = serve(&room, &[&checkpoint, "--resume"]);
-    let mut trainer = room.connect("gym");
+    let _engine = serve(&place, &[&checkpoint, "--resume"]);
+    let mut trainer = place.trainer("gym").unwrap();
     twin.adopt(&mut trainer);
-    twin.play(Some(&mut trainer), 160..200);
+    twin.play(&mut trainer, 160..200);
 }
 
 #[test]
 fn a_checkpoint_that_is_missing_or_damaged_is_told_apart() {
-    let room = Room::new("damaged");
-    let file = room.root.join("state");
+    let place = Place::new();
+    let file = place.root().join("state");
     let checkpoint = format!("--checkpoint={}", file.display());
-    let engine = serve(&room, &[&checkpoint, "--resume"]);
-    Twin::new().reset(&mut room.connect("gym"));
-    let output = engine.end(Signal::INT);
+    let engine = serve(&place, &[&checkpoint, "--resume"]);
+    Twin::new().reset(&mut place.trainer("gym").unwrap());
+    let output = ended(engine, Signal::INT);
     assert!(output.contains("does not exist yet"), "{output}");
-    wait_for(&file);
     let good = std::fs::read(&file).unwrap();
-    for (bytes, part) in [
-        (good[..good.len() / 2].to_vec(), "is damaged: its checksum differs"),
-        (b"something else".to_vec(), "is not a checkpoint"),
-        (vec![], "is not a checkpoint"),
-    ] {
-        std::fs::write(&file, bytes).unwrap();
-        let output = room.run(&[&["serve"], &ENVIRONMENTS[..], &[&checkpoint, "--resume"]].concat());
-        assert_eq!(output.status.code(), Some(1));
-        assert!(text(&output.stderr).contains(part), "{}", text(&output.stderr));
-        assert_eq!(text(&output.stderr).lines().count(), 1);
-    }
-    let nowhere = room.run(&["serve", "--checkpoint=/nowhere/state"]);
-    assert!(text(&nowhere.stderr).contains("checkpoint /nowhere/state cannot be written"), "{}", text(&nowhere.stderr));
+    std::fs::write(&file, &good[..good.len() / 2]).unwrap();
+    let damaged = place.run(&[&["serve"], &ENVIRONMENTS[..], &[&checkpoint, "--resume"]].concat());
+    assert_eq!(damaged.status.code(), Some(1));
+    let message = format!("endless: checkpoint {} is damaged: its checksum differs\n", file.display());
+    assert_eq!(text(&damaged.stderr), message);
     for wrong in [vec!["--every=5m"], vec!["--resume"], vec![&checkpoint, "--every=soon"]] {
-        assert_eq!(room.run(&[vec!["serve"], wrong].concat()).status.code(), Some(2));
+        assert_eq!(place.run(&[vec!["serve"], wrong].concat()).status.code(), Some(2));
     }
 }
 
 #[test]
 fn status_shows_engines_and_their_processes() {
-    let room = Room::new("status");
-    let missing = room.run(&["status", "gym"]);
+    let place = Place::new();
+    let missing = place.run(&["status", "gym"]);
     assert_eq!(missing.status.code(), Some(1));
     assert!(text(&missing.stderr).starts_with("endless: no engine `gym` is running in"), "{}", text(&missing.stderr));
-    assert_eq!(text(&room.run(&["status"]).stdout), "no engine is running\n");
-    assert_eq!(text(&room.run(&["status", "--json"]).stdout), "[]\n");
+    assert_eq!(text(&place.run(&["status"]).stdout), "no engine is running\n");
+    assert_eq!(text(&place.run(&["status", "--json"]).stdout), "[]\n");
 
-    let engine = serve(&room, &[]);
-    let mut trainer = room.connect("gym");
+    let engine = serve(&place, &[]);
+    let mut trainer = place.trainer("gym").unwrap();
     let own = std::process::id();
-    let idle = room.status("gym");
+    let idle = place.status("gym");
     assert_eq!(
         (&idle["process"], &idle["trainers"], &idle["observers"]),
-        (&engine.0.id().into(), &[own].into(), &Json::Array(vec![]))
+        (&engine.id().into(), &[own].into(), &Json::Array(vec![]))
     );
     assert_eq!((&idle["groups"][0]["trainer_process"], &idle["env_steps"]), (&Json::Null, &0.into()));
-    let mut observer = Observer::connect(&room.config("gym"), 1).unwrap();
+    let mut observer = Observer::connect(&place.connect_config("gym"), 1).unwrap();
     let mut twin = Twin::new();
     twin.reset(&mut trainer);
-    twin.play(Some(&mut trainer), 0..50);
-    trainer.send(0, &[0; NUM_ENVS]).unwrap();
-    let _held = trainer.receive(0, SECONDS).unwrap();
-    trainer.send(0, &[0; NUM_ENVS]).unwrap();
-    let lease = trainer.receive(0, SECONDS).unwrap();
-    drop(lease);
-    let seen = observer.next(SECONDS).unwrap();
-    trainer.send(1, &[0; NUM_ENVS]).unwrap();
-    trainer.receive(1, SECONDS).unwrap();
-    let seen = [seen, observer.next(SECONDS).unwrap()];
+    twin.play(&mut trainer, 0..50);
+    let _held = step(&mut trainer, 0);
+    step(&mut trainer, 0);
+    let seen = observer.next(TIMEOUT).unwrap();
+    step(&mut trainer, 1);
+    let seen = [seen, observer.next(TIMEOUT).unwrap()];
 
-    let before = room.everything();
-    let status = room.status("gym");
+    let before = place.leftovers();
+    let status = place.status("gym");
     assert_eq!((&status["trainers"], &status["observers"]), (&[own].into(), &[own].into()));
     assert_eq!((&status["env_steps"], &status["groups"][0]["step"]), (&(103 * NUM_ENVS).into(), &53.into()));
     let observers = [0, 1].map(|group| status["groups"][group]["observers"].as_array().unwrap().len());
@@ -273,7 +226,7 @@ fn status_shows_engines_and_their_processes() {
     assert_eq!(status["incarnation"], format!("{:016x}", trainer.specification().incarnation));
     assert!(status["shared_memory_bytes"].as_u64().unwrap() > 1_000_000, "{status}");
     assert!(status["groups"][1]["seconds_since_request"].as_f64().unwrap() < 60.0);
-    let table = room.run(&["status"]);
+    let table = place.run(&["status"]);
     for part in [
         "gym",
         "Endless-MysteryPath-v0",
@@ -281,27 +234,28 @@ fn status_shows_engines_and_their_processes() {
         "309",
         "held by observers",
         &own.to_string(),
-        &engine.0.id().to_string(),
+        &engine.id().to_string(),
     ] {
         assert!(text(&table.stdout).contains(part), "{part}: {}", text(&table.stdout));
     }
-    assert!(text(&room.run(&["status", "gym"]).stdout).contains("incarnation"));
-    assert_eq!(room.everything(), before, "looking leaves nothing and removes nothing");
+    assert!(text(&place.run(&["status", "gym"]).stdout).contains("incarnation"));
+    assert_eq!(place.leftovers(), before, "looking leaves nothing and removes nothing");
     drop((seen, observer));
-    assert_eq!(room.status("gym")["groups"][1]["observers"], Json::Array(vec![]));
+    assert_eq!(place.status("gym")["groups"][1]["observers"], Json::Array(vec![]));
 
     // An engine that is stopped does not answer, and its status can still be read.
-    signal(&engine.0, Signal::STOP);
-    trainer.send(0, &[0; NUM_ENVS]).unwrap();
-    assert_eq!(room.status("gym")["groups"][0]["step"], 53);
-    signal(&engine.0, Signal::CONT);
-    trainer.receive(0, SECONDS).unwrap();
+    engine.stop();
+    send(&mut trainer, 0);
+    assert_eq!(place.status("gym")["groups"][0]["step"], 53);
+    engine.resume();
+    trainer.receive(0, TIMEOUT).unwrap();
 
-    let mut watch = room.endless(&["status", "--watch", "0.05", "--json"]).stdout(Stdio::piped()).spawn().unwrap();
-    let lines = BufReader::new(watch.stdout.take().unwrap()).lines();
+    let mut watch = place.endless(&["status", "--watch", "0.05", "--json"]);
+    let mut watch = Process::spawn(watch.stdout(Stdio::piped()));
+    let lines = BufReader::new(watch.0.stdout.take().unwrap()).lines();
     assert!(lines.map_while(Result::ok).filter(|line| line.contains("\"incarnation\"")).nth(2).is_some());
-    signal(&watch, Signal::INT);
-    wait(&mut watch);
+    watch.signal(Signal::INT);
+    watch.wait();
 }
 
 /// The answer to a request, head and body.
@@ -315,8 +269,8 @@ fn http(address: &str, request: &str) -> String {
 
 #[test]
 fn metrics_are_served_for_prometheus() {
-    let room = Room::new("metrics");
-    let mut engine = serve(&room, &["--metrics=127.0.0.1:0"]);
+    let place = Place::new();
+    let mut engine = serve(&place, &["--metrics=127.0.0.1:0"]);
     let mut lines = BufReader::new(engine.0.stdout.take().unwrap()).lines();
     let printed = lines.by_ref().map(Result::unwrap).find(|line| line.starts_with("metrics at ")).unwrap();
     let address = printed.strip_prefix("metrics at http://").unwrap().strip_suffix("/metrics").unwrap().to_owned();
@@ -328,10 +282,10 @@ fn metrics_are_served_for_prometheus() {
             stream
         })
         .collect();
-    let mut trainer = room.connect("gym");
+    let mut trainer = place.trainer("gym").unwrap();
     let mut twin = Twin::new();
     twin.reset(&mut trainer);
-    twin.play(Some(&mut trainer), 0..10);
+    twin.play(&mut trainer, 0..10);
     let get = |path: &str| http(&address, &format!("GET {path} HTTP/1.1\r\nHost: here\r\nConnection: close\r\n\r\n"));
     let answer = get("/metrics");
     assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("text/plain; version=0.0.4"), "{answer}");
@@ -364,31 +318,26 @@ fn metrics_are_served_for_prometheus() {
         http(&address, "POST /metrics HTTP/1.1\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
             .starts_with("HTTP/1.1 405")
     );
-    let taken = room.run(&["serve", "--service=other", &format!("--metrics={address}")]);
+    let taken = place.run(&["serve", "--service=other", &format!("--metrics={address}")]);
     assert!(text(&taken.stderr).starts_with(&format!("endless: --metrics {address}: ")), "{}", text(&taken.stderr));
     // The stuck clients do not delay the end.
     let start = Instant::now();
-    signal(&engine.0, Signal::TERM);
-    assert!(wait(&mut engine.0).success());
+    engine.signal(Signal::TERM);
+    assert!(engine.wait().success());
     assert!(start.elapsed() < Duration::from_secs(5));
 }
 
 #[test]
 fn logs_follow_the_option_and_the_variable() {
-    let room = Room::new("logs");
+    let place = Place::new();
     let errors = |arguments: &[&str], variable: Option<&str>| {
-        let mut command = room.endless(&[&["serve", "--num-envs=1"], arguments].concat());
+        let mut command = place.endless(&[&["serve", "--num-envs=1"], arguments].concat());
         command.env_remove("ENDLESS_GYM_LOG").stdout(Stdio::null()).stderr(Stdio::piped());
         variable.map(|value| command.env("ENDLESS_GYM_LOG", value));
-        let mut engine = Served(command.spawn().unwrap());
-        let mut trainer = room.connect("endless");
-        trainer.reset(0, ResetRequest::All).unwrap();
-        trainer.receive(0, SECONDS).unwrap();
-        signal(&engine.0, Signal::INT);
-        wait(&mut engine.0);
-        let mut output = String::new();
-        engine.0.stderr.take().unwrap().read_to_string(&mut output).unwrap();
-        output
+        let mut engine = Process::spawn(&mut command);
+        reset(&mut place.trainer("endless").unwrap(), 0);
+        engine.interrupt();
+        engine.errors()
     };
     assert_eq!(errors(&[], None), "");
     for output in [errors(&["--log=info"], None), errors(&["--log", "info"], Some("off")), errors(&[], Some("info"))] {
@@ -399,22 +348,22 @@ fn logs_follow_the_option_and_the_variable() {
         }
     }
     assert_eq!(errors(&["--log=off"], Some("info")), "");
-    let wrong = room.run(&["list", "--log=loud=very"]);
+    let wrong = place.run(&["list", "--log=loud=very"]);
     assert_eq!(wrong.status.code(), Some(1));
     assert!(text(&wrong.stderr).starts_with("endless: --log must be off, error, warn"), "{}", text(&wrong.stderr));
 }
 
 #[test]
 fn a_second_signal_ends_the_program_at_once() {
-    let room = Room::new("twice");
+    let place = Place::new();
     // A fifo without a reader: the last checkpoint cannot be written, and the engine never ends by itself.
-    let fifo: PathBuf = room.root.join("state.new");
-    let mut engine = serve(&room, &[&format!("--checkpoint={}", room.root.join("state").display())]);
-    Twin::new().reset(&mut room.connect("gym"));
+    let fifo: PathBuf = place.root().join("state.new");
+    let mut engine = serve(&place, &[&format!("--checkpoint={}", place.root().join("state").display())]);
+    Twin::new().reset(&mut place.trainer("gym").unwrap());
     assert!(Command::new("mkfifo").arg(&fifo).status().unwrap().success());
-    signal(&engine.0, Signal::INT);
+    engine.signal(Signal::INT);
     std::thread::sleep(Duration::from_millis(500));
     assert_eq!(engine.0.try_wait().unwrap(), None, "the engine waits");
-    signal(&engine.0, Signal::INT);
-    assert_eq!(wait(&mut engine.0).code(), Some(130));
+    engine.signal(Signal::INT);
+    assert_eq!(engine.wait().code(), Some(130));
 }

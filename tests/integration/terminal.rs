@@ -2,39 +2,33 @@
 
 use std::fs::File;
 use std::io::{Read, Write};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use crate::support::program::{Room, signal, text, wait};
-use endless_gym::batch::{Batch, zeroed};
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use crate::support::place::Place;
+use crate::support::player::Player;
+use crate::support::process::{Process, TIMEOUT, pseudo_terminal, text, wait_until};
+use endless_gym::pool::{PoolConfig, ResetRequest};
 use rustix::process::Signal;
-use rustix::pty::OpenptFlags;
-use rustix::termios::{LocalModes, Winsize, tcgetattr};
+use rustix::termios::{LocalModes, tcgetattr};
 
 const COLUMNS: u16 = 84;
 const ROWS: u16 = 46;
 
 /// A program in a terminal.
 struct Session {
-    child: Child,
+    process: Process,
     terminal: File,
     screen: Arc<Mutex<vt100::Parser>>,
 }
 
 impl Session {
     fn start(command: &mut Command) -> Self {
-        let terminal = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
-        rustix::pty::grantpt(&terminal).unwrap();
-        rustix::pty::unlockpt(&terminal).unwrap();
-        let size = Winsize { ws_row: ROWS, ws_col: COLUMNS, ws_xpixel: 0, ws_ypixel: 0 };
-        rustix::termios::tcsetwinsize(&terminal, size).unwrap();
-        let name = rustix::pty::ptsname(&terminal, Vec::new()).unwrap().into_string().unwrap();
-        let open = || File::options().read(true).write(true).open(&name).unwrap();
-        let child = command.stdin(open()).stdout(open()).stderr(open()).spawn().unwrap();
+        let (terminal, program_side) = pseudo_terminal(COLUMNS, ROWS);
+        let side = || program_side.try_clone().unwrap();
+        let process = Process::spawn(command.stdin(side()).stdout(side()).stderr(side()));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-        let terminal = File::from(terminal);
         let screen = Arc::new(Mutex::new(vt100::Parser::new(ROWS, COLUMNS, 0)));
         let (mut output, written) = (terminal.try_clone().unwrap(), Arc::clone(&screen));
         std::thread::spawn(move || {
@@ -43,7 +37,7 @@ impl Session {
                 written.lock().unwrap().process(&bytes[..count]);
             }
         });
-        Session { child, terminal, screen }
+        Session { process, terminal, screen }
     }
 
     fn press(&mut self, keys: &str) {
@@ -55,12 +49,9 @@ impl Session {
     }
 
     /// Waits until the screen has that text.
+    #[track_caller]
     fn wait_for(&self, text: &str) {
-        let start = Instant::now();
-        while !self.contents().contains(text) {
-            assert!(start.elapsed() < Duration::from_secs(60), "no `{text}`:\n{}", self.contents());
-            std::thread::sleep(Duration::from_millis(10));
-        }
+        wait_until(text, || self.contents().contains(text));
     }
 
     /// The picture of a frame's size in the upper left corner, in rows.
@@ -86,7 +77,7 @@ impl Session {
     }
 
     fn end(&mut self) -> Option<i32> {
-        let status = wait(&mut self.child);
+        let status = self.process.wait();
         // What it wrote last may not have been read yet.
         std::thread::sleep(Duration::from_millis(300));
         assert!(self.is_left(), "{}", self.contents());
@@ -96,21 +87,18 @@ impl Session {
 
 /// The observation of an episode after these actions, in rows.
 fn frame(id: &str, seed: u64, actions: &[&[i32]]) -> Vec<[u8; 3]> {
-    let mut pool = Pool::new(&PoolConfig::new(id, 1), &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
-    pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-    for action in actions {
-        pool.step(action, &mut blocks).unwrap();
-    }
-    let observation = Batch::new(pool.layout(), &blocks).observation().as_chunks::<3>().0.to_vec();
+    let mut player = Player::new(&PoolConfig::new(id, 1));
+    player.reset(ResetRequest::Seed(seed));
+    actions.iter().for_each(|action| player.step(action));
+    let observation = player.batch().observation().as_chunks::<3>().0;
     (0..84 * 84).map(|place| observation[place % 84 * 84 + place / 84]).collect()
 }
 
 #[test]
 fn a_game_is_played_with_keys() {
-    let room = Room::new("play");
+    let place = Place::new();
     let id = "MysteryPath-Grid-v0";
-    let mut session = Session::start(&mut room.endless(&["play", id, "--terminal", "--seed", "3", "--fps", "1"]));
+    let mut session = Session::start(&mut place.endless(&["play", id, "--terminal", "--seed", "3", "--fps", "1"]));
     session.wait_for("seed 3");
     assert!(!session.is_left());
     session.press(" ");
@@ -140,15 +128,15 @@ fn a_game_is_played_with_keys() {
 
 #[test]
 fn the_terminal_is_left_after_signals() {
-    let room = Room::new("play-signals");
+    let place = Place::new();
     for (given, name) in [(Signal::TERM, "TERM"), (Signal::HUP, "HUP")] {
-        let mut session = Session::start(&mut room.endless(&["play", "--terminal"]));
+        let mut session = Session::start(&mut place.endless(&["play", "--terminal"]));
         session.wait_for("MortarMayhem-v0");
         assert!(!session.is_left());
-        signal(&session.child, given);
+        session.process.signal(given);
         assert_eq!(session.end(), Some(0), "{name}");
     }
-    let mut session = Session::start(&mut room.endless(&["play", "--terminal"]));
+    let mut session = Session::start(&mut place.endless(&["play", "--terminal"]));
     session.wait_for("MortarMayhem-v0");
     session.press("\x03");
     assert_eq!(session.end(), Some(0));
@@ -156,9 +144,9 @@ fn the_terminal_is_left_after_signals() {
 
 #[test]
 fn what_cannot_be_played_is_an_error() {
-    let room = Room::new("play-errors");
+    let place = Place::new();
     let run = |arguments: &[&str]| {
-        let output = room.endless(arguments).stdin(Stdio::null()).output().unwrap();
+        let output = place.endless(arguments).stdin(Stdio::null()).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         text(&output.stderr).to_owned()
     };
@@ -173,24 +161,18 @@ fn what_cannot_be_played_is_an_error() {
 
 #[test]
 fn a_training_is_viewed_until_the_engine_ends() {
-    let room = Room::new("view");
+    let place = Place::new();
     let id = "SearingSpotlights-v0";
-    let mut engine = room.endless(&["serve", "--env", id, "--num-envs", "1", "--seed", "5"]).spawn().unwrap();
-    room.wait_for_engine();
-    let mut trainer = room.connect("endless");
-    let mut session = Session::start(&mut room.endless(&["view", "--terminal", "--timeout", "20"]));
+    let mut engine = place.serve(&["--env", id, "--num-envs", "1", "--seed", "5"]);
+    let mut trainer = place.trainer("endless").unwrap();
+    let mut session = Session::start(&mut place.endless(&["view", "--terminal", "--timeout", "20"]));
     session.wait_for("no trainer has stepped");
     trainer.reset(0, ResetRequest::All).unwrap();
-    trainer.receive(0, Duration::from_secs(20)).unwrap();
+    trainer.receive(0, TIMEOUT).unwrap();
     session.wait_for("1 of 1 environments are shown");
     session.wait_for(&format!("endless {id}: "));
-    let start = Instant::now();
-    while session.picture() != frame(id, 5, &[]) {
-        assert!(start.elapsed() < Duration::from_secs(20), "another picture");
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    engine.kill().unwrap();
-    wait(&mut engine);
+    wait_until("the frame is shown", || session.picture() == frame(id, 5, &[]));
+    engine.kill();
     session.wait_for("the engine has ended; Q, Esc or Ctrl-C quits");
     assert!(!session.is_left());
     session.press("q");

@@ -2,16 +2,16 @@
 
 use std::io::Read;
 
-use endless_gym::batch::{Batch, zeroed};
+use crate::support::player::Player;
+use crate::support::recorded::{reference, traces, traces_with_views};
 use endless_gym::envs;
-use endless_gym::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Threads};
+use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Trace, TraceError, replay};
 
 /// Replays all traces of an id, those with ground-truth views last.
 fn replay_all(id: &str) {
     let mut views = 0;
-    for file in crate::support::recorded::traces(id).into_iter().chain(crate::support::recorded::traces_with_views(id))
-    {
+    for file in traces(id).into_iter().chain(traces_with_views(id)) {
         let trace = Trace::open(&file).unwrap();
         let replay = replay(&trace).unwrap();
         assert_eq!(replay.first, None, "{}", file.display());
@@ -49,7 +49,7 @@ traces! {
 #[test]
 fn every_kind_of_difference_is_found() {
     let open = |id: &str, file: usize| {
-        let files = [crate::support::recorded::traces(id), crate::support::recorded::traces_with_views(id)].concat();
+        let files = [traces(id), traces_with_views(id)].concat();
         Trace::open(&files[file.min(files.len() - 1)]).unwrap()
     };
     type Change = fn(&mut Trace);
@@ -81,9 +81,7 @@ fn every_kind_of_difference_is_found() {
 #[test]
 fn the_first_frames_are_the_same_byte_by_byte() {
     for spec in envs::specs() {
-        let trace =
-            Trace::open(&crate::support::recorded::reference().join(format!("traces/{}.04.mixed20.json.gz", spec.id)))
-                .unwrap();
+        let trace = Trace::open(&reference().join(format!("traces/{}.04.mixed20.json.gz", spec.id))).unwrap();
         let expected = recorded_frames(spec.id);
         let found = frames(&trace, expected.len());
         assert_eq!((expected.len(), found.len()), (40, 40), "{}", spec.id);
@@ -107,8 +105,7 @@ fn traces_have_the_newest_reset_parameters() {
         ("Endless-MysteryPath-v0.05.mixed02", "reward_path_progress_dense"),
         ("Endless-SearingSpotlights-v0.13.mixed02", "coin_enabled"),
     ] {
-        let trace =
-            Trace::open(&crate::support::recorded::reference().join(format!("traces/{trace}.json.gz"))).unwrap();
+        let trace = Trace::open(&reference().join(format!("traces/{trace}.json.gz"))).unwrap();
         assert!(trace.options.contains_key(parameter), "{parameter}: {:?}", trace.options);
     }
 }
@@ -125,7 +122,7 @@ fn a_byte_that_differs_is_found() {
 
 /// The raw frames that were recorded of an id.
 fn recorded_frames(id: &str) -> Vec<Vec<u8>> {
-    let file = std::fs::File::open(crate::support::recorded::reference().join(format!("frames/{id}.gz"))).unwrap();
+    let file = std::fs::File::open(reference().join(format!("frames/{id}.gz"))).unwrap();
     let mut bytes = Vec::new();
     flate2::read::GzDecoder::new(file).read_to_end(&mut bytes).unwrap();
     let frames = bytes.chunks_exact(84 * 84 * 3);
@@ -140,22 +137,18 @@ fn frames(trace: &Trace, count: usize) -> Vec<(Vec<u8>, u32)> {
         autoreset: Autoreset::Disabled,
         ..PoolConfig::new(&trace.env, 1)
     };
-    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
-    let mut blocks = zeroed(pool.layout().blocks());
+    let mut player = Player::new(&config);
     let mut frames = Vec::new();
     for episode in &trace.episodes {
-        if frames.len() == count {
-            break;
-        }
-        let request = episode.seed.map_or(ResetRequest::All, ResetRequest::Seed);
-        pool.reset(request, &mut blocks).unwrap();
-        frames.push((Batch::new(pool.layout(), &blocks).observation().to_vec(), episode.reset_crc));
+        player.reset(episode.seed.map_or(ResetRequest::All, ResetRequest::Seed));
+        frames.push((player.batch().observation().to_vec(), episode.reset_crc));
         for step in &episode.steps {
-            if frames.len() == count {
-                break;
+            if frames.len() >= count {
+                frames.truncate(count);
+                return frames;
             }
-            pool.step(&step.action, &mut blocks).unwrap();
-            frames.push((Batch::new(pool.layout(), &blocks).observation().to_vec(), step.crc));
+            player.step(&step.action);
+            frames.push((player.batch().observation().to_vec(), step.crc));
         }
     }
     frames
@@ -171,9 +164,7 @@ fn difference(expected: &[u8], found: &[u8]) -> Option<([usize; 3], u8, u8)> {
 #[test]
 fn a_trace_without_its_last_steps_is_an_error() {
     for (id, views) in [("MortarMayhem-v0", false), ("Endless-MortarMayhem-v0", false), ("MysteryPath-v0", true)] {
-        for file in
-            if views { crate::support::recorded::traces_with_views(id) } else { crate::support::recorded::traces(id) }
-        {
+        for file in if views { traces_with_views(id) } else { traces(id) } {
             let truncated = |change: fn(&mut Trace)| {
                 let mut trace = Trace::open(&file).unwrap();
                 change(&mut trace);
@@ -201,7 +192,7 @@ fn a_trace_without_its_last_steps_is_an_error() {
 
 #[test]
 fn a_trace_of_an_unknown_environment_is_an_error() {
-    let mut trace = Trace::open(&crate::support::recorded::traces("MortarMayhem-v0")[0]).unwrap();
+    let mut trace = Trace::open(&traces("MortarMayhem-v0")[0]).unwrap();
     trace.env = "NoSuchThing-v0".to_owned();
     assert!(matches!(replay(&trace), Err(TraceError::Pool(_))));
 }

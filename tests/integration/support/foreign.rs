@@ -10,6 +10,7 @@ use endless_gym::service::{Namespace, ServiceSpecification};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
+use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::header::publish_subscribe::Header;
 
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -46,7 +47,7 @@ impl RequestHeader {
     }
 }
 
-#[derive(Clone, Copy, Debug, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
 #[type_name("endless_gym::ResponseHeader")]
 #[repr(C)]
 pub struct ResponseHeader {
@@ -74,20 +75,10 @@ fn node(namespace: &Namespace) -> Node<ipc::Service> {
     NodeBuilder::new().config(&config).create().unwrap()
 }
 
-impl Default for ResponseHeader {
-    fn default() -> Self {
-        ResponseHeader {
-            layout_version: LAYOUT_VERSION,
-            group: 0,
-            incarnation: 0,
-            step: 0,
-            trainer: 0,
-            request: 0,
-            bytes: 0,
-            status: 0,
-            padding: 0,
-        }
-    }
+/// The name of a service of an engine.
+fn service_name(specification: &ServiceSpecification, what: &str) -> ServiceName {
+    let ServiceSpecification { service, incarnation, .. } = specification;
+    ServiceName::new(&format!("endless-gym/{service}/{incarnation:016x}/{what}/0")).unwrap()
 }
 
 /// A trainer that can send any message.
@@ -101,10 +92,7 @@ pub struct Foreign {
 impl Foreign {
     pub fn new(namespace: &Namespace, specification: &ServiceSpecification) -> Self {
         let node = node(namespace);
-        let name = |what: &str| {
-            let name = format!("endless-gym/{}/{:016x}/{what}/0", specification.service, specification.incarnation);
-            ServiceName::new(&name).unwrap()
-        };
+        let name = |what| service_name(specification, what);
         let blocks = specification.action.blocks();
         let act =
             node.service_builder(&name("act")).publish_subscribe::<[PayloadBlock]>().user_header::<RequestHeader>();
@@ -118,11 +106,17 @@ impl Foreign {
         self.blocks
     }
 
-    /// Sends a request and returns the status and the text of the response; `None` if there is no response.
-    pub fn ask(&self, header: RequestHeader, blocks: usize, fill: impl FnOnce(&mut [Block])) -> Option<(u32, String)> {
+    /// A request with a payload of zeros.
+    fn loan(&self, header: RequestHeader, blocks: usize) -> SampleMut<ipc::Service, [PayloadBlock], RequestHeader> {
         let zero = vec![PayloadBlock::zeroed(); blocks];
         let mut message = self.publisher.loan_slice_uninit(blocks).unwrap().write_from_slice(&zero);
         *message.user_header_mut() = header;
+        message
+    }
+
+    /// Sends a request and returns the status and the text of the response; `None` if there is no response.
+    pub fn ask(&self, header: RequestHeader, blocks: usize, fill: impl FnOnce(&mut [Block])) -> Option<(u32, String)> {
+        let mut message = self.loan(header, blocks);
         fill(bytemuck::cast_slice_mut(message.payload_mut()));
         assert_eq!(message.send().unwrap(), 1);
         self.answer()
@@ -131,9 +125,7 @@ impl Foreign {
     /// Sends a request with any header, and changes header and payload by `words` until the engine has answered or for 20
     /// milliseconds, which is long enough for it to read them several times.
     pub fn ask_while_changing(&self, header: RequestHeader, mut words: impl FnMut() -> u64) {
-        let zero = vec![PayloadBlock::zeroed(); self.blocks];
-        let mut message = self.publisher.loan_slice_uninit(self.blocks).unwrap().write_from_slice(&zero);
-        *message.user_header_mut() = header;
+        let mut message = self.loan(header, self.blocks);
         let mut memory = SharedWords::of(message.user_header_mut());
         let mut payload = SharedWords::of(message.payload_mut());
         message.send().unwrap();
@@ -228,9 +220,8 @@ impl Engine {
     pub fn new(namespace: &Namespace, service: &str, specification: &ServiceSpecification) -> Self {
         let node = node(namespace);
         let specification = ServiceSpecification { service: service.to_owned(), ..specification.clone() };
-        let name = format!("endless-gym/{service}/{:016x}/obs/0", specification.incarnation);
         let service = node
-            .service_builder(&ServiceName::new(&name).unwrap())
+            .service_builder(&service_name(&specification, "obs"))
             .publish_subscribe::<[PayloadBlock]>()
             .user_header::<ResponseHeader>()
             .enable_safe_overflow(true)
@@ -255,7 +246,8 @@ impl Engine {
         let mut message = self.observations.loan_slice_uninit(zero.len()).unwrap().write_from_slice(&zero);
         let header = message.user_header_mut();
         let incarnation = self.specification.incarnation;
-        *header = ResponseHeader { incarnation, step, trainer: 42, request: 1, ..ResponseHeader::default() };
+        let (layout_version, default) = (LAYOUT_VERSION, ResponseHeader::default());
+        *header = ResponseHeader { layout_version, incarnation, step, trainer: 42, request: 1, ..default };
         let (words, header) = (SharedWords::of(header), std::ptr::from_mut(header));
         let length = number_of_elements(message.header(), zero.len());
         let header = SentHeader { words, payload: SharedWords::of(message.payload_mut()), header, length };
@@ -299,42 +291,27 @@ fn publish(namespace: &Namespace, service: &str, layout_version: u32, text: &[u8
 }
 
 /// An engine of another layout version.
-pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u32) -> Box<dyn std::any::Any> {
+pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u32) -> impl Sized + use<> {
     let node = node(namespace);
-    let published = publish(namespace, service, layout_version, b"not JSON");
-    Box::new((published, node))
+    (publish(namespace, service, layout_version, b"not JSON"), node)
 }
 
 /// Publishes any text as a specification.
-pub fn specification_text(namespace: &Namespace, service: &str, text: &[u8]) -> Box<dyn std::any::Any> {
+pub fn specification_text(namespace: &Namespace, service: &str, text: &[u8]) -> impl Sized + use<> {
     let node = node(namespace);
-    let published = publish(namespace, service, LAYOUT_VERSION, text);
-    Box::new((published, node))
+    (publish(namespace, service, LAYOUT_VERSION, text), node)
 }
 
 /// Publishes a specification under the name `service`, without the services that it describes.
-pub fn specification(
-    namespace: &Namespace,
-    service: &str,
-    specification: &ServiceSpecification,
-) -> Box<dyn std::any::Any> {
-    let node = node(namespace);
-    let text = serde_json::to_vec(specification).unwrap();
-    let published = publish(namespace, service, LAYOUT_VERSION, &text);
-    Box::new((published, node))
+pub fn specification(namespace: &Namespace, service: &str, specification: &ServiceSpecification) -> impl Sized + use<> {
+    specification_text(namespace, service, &serde_json::to_vec(specification).unwrap())
 }
 
 /// An engine of the right version whose requests have another type.
-pub fn engine_of_other_type(
-    namespace: &Namespace,
-    service: &str,
-    specification: &ServiceSpecification,
-) -> Box<dyn std::any::Any> {
+pub fn engine_of_other_type(namespace: &Namespace, service: &str, model: &ServiceSpecification) -> impl Sized + use<> {
+    let renamed = ServiceSpecification { service: service.to_owned(), ..model.clone() };
+    let published = specification(namespace, service, &renamed);
     let node = node(namespace);
-    let specification = ServiceSpecification { service: service.to_owned(), ..specification.clone() };
-    let name = format!("endless-gym/{service}/{:016x}/act/0", specification.incarnation);
-    let act = node.service_builder(&ServiceName::new(&name).unwrap()).publish_subscribe::<[u8]>().create().unwrap();
-    let text = serde_json::to_vec(&specification).unwrap();
-    let published = publish(namespace, service, LAYOUT_VERSION, &text);
-    Box::new((published, act, node))
+    let act = node.service_builder(&service_name(&renamed, "act")).publish_subscribe::<[u8]>().create().unwrap();
+    (published, act, node)
 }

@@ -3,12 +3,14 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value as Json, json};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
+
+use super::process::{Process, wait_until};
 
 /// How long anything may take; the machine may be busy with other tests.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -18,37 +20,31 @@ pub const BROWSER: &str = "echo \"$@\" > \"$0.part\"; mv \"$0.part\" \"$0.given\
 
 /// What such a browser was given, once it was started; it may be started again.
 pub fn given(browser: &Path) -> String {
-    let (file, start) = (PathBuf::from(format!("{}.given", browser.display())), Instant::now());
-    while !file.exists() {
-        assert!(start.elapsed() < PATIENCE, "{} was not started", browser.display());
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    let file = PathBuf::from(format!("{}.given", browser.display()));
+    wait_until("the browser is started", || file.exists());
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::remove_file(&file).unwrap();
     text.trim().to_owned()
 }
 
-/// A server process. It is killed when this is dropped.
+/// A server process.
 pub struct Server {
-    pub child: Child,
+    pub process: Process,
     /// The address that it has printed.
     pub url: String,
 }
 
 impl Server {
     pub fn start(mut command: Command) -> Self {
-        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut process = Process::spawn(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
         let mut line = String::new();
-        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        let mut stdout = BufReader::new(process.0.stdout.take().unwrap());
         stdout.read_line(&mut line).unwrap();
         let url = line.trim().split(' ').find(|word| word.starts_with("http://")).map(str::to_owned);
         // What it prints later is not needed, but must have a reader.
         std::thread::spawn(move || drop(stdout.read_to_end(&mut Vec::new())));
-        let Some(url) = url else {
-            let output = child.wait_with_output().unwrap();
-            panic!("no address: `{line}` {}", String::from_utf8_lossy(&output.stderr));
-        };
-        Server { child, url }
+        let url = url.unwrap_or_else(|| panic!("no address: `{line}` {}", process.errors()));
+        Server { process, url }
     }
 
     pub fn address(&self) -> SocketAddr {
@@ -94,13 +90,6 @@ impl Server {
     }
 }
 
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
 /// What a browser receives.
 pub struct Socket {
     socket: WebSocket<TcpStream>,
@@ -127,6 +116,7 @@ impl Socket {
     }
 
     /// The first message for which a condition holds.
+    #[track_caller]
     pub fn wait(&mut self, condition: impl Fn(&Json) -> bool) -> (Json, Vec<u8>) {
         let start = Instant::now();
         loop {

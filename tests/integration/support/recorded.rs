@@ -70,13 +70,14 @@ pub fn options(spec: &'static EnvSpec) -> impl Strategy<Value = Map<String, Json
     options.prop_map(|options| options.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect())
 }
 
+/// All formats of the pixels.
+pub fn pixel_formats() -> impl Iterator<Item = PixelFormat> {
+    (0..8).map(|bits| PixelFormat { grayscale: bits & 1 != 0, channels_first: bits & 2 != 0, row_major: bits & 4 != 0 })
+}
+
 /// Any format of the pixels.
 pub fn pixel_format() -> impl Strategy<Value = PixelFormat> {
-    any::<[bool; 3]>().prop_map(|[grayscale, channels_first, row_major]| PixelFormat {
-        grayscale,
-        channels_first,
-        row_major,
-    })
+    prop::sample::select(pixel_formats().collect::<Vec<_>>())
 }
 
 /// `cases` runs of a property, or as many as the environment variable `PROPTEST_CASES` says.

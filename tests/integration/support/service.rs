@@ -1,15 +1,19 @@
-//! Processes for the tests of the service.
+//! Engines and trainers in child processes of the tests of the service.
+//!
+//! The test program starts itself: the ignored test `role` plays the role that the environment names.
 
-use std::fs;
 use std::io::Read;
-use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
 use endless_gym::pool::{PoolConfig, ResetRequest};
-use endless_gym::service::{ConnectConfig, Engine, EngineConfig, Namespace, ServiceError, Trainer};
+use endless_gym::service::{
+    BatchLease, ConnectConfig, Engine, EngineConfig, Namespace, Rejection, ServiceError, Trainer,
+};
+
+use super::place::Place;
+use super::process::{Process, TIMEOUT};
 
 pub const ID: &str = "MortarMayhem-Grid-v0";
 const ROLE: &str = "ENDLESS_TEST_ROLE";
@@ -17,161 +21,107 @@ const ROLE: &str = "ENDLESS_TEST_ROLE";
 /// Arguments with which a test program runs its ignored test `role`, and no other.
 pub const ROLE_ARGUMENTS: [&str; 4] = ["role", "--exact", "--ignored", "--nocapture"];
 
-/// A namespace for one test. It is removed at the end of the test.
-pub struct Place {
-    namespace: Namespace,
-}
-
 impl Place {
-    pub fn new() -> Self {
-        // At random, since another test run may have the same process ids in a container of its own.
-        Place { namespace: Namespace::at(format!("/tmp/endless-{:016x}", rand::random::<u64>())) }
-    }
-
-    pub fn namespace(&self) -> &Namespace {
-        &self.namespace
-    }
-
     /// Starts an engine in a child process.
-    pub fn engine(&self, service: &str, num_envs: usize, groups: usize) -> Running {
-        self.role("engine", service, &[&num_envs.to_string(), &groups.to_string()])
+    pub fn engine(&self, service: &str, num_envs: usize, groups: usize) -> Process {
+        self.role(&format!("engine {service} {num_envs} {groups}"))
     }
 
-    /// Connects to an engine; waits for it to start.
-    pub fn trainer(&self, service: &str) -> Result<Trainer, ServiceError> {
-        Trainer::connect(&self.connect_config(service))
+    /// Starts this test program in a role.
+    pub fn role(&self, role: &str) -> Process {
+        let mut command = self.command(std::env::current_exe().unwrap());
+        Process::spawn(command.args(ROLE_ARGUMENTS).env(ROLE, role).stdin(Stdio::piped()).stdout(Stdio::null()))
     }
 
-    /// Connects to an engine that must be running.
-    pub fn trainer_now(&self, service: &str) -> Result<Trainer, ServiceError> {
-        Trainer::connect(&ConnectConfig { timeout: Duration::ZERO, ..self.connect_config(service) })
-    }
-
-    pub fn connect_config(&self, service: &str) -> ConnectConfig {
-        let timeout = Duration::from_secs(10);
-        ConnectConfig { service: service.to_owned(), namespace: self.namespace.clone(), timeout }
-    }
-
-    /// Starts this test program in another role.
-    pub fn role(&self, role: &str, service: &str, arguments: &[&str]) -> Running {
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(ROLE_ARGUMENTS)
-            .envs(self.role_environment(role, service, arguments))
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .spawn()
-            .unwrap();
-        let stdin = child.stdin.take();
-        Running { child, stdin }
-    }
-
-    pub fn role_environment(&self, role: &str, service: &str, arguments: &[&str]) -> [(&'static str, String); 2] {
-        let value = [&[role, service], arguments].concat().join(" ");
-        [(ROLE, value), ("ENDLESS_GYM_ROOT", self.namespace.root().display().to_string())]
-    }
-
-    /// The files in the namespace's directory, and its shared memory segments.
-    pub fn leftovers(&self) -> Vec<PathBuf> {
-        let mut found = Vec::new();
-        files(self.namespace.root(), &mut found);
-        found.extend(self.segments());
-        found
-    }
-
-    fn segments(&self) -> impl Iterator<Item = PathBuf> {
-        let ours = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().starts_with(self.namespace.prefix());
-        let entries = fs::read_dir("/dev/shm").into_iter().flatten();
-        entries.filter_map(|entry| entry.ok().map(|entry| entry.path())).filter(ours)
+    /// The configuration of an engine that checks what it draws.
+    pub fn engine_config(&self, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
+        engine_config(self.namespace(), service, num_envs, groups)
     }
 }
 
-impl Drop for Place {
-    fn drop(&mut self) {
-        self.segments().for_each(|segment| drop(fs::remove_file(segment)));
-        let _ = fs::remove_dir_all(self.namespace.root());
-    }
+/// Lets a command that starts this test program play a role.
+pub fn set_role(command: &mut Command, role: &str) {
+    command.args(ROLE_ARGUMENTS).env(ROLE, role);
 }
 
-fn files(directory: &Path, found: &mut Vec<PathBuf>) {
-    for entry in fs::read_dir(directory).into_iter().flatten().flatten() {
-        match entry.file_type() {
-            Ok(kind) if kind.is_dir() => files(&entry.path(), found),
-            _ => found.push(entry.path()),
-        }
-    }
-}
-
-/// A child process of a test. It is killed when this is dropped.
-pub struct Running {
-    child: Child,
-    stdin: Option<ChildStdin>,
-}
-
-impl Running {
-    pub fn id(&self) -> u32 {
-        self.child.id()
-    }
-
-    /// Kills the process, which cannot clean up.
-    pub fn kill(&mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-
-    /// Ends the process regularly.
-    pub fn end(mut self) {
-        drop(self.stdin.take());
-        assert!(self.child.wait().unwrap().success());
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-pub fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
+fn engine_config(namespace: &Namespace, service: &str, num_envs: usize, groups: usize) -> EngineConfig {
     let pool = PoolConfig { check_drawing: true, ..PoolConfig::new(ID, num_envs) };
-    let config = EngineConfig::new(service, pool, 1);
-    EngineConfig { namespace: namespace.clone(), groups, ..config }
+    EngineConfig { namespace: namespace.clone(), groups, ..EngineConfig::new(service, pool, 1) }
 }
 
-/// Runs in the role that the environment names; does nothing if there is none.
+/// Resets a group with seed 3, and returns its first batch.
+pub fn reset(trainer: &mut Trainer, group: usize) -> BatchLease {
+    trainer.reset(group, ResetRequest::Seed(3)).unwrap();
+    trainer.receive(group, TIMEOUT).unwrap()
+}
+
+/// Requests a step of a group with actions of 1.
+pub fn send(trainer: &mut Trainer, group: usize) {
+    trainer.send_with(group, |actions| actions.fill(1)).unwrap();
+}
+
+/// Steps a group with actions of 1.
+pub fn step(trainer: &mut Trainer, group: usize) -> BatchLease {
+    try_step(trainer, group).unwrap()
+}
+
+pub fn try_step(trainer: &mut Trainer, group: usize) -> Result<BatchLease, ServiceError> {
+    trainer.send_with(group, |actions| actions.fill(1))?;
+    trainer.receive(group, TIMEOUT)
+}
+
+/// Resets a group and steps it.
+pub fn play(trainer: &mut Trainer, group: usize, steps: u64) {
+    let first = reset(trainer, group).step();
+    for number in 1..=steps {
+        let received = step(trainer, group);
+        assert_eq!(received.step(), first + number);
+        assert_eq!(received.batch().reward().len(), trainer.specification().num_envs);
+    }
+}
+
+/// Checks that a call failed with an error of that pattern, and returns the error.
+macro_rules! assert_error {
+    ($result:expr, $pattern:pat $(if $guard:expr)?) => {{
+        let error = $result.map(drop).unwrap_err();
+        assert!(matches!(&error, $pattern $(if $guard)?), "{error}");
+        error
+    }};
+}
+pub(crate) use assert_error;
+
+/// Checks that an engine rejected a request for that reason, with a text that contains `part`.
+#[track_caller]
+pub fn assert_rejected<T>(result: Result<T, ServiceError>, expected: Rejection, part: &str) {
+    let error = result.map(drop).unwrap_err();
+    assert!(matches!(error, ServiceError::Rejected { reason, .. } if reason == expected), "{error}");
+    assert!(error.to_string().contains(part), "{error}");
+}
+
+/// Plays the role that the environment names; does nothing if there is none.
 pub fn play_role() {
     let Ok(role) = std::env::var(ROLE) else { return };
-    let words: Vec<&str> = role.split(' ').collect();
-    match words[..] {
+    let connect =
+        |service| Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(service) }).unwrap();
+    match role.split(' ').collect::<Vec<_>>()[..] {
         ["engine", service, num_envs, groups] => {
-            let config =
-                engine_config(&Namespace::default(), service, num_envs.parse().unwrap(), groups.parse().unwrap());
+            let (num_envs, groups) = (num_envs.parse().unwrap(), groups.parse().unwrap());
+            let config = engine_config(&Namespace::default(), service, num_envs, groups);
             let mut engine = Engine::new(&config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
             engine.run(&stop_at_end_of_input()).unwrap();
         }
         ["trainer", service] => {
-            let timeout = Duration::from_secs(10);
-            let mut trainer = Trainer::connect(&ConnectConfig { timeout, ..ConnectConfig::new(service) }).unwrap();
-            let groups = trainer.specification().groups;
-            for group in 0..groups {
+            let mut trainer = connect(service);
+            for group in 0..trainer.specification().groups {
                 trainer.reset(group, ResetRequest::All).unwrap();
             }
             loop {
-                let group = trainer.receive_any(timeout).unwrap().group();
-                trainer.send_with(group, |actions| actions.fill(0)).unwrap();
-            }
-        }
-        ["sender", service] => {
-            let timeout = Duration::from_secs(10);
-            let mut trainer = Trainer::connect(&ConnectConfig { timeout, ..ConnectConfig::new(service) }).unwrap();
-            trainer.reset(0, ResetRequest::All).unwrap();
-            loop {
-                // An engine that is stopped answers when it is killed or continued.
-                match trainer.receive(0, timeout) {
+                match trainer.receive_any(TIMEOUT) {
+                    // An engine that is stopped answers when it is killed or continued.
                     Err(ServiceError::TimedOut { .. }) => {}
                     received => {
-                        received.unwrap();
-                        trainer.send_with(0, |actions| actions.fill(0)).unwrap();
+                        let group = received.unwrap().group();
+                        send(&mut trainer, group);
                     }
                 }
             }
