@@ -314,8 +314,8 @@ pub enum ServiceError {
 
 impl ServiceError {
     /// Wraps an iceoryx2 error that has no variant of its own.
-    pub(crate) fn middleware(action: &'static str) -> impl Fn(String) -> Self {
-        move |reason| ServiceError::Middleware { action, reason }
+    pub(crate) fn middleware<E: fmt::Display>(action: &'static str) -> impl Fn(E) -> Self {
+        move |error| ServiceError::Middleware { action, reason: error.to_string() }
     }
 
     /// The error for an engine that was built with another version of iceoryx2.

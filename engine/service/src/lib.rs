@@ -100,6 +100,7 @@ mod namespace {
     pub(crate) mod memory;
     pub(crate) mod node;
     pub(crate) mod process;
+    pub(crate) mod segments;
 }
 
 /// What an engine and its clients exchange.

@@ -120,10 +120,13 @@ mod tests {
 
     #[test]
     fn every_other_timeout_is_valid() {
-        assert_eq!(timeout_from_seconds(0.0).unwrap(), Duration::ZERO);
-        assert_eq!(timeout_from_seconds(-0.0).unwrap(), Duration::ZERO);
-        assert_eq!(timeout_from_seconds(1.5).unwrap(), Duration::from_millis(1500));
-        assert_eq!(timeout_from_seconds(1e19).unwrap(), Duration::from_secs(10_000_000_000_000_000_000));
-        assert_eq!(timeout_from_seconds(f64::MAX).unwrap(), Duration::MAX);
+        for (given, expected) in [
+            (-0.0, Duration::ZERO),
+            (1.5, Duration::from_millis(1500)),
+            (1e19, Duration::from_secs(10_000_000_000_000_000_000)),
+            (f64::MAX, Duration::MAX),
+        ] {
+            assert_eq!(timeout_from_seconds(given).unwrap(), expected);
+        }
     }
 }

@@ -162,13 +162,13 @@ impl ResponseService {
         is_resumed: bool,
     ) -> Result<ResponsePort, ServiceError> {
         let name = PortName::new(if is_resumed { ports::RESUMED } else { "" });
-        let name = name.map_err(|e| ServiceError::middleware("cannot name a port")(e.to_string()))?;
+        let name = name.map_err(ServiceError::middleware("cannot name a port"))?;
         let subscriber = self.service.subscriber_builder().name(&name).create().map_err(|e| match e {
             SubscriberCreateError::ExceedsMaxSupportedSubscribers => ServiceError::TooManyObservers {
                 service: specification.service.clone(),
                 limit: specification.observers,
             },
-            e => ServiceError::middleware("cannot create a subscriber")(e.to_string()),
+            e => ServiceError::middleware("cannot create a subscriber")(e),
         })?;
         let (group, engine, node) = (self.group, self.engine, Arc::clone(&self.node));
         Ok(ResponsePort { subscriber: ForkGuard::new(subscriber), group, engine, _node: node })

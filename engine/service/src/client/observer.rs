@@ -16,6 +16,7 @@ use crate::client::lease::{BatchLease, Response, ResponsePort, ResponseService};
 use crate::client::status;
 use crate::error::ServiceError;
 use crate::namespace::node::NamespaceNode;
+use crate::namespace::segments::DIRECTORY;
 use crate::namespace::{descriptors, memory};
 use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk_blocks};
 use crate::protocol::specification::ServiceSpecification;
@@ -387,7 +388,7 @@ pub(crate) fn reserve_for_observer(
 
     let unused = limits.observer_chunks() * (specification.observers - observers);
     let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
-    let failed = |e: std::io::Error| ServiceError::middleware("cannot reserve shared memory")(e.to_string());
+    let failed = |e: std::io::Error| ServiceError::middleware("cannot reserve shared memory")(e);
     let bytes = segment.metadata().map_err(failed)?.len().saturating_sub(chunk * unused as u64).max(1);
     // What is allocated already, in the file system's blocks of 512 bytes. The observer's own port needs memory, too.
     let allocated = segment.metadata().map_err(failed)?.blocks().saturating_mul(512);
@@ -406,7 +407,6 @@ fn segment(services: &EngineServices<'_>, publisher: u128) -> Option<File> {
     let global = &services.node.config().global;
     let suffix = format!("_{publisher}{}", global.service.data_segment_suffix);
     let is_segment = |name: &[u8]| name.starts_with(global.prefix.as_bytes()) && name.ends_with(suffix.as_bytes());
-    let found =
-        std::fs::read_dir(memory::PATH).ok()?.flatten().find(|entry| is_segment(entry.file_name().as_bytes()))?;
+    let found = std::fs::read_dir(DIRECTORY).ok()?.flatten().find(|entry| is_segment(entry.file_name().as_bytes()))?;
     File::options().read(true).write(true).open(found.path()).ok()
 }

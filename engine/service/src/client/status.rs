@@ -123,6 +123,12 @@ impl EngineStatus {
         EngineStatus::all(namespace).into_iter().find(|status| status.service == service)
     }
 
+    /// The sum of a field over the groups.
+    pub fn total(&self, field: impl Fn(&GroupStatus) -> u64) -> u64 {
+        // Saturating: the numbers come from another process.
+        self.groups.iter().map(field).fold(0, u64::saturating_add)
+    }
+
     fn read(reader: &StatusReader, prefix: &str) -> Option<Self> {
         let engine = reader.engine()?;
         let groups: Option<Vec<_>> = (0..engine.groups as usize).map(|group| reader.group(group)).collect();
@@ -155,6 +161,11 @@ impl EngineStatus {
 }
 
 impl GroupStatus {
+    /// Batches that the observers held when they received their last ones.
+    pub fn held_by_observers(&self) -> u64 {
+        self.observers.iter().map(|observer| u64::from(observer.held)).sum()
+    }
+
     fn new<'a>(group: &GroupRecord, observers: impl Iterator<Item = &'a ObserverRecord>, now: u64) -> Self {
         let had_request = group.last_request != 0;
         let mut observers: Vec<_> = observers.map(|observer| ObserverStatus::new(observer, now)).collect();

@@ -405,14 +405,7 @@ impl Trainer {
     /// ```
     pub fn set_options(&mut self, group: usize, sets: &[NextOptions], timeout: Duration) -> Result<(), ServiceError> {
         for text in messages(sets)? {
-            let specification = Arc::clone(&self.specification);
-            let write = |message: &mut [Block]| {
-                let place = specification.action.write::<u8>(message, ActionSection::Snapshot);
-                place[..text.len()].copy_from_slice(&text);
-                Ok(text.len())
-            };
-            let request = Request { checksum: crc32fast::hash(&text), ..Request::new(RequestKind::SetOptions) };
-            self.transfer(group, request, timeout, write)?;
+            self.transfer_bytes(group, Request::new(RequestKind::SetOptions), &text, timeout)?;
         }
         Ok(())
     }
@@ -532,13 +525,7 @@ impl Trainer {
         if given > SNAPSHOT_BYTES {
             return Err(ServiceError::SnapshotTooLong { given });
         }
-        let specification = Arc::clone(&self.specification);
-        let write = |message: &mut [Block]| {
-            specification.action.write::<u8>(message, ActionSection::Snapshot)[..given].copy_from_slice(snapshot);
-            Ok(given)
-        };
-        let request = Request { env, checksum: crc32fast::hash(snapshot), ..Request::new(RequestKind::Restore) };
-        self.transfer(group, request, timeout, write).map(|_| ())
+        self.transfer_bytes(group, Request { env, ..Request::new(RequestKind::Restore) }, snapshot, timeout)
     }
 
     /// Saves all environments of the engine to its checkpoint file, and returns the step of each group that was saved. The file is
@@ -553,6 +540,23 @@ impl Trainer {
     pub fn checkpoint(&mut self, timeout: Duration) -> Result<Vec<u64>, ServiceError> {
         let steps = self.transfer(0, Request::new(RequestKind::Checkpoint), timeout, |_| Ok(0))?;
         Ok(steps.chunks_exact(size_of::<u64>()).map(bytemuck::pod_read_unaligned).collect())
+    }
+
+    /// As [`transfer`](Self::transfer), with these bytes in the payload's `snapshot`, for an answer without content.
+    fn transfer_bytes(
+        &mut self,
+        group: usize,
+        request: Request,
+        bytes: &[u8],
+        timeout: Duration,
+    ) -> Result<(), ServiceError> {
+        let specification = Arc::clone(&self.specification);
+        let write = |message: &mut [Block]| {
+            let section = specification.action.write::<u8>(message, ActionSection::Snapshot);
+            section[..bytes.len()].copy_from_slice(bytes);
+            Ok(bytes.len())
+        };
+        self.transfer(group, Request { checksum: crc32fast::hash(bytes), ..request }, timeout, write).map(drop)
     }
 
     /// Sends a request whose answer is not a batch, unless the same request is pending, and waits for the answer.

@@ -64,7 +64,7 @@ impl Group {
             .requests(number)?
             .subscriber_builder()
             .create()
-            .map_err(|e| ServiceError::middleware("cannot create a subscriber")(e.to_string()))?;
+            .map_err(ServiceError::middleware("cannot create a subscriber"))?;
         let service = services.responses(number, limits)?;
         // An observer reserves its chunks when it connects.
         let publisher = ports::publisher(&service, ports::chunk_blocks(pool.layout()), limits.trainer_chunks());
@@ -88,7 +88,7 @@ impl Group {
         let mut chunk = self
             .responses
             .loan_slice_uninit(ports::chunk_blocks(self.pool.layout()))
-            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
+            .map_err(ServiceError::middleware("cannot loan a chunk"))?;
         self.memory.prefault(chunk.payload_mut())?;
         self.last = None;
         // SAFETY: every byte pattern is a valid block, and the memory is initialised: the operating system zeroes new shared
@@ -145,7 +145,7 @@ impl Group {
                 tracing::warn!(error = %e, "cannot receive from a trainer");
                 Ok(None)
             }
-            received => received.map_err(|e| ServiceError::middleware("cannot receive a request")(e.to_string())),
+            received => received.map_err(ServiceError::middleware("cannot receive a request")),
         }
     }
 

@@ -322,9 +322,7 @@ impl Engine {
         }
         Ok(())
     }
-}
 
-impl Engine {
     /// Saves a checkpoint and writes the steps of the groups into the payload of the response.
     fn save(&mut self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
         let rejected = |e: CheckpointError| match e {
@@ -338,9 +336,7 @@ impl Engine {
         bytemuck::cast_slice_mut(payload)[..steps.len()].copy_from_slice(&steps);
         Ok(Outcome::Snapshot { bytes: size_of_val(&*steps) })
     }
-}
 
-impl Engine {
     /// Removes the resources of a trainer that ends together with the engine: often the engine stops since its trainer was killed,
     /// and no process remains that would find what that has left.
     fn remove_ending_trainer(&self) {

@@ -23,7 +23,7 @@ impl StatusWriter {
     pub(crate) fn create(prefix: &str, specification: &ServiceSpecification) -> Result<Self, ServiceError> {
         let (service, incarnation) = (&specification.service, specification.incarnation);
         let text = serde_json::to_vec(specification);
-        let text = text.map_err(|e| ServiceError::middleware("cannot write the specification")(e.to_string()))?;
+        let text = text.map_err(ServiceError::middleware("cannot write the specification"))?;
         let head = EngineHead {
             magic: MAGIC,
             layout_version: specification.layout_version,

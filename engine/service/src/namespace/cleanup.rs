@@ -29,8 +29,7 @@ use crate::error::ServiceError;
 use crate::namespace::directory::Ipc;
 use crate::namespace::identity::ExclusiveCreation;
 use crate::namespace::lock::NamespaceLock;
-
-const SEGMENTS: &str = "/dev/shm";
+use crate::namespace::segments::DIRECTORY;
 
 /// Whether the namespace has an unsized segment.
 pub(crate) fn has_unsized_segments(config: &Config) -> bool {
@@ -48,7 +47,7 @@ fn unsized_segments(config: &Config) -> impl Iterator<Item = PathBuf> {
 
 fn segments(config: &Config) -> impl Iterator<Item = PathBuf> {
     let prefix = config.global.prefix;
-    entries(Path::new(SEGMENTS)).into_iter().filter(move |path| is_named(path, prefix.as_bytes()))
+    entries(Path::new(DIRECTORY)).into_iter().filter(move |path| is_named(path, prefix.as_bytes()))
 }
 
 /// A segment of the namespace that belongs to another user, and that user.
@@ -237,7 +236,7 @@ mod tests {
         let [finished, begun] = [("a", 0o400), ("b", 0o600)].map(|(name, mode)| file(&services, &config, name, mode));
         let node = file(&nodes, &config, "1.node_monitor_context", 0o200);
         fs::create_dir(nodes.join("1")).unwrap();
-        let segments = Path::new(SEGMENTS);
+        let segments = Path::new(DIRECTORY);
         let [empty, sized, counter] =
             ["empty", "sized", ".global_mgmt"].map(|name| file(segments, &config, name, 0o200));
         fs::write(&sized, "x").unwrap();

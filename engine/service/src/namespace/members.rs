@@ -5,14 +5,13 @@
 
 use std::fs::{self, File};
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use crate::error::ServiceError;
 use crate::namespace::directory::{MAX_PREFIX, Namespace};
 use crate::namespace::lock::NamespaceLock;
 use crate::namespace::locked_file::{is_same, open};
-
-const SEGMENTS: &str = "/dev/shm";
+use crate::namespace::segments;
 
 /// What follows the prefix in the name of the file.
 const SUFFIX: &str = ".members";
@@ -45,13 +44,10 @@ impl Membership {
 
 /// Removes the segments of all prefixes of a namespace's path that no process uses, except for the prefix `own`.
 pub(crate) fn remove_abandoned(namespace: &Namespace, own: Option<&str>) {
-    let names =
-        fs::read_dir(SEGMENTS).into_iter().flatten().flatten().filter_map(|entry| entry.file_name().into_string().ok());
-    for name in names.filter(|name| name.starts_with(namespace.prefix())) {
-        let Some(prefix) = name.strip_suffix(SUFFIX).filter(|prefix| prefix.len() == MAX_PREFIX) else { continue };
-        if Some(prefix) != own {
-            remove_if_unused(prefix);
-        }
+    for path in segments::named(namespace.prefix(), SUFFIX) {
+        let name = path.file_name().and_then(|name| name.to_str()?.strip_suffix(SUFFIX));
+        let abandoned = name.filter(|prefix| prefix.len() == MAX_PREFIX && Some(*prefix) != own);
+        abandoned.map(remove_if_unused);
     }
 }
 
@@ -62,12 +58,9 @@ pub(crate) fn remove_if_unused(prefix: &str) -> bool {
     if file.try_lock().is_err() || !is_same(&file, &path) {
         return false;
     }
-    for entry in fs::read_dir(SEGMENTS).into_iter().flatten().flatten() {
-        let segment = entry.path();
-        if entry.file_name().to_str().is_some_and(|name| name.starts_with(prefix)) && segment != path {
-            tracing::debug!(path = %segment.display(), "removing a segment that no process uses");
-            let _ = fs::remove_file(segment);
-        }
+    for segment in segments::named(prefix, "").into_iter().filter(|segment| *segment != path) {
+        tracing::debug!(path = %segment.display(), "removing a segment that no process uses");
+        let _ = fs::remove_file(segment);
     }
     // Last: as long as it is there, another process can continue what this one leaves.
     fs::remove_file(path).is_ok()
@@ -79,7 +72,7 @@ pub(crate) fn is_used(prefix: &str) -> bool {
 }
 
 fn file_of(prefix: &str) -> PathBuf {
-    Path::new(SEGMENTS).join(format!("{prefix}{SUFFIX}"))
+    segments::path(&format!("{prefix}{SUFFIX}"))
 }
 
 #[cfg(test)]
@@ -96,7 +89,7 @@ mod tests {
             format!("{}{}", namespace.prefix(), last.to_string().repeat(MAX_PREFIX - namespace.prefix().len()))
         };
         let (own, other) = (prefix('a'), prefix('b'));
-        let segment = Path::new(SEGMENTS).join(format!("{other}.data"));
+        let segment = segments::path(&format!("{other}.data"));
         fs::write(&segment, "x").unwrap();
 
         let membership = Membership::join(&own, &lock).unwrap();

@@ -12,9 +12,7 @@ use rustix::mm::Advice;
 use endless_gym_core::batch::BLOCK_BYTES;
 
 use crate::error::ServiceError;
-use crate::protocol::message::PayloadBlock;
-
-pub(crate) const PATH: &str = "/dev/shm";
+use crate::namespace::segments::DIRECTORY;
 
 /// Bytes reserved for iceoryx2's own segments and for headers.
 pub(crate) const MARGIN: u64 = 1 << 20;
@@ -39,7 +37,7 @@ impl PrefaultedChunks {
     }
 
     /// Prefaults a chunk unless it has been prefaulted before.
-    pub(crate) fn prefault(&mut self, chunk: &mut [MaybeUninit<PayloadBlock>]) -> Result<(), ServiceError> {
+    pub(crate) fn prefault<T>(&mut self, chunk: &mut [MaybeUninit<T>]) -> Result<(), ServiceError> {
         let address = chunk.as_ptr().addr();
         if self.0.contains(&address) {
             return Ok(());
@@ -50,14 +48,14 @@ impl PrefaultedChunks {
                 self.0.push(address);
                 Ok(())
             }
-            Err(_) => Err(too_small(needed(chunk.len(), 1))),
+            Err(_) => Err(too_small(size_of_val(chunk) as u64 + MARGIN)),
         }
     }
 }
 
 /// The error if `needed` bytes cannot be had.
 pub(crate) fn too_small(needed: u64) -> ServiceError {
-    ServiceError::SharedMemoryTooSmall { needed, available: available().unwrap_or(0), path: PATH }
+    ServiceError::SharedMemoryTooSmall { needed, available: available().unwrap_or(0), path: DIRECTORY }
 }
 
 fn needed(blocks: usize, chunks: usize) -> u64 {
@@ -65,12 +63,16 @@ fn needed(blocks: usize, chunks: usize) -> u64 {
 }
 
 fn check(needed: u64, available: u64) -> Result<(), ServiceError> {
-    if needed <= available { Ok(()) } else { Err(ServiceError::SharedMemoryTooSmall { needed, available, path: PATH }) }
+    if needed <= available {
+        Ok(())
+    } else {
+        Err(ServiceError::SharedMemoryTooSmall { needed, available, path: DIRECTORY })
+    }
 }
 
 /// Free bytes; `None` if the file system does not report them or has no limit.
 fn available() -> Option<u64> {
-    let file_system = rustix::fs::statvfs(PATH).ok()?;
+    let file_system = rustix::fs::statvfs(DIRECTORY).ok()?;
     (file_system.f_blocks > 0).then(|| file_system.f_bavail.saturating_mul(file_system.f_frsize))
 }
 
@@ -78,7 +80,7 @@ fn available() -> Option<u64> {
 const PAGE_SIZES: [usize; 3] = [4 << 10, 16 << 10, 64 << 10];
 
 /// Allocates the pages of `chunk` without changing their content.
-fn populate(chunk: &mut [MaybeUninit<PayloadBlock>]) -> rustix::io::Result<()> {
+fn populate<T>(chunk: &mut [MaybeUninit<T>]) -> rustix::io::Result<()> {
     let start = chunk.as_mut_ptr();
     let mut pages = PAGE_SIZES.into_iter();
     let mut page = pages.next().unwrap_or(1);
@@ -102,6 +104,7 @@ fn populate(chunk: &mut [MaybeUninit<PayloadBlock>]) -> rustix::io::Result<()> {
 mod tests {
     use std::fs::File;
 
+    use endless_gym_core::batch::Block;
     use rustix::mm::{MapFlags, ProtFlags, mmap};
 
     use super::*;
@@ -126,7 +129,7 @@ mod tests {
         let start = unsafe {
             mmap(std::ptr::null_mut(), 2 * page, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0)
         };
-        let start = start.unwrap().cast::<MaybeUninit<PayloadBlock>>();
+        let start = start.unwrap().cast::<MaybeUninit<Block>>();
         let blocks = page / BLOCK_BYTES;
         // SAFETY: both pages are mapped for writing and not used elsewhere; the second is never accessed.
         let (present, missing) = unsafe { std::slice::from_raw_parts_mut(start, 2 * blocks) }.split_at_mut(blocks);

@@ -20,8 +20,7 @@ use crate::namespace::fork_guard::ForkGuard;
 use crate::namespace::identity::{CreationLock, Identity};
 use crate::namespace::lock::{LOCK_TIMEOUT, NamespaceLock};
 use crate::namespace::members::{self, Membership};
-use crate::namespace::{cleanup, descriptors, memory, process};
-use crate::protocol::status_file;
+use crate::namespace::{cleanup, descriptors, memory, process, segments};
 
 /// How often a process tries to join a namespace whose directory is removed meanwhile.
 const JOIN_ATTEMPTS: usize = 5;
@@ -72,11 +71,11 @@ impl NamespaceNode {
         let (identity, config) = own_identity(namespace, lock)?;
         let membership = Membership::join(identity.prefix(), lock)?;
         members::remove_abandoned(namespace, Some(identity.prefix()));
-        status_file::remove_abandoned(identity.prefix());
+        segments::remove_abandoned_status(identity.prefix());
         cleanup::remove_counter(&config, lock)?;
         let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled).create();
         cleanup::remove_counter(&config, lock)?;
-        let node = node.map_err(|e| ServiceError::middleware("cannot register this process")(e.to_string()))?;
+        let node = node.map_err(ServiceError::middleware("cannot register this process"))?;
         let root = namespace.root().to_owned();
         let node = NamespaceNode { node: ForkGuard::new(node), identity, membership: Some(membership), root, patience };
         node.clean(lock);

@@ -50,7 +50,7 @@ impl ServiceNames {
 
     fn of_incarnation(&self, what: &str) -> Result<ServiceName, ServiceError> {
         let text = format!("{SERVICE_PREFIX}{}/{:016x}/{what}", self.service, self.incarnation);
-        ServiceName::new(&text).map_err(|e| ServiceError::middleware("cannot create a service name")(e.to_string()))
+        ServiceName::new(&text).map_err(ServiceError::middleware("cannot create a service name"))
     }
 }
 
@@ -127,7 +127,7 @@ impl EngineServices<'_> {
             .max_subscribers(subscribers)
             .max_nodes(MAX_NODES);
         match self.mode {
-            OpenMode::Create => builder.create().map_err(create_error),
+            OpenMode::Create => builder.create().map_err(ServiceError::middleware("cannot create a service")),
             OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
         }
     }
@@ -143,7 +143,7 @@ impl EngineServices<'_> {
             .max_notifiers(1)
             .max_nodes(MAX_NODES);
         match self.mode {
-            OpenMode::Create => builder.create().map_err(create_error),
+            OpenMode::Create => builder.create().map_err(ServiceError::middleware("cannot create a service")),
             OpenMode::Open => builder.open().map_err(|e| self.open_error(e.into())),
         }
     }
@@ -159,10 +159,6 @@ impl EngineServices<'_> {
     }
 }
 
-fn create_error(error: impl std::fmt::Display) -> ServiceError {
-    ServiceError::middleware("cannot create a service")(error.to_string())
-}
-
 /// Why a service could not be opened.
 #[derive(Debug, PartialEq, Eq)]
 enum OpenFailure {
@@ -175,33 +171,27 @@ enum OpenFailure {
     Other(String),
 }
 
-impl From<PublishSubscribeOpenError> for OpenFailure {
-    fn from(error: PublishSubscribeOpenError) -> Self {
-        use PublishSubscribeOpenError as E;
-        match error {
-            E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
-                OpenFailure::Missing
+/// Divides the errors of opening a service; the other variants say that the messages have another type.
+macro_rules! open_failure {
+    ($error:ident, $($other_type:ident)|+) => {
+        impl From<$error> for OpenFailure {
+            fn from(error: $error) -> Self {
+                use $error as E;
+                match error {
+                    E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
+                        OpenFailure::Missing
+                    }
+                    $(E::$other_type)|+ => OpenFailure::OtherType,
+                    E::VersionMismatch => OpenFailure::OtherVersion,
+                    e => OpenFailure::Other(e.to_string()),
+                }
             }
-            E::IncompatibleTypes | E::IncompatibleMessagingPattern => OpenFailure::OtherType,
-            E::VersionMismatch => OpenFailure::OtherVersion,
-            e => OpenFailure::Other(e.to_string()),
         }
-    }
+    };
 }
 
-impl From<EventOpenError> for OpenFailure {
-    fn from(error: EventOpenError) -> Self {
-        use EventOpenError as E;
-        match error {
-            E::DoesNotExist | E::IsMarkedForDestruction | E::HangsInCreation | E::ServiceInCorruptedState => {
-                OpenFailure::Missing
-            }
-            E::IncompatibleMessagingPattern => OpenFailure::OtherType,
-            E::VersionMismatch => OpenFailure::OtherVersion,
-            e => OpenFailure::Other(e.to_string()),
-        }
-    }
-}
+open_failure!(PublishSubscribeOpenError, IncompatibleTypes | IncompatibleMessagingPattern);
+open_failure!(EventOpenError, IncompatibleMessagingPattern);
 
 /// A publisher of messages of `blocks` blocks. Prefaults `prefaulted` chunks, so that missing memory is an error here and not a
 /// SIGBUS later.
@@ -224,9 +214,7 @@ pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
     let mut loans = Vec::with_capacity(prefaulted);
     for _ in 0..prefaulted {
         PrefaultedChunks::check_available(blocks, 1)?;
-        let mut loan = publisher
-            .loan_slice_uninit(blocks)
-            .map_err(|e| ServiceError::middleware("cannot loan a chunk")(e.to_string()))?;
+        let mut loan = publisher.loan_slice_uninit(blocks).map_err(ServiceError::middleware("cannot loan a chunk"))?;
         memory.prefault(loan.payload_mut())?;
         loans.push(loan);
     }
@@ -249,32 +237,23 @@ impl From<ServiceError> for PortError {
     }
 }
 
-impl From<PublisherCreateError> for PortError {
-    fn from(error: PublisherCreateError) -> Self {
-        match error {
-            PublisherCreateError::ExceedsMaxSupportedPublishers => PortError::LimitReached,
-            e => PortError::Other(ServiceError::middleware("cannot create a publisher")(e.to_string())),
+/// Tells the limit from the other errors of creating a port.
+macro_rules! port_error {
+    ($error:ident, $limit:ident, $action:literal) => {
+        impl From<$error> for PortError {
+            fn from(error: $error) -> Self {
+                match error {
+                    $error::$limit => PortError::LimitReached,
+                    e => PortError::Other(ServiceError::middleware($action)(e)),
+                }
+            }
         }
-    }
+    };
 }
 
-impl From<NotifierCreateError> for PortError {
-    fn from(error: NotifierCreateError) -> Self {
-        match error {
-            NotifierCreateError::ExceedsMaxSupportedNotifiers => PortError::LimitReached,
-            e => PortError::Other(ServiceError::middleware("cannot create a notifier")(e.to_string())),
-        }
-    }
-}
-
-impl From<ListenerCreateError> for PortError {
-    fn from(error: ListenerCreateError) -> Self {
-        match error {
-            ListenerCreateError::ExceedsMaxSupportedListeners => PortError::LimitReached,
-            e => PortError::Other(ServiceError::middleware("cannot create a listener")(e.to_string())),
-        }
-    }
-}
+port_error!(PublisherCreateError, ExceedsMaxSupportedPublishers, "cannot create a publisher");
+port_error!(NotifierCreateError, ExceedsMaxSupportedNotifiers, "cannot create a notifier");
+port_error!(ListenerCreateError, ExceedsMaxSupportedListeners, "cannot create a listener");
 
 impl PortError {
     /// The error where no other process can have such a port.

@@ -11,26 +11,21 @@
 //! so that this does not happen by mistake; root, and a process of the same user that changes the mode first, still can.
 
 use std::fs::{self, File};
-use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::LAYOUT_VERSION;
-use rustix::fs::{FallocateFlags, FlockOperation, OFlags, fallocate, flock};
+use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
 
 use crate::error::ServiceError;
+use crate::namespace::segments::{self, OBSERVER_SUFFIX, STATUS_SUFFIX, open_status};
 use crate::protocol::limits::MAX_GROUPS;
 use crate::protocol::message::RequestKind;
-
-const DIRECTORY: &str = "/dev/shm";
-
-/// End of the names of the files of engines, and of observers.
-const SUFFIX: &str = ".status";
-const OBSERVER_SUFFIX: &str = ".observer";
 
 const WORD: usize = size_of::<u64>();
 
@@ -47,21 +42,21 @@ const READ_ATTEMPTS: usize = 100;
 
 /// The file of an engine's status.
 pub(crate) fn path(prefix: &str, service: &str, incarnation: u64) -> PathBuf {
-    Path::new(DIRECTORY).join(format!("{prefix}{service}.{incarnation:016x}{SUFFIX}"))
+    segments::path(&format!("{prefix}{service}.{incarnation:016x}{STATUS_SUFFIX}"))
 }
 
 /// The file of an observer of an engine, with a random number.
 pub(crate) fn observer_path(prefix: &str, incarnation: u64, number: u64) -> PathBuf {
-    Path::new(DIRECTORY).join(format!("{prefix}{incarnation:016x}.{number:016x}{OBSERVER_SUFFIX}"))
+    segments::path(&format!("{prefix}{incarnation:016x}.{number:016x}{OBSERVER_SUFFIX}"))
 }
 
 /// The names of a namespace's engines, and their status files.
 pub(crate) fn engines(prefix: &str) -> Vec<(String, PathBuf)> {
     let service = |path: &Path| {
-        let name = path.file_name()?.to_str()?.strip_prefix(prefix)?.strip_suffix(SUFFIX)?;
+        let name = path.file_name()?.to_str()?.strip_prefix(prefix)?.strip_suffix(STATUS_SUFFIX)?;
         Some(name.rsplit_once('.')?.0.to_owned())
     };
-    paths_with(prefix, SUFFIX).into_iter().filter_map(|path| Some((service(&path)?, path))).collect()
+    segments::named(prefix, STATUS_SUFFIX).into_iter().filter_map(|path| Some((service(&path)?, path))).collect()
 }
 
 /// The records of an engine's observers that are running.
@@ -71,35 +66,7 @@ pub(crate) fn running_observers(prefix: &str, incarnation: u64) -> Vec<ObserverR
 
 /// The files of an engine's observers.
 fn observer_paths(prefix: &str, incarnation: u64) -> Vec<PathBuf> {
-    paths_with(&format!("{prefix}{incarnation:016x}."), OBSERVER_SUFFIX)
-}
-
-fn paths_with(prefix: &str, suffix: &str) -> Vec<PathBuf> {
-    let is_status = |name: &str| name.starts_with(prefix) && name.ends_with(suffix);
-    let entries = fs::read_dir(DIRECTORY).into_iter().flatten().flatten();
-    let named = entries.filter(|entry| entry.file_name().to_str().is_some_and(is_status));
-    named.map(|entry| entry.path()).collect()
-}
-
-/// Removes the files of dead engines and observers.
-pub(crate) fn remove_abandoned(prefix: &str) {
-    for path in paths_with(prefix, SUFFIX).into_iter().chain(paths_with(prefix, OBSERVER_SUFFIX)) {
-        let Some(file) = open(&path) else { continue };
-        // Shared: with an exclusive lock, this process would look like the writer to others.
-        if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
-            tracing::debug!(path = %path.display(), "removing the status of a dead process");
-            // An error means that another process has removed it.
-            let _ = fs::remove_file(&path);
-        }
-    }
-}
-
-/// Opens a status file of this user for reading.
-fn open(path: &Path) -> Option<File> {
-    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
-    let file = File::options().read(true).custom_flags(flags.cast_signed()).open(path).ok()?;
-    let metadata = file.metadata().ok()?;
-    (metadata.is_file() && metadata.uid() == rustix::process::getuid().as_raw()).then_some(file)
+    segments::named(&format!("{prefix}{incarnation:016x}."), OBSERVER_SUFFIX)
 }
 
 /// The number of words of a file with that many groups.
@@ -133,13 +100,12 @@ impl StatusFile {
         groups: usize,
         specification: &[u8],
     ) -> Result<Self, ServiceError> {
-        Self::with_record(path, words(groups), bytemuck::cast_slice(std::slice::from_ref(engine)), specification)
+        Self::with_record(path, words(groups), engine, specification)
     }
 
     /// Creates the file of an observer.
     pub(crate) fn create_observer(path: &Path, record: &ObserverRecord) -> Result<Self, ServiceError> {
-        let mut file =
-            Self::with_record(path, OBSERVER_WORDS, bytemuck::cast_slice(std::slice::from_ref(record)), &[])?;
+        let mut file = Self::with_record(path, OBSERVER_WORDS, record, &[])?;
         file.publish(path)?;
         Ok(file)
     }
@@ -152,8 +118,8 @@ impl StatusFile {
         Ok(())
     }
 
-    fn with_record(path: &Path, words: usize, record: &[u64], text: &[u8]) -> Result<Self, ServiceError> {
-        let failed = |e: &dyn std::fmt::Display| ServiceError::middleware("cannot create the status")(e.to_string());
+    fn with_record(path: &Path, words: usize, record: &impl Pod, text: &[u8]) -> Result<Self, ServiceError> {
+        let failed = |e: &dyn std::fmt::Display| ServiceError::middleware("cannot create the status")(e);
         let unnamed = path.with_extension("new");
         let file = File::options()
             .read(true)
@@ -184,25 +150,26 @@ impl StatusFile {
     }
 
     pub(crate) fn write_engine(&self, record: &EngineRecord) {
-        self.write(0, bytemuck::cast_slice(std::slice::from_ref(record)));
+        self.write(0, record);
     }
 
     pub(crate) fn write_observer(&self, record: &ObserverRecord) {
-        self.write(0, bytemuck::cast_slice(std::slice::from_ref(record)));
+        self.write(0, record);
     }
 
     pub(crate) fn write_group(&self, group: usize, record: &GroupRecord) {
-        self.write(words(group), bytemuck::cast_slice(std::slice::from_ref(record)));
+        self.write(words(group), record);
     }
 
-    fn write(&self, at: usize, record: &[u64]) {
+    /// Writes a record, which consists of words.
+    fn write(&self, at: usize, record: &impl Pod) {
         // SAFETY: the mapping has that many words, is aligned to a page, and lasts until this value is dropped. All access to it
         // in this process is atomic.
         let memory = unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.words) };
         let sequence = memory[at].load(Ordering::Relaxed);
         memory[at].store(sequence.wrapping_add(1), Ordering::Relaxed);
         fence(Ordering::Release);
-        for (to, from) in memory[at + 1..].iter().zip(record) {
+        for (to, from) in memory[at + 1..].iter().zip(bytemuck::cast_slice(bytemuck::bytes_of(record))) {
             to.store(*from, Ordering::Relaxed);
         }
         memory[at].store(sequence.wrapping_add(2), Ordering::Release);
@@ -229,13 +196,13 @@ pub(crate) struct StatusReader {
 impl StatusReader {
     /// Opens an engine's file; `None` if it is missing, or not of this version.
     pub(crate) fn open(path: &Path) -> Option<Self> {
-        let reader = StatusReader { file: open(path)? };
+        let reader = StatusReader { file: open_status(path)? };
         reader.engine().map(|_| reader)
     }
 
     /// Opens the file of an engine of any version.
     pub(crate) fn open_any(path: &Path) -> Option<Self> {
-        let reader = StatusReader { file: open(path)? };
+        let reader = StatusReader { file: open_status(path)? };
         reader.head().map(|_| reader)
     }
 
@@ -259,19 +226,13 @@ impl StatusReader {
 
     /// The record of an observer that is running; `None` if it cannot be read.
     fn running_observer(path: &Path) -> Option<ObserverRecord> {
-        let reader = StatusReader { file: open(path)? };
+        let reader = StatusReader { file: open_status(path)? };
         if reader.is_alive() { reader.read(0) } else { None }
     }
 
     /// Whether the process that writes the file is running.
     pub(crate) fn is_alive(&self) -> bool {
-        match flock(&self.file, FlockOperation::NonBlockingLockShared) {
-            Ok(()) => {
-                let _ = flock(&self.file, FlockOperation::Unlock);
-                false
-            }
-            Err(_) => true,
-        }
+        segments::has_writer(&self.file)
     }
 
     /// The record of the engine; `None` if it cannot be read.
@@ -425,11 +386,7 @@ pub(crate) fn unpadded(bytes: &[u8]) -> String {
 mod tests {
     use std::os::unix::fs::PermissionsExt;
 
-    use bytemuck::Zeroable;
-    use endless_gym_core::batch::LAYOUT_VERSION;
-
     use super::*;
-    use crate::protocol::status_file::{MAGIC, padded};
 
     fn record() -> EngineRecord {
         let (id, service) = (padded("MortarMayhem-v0"), padded("gym"));
@@ -501,7 +458,7 @@ mod tests {
         fs::copy(&observer, &gone).unwrap();
         assert_eq!(StatusReader::running_observer(&observer), Some(seen));
         assert_eq!(StatusReader::running_observer(&gone), None);
-        remove_abandoned(&prefix);
+        segments::remove_abandoned_status(&prefix);
         assert_eq!(observer_paths(&prefix, 9), [observer]);
         drop(file_of_observer);
         assert!(observer_paths(&prefix, 9).is_empty());

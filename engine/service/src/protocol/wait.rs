@@ -61,7 +61,7 @@ fn park(listener: &Listener<Ipc>, timeout: Duration) -> Result<bool, ServiceErro
     match listener.timed_wait(|_| {}, timeout.max(SHORTEST_PARK)) {
         Ok(_) => Ok(true),
         Err(ListenerWaitError::InterruptSignal) => Ok(false),
-        Err(e) => Err(ServiceError::middleware("cannot wait for a message")(e.to_string())),
+        Err(e) => Err(ServiceError::middleware("cannot wait for a message")(e)),
     }
 }
 
