@@ -155,10 +155,7 @@ fn summarise(
     statistics: &EpisodeStatistics,
     elapsed: Duration,
 ) -> Result<(), Failure> {
-    let policy = match args.policy {
-        Policy::Expert => "expert",
-        Policy::Random => "random",
-    };
+    let policy = if args.policy == Policy::Expert { "expert" } else { "random" };
     if args.json {
         let info: Map<String, Json> = spec
             .info

@@ -19,7 +19,6 @@ mod output;
 mod picture;
 mod play;
 mod play_command;
-mod play_page;
 mod record;
 mod serve;
 mod status;

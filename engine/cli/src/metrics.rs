@@ -81,7 +81,7 @@ const GROUP_METRICS: [GroupMetric; 12] = [
     ("undelivered_total", "counter", "Batches that no process received.", |g| g.undelivered as f64),
     ("trainers_total", "counter", "Trainers that sent requests.", |g| g.trainers as f64),
     ("observer_held_batches", "gauge", "Batches that the observers held when they received their last ones.", |g| {
-        g.observers.iter().map(|observer| f64::from(observer.held)).sum()
+        g.held_by_observers() as f64
     }),
     ("held_batches", "gauge", "Batches that the trainer held at its last request.", |g| f64::from(g.held)),
     ("pending_requests", "gauge", "Requests that were taken and not answered.", |g| {

@@ -5,7 +5,7 @@ use std::io;
 use std::process::{Child, Command, Stdio};
 use std::thread;
 
-use super::output::print_warning;
+use super::output::print_error;
 
 /// The variable that names the browser: commands with `:` between them, in each of which `%s` stands for the address.
 const BROWSER: &str = "BROWSER";
@@ -24,7 +24,7 @@ pub fn in_browser(url: &str) {
             Err(error) => failures.push(format!("`{command}`: {error}")),
         }
     }
-    print_warning(&format!("--open found no browser ({}); open the address yourself", failures.join(", ")));
+    print_error(format_args!("--open found no browser ({}); open the address yourself", failures.join(", ")));
 }
 
 fn start(command: &str, url: &str) -> io::Result<Child> {
@@ -47,7 +47,7 @@ fn words(command: &str, url: &str) -> (OsString, Vec<OsString>) {
 fn report_end(command: String, mut child: Child) {
     let wait = move || match child.wait() {
         Ok(status) if !status.success() => {
-            print_warning(&format!("--open: `{command}` failed ({status}); open the address yourself"));
+            print_error(format_args!("--open: `{command}` failed ({status}); open the address yourself"));
         }
         _ => {}
     };

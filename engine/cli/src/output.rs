@@ -60,14 +60,9 @@ pub fn print_help(help: &clap::Error) -> Result<(), Failure> {
     check(help.print().and_then(|()| io::stdout().flush()))
 }
 
-/// Prints an error to standard error. Without standard error, the exit status is the only remaining way to report.
-pub fn print_error(error: &dyn std::error::Error) {
+/// Prints an error or a warning to standard error. Without standard error, the exit status is the only remaining way to report.
+pub fn print_error(error: impl std::fmt::Display) {
     let _ = writeln!(io::stderr(), "endless: {error}");
-}
-
-/// Prints a line to standard error about something that does not end the command.
-pub fn print_warning(text: &str) {
-    let _ = writeln!(io::stderr(), "endless: {text}");
 }
 
 /// Turns an error of standard output into a failure. A closed pipe is none: with `endless list | head -1`, the reader closed

@@ -9,6 +9,7 @@ use endless_gym_core::pool::{PoolConfig, Seeding};
 
 use super::failure::Failure;
 use super::film::Film;
+use super::terminal::picture::Pixels;
 
 /// When to print a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -50,9 +51,6 @@ const GAP: usize = 2;
 /// The seed of the episode that is shown: long enough in every environment.
 const SEED: u64 = 15;
 
-/// Pixels of a picture, in rows.
-type Pixels = Vec<[u8; 3]>;
-
 /// The ground-truth view at a typical step of an expert's episode, in 42 columns and 22 lines; if 86 columns are available, beside
 /// the observation.
 pub fn picture(spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
@@ -61,6 +59,7 @@ pub fn picture(spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
     for _ in 0..typical_step(spec) {
         film.step()?;
     }
+    let reduced = |frame: &[u8], side| Pixels { side, pixels: frame.as_chunks().0.to_vec() }.resized(SIDE);
     let mut pictures = vec![("ground truth", reduced(&film.ground_truth_view()?, VIEW))];
     if usize::from(columns) >= 2 * SIDE + GAP {
         pictures.insert(0, ("observation", reduced(film.observation(), SCREEN)));
@@ -77,26 +76,13 @@ fn typical_step(spec: &EnvSpec) -> usize {
     }
 }
 
-/// Reduces a square frame, indexed \[row\]\[column\]\[channel\], to the size of the picture, by averages.
-fn reduced(frame: &[u8], side: usize) -> Pixels {
-    let (pixels, block) = (frame.as_chunks::<3>().0, side / SIDE);
-    let average = |row: usize, column: usize| {
-        std::array::from_fn(|channel| {
-            let lines = pixels.chunks_exact(side).skip(row * block).take(block);
-            let sum: usize =
-                lines.flat_map(|line| &line[column * block..][..block]).map(|pixel| usize::from(pixel[channel])).sum();
-            (sum / (block * block)) as u8
-        })
-    };
-    (0..SIDE * SIDE).map(|place| average(place / SIDE, place % SIDE)).collect()
-}
-
 /// Pictures side by side, below their titles: the upper half of a character in its foreground colour, the lower half in its
 /// background colour.
 fn half_blocks(pictures: &[(&str, Pixels)]) -> String {
     let mut lines = vec![pictures.iter().map(|(title, _)| format!("{title:<SIDE$}")).collect::<Vec<_>>()];
     for row in (0..SIDE).step_by(2) {
-        lines.push(pictures.iter().map(|(_, pixels)| half_block_line(&pixels[row * SIDE..][..2 * SIDE])).collect());
+        let rows = pictures.iter().map(|(_, picture)| &picture.pixels[row * SIDE..][..2 * SIDE]);
+        lines.push(rows.map(half_block_line).collect());
     }
     let gap = " ".repeat(GAP);
     lines.iter().map(|line| line.join(&gap).trim_end().to_owned() + "\n").collect()
@@ -125,20 +111,6 @@ mod tests {
     fn colours_need_a_terminal_that_has_them_and_a_user_who_wants_them() {
         assert!(true_colour("truecolor", "") && true_colour("24bit", ""));
         assert!(!true_colour("", "") && !true_colour("256color", "") && !true_colour("truecolor", "1"));
-    }
-
-    #[test]
-    fn pixels_are_averages_of_the_frame() {
-        let mut frame = vec![0; SCREEN * SCREEN * 3];
-        let (row, column) = (10, 21);
-        frame[(row * SCREEN + column) * 3 + 1] = 200;
-        let mut expected = vec![[0; 3]; SIDE * SIDE];
-        expected[row / 2 * SIDE + column / 2] = [0, 50, 0];
-        assert_eq!(reduced(&frame, SCREEN), expected);
-        let magnified: Vec<u8> = (0..VIEW * VIEW * 3)
-            .map(|byte| frame[(byte / 3 / VIEW / 4 * SCREEN + byte / 3 % VIEW / 4) * 3 + byte % 3])
-            .collect();
-        assert_eq!(reduced(&magnified, VIEW), expected);
     }
 
     #[test]

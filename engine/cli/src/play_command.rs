@@ -1,9 +1,14 @@
 //! `endless play`: an environment for a person, on a page or in the terminal.
 
+use endless_gym_core::envs;
+use endless_gym_core::pool::{PoolConfig, ResetOptions};
+use endless_gym_view::PlayServer;
+
 use super::failure::Failure;
 use super::options::parameters;
+use super::output::print;
 use super::view::PageArgs;
-use super::{play_page, terminal};
+use super::{open, stop, terminal};
 
 /// Arguments of `endless play`.
 ///
@@ -32,11 +37,20 @@ pub struct Args {
     terminal: terminal::play::TerminalArgs,
 }
 
-/// Runs `endless play`.
+/// Runs `endless play`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let options = parameters(&args.options)?;
     if args.terminal.terminal {
         return terminal::play::run(&args.id, options, args.seed.unwrap_or(0), &args.terminal);
     }
-    play_page::run(&args.id, options, args.seed, &args.page)
+    let id = envs::spec(&args.id)?.id;
+    PoolConfig { options: ResetOptions::Shared(options.clone()), ..PoolConfig::new(id, 1) }.validate()?;
+    let stop = stop::on_signal()?;
+    let server = PlayServer::bind(args.page.port)?;
+    let url = server.url(id, &options, args.seed);
+    print(format_args!("play {id} at {url}\nstop with Ctrl-C"))?;
+    if args.page.open {
+        open::in_browser(&url);
+    }
+    Ok(server.run(stop)?)
 }

@@ -96,17 +96,7 @@ fn readings(
 }
 
 fn env_steps(status: &EngineStatus) -> u64 {
-    sum(status, |group| group.env_steps)
-}
-
-fn sum(status: &EngineStatus, field: fn(&GroupStatus) -> u64) -> u64 {
-    // Saturating: the numbers come from another process.
-    status.groups.iter().map(field).fold(0, u64::saturating_add)
-}
-
-/// Batches that the observers of a group held when they received their last ones.
-fn held_by_observers(group: &GroupStatus) -> u64 {
-    group.observers.iter().map(|observer| u64::from(observer.held)).sum()
+    status.total(|group| group.env_steps)
 }
 
 fn show(args: &Args, readings: &[Reading]) -> Result<(), Failure> {
@@ -126,7 +116,7 @@ fn as_json(reading: &Reading) -> Result<Json, Failure> {
     // Not every reader of JSON keeps 64 bits.
     value["incarnation"] = json!(format!("{:016x}", reading.status.incarnation));
     value["env_steps"] = json!(env_steps(&reading.status));
-    value["episodes"] = json!(sum(&reading.status, |group| group.episodes));
+    value["episodes"] = json!(reading.status.total(|group| group.episodes));
     value["steps_per_second"] = json!(reading.steps_per_second);
     value["shared_memory_bytes"] = json!(reading.shared_memory);
     value["trainers"] = json!(reading.processes.trainers);
@@ -157,14 +147,14 @@ fn engines(readings: &[Reading]) -> String {
             format!("{} x {}", status.groups.len(), status.num_envs),
             grouped(env_steps(status) as f64),
             grouped(*steps_per_second),
-            grouped(sum(status, |group| group.episodes) as f64),
+            grouped(status.total(|group| group.episodes) as f64),
         ]);
         users.add_row([
             status.service.clone(),
             list(&processes.trainers),
             list(&processes.observers),
-            sum(status, |group| u64::from(group.held)).to_string(),
-            sum(status, held_by_observers).to_string(),
+            status.total(|group| u64::from(group.held)).to_string(),
+            status.total(GroupStatus::held_by_observers).to_string(),
             shared_memory.map_or_else(|| "-".to_owned(), |bytes| format!("{} MB", bytes.div_ceil(1_000_000))),
             status.recoveries.to_string(),
             duration(status.groups.iter().filter_map(|group| group.last_request).min()),
@@ -201,7 +191,7 @@ fn groups(status: &EngineStatus) -> String {
             grouped(group.episodes as f64),
             grouped(group.rejected as f64),
             group.held.to_string(),
-            held_by_observers(group).to_string(),
+            group.held_by_observers().to_string(),
             group.kind.unwrap_or("-").to_owned(),
             duration(group.last_request),
             duration(group.busy),

@@ -1,12 +1,11 @@
 //! `endless watch`: what an observer sees of a training, as one line.
 
-use std::collections::VecDeque;
 use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::Batch;
 use endless_gym_service::{ConnectConfig, Observed, Observers, ServiceError};
+use endless_gym_view::RecentEpisodes;
 use serde_json::json;
 
 use super::failure::Failure;
@@ -20,9 +19,6 @@ const LINE_INTERVAL: f64 = 1.0;
 
 /// Longest wait between two looks at the stop flag.
 const SLICE: Duration = Duration::from_millis(50);
-
-/// The mean return and length are those of this number of episodes.
-const WINDOW: usize = 1000;
 
 /// Arguments of `endless watch`.
 #[derive(clap::Args)]
@@ -50,10 +46,7 @@ pub struct Statistics {
     /// Batches of all groups, those that were missed included, without the first of each group.
     batches: u64,
     missed: u64,
-    /// Episodes that have ended.
-    pub episodes: u64,
-    /// Returns and lengths of the last episodes.
-    recent: VecDeque<(f64, i32)>,
+    pub episodes: RecentEpisodes,
     /// The time of the last batch.
     last: Instant,
     /// When the rate was last computed, and the batches then.
@@ -68,8 +61,7 @@ impl Statistics {
             num_envs: num_envs as u64,
             batches: 0,
             missed: 0,
-            episodes: 0,
-            recent: VecDeque::with_capacity(WINDOW),
+            episodes: RecentEpisodes::default(),
             last: now,
             since: (now, 0),
         }
@@ -80,33 +72,13 @@ impl Statistics {
         self.batches += observed.missed.saturating_add(1);
         self.missed += observed.missed;
         self.last = Instant::now();
-        self.add_episodes(&observed.lease.batch());
-    }
-
-    fn add_episodes(&mut self, batch: &Batch<'_>) {
-        let ended =
-            batch.terminated().iter().zip(batch.truncated()).map(|(terminated, truncated)| terminated | truncated);
-        let ends = batch.episode_return().iter().zip(batch.episode_length());
-        for (_, (total, length)) in ended.zip(ends).filter(|(ended, _)| *ended != 0) {
-            self.episodes += 1;
-            if self.recent.len() == WINDOW {
-                self.recent.pop_front();
-            }
-            self.recent.push_back((*total, *length));
-        }
+        self.episodes.add(&observed.lease.batch());
     }
 
     /// Environment steps per second since the last call.
     pub fn rate(&mut self) -> f64 {
         let (moment, before) = std::mem::replace(&mut self.since, (Instant::now(), self.batches));
         ((self.batches - before) * self.num_envs) as f64 / moment.elapsed().as_secs_f64().max(1e-3)
-    }
-
-    /// The mean return and the mean length of the last episodes.
-    pub fn means(&self) -> Option<(f64, f64)> {
-        let count = self.recent.len() as f64;
-        let sum = |value: fn(&(f64, i32)) -> f64| self.recent.iter().map(value).sum::<f64>();
-        (count > 0.0).then(|| (sum(|recent| recent.0) / count, sum(|recent| f64::from(recent.1)) / count))
     }
 }
 
@@ -173,7 +145,7 @@ pub fn connect(
 
 fn show(args: &Args, is_live: bool, id: &str, statistics: &mut Statistics, is_over: bool) -> Result<(), Failure> {
     let rate = statistics.rate();
-    let (means, idle) = (statistics.means(), statistics.last.elapsed());
+    let (means, idle) = (statistics.episodes.means(), statistics.last.elapsed());
     if args.json {
         return print(json!({
             "service": args.service,
@@ -181,7 +153,7 @@ fn show(args: &Args, is_live: bool, id: &str, statistics: &mut Statistics, is_ov
             "steps_per_second": rate,
             "batches": statistics.batches,
             "missed": statistics.missed,
-            "episodes": statistics.episodes,
+            "episodes": statistics.episodes.ended,
             "mean_return": means.map(|(mean, _)| mean),
             "mean_length": means.map(|(_, mean)| mean),
             "idle_seconds": idle.as_secs_f64(),
@@ -189,7 +161,7 @@ fn show(args: &Args, is_live: bool, id: &str, statistics: &mut Statistics, is_ov
         }));
     }
     let mut text = format!("{} {id}: {} steps/s", args.service, grouped(rate));
-    text += &format!(", {} episodes", grouped(statistics.episodes as f64));
+    text += &format!(", {} episodes", grouped(statistics.episodes.ended as f64));
     if let Some((mean_return, mean_length)) = means {
         text += &format!(", mean return {mean_return:.3}, mean length {mean_length:.1}");
     }

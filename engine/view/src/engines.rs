@@ -23,8 +23,6 @@ impl Details {
 
 /// One engine: what it has done, and who uses it.
 pub(crate) fn describe(status: &EngineStatus, details: &Details) -> Json {
-    // Saturating: the numbers come from another process.
-    let sum = |field: fn(&GroupStatus) -> u64| status.groups.iter().map(field).fold(0, u64::saturating_add);
     let last_request = status.groups.iter().filter_map(|group| group.last_request).min();
     json!({
         "service": status.service,
@@ -35,10 +33,10 @@ pub(crate) fn describe(status: &EngineStatus, details: &Details) -> Json {
         "groups": status.groups.len(),
         "num_envs": status.num_envs,
         "uptime_seconds": status.uptime.as_secs_f64(),
-        "env_steps": sum(|group| group.env_steps),
-        "episodes": sum(|group| group.episodes),
-        "held": sum(|group| u64::from(group.held)),
-        "held_by_observers": sum(|group| group.observers.iter().map(|observer| u64::from(observer.held)).sum()),
+        "env_steps": status.total(|group| group.env_steps),
+        "episodes": status.total(|group| group.episodes),
+        "held": status.total(|group| u64::from(group.held)),
+        "held_by_observers": status.total(GroupStatus::held_by_observers),
         "trainers": details.processes.trainers,
         "observers": details.processes.observers,
         "shared_memory_bytes": details.shared_memory,

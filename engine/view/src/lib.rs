@@ -19,4 +19,5 @@ mod watcher;
 
 pub use error::ViewError;
 pub use play::PlayServer;
+pub use statistics::RecentEpisodes;
 pub use view::ViewServer;

@@ -27,6 +27,36 @@ pub(crate) struct Point {
     pub mean_length: Option<f64>,
 }
 
+/// The returns and lengths of the last episodes that ended in batches.
+#[derive(Debug, Default)]
+pub struct RecentEpisodes {
+    results: VecDeque<(f64, i32)>,
+    /// Episodes that have ended in all batches.
+    pub ended: u64,
+}
+
+impl RecentEpisodes {
+    /// Adds the episodes that have ended in a batch.
+    pub fn add(&mut self, batch: &Batch<'_>) {
+        let ended = batch.terminated().iter().zip(batch.truncated()).map(|(a, b)| a | b);
+        let results = batch.episode_return().iter().zip(batch.episode_length());
+        for (_, (total, length)) in ended.zip(results).filter(|(ended, _)| *ended != 0) {
+            self.ended += 1;
+            if self.results.len() == WINDOW {
+                self.results.pop_front();
+            }
+            self.results.push_back((*total, *length));
+        }
+    }
+
+    /// The mean return and the mean length of the last 1,000 episodes, or of all if there were fewer; `None` before the first.
+    pub fn means(&self) -> Option<(f64, f64)> {
+        let count = self.results.len() as f64;
+        let sum = |value: fn(&(f64, i32)) -> f64| self.results.iter().map(value).sum::<f64>();
+        (count > 0.0).then(|| (sum(|result| result.0) / count, sum(|result| f64::from(result.1)) / count))
+    }
+}
+
 /// The points of one run of an engine.
 #[derive(Debug, Default)]
 pub(crate) struct History {
@@ -37,8 +67,7 @@ pub(crate) struct History {
     points: VecDeque<Point>,
     /// When steps were last counted, and how many there were.
     counted: Option<(Instant, u64)>,
-    /// Returns and lengths of the last episodes.
-    recent: VecDeque<(f64, i32)>,
+    pub recent: RecentEpisodes,
 }
 
 impl History {
@@ -51,35 +80,17 @@ impl History {
         self.counted = None;
     }
 
-    /// Takes the episodes that have ended in a batch.
-    pub fn add(&mut self, batch: &Batch<'_>) {
-        let ended = batch.terminated().iter().zip(batch.truncated()).map(|(a, b)| a | b);
-        let results = batch.episode_return().iter().zip(batch.episode_length());
-        for (_, (total, length)) in ended.zip(results).filter(|(ended, _)| *ended != 0) {
-            if self.recent.len() == WINDOW {
-                self.recent.pop_front();
-            }
-            self.recent.push_back((*total, *length));
-        }
-    }
-
     /// Adds a point, from the second status on.
     pub fn point(&mut self, status: &EngineStatus) {
-        // Saturating: the numbers come from another process.
-        let sum = |field: fn(&endless_gym_service::GroupStatus) -> u64| {
-            status.groups.iter().map(field).fold(0, u64::saturating_add)
-        };
-        let (now, steps) = (Instant::now(), sum(|group| group.env_steps));
+        let (now, steps) = (Instant::now(), status.total(|group| group.env_steps));
         let Some((moment, before)) = self.counted.replace((now, steps)) else { return };
-        let count = self.recent.len() as f64;
-        let mean =
-            |value: fn(&(f64, i32)) -> f64| (count > 0.0).then(|| self.recent.iter().map(value).sum::<f64>() / count);
+        let means = self.recent.means();
         let point = Point {
             seconds: status.uptime.as_secs_f64(),
             steps_per_second: steps.saturating_sub(before) as f64 / (now - moment).as_secs_f64().max(1e-3),
-            episodes: sum(|group| group.episodes),
-            mean_return: mean(|episode| episode.0),
-            mean_length: mean(|episode| f64::from(episode.1)),
+            episodes: status.total(|group| group.episodes),
+            mean_return: means.map(|means| means.0),
+            mean_length: means.map(|means| means.1),
         };
         if self.points.len() == MAX_POINTS {
             self.points.pop_front();

@@ -161,7 +161,7 @@ impl Observation {
         let mut is_new = false;
         for group in &mut self.groups {
             if let Some(batch) = group.take()? {
-                channel.history().add(&batch);
+                channel.history().recent.add(&batch);
                 is_new = true;
             }
         }

@@ -3,7 +3,7 @@
 mod frame;
 mod game;
 mod keys;
-mod picture;
+pub mod picture;
 pub mod play;
 mod screen;
 mod status;

@@ -175,8 +175,9 @@ fn is_quit(screen: &Screen, is_waiting: bool) -> Result<bool, Failure> {
 }
 
 fn lines(title: &str, statistics: &Statistics, rate: f64, has_ended: bool) -> [String; 2] {
-    let mut first = format!("{title}: {} steps/s, {} episodes", grouped(rate), grouped(statistics.episodes as f64));
-    if let Some((mean_return, mean_length)) = statistics.means() {
+    let mut first =
+        format!("{title}: {} steps/s, {} episodes", grouped(rate), grouped(statistics.episodes.ended as f64));
+    if let Some((mean_return, mean_length)) = statistics.episodes.means() {
         first += &format!(", mean return {mean_return:.3}, mean length {mean_length:.1}");
     }
     let second = if has_ended { "the engine has ended; Q, Esc or Ctrl-C quits" } else { "Q, Esc or Ctrl-C quits" };
