@@ -151,41 +151,35 @@ pub fn role(name: &str, argument: &impl serde::Serialize) -> Result<Command, Str
     Ok(command)
 }
 
+/// The command as the further arguments of another one.
+fn within(arguments: &[&str], command: &Command) -> Command {
+    let mut outer = Command::new(arguments[0]);
+    outer.args(&arguments[1..]).arg(command.get_program()).args(command.get_args());
+    outer
+}
+
 /// The command under a limit of its descriptors.
 pub fn with_descriptors(command: &Command, limit: u64) -> Command {
-    let mut limited = Command::new("sh");
-    limited.args(["-c", &format!("ulimit -n {limit}; exec \"$0\" \"$@\"")]);
-    limited.arg(command.get_program()).args(command.get_args());
-    limited
+    within(&["sh", "-c", &format!("ulimit -n {limit}; exec \"$0\" \"$@\"")], command)
+}
+
+/// The command in a mount namespace of its own, after the shell command `mount`.
+fn with_mount(command: &Command, mount: &str) -> Command {
+    let script = format!("{mount} && exec \"$0\" \"$@\"");
+    within(&["unshare", "--mount", "--map-root-user", "sh", "-c", &script], command)
 }
 
 /// The command with an empty directory of its own in the place of the namespace's.
 pub fn with_own_root(command: &Command) -> Command {
-    let mut own = Command::new("unshare");
-    own.args([
-        "--mount",
-        "--map-root-user",
-        "sh",
-        "-c",
-        "mount -t tmpfs -o mode=700 tmpfs \"$ENDLESS_GYM_ROOT\" && exec \"$0\" \"$@\"",
-    ]);
-    own.arg(command.get_program()).args(command.get_args());
-    own
+    with_mount(command, "mount -t tmpfs -o mode=700 tmpfs \"$ENDLESS_GYM_ROOT\"")
 }
 
 /// The command with a /dev/shm of its own, of some megabytes.
 pub fn with_own_memory(command: &Command, megabytes: u64) -> Command {
-    let mut own = Command::new("unshare");
-    let script = format!("mount -t tmpfs -o size={megabytes}M tmpfs /dev/shm && exec \"$0\" \"$@\"");
-    own.args(["--mount", "--map-root-user", "sh", "-c", &script]);
-    own.arg(command.get_program()).args(command.get_args());
-    own
+    with_mount(command, &format!("mount -t tmpfs -o size={megabytes}M tmpfs /dev/shm"))
 }
 
 /// The command as the user nobody.
 pub fn as_nobody(command: &Command) -> Command {
-    let mut other = Command::new("setpriv");
-    other.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
-    other.arg(command.get_program()).args(command.get_args());
-    other
+    within(&["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"], command)
 }

@@ -32,11 +32,9 @@ impl Scene<'_> {
                 self.start(role)?;
             }
             Fault::KillStarting { role, moment } => {
-                self.kill(role);
-                self.start(role)?;
+                self.replace(role)?;
                 std::thread::sleep(Duration::from_micros(moment));
-                self.kill(role);
-                self.start(role)?;
+                self.replace(role)?;
             }
             Fault::KillEnding { role, moment } => {
                 if let Some(mut actor) = self.take(role) {
@@ -49,8 +47,7 @@ impl Scene<'_> {
             Fault::Stop { role, time } => self.stop(role, milliseconds(time))?,
             Fault::StopStarting { role, moment, time } => {
                 self.visitor(20)?;
-                self.kill(role);
-                self.start(role)?;
+                self.replace(role)?;
                 std::thread::sleep(Duration::from_micros(moment));
                 self.stop(role, milliseconds(time))?;
             }
@@ -65,22 +62,19 @@ impl Scene<'_> {
                 cleanliness::set_age(&self.namespace, seconds);
                 self.visitor(5)?;
                 self.watch(milliseconds(200))?;
-                self.kill(Role::Trainer);
-                self.start(Role::Trainer)?;
+                self.replace(Role::Trainer)?;
             }
             Fault::RemoveRoot { then } => {
                 let _ = fs::remove_dir_all(self.namespace.root());
                 self.removed = Some(now());
                 self.visitor(3)?;
                 self.watch(milliseconds(400))?;
-                self.kill(then);
-                self.start(then)?;
+                self.replace(then)?;
             }
             Fault::FillMemory { role, time } => {
                 fill();
                 self.filled = Some(now());
-                self.kill(role);
-                self.start(role)?;
+                self.replace(role)?;
                 self.watch(milliseconds(time))?;
                 let _ = fs::remove_file(BALLAST);
             }
@@ -95,17 +89,21 @@ impl Scene<'_> {
                 let visit = actors::role("visit", &(self.plan.trainer_seed, 3))?;
                 let visitor = self.spawn(actors::with_own_root(&visit))?;
                 self.wait_for(visitor)?;
-                self.kill(Role::Trainer);
-                self.start(Role::Trainer)?;
+                self.replace(Role::Trainer)?;
             }
             Fault::OtherUser => {
                 let intruder = self.spawn(actors::as_nobody(&actors::role("intrude", &())?))?;
                 self.wait_for(intruder)?;
-                self.kill(Role::Trainer);
-                self.start(Role::Trainer)?;
+                self.replace(Role::Trainer)?;
             }
         }
         Ok(now())
+    }
+
+    /// Kills the process of a role and starts its successor.
+    fn replace(&mut self, role: Role) -> Result<(), String> {
+        self.kill(role);
+        self.start(role)
     }
 
     /// Starts a process that lists engines and tries to connect.

@@ -62,22 +62,18 @@ fn main() -> ExitCode {
 }
 
 fn role(name: &str, argument: &str) -> Result<(), String> {
-    let invalid = |error: serde_json::Error| error.to_string();
-    match name {
-        "train" => trainer::run(&serde_json::from_str(argument).map_err(invalid)?),
-        "observe" => {
-            others::observe(&serde_json::from_str(argument).map_err(invalid)?);
-            Ok(())
-        }
-        "visit" => {
-            let (seed, times) = serde_json::from_str(argument).map_err(invalid)?;
-            others::visit(seed, times);
-            Ok(())
-        }
-        "intrude" => {
-            others::intrude();
-            Ok(())
-        }
-        _ => Err(format!("unknown role {name}")),
+    fn parsed<T: serde::de::DeserializeOwned>(argument: &str) -> Result<T, String> {
+        serde_json::from_str(argument).map_err(|error| error.to_string())
     }
+    match name {
+        "train" => return trainer::run(&parsed(argument)?),
+        "observe" => others::observe(&parsed(argument)?),
+        "visit" => {
+            let (seed, times) = parsed(argument)?;
+            others::visit(seed, times);
+        }
+        "intrude" => others::intrude(),
+        _ => return Err(format!("unknown role {name}")),
+    }
+    Ok(())
 }

@@ -1,7 +1,5 @@
 //! Which faults happen when. A plan follows from a seed and the number of its round alone, so that a printed pair repeats it.
 
-use std::fmt;
-
 use endless_gym_core::random::{Generator, SeedSequence};
 use serde::{Deserialize, Serialize};
 
@@ -57,36 +55,25 @@ pub enum Right {
 
 impl Fault {
     /// The name under which faults are counted.
-    pub fn kind(self) -> &'static str {
-        match self {
-            Fault::Kill { role: Role::Engine, .. } => "engine killed",
-            Fault::Kill { role: Role::Trainer, .. } => "trainer killed",
-            Fault::Kill { role: Role::Observer, .. } => "observer killed",
-            Fault::KillStarting { role: Role::Engine, .. } => "engine killed while it starts",
-            Fault::KillStarting { role: Role::Trainer, .. } => "trainer killed while it starts",
-            Fault::KillStarting { role: Role::Observer, .. } => "observer killed while it starts",
-            Fault::KillEnding { role: Role::Engine, .. } => "engine killed while it ends",
-            Fault::KillEnding { role: Role::Trainer, .. } => "trainer killed while it ends",
-            Fault::KillEnding { role: Role::Observer, .. } => "observer killed while it ends",
-            Fault::Stop { role: Role::Engine, .. } => "engine stopped",
-            Fault::Stop { role: Role::Trainer, .. } => "trainer stopped",
-            Fault::Stop { role: Role::Observer, .. } => "observer stopped",
-            Fault::StopStarting { role: Role::Engine, .. } => "engine stopped while it starts",
-            Fault::StopStarting { role: Role::Trainer, .. } => "trainer stopped while it starts",
-            Fault::StopStarting { role: Role::Observer, .. } => "observer stopped while it starts",
-            Fault::Restart { .. } => "engine restarted",
-            Fault::Fork { is_killed: true } => "forked trainer killed",
-            Fault::Fork { is_killed: false } => "forked trainer ended",
-            Fault::Descriptors { role: Role::Engine, .. } => "few descriptors, engine",
-            Fault::Descriptors { role: Role::Trainer, .. } => "few descriptors, trainer",
-            Fault::Descriptors { role: Role::Observer, .. } => "few descriptors, observer",
-            Fault::ClockJump { .. } => "clock jump",
-            Fault::RemoveRoot { .. } => "directory removed",
-            Fault::FillMemory { .. } => "full /dev/shm",
-            Fault::HoardingObserver => "hoarding observer",
-            Fault::OtherContainer => "container with its own root",
-            Fault::OtherUser => "other user",
-        }
+    pub fn kind(self) -> String {
+        let (role, what) = match self {
+            Fault::Kill { role, .. } => (role, "killed"),
+            Fault::KillStarting { role, .. } => (role, "killed while it starts"),
+            Fault::KillEnding { role, .. } => (role, "killed while it ends"),
+            Fault::Stop { role, .. } => (role, "stopped"),
+            Fault::StopStarting { role, .. } => (role, "stopped while it starts"),
+            Fault::Descriptors { role, .. } => (role, "with few descriptors"),
+            Fault::Restart { .. } => (Role::Engine, "restarted"),
+            Fault::Fork { is_killed: true } => return "forked trainer killed".to_owned(),
+            Fault::Fork { is_killed: false } => return "forked trainer ended".to_owned(),
+            Fault::ClockJump { .. } => return "clock jump".to_owned(),
+            Fault::RemoveRoot { .. } => return "directory removed".to_owned(),
+            Fault::FillMemory { .. } => return "full /dev/shm".to_owned(),
+            Fault::HoardingObserver => return "hoarding observer".to_owned(),
+            Fault::OtherContainer => return "container with its own root".to_owned(),
+            Fault::OtherUser => return "other user".to_owned(),
+        };
+        format!("{role:?} {what}").to_lowercase()
     }
 
     /// What it needs.
@@ -178,12 +165,6 @@ fn fault(draws: &mut Generator, owns_memory: bool) -> Fault {
         // In a user namespace there is no other user.
         _ if owns_memory => Fault::Kill { role, down },
         _ => Fault::OtherUser,
-    }
-}
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{self:?}")
     }
 }
 

@@ -41,14 +41,14 @@ pub fn play(plan: &Plan, rights: Rights) -> Result<Outcome, String> {
 fn faults(scene: &mut Scene<'_>, rights: Rights) -> Result<(), String> {
     for step in &scene.plan.steps {
         if !rights.permit(step.fault.right()) {
-            *scene.outcome.left_out.entry(step.fault.kind().to_owned()).or_default() += 1;
+            *scene.outcome.left_out.entry(step.fault.kind()).or_default() += 1;
             continue;
         }
         scene.watch(Duration::from_millis(step.pause))?;
         scene.current = Some(step.fault);
         let over = scene.apply(step.fault)?;
         let recovered = recover(scene, over)?;
-        scene.outcome.faults.push((step.fault.kind().to_owned(), recovered.map(|time| time.as_secs_f64() * 1e3)));
+        scene.outcome.faults.push((step.fault.kind(), recovered.map(|time| time.as_secs_f64() * 1e3)));
         if recovered.is_none() && !rescue(scene)? {
             break;
         }

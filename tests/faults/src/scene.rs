@@ -100,7 +100,7 @@ impl<'a> Scene<'a> {
 
     /// Notes something that must not happen.
     pub fn fail(&mut self, kind: &str, text: String) {
-        let fault = self.current.map_or("no fault", Fault::kind).to_owned();
+        let fault = self.current.map_or("no fault".to_owned(), Fault::kind);
         let same = |failure: &&Failure| failure.kind == kind && failure.fault == fault;
         if self.outcome.failures.iter().filter(same).count() < KEPT {
             self.outcome.failures.push(Failure { kind: kind.to_owned(), fault, text });

@@ -4,8 +4,7 @@
 use ciborium::Value;
 use endless_gym_core::envs::{self, EnvSpec, Family, ParameterKind};
 use endless_gym_core::pool::{Seeding, SnapshotError};
-use endless_gym_fuzz::snapshots::{Game, Outcome, Path, at, extremes, paths};
-use proptest::prelude::*;
+use endless_gym_fuzz::snapshots::{Game, Outcome, at, extremes, paths};
 use serde_json::{Map, Value as Json};
 
 /// Number of items of a forged list: more than any list has by play within a test.
@@ -122,31 +121,5 @@ fn sums_of_the_episode_stay_in_range() {
         game.play(1);
         let mut content = game.content();
         assert_eq!(*field(&mut content, "episode_length"), Value::from(i32::MAX));
-    }
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(endless_gym_fuzz::property_cases(300)))]
-
-    /// Several numbers at a time.
-    #[test]
-    fn numbers_can_be_extreme_together(
-        number in 0..10_usize,
-        steps in 0..60_usize,
-        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<prop::sample::Index>()), 2..5),
-    ) {
-        let mut game = Game::new(envs::specs().nth(number).unwrap(), Seeding::Continue { seed: Some(3) }, Map::new());
-        game.play(steps);
-        let (mut content, extremes) = (game.content(), extremes());
-        for (path, extreme) in changes {
-            let mut forged = content.clone();
-            let paths = paths(&mut forged);
-            let path: &Path = path.get(&paths);
-            *at(&mut forged, path) = extreme.get(&extremes).clone();
-            // Keeps what can be played, and forges further numbers of it.
-            if game.try_to_play(&forged) == Outcome::Played {
-                content = forged;
-            }
-        }
     }
 }
