@@ -3,8 +3,8 @@
 //! Phases are cumulative variants of a step, each with environments of its own, and a phase's cost is the
 //! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
 //!
-//! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--caches` simulates caches and the
-//! translation of addresses; `--memory` measures the memory; `--on-request` steps for `benches/compare_builds.py`.
+//! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--on-request` steps for
+//! `benches/compare_builds.py`.
 
 mod actions;
 
@@ -33,9 +33,6 @@ const ROUNDS: usize = 9;
 const ROUND_STEPS: usize = 16384;
 /// Steps before the first round: episodes that began together have spread.
 const WARM_UP: usize = 150;
-/// Numbers of environments, and environment steps of each, whose caches are simulated.
-const SIMULATED_SIZES: [usize; 3] = [64, 1024, 4096];
-const SIMULATED_STEPS: usize = 16384;
 
 /// The rules with their random draws, and resets.
 const RULES: u8 = 0;
@@ -224,7 +221,7 @@ const COUNTED_STEPS: usize = 250;
 /// What callgrind counts; the caller is this program under valgrind.
 fn count<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant, phase: u8) {
     if phase == POOL {
-        return counted(&mut pool_step(spec, COUNTED_ENVS, false), COUNTED_STEPS);
+        return counted(&mut pool_step(spec, COUNTED_ENVS, false));
     }
     let mut players = Players::<E>::new(spec, variant, COUNTED_ENVS, WARM_UP);
     let mut frame = vec![0; FRAME_BYTES];
@@ -234,7 +231,7 @@ fn count<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant, 
         COMPARED => players.step::<COMPARED>(&mut frame),
         _ => players.step::<PAINTED>(&mut frame),
     };
-    counted(&mut step, COUNTED_STEPS);
+    counted(&mut step);
 }
 
 /// Reads a number of steps from each line of the standard input, takes them, and prints the processor time of an environment's step in
@@ -254,19 +251,18 @@ fn on_request(spec: &'static EnvSpec, num_envs: usize) {
 }
 
 #[inline(never)]
-fn counted(step: &mut dyn FnMut(), steps: usize) {
-    for _ in 0..steps {
+fn counted(step: &mut dyn FnMut()) {
+    for _ in 0..COUNTED_STEPS {
         step();
     }
 }
 
 /// Runs this program under callgrind, which counts what happens in [`counted`], and returns its output.
-fn callgrind(options: &[&str], arguments: &[&str]) -> String {
+fn callgrind(arguments: &[&str]) -> String {
     let file = std::env::temp_dir().join(format!("endless-step-profile-{}", std::process::id()));
     let output = Command::new("valgrind")
         .args(["--tool=callgrind", "--toggle-collect=step_profile::counted"])
         .arg(format!("--callgrind-out-file={}", file.display()))
-        .args(options)
         .arg(std::env::current_exe().unwrap())
         .args(arguments)
         // No `rep movsb` and `rep stosb`, of which callgrind counts every byte as an instruction.
@@ -280,37 +276,6 @@ fn callgrind(options: &[&str], arguments: &[&str]) -> String {
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::remove_file(&file).unwrap();
     text
-}
-
-/// A cache of 48 KiB and one of 2 MiB, with lines of 64 bytes.
-const CACHES: [&str; 2] = ["--D1=49152,12,64", "--LL=2097152,16,64"];
-/// The translation of addresses as caches with a page for a line: 64 and 2,048 entries, for pages of 4 KiB.
-const PAGES: [&str; 2] = ["--D1=262144,4,4096", "--LL=8388608,16,4096"];
-
-/// Prints the rows of one id: simulated misses in the two caches, and in the tables of address translations.
-fn caches(spec: &EnvSpec) {
-    for num_envs in SIMULATED_SIZES {
-        let steps = SIMULATED_STEPS / num_envs;
-        let misses = [CACHES, PAGES].map(|sizes| {
-            // What the first steps miss because nothing was simulated before them is in both runs.
-            let [less, more] = [steps, 2 * steps].map(|steps| {
-                let text = callgrind(
-                    &["--cache-sim=yes", "--I1=65536,8,64", sizes[0], sizes[1]],
-                    &["--touch", spec.id, &num_envs.to_string(), &steps.to_string()],
-                );
-                let totals = text.lines().find_map(|line| line.strip_prefix("totals: ")).expect("totals");
-                // Ir Dr Dw I1mr D1mr D1mw ILmr DLmr DLmw, of which zeros at the end are left out.
-                let mut counts = [0.0; 9];
-                for (count, text) in counts.iter_mut().zip(totals.split(' ')) {
-                    *count = text.parse::<f64>().unwrap();
-                }
-                [counts[4] + counts[5], counts[7] + counts[8]]
-            });
-            [0, 1].map(|level| (more[level] - less[level]) / (num_envs * steps) as f64)
-        });
-        let columns: Vec<String> = misses.as_flattened().iter().map(|misses| format!("{misses:.2}")).collect();
-        println!("| {} | {num_envs} | {} |", spec.id, columns.join(" | "));
-    }
 }
 
 /// Instructions that callgrind noted.
@@ -378,7 +343,7 @@ fn name<'a>(names: &mut HashMap<&'a str, &'a str>, value: &'a str) -> &'a str {
 /// Prints the row of one id: instructions of an environment's step, by phase.
 fn instructions(spec: &EnvSpec) {
     let counts = [RULES, SCENE, COMPARED, PAINTED, POOL]
-        .map(|phase| Counts::read(&callgrind(&[], &["--count", spec.id, &phase.to_string()])));
+        .map(|phase| Counts::read(&callgrind(&["--count", spec.id, &phase.to_string()])));
     let steps = (COUNTED_ENVS * COUNTED_STEPS) as f64;
     let each = counts.each_ref().map(|counts| counts.all as f64 / steps);
     let rules = &counts[0];
@@ -400,55 +365,6 @@ fn instructions(spec: &EnvSpec) {
     );
 }
 
-/// Prints what memory of a batch's size gives: bytes a nanosecond in order, nanoseconds a line in no order.
-fn memory_speed() {
-    println!("| environments | pages | fill, GB/s | copy, GB/s | line changed, ns | line after line, ns |");
-    println!("| ---: | --- | ---: | ---: | ---: | ---: |");
-    for num_envs in SIZES {
-        for huge in [false, true] {
-            let bytes = num_envs * FRAME_BYTES / 64 * 64;
-            let mut memory = memory(bytes, huge);
-            let mut other = self::memory(bytes, huge);
-            let repeats = ((256 << 20) / bytes).max(1);
-            let mut results = [const { Vec::new() }; 4];
-            for round in 0..ROUNDS as u8 {
-                let mut timed = |result: usize, per: usize, work: &mut dyn FnMut()| {
-                    work();
-                    let start = processor_time();
-                    (0..repeats).for_each(|_| work());
-                    results[result].push((processor_time() - start) / (repeats * per) as f64);
-                };
-                timed(0, bytes, &mut || black_box(&mut memory[..]).fill(round));
-                timed(1, bytes, &mut || black_box(&mut other[..]).copy_from_slice(&memory));
-                let lines = bytes / 64;
-                // A congruential generator: the next address depends on nothing in memory.
-                let draw = |state: &mut u64| {
-                    *state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-                    (((*state >> 32) * lines as u64) >> 32) as usize * 64
-                };
-                let mut state = u64::from(round);
-                timed(2, lines / 8, &mut || {
-                    for _ in 0..lines / 8 {
-                        let line = draw(&mut state);
-                        memory[line] = memory[line].wrapping_add(1);
-                    }
-                });
-                memory.fill(0);
-                timed(3, lines / 8, &mut || {
-                    for _ in 0..lines / 8 {
-                        let line = draw(&mut state);
-                        // Each address depends on the byte before, which is 0.
-                        state = state.wrapping_add(u64::from(black_box(memory[line])));
-                    }
-                });
-            }
-            let [fill, copy, changed, latency] = results.map(median);
-            let pages = if huge { "huge" } else { "4 KiB" };
-            println!("| {num_envs} | {pages} | {:.0} | {:.0} | {changed:.1} | {latency:.0} |", 1.0 / fill, 1.0 / copy);
-        }
-    }
-}
-
 /// Calls the function for the family of `spec`.
 macro_rules! for_family {
     ($spec:expr, $function:ident ($($argument:expr),*)) => {
@@ -468,15 +384,8 @@ fn main() {
         let spec = envs::spec(id).unwrap();
         return for_family!(spec, count(phase.parse().unwrap()));
     }
-    if let ["--touch", id, num_envs, steps] = arguments[..] {
-        let mut step = pool_step(envs::spec(id).unwrap(), num_envs.parse().unwrap(), false);
-        return counted(&mut step, steps.parse().unwrap());
-    }
     if let ["--on-request", id, num_envs] = arguments[..] {
         return on_request(envs::spec(id).unwrap(), num_envs.parse().unwrap());
-    }
-    if arguments == ["--memory"] {
-        return memory_speed();
     }
     let ids: Vec<&str> = arguments.iter().copied().filter(|argument| !argument.starts_with("--")).collect();
     let specs = envs::specs().filter(|spec| ids.is_empty() || ids.contains(&spec.id));
@@ -484,11 +393,6 @@ fn main() {
         println!("| id | rules | of these: random | resets | steps a reset | scene | compare | paint | pool | all |");
         println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
         return specs.for_each(instructions);
-    }
-    if arguments.contains(&"--caches") {
-        println!("| id | environments | first cache | second | first table of pages | second |");
-        println!("| --- | ---: | ---: | ---: | ---: | ---: |");
-        return specs.for_each(caches);
     }
     println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
