@@ -178,11 +178,9 @@ mod tests {
     }
 
     #[test]
-    fn numbers_out_of_range_are_errors() {
-        let message = |config: EngineConfig| config.check().unwrap_err().to_string();
-        assert_eq!(message(EngineConfig { batches_held: 20, ..config() }), "batches_held must be 1 to 16, got 20");
-        assert_eq!(message(EngineConfig { groups: 0, ..config() }), "groups must be 1 to 64, got 0");
-        assert_eq!(message(EngineConfig { observers: 17, ..config() }), "observers must be 0 to 16, got 17");
+    fn too_many_observers_are_an_error() {
+        let error = EngineConfig { observers: 17, ..config() }.check().unwrap_err();
+        assert_eq!(error.to_string(), "observers must be 0 to 16, got 17");
     }
 
     #[test]
@@ -196,13 +194,6 @@ mod tests {
         assert_eq!(serde_json::from_str::<EngineConfig>(short).unwrap(), config());
         let error = serde_json::from_str::<EngineConfig>(&short.replace("threads", "thread")).unwrap_err().to_string();
         assert!(error.starts_with("unknown field `thread`"), "{error}");
-    }
-
-    #[test]
-    fn too_many_environments_are_an_error() {
-        let pool = PoolConfig::new("MortarMayhem-Grid-v0", usize::MAX);
-        let pools = EngineConfig { pool, groups: 2, ..config() }.pools();
-        assert!(matches!(pools, Err(PoolError::NumEnvs { given: usize::MAX })));
     }
 
     #[test]

@@ -69,16 +69,15 @@ impl Group {
         // An observer reserves its chunks when it connects.
         let publisher = ports::publisher(&service, ports::chunk_blocks(pool.layout()), limits.trainer_chunks());
         let (responses, memory) = publisher.map_err(|e| e.unexpected("a publisher"))?;
-        let (last, resumed, request) = (None, Vec::new(), RequestData::default());
         Ok(Group {
             pool,
             requests,
             responses,
             memory,
             response_service: service,
-            last,
-            resumed,
-            request,
+            last: None,
+            resumed: Vec::new(),
+            request: RequestData::default(),
             trainer: None,
         })
     }

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use bytemuck::Zeroable;
+
 use crate::engine::group::Outcome;
 use crate::error::{PACKAGE_VERSION, ServiceError};
 use crate::protocol::message::RequestHeader;
@@ -37,12 +39,9 @@ impl StatusWriter {
             started: now(),
             groups: specification.groups as u32,
             num_envs: specification.num_envs as u32,
-            dropped: 0,
-            recoveries: 0,
-            checkpoints: 0,
-            last_checkpoint: 0,
             id: padded(&specification.id),
             service: padded(service),
+            ..EngineRecord::zeroed()
         };
         let path = status_file::path(prefix, service, incarnation);
         let file = StatusFile::create(&path, &engine, specification.groups, &text)?;

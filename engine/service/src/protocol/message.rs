@@ -150,7 +150,7 @@ pub(crate) enum ResponseContent {
 }
 
 /// Header of a message from the engine.
-#[derive(Clone, Copy, Debug, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, ZeroCopySend)]
 #[type_name("endless_gym::ResponseHeader")]
 #[repr(C)]
 pub(crate) struct ResponseHeader {
@@ -169,27 +169,12 @@ pub(crate) struct ResponseHeader {
     padding: u32,
 }
 
-impl Default for ResponseHeader {
-    fn default() -> Self {
-        ResponseHeader {
-            layout_version: LAYOUT_VERSION,
-            group: 0,
-            incarnation: 0,
-            step: 0,
-            trainer: 0,
-            request: 0,
-            bytes: 0,
-            status: BATCH,
-            padding: 0,
-        }
-    }
-}
-
 impl ResponseHeader {
     /// The header of the batch that answers `request`.
     pub(crate) fn answering(request: &RequestHeader, group: usize, incarnation: u64, step: u64) -> Self {
-        let (trainer, request) = (request.trainer, request.request);
-        ResponseHeader { group: group as u32, incarnation, step, trainer, request, ..ResponseHeader::default() }
+        let RequestHeader { trainer, request, .. } = *request;
+        let (layout_version, group) = (LAYOUT_VERSION, group as u32);
+        ResponseHeader { layout_version, group, incarnation, step, trainer, request, ..ResponseHeader::default() }
     }
 
     /// Turns the response into a snapshot of that many bytes.
