@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::engine_process::EngineProcess;
 use super::failure::Failure;
-use super::huge_pages::{self, Kind};
+use super::huge_pages;
 use super::options::{self, EnvironmentArgs};
 use super::output::{grouped, print, print_json, progress, table};
 use super::play::RandomPolicy;
@@ -89,7 +89,7 @@ struct Measurement {
 }
 
 /// The result of one round.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Round {
     steps_per_second: f64,
     batch_bytes: Option<usize>,
@@ -214,9 +214,7 @@ fn measure(args: &Args, spec: &'static EnvSpec, method: Method, stop: &AtomicBoo
         Method::InProcess { threads } => in_process(args, spec, threads, stop),
         Method::ServiceReceives => through_service(args, spec, false, stop),
         Method::ServiceReads => through_service(args, spec, true, stop),
-        Method::Original => {
-            Ok(Round { steps_per_second: original(args, spec)?, batch_bytes: None, huge_page_bytes: None })
-        }
+        Method::Original => Ok(Round { steps_per_second: original(args, spec)?, ..Round::default() }),
     }
 }
 
@@ -237,10 +235,10 @@ fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Fai
 fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &AtomicBool) -> Result<Round, Failure> {
     let mut pool = Pool::new(&args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
     let mut actions = Actions::new(spec, args.num_envs);
-    let before = huge_pages::bytes(std::process::id(), Kind::Anonymous);
+    let before = huge_pages::bytes(std::process::id(), huge_pages::PRIVATE);
     let mut blocks = BatchBuffer::new(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut blocks)?;
-    let after = huge_pages::bytes(std::process::id(), Kind::Anonymous);
+    let after = huge_pages::bytes(std::process::id(), huge_pages::PRIVATE);
     let steps_per_second = time(args, stop, || {
         pool.step(actions.next(), &mut blocks)?;
         Ok(())
@@ -270,7 +268,7 @@ fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &Atom
         trainer.send(0, actions.next())?;
         Ok(())
     })?;
-    Ok(Round { steps_per_second, batch_bytes, huge_page_bytes: huge_pages::bytes(engine.id(), Kind::Shared) })
+    Ok(Round { steps_per_second, batch_bytes, huge_page_bytes: huge_pages::bytes(engine.id(), huge_pages::SHARED) })
 }
 
 /// Random actions that are drawn before the measurement, as `original.py` does.

@@ -212,9 +212,5 @@ mod tests {
         {
             assert_eq!(Format::of(Path::new(name)).unwrap(), format);
         }
-        for wrong in ["film", ".gif", "film.apng", ""] {
-            let error = Format::of(Path::new(wrong)).unwrap_err().to_string();
-            assert_eq!(error, format!("--film must end in .gif, .webp, .png or .mp4, got `{wrong}`"));
-        }
     }
 }

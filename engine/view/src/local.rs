@@ -8,7 +8,7 @@ use axum::Router;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE, HOST, ORIGIN, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS};
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 
@@ -103,11 +103,6 @@ fn protected(mut response: Response) -> Response {
 /// Answers with a file.
 pub(crate) fn file(name: &str, bytes: &'static [u8]) -> Response {
     ([(CONTENT_TYPE, HeaderValue::from_static(content_type(name)))], Body::from(bytes)).into_response()
-}
-
-/// Whether a request only reads.
-pub(crate) fn reads(method: &Method) -> bool {
-    matches!(*method, Method::GET | Method::HEAD)
 }
 
 /// The type of a file by its name.
