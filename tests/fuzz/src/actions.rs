@@ -8,12 +8,7 @@ use crate::playing;
 
 const STEPS: usize = 100;
 
-pub(crate) fn target(data: &[u8]) {
-    // Too short an input ends the game early.
-    let _ = play(&mut Unstructured::new(data));
-}
-
-fn play(input: &mut Unstructured<'_>) -> Result<()> {
+pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let spec = playing::spec(input)?;
     let autoreset = *input.choose(&[Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled])?;
     let mut pool = playing::pool(spec, OptionMap::new(), autoreset).expect("defaults are valid");

@@ -1,11 +1,13 @@
 //! Layouts of batches and requests: JSON text.
 
+use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{ActionLayout, Batch, Layout, zeroed};
 
 /// A larger batch is not allocated.
 const MAX_BLOCKS: usize = 1 << 14;
 
-pub(crate) fn target(data: &[u8]) {
+pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
+    let data = input.bytes(input.len())?;
     if let Ok(layout) = serde_json::from_slice::<Layout>(data)
         && layout.blocks() <= MAX_BLOCKS
     {
@@ -32,4 +34,5 @@ pub(crate) fn target(data: &[u8]) {
             assert!(layout.read::<u8>(&[], section.name()).is_empty());
         }
     }
+    Ok(())
 }

@@ -13,10 +13,11 @@ pub mod snapshots;
 mod traces;
 mod watchdog;
 
+use arbitrary::Unstructured;
 pub use watchdog::BUDGET;
 
-/// A function of arbitrary bytes.
-pub type Target = fn(&[u8]);
+/// A function of arbitrary bytes. An error means that the input was too short, which ends it early.
+pub type Target = fn(&mut Unstructured<'_>) -> arbitrary::Result<()>;
 
 /// The targets by name.
 pub const TARGETS: [(&str, Target); 6] = [
@@ -35,7 +36,7 @@ pub const TARGETS: [(&str, Target); 6] = [
 /// If there is no such target, or if the target finds a fault.
 pub fn run(name: &str, data: &[u8]) {
     let (_, target) = TARGETS.into_iter().find(|(known, _)| *known == name).expect("the name of a target");
-    watchdog::within_budget(data.to_vec(), || target(data));
+    let _ = watchdog::within_budget(data.to_vec(), || target(&mut Unstructured::new(data)));
 }
 
 /// Runs of a property: `cases`, or as many as the environment variable `PROPTEST_CASES` says.

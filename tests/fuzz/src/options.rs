@@ -9,12 +9,7 @@ use crate::playing;
 
 const STEPS: usize = 60;
 
-pub(crate) fn target(data: &[u8]) {
-    // Too short an input ends the game early.
-    let _ = play(&mut Unstructured::new(data));
-}
-
-fn play(input: &mut Unstructured<'_>) -> Result<()> {
+pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let spec = playing::spec(input)?;
     let autoreset = *input.choose(&[Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled])?;
     let later: bool = input.arbitrary()?;

@@ -1,10 +1,12 @@
 //! Traces: JSON text. A trace plays no more steps than it has bytes.
 
+use arbitrary::{Result, Unstructured};
 use endless_gym_core::trace::{Trace, replay};
 
-pub(crate) fn target(data: &[u8]) {
-    if let Ok(trace) = serde_json::from_slice::<Trace>(data) {
+pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
+    if let Ok(trace) = serde_json::from_slice::<Trace>(input.bytes(input.len())?) {
         // Any result but a panic.
         let _ = replay(&trace);
     }
+    Ok(())
 }
