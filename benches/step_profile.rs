@@ -3,14 +3,12 @@
 //! Phases are cumulative variants of a step, each with environments of its own, and a phase's cost is the
 //! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
 //!
-//! Arguments: ids (default: all); `--instructions` counts instructions with valgrind instead; `--on-request` steps for
-//! `benches/compare_builds.py`.
+//! Arguments: ids (default: all); `--on-request` steps for `benches/compare_builds.py`. `cargo xtask instructions` counts the
+//! instructions of a step.
 
 mod actions;
 
-use std::collections::HashMap;
 use std::hint::black_box;
-use std::process::Command;
 use std::sync::Arc;
 
 use endless_gym_core::batch::Block;
@@ -42,8 +40,6 @@ const SCENE: u8 = 1;
 const COMPARED: u8 = 2;
 /// What differs is painted.
 const PAINTED: u8 = 3;
-/// The pool's own step.
-const POOL: u8 = 4;
 
 /// One environment, with what a pool keeps for it.
 struct Player<E: Environment> {
@@ -91,7 +87,8 @@ impl<E: Environment> Players<E> {
         let own = frames.len() > FRAME_BYTES;
         for (number, player) in self.players.iter_mut().enumerate() {
             if player.ended {
-                start_episode(&self.assets, player);
+                player.env.reset(&self.assets, &mut player.random);
+                player.ended = false;
             } else {
                 let action = &actions[number * branches..][..branches];
                 player.ended = black_box(player.env.step(action, &mut player.random)).terminated;
@@ -111,13 +108,6 @@ impl<E: Environment> Players<E> {
             }
         }
     }
-}
-
-/// A call of its own, so that callgrind counts what it includes.
-#[inline(never)]
-fn start_episode<E: Environment>(assets: &Arc<E::Assets>, player: &mut Player<E>) {
-    player.env.reset(assets, &mut player.random);
-    player.ended = false;
 }
 
 /// A step of all environments.
@@ -214,26 +204,6 @@ fn times<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant) 
     }
 }
 
-/// Environments and steps that valgrind counts.
-const COUNTED_ENVS: usize = 16;
-const COUNTED_STEPS: usize = 250;
-
-/// What callgrind counts; the caller is this program under valgrind.
-fn count<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant, phase: u8) {
-    if phase == POOL {
-        return counted(&mut pool_step(spec, COUNTED_ENVS, false));
-    }
-    let mut players = Players::<E>::new(spec, variant, COUNTED_ENVS, WARM_UP);
-    let mut frame = vec![0; FRAME_BYTES];
-    let mut step = || match phase {
-        RULES => players.step::<RULES>(&mut frame),
-        SCENE => players.step::<SCENE>(&mut frame),
-        COMPARED => players.step::<COMPARED>(&mut frame),
-        _ => players.step::<PAINTED>(&mut frame),
-    };
-    counted(&mut step);
-}
-
 /// Reads a number of steps from each line of the standard input, takes them, and prints the processor time of an environment's step in
 /// nanoseconds.
 fn on_request(spec: &'static EnvSpec, num_envs: usize) {
@@ -250,153 +220,20 @@ fn on_request(spec: &'static EnvSpec, num_envs: usize) {
     }
 }
 
-#[inline(never)]
-fn counted(step: &mut dyn FnMut()) {
-    for _ in 0..COUNTED_STEPS {
-        step();
-    }
-}
-
-/// Runs this program under callgrind, which counts what happens in [`counted`], and returns its output.
-fn callgrind(arguments: &[&str]) -> String {
-    let file = std::env::temp_dir().join(format!("endless-step-profile-{}", std::process::id()));
-    let output = Command::new("valgrind")
-        .args(["--tool=callgrind", "--toggle-collect=step_profile::counted"])
-        .arg(format!("--callgrind-out-file={}", file.display()))
-        .arg(std::env::current_exe().unwrap())
-        .args(arguments)
-        // No `rep movsb` and `rep stosb`, of which callgrind counts every byte as an instruction.
-        .env(
-            "GLIBC_TUNABLES",
-            "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000",
-        )
-        .output()
-        .expect("valgrind must be installed");
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let text = std::fs::read_to_string(&file).unwrap();
-    std::fs::remove_file(&file).unwrap();
-    text
-}
-
-/// Instructions that callgrind noted.
-#[derive(Default)]
-struct Counts {
-    all: u64,
-    /// In the files of `random`, with what is inlined there.
-    random: u64,
-    /// In `start_episode`, with everything that it calls.
-    resets: u64,
-    num_resets: u64,
-}
-
-impl Counts {
-    /// Reads callgrind's output: lines `fl=`, `fi=` and `fe=` name the file of the lines of costs after them, and `calls=` says that
-    /// the next cost is that of a call.
-    fn read(text: &str) -> Counts {
-        let mut counts = Counts::default();
-        // A name is given once, as `(number) name`, and then by its number.
-        let (mut files, mut functions) = (HashMap::new(), HashMap::new());
-        let (mut in_random, mut is_reset, mut call) = (false, false, None);
-        for line in text.lines() {
-            let (key, value) = line.split_once('=').unwrap_or(("", line));
-            match key {
-                "fl" | "fi" | "fe" | "cfi" | "cfl" => {
-                    let file = name(&mut files, value);
-                    if !key.starts_with('c') {
-                        in_random = file.contains("/src/random/") || file.contains("rand_pcg");
-                    }
-                }
-                "fn" => _ = name(&mut functions, value),
-                "cfn" => is_reset = name(&mut functions, value).contains("start_episode"),
-                "calls" => call = value.split(' ').next().and_then(|calls| calls.parse::<u64>().ok()),
-                "" if line.starts_with(|first: char| first.is_ascii_digit() || "+-*".contains(first)) => {
-                    let cost: u64 = line.split(' ').nth(1).and_then(|cost| cost.parse().ok()).unwrap_or(0);
-                    match call.take() {
-                        Some(calls) if is_reset => {
-                            counts.resets += cost;
-                            counts.num_resets += calls;
-                        }
-                        Some(_) => {}
-                        None => {
-                            counts.all += cost;
-                            counts.random += if in_random { cost } else { 0 };
-                        }
-                    }
-                }
-                _ => {}
-            }
-        }
-        counts
-    }
-}
-
-fn name<'a>(names: &mut HashMap<&'a str, &'a str>, value: &'a str) -> &'a str {
-    match value.split_once(' ') {
-        Some((number, name)) => {
-            names.insert(number, name);
-            name
-        }
-        None => names.get(value).copied().unwrap_or(""),
-    }
-}
-
-/// Prints the row of one id: instructions of an environment's step, by phase.
-fn instructions(spec: &EnvSpec) {
-    let counts = [RULES, SCENE, COMPARED, PAINTED, POOL]
-        .map(|phase| Counts::read(&callgrind(&["--count", spec.id, &phase.to_string()])));
-    let steps = (COUNTED_ENVS * COUNTED_STEPS) as f64;
-    let each = counts.each_ref().map(|counts| counts.all as f64 / steps);
-    let rules = &counts[0];
-    let [random, resets] = [rules.random, rules.resets].map(|count| count as f64 / steps);
-    println!(
-        "| {} | {:.0} | {random:.0} | {resets:.0} | {} | {:.0} | {:.0} | {:.0} | {:.0} | {:.0} |",
-        spec.id,
-        each[0],
-        if rules.num_resets == 0 {
-            "-".to_owned()
-        } else {
-            (COUNTED_ENVS * COUNTED_STEPS / rules.num_resets as usize).to_string()
-        },
-        each[1] - each[0],
-        each[2] - each[1],
-        each[3] - each[2],
-        each[4] - each[3],
-        each[4],
-    );
-}
-
-/// Calls the function for the family of `spec`.
-macro_rules! for_family {
-    ($spec:expr, $function:ident ($($argument:expr),*)) => {
-        match $spec.family {
-            Family::MortarMayhem(variant) => $function::<MortarMayhem>($spec, variant $(, $argument)*),
-            Family::MysteryPath(variant) => $function::<MysteryPath>($spec, variant $(, $argument)*),
-            Family::SearingSpotlights(variant) => $function::<SearingSpotlights>($spec, variant $(, $argument)*),
-        }
-    };
-}
-
 fn main() {
     // Cargo adds `--bench`.
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    if let ["--count", id, phase] = arguments[..] {
-        let spec = envs::spec(id).unwrap();
-        return for_family!(spec, count(phase.parse().unwrap()));
-    }
     if let ["--on-request", id, num_envs] = arguments[..] {
         return on_request(envs::spec(id).unwrap(), num_envs.parse().unwrap());
     }
-    let ids: Vec<&str> = arguments.iter().copied().filter(|argument| !argument.starts_with("--")).collect();
-    let specs = envs::specs().filter(|spec| ids.is_empty() || ids.contains(&spec.id));
-    if arguments.contains(&"--instructions") {
-        println!("| id | rules | of these: random | resets | steps a reset | scene | compare | paint | pool | all |");
-        println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
-        return specs.for_each(instructions);
-    }
     println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
-    for spec in specs {
-        for_family!(spec, times());
+    for spec in envs::specs().filter(|spec| arguments.is_empty() || arguments.contains(&spec.id)) {
+        match spec.family {
+            Family::MortarMayhem(variant) => times::<MortarMayhem>(spec, variant),
+            Family::MysteryPath(variant) => times::<MysteryPath>(spec, variant),
+            Family::SearingSpotlights(variant) => times::<SearingSpotlights>(spec, variant),
+        }
     }
 }
