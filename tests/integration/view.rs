@@ -85,9 +85,8 @@ fn frames_are_the_batchs_bytes_in_every_layout() {
         let mut socket = server.show("endless");
         let envs = [3, 0, 4];
         socket.select(0, &envs);
-        // Observers receive what is sent after they have connected.
-        wait_for_observers(&place, 1);
-
+        // A page shows what is sent after its server has connected.
+        socket.wait(|about| about["state"] == "live");
         let config = PoolConfig { frames: Some(Frames { format, stack }), ..PoolConfig::new(id, 5) };
         // The same episode as [x][y][channel].
         let mut twins = [Player::new(&config), Player::new(&PoolConfig::new(id, 5))];
@@ -134,7 +133,7 @@ fn without_frames_there_are_numbers() {
     let mut trainer = place.trainer("endless").unwrap();
     let mut socket = server.show("endless");
     socket.select(1, &[2, 1000]);
-    wait_for_observers(&place, 2);
+    socket.wait(|about| about["state"] == "live");
     trainer.reset(1, ResetRequest::Seed(3)).unwrap();
     let lease = trainer.receive(1, TIMEOUT).unwrap();
     let (about, pixels) = socket.wait(|about| about["batch"]["group"] == 1);
