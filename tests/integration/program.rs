@@ -202,7 +202,7 @@ fn serve_reads_its_configuration_as_json_from_a_file_or_standard_input() {
     let place = Place::new();
     let config =
         r#"{"service": "one", "pool": {"id": "MysteryPath-Grid-v0", "num_envs": 3}, "groups": 2, "threads": 1}"#;
-    let file = place.root().with_extension("json");
+    let file = place.root().join("config.json");
     std::fs::write(&file, config).unwrap();
     let path = file.to_str().unwrap();
     for arguments in [vec!["serve", "--child", "--config", path], vec!["serve", "--child", "--config=-"]] {
@@ -222,7 +222,6 @@ fn serve_reads_its_configuration_as_json_from_a_file_or_standard_input() {
     for option in ["--num-envs=3", "--seed=1", "--no-frames"] {
         assert_eq!(place.run(&["serve", "--config", path, option]).status.code(), Some(2), "{option}");
     }
-    std::fs::remove_file(file).unwrap();
 }
 
 #[test]
