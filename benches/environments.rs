@@ -5,16 +5,16 @@ mod actions;
 use std::sync::Arc;
 
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main, measurement::WallTime};
-use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
-use endless_gym_core::envs::mystery_path::MysteryPath;
-use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
-use endless_gym_core::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters};
+use endless_gym_core::envs::mortar_mayhem::{self, MortarMayhem};
+use endless_gym_core::envs::mystery_path::{self, MysteryPath};
+use endless_gym_core::envs::searing_spotlights::{self, SearingSpotlights};
+use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters};
 use endless_gym_core::random::Generator;
 use serde_json::Map;
 
 use actions::Actions;
 
-fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &'static EnvSpec, variant: E::Variant) {
+fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &EnvSpec, variant: E::Variant) {
     let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
     let assets = Arc::new(E::assets(variant, &parameters));
     let mut env = E::new(&assets);
@@ -37,13 +37,9 @@ fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &'sta
 
 fn environments(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("environment");
-    for spec in envs::specs() {
-        match spec.family {
-            Family::MortarMayhem(variant) => measure::<MortarMayhem>(&mut group, spec, variant),
-            Family::MysteryPath(variant) => measure::<MysteryPath>(&mut group, spec, variant),
-            Family::SearingSpotlights(variant) => measure::<SearingSpotlights>(&mut group, spec, variant),
-        }
-    }
+    mortar_mayhem::IDS.iter().for_each(|(spec, variant)| measure::<MortarMayhem>(&mut group, spec, *variant));
+    mystery_path::IDS.iter().for_each(|(spec, variant)| measure::<MysteryPath>(&mut group, spec, *variant));
+    searing_spotlights::IDS.iter().for_each(|(spec, variant)| measure::<SearingSpotlights>(&mut group, spec, *variant));
     group.finish();
 }
 

@@ -5,7 +5,7 @@
 mod actions;
 
 use endless_gym::batch::{Block, zeroed};
-use endless_gym::envs;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 
 use actions::Actions;
@@ -17,9 +17,9 @@ const STEPS: usize = 250;
 fn main() {
     let id = std::env::args().nth(1).unwrap_or_default();
     // Cargo's own runs of all benchmarks give no id.
-    let Ok(spec) = envs::spec(&id) else { return };
+    let Ok(spec) = memory_gym().spec(&id) else { return };
     let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, NUM_ENVS) };
-    let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+    let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
     let mut batch = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut batch).unwrap();
     let mut actions = Actions::new(spec, NUM_ENVS);

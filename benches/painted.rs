@@ -4,10 +4,10 @@ mod actions;
 
 use std::sync::Arc;
 
-use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
-use endless_gym_core::envs::mystery_path::MysteryPath;
-use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
-use endless_gym_core::envs::{self, EnvSpec, Environment, Family, ResetParameters, SCREEN};
+use endless_gym_core::envs::mortar_mayhem::{self, MortarMayhem};
+use endless_gym_core::envs::mystery_path::{self, MysteryPath};
+use endless_gym_core::envs::searing_spotlights::{self, SearingSpotlights};
+use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters, SCREEN};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::DirtySurface;
 use serde_json::Map;
@@ -17,7 +17,7 @@ use actions::Actions;
 const STEPS: usize = 30_000;
 const LINE: usize = 64;
 
-fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
+fn measure<E: Environment>(spec: &EnvSpec, variant: E::Variant) {
     let parameters = ResetParameters::new(spec.id, spec.parameters, &Map::new()).unwrap();
     let assets = Arc::new(E::assets(variant, &parameters));
     let (mut env, mut random) = (E::new(&assets), Generator::from_seed(1));
@@ -48,11 +48,7 @@ fn measure<E: Environment>(spec: &'static EnvSpec, variant: E::Variant) {
 
 fn main() {
     println!("{:30} {:>8} {:>12} {:>14}", "a step of", "bytes", "cache lines", "bytes noted");
-    for spec in envs::specs() {
-        match spec.family {
-            Family::MortarMayhem(variant) => measure::<MortarMayhem>(spec, variant),
-            Family::MysteryPath(variant) => measure::<MysteryPath>(spec, variant),
-            Family::SearingSpotlights(variant) => measure::<SearingSpotlights>(spec, variant),
-        }
-    }
+    mortar_mayhem::IDS.iter().for_each(|(spec, variant)| measure::<MortarMayhem>(spec, *variant));
+    mystery_path::IDS.iter().for_each(|(spec, variant)| measure::<MysteryPath>(spec, *variant));
+    searing_spotlights::IDS.iter().for_each(|(spec, variant)| measure::<SearingSpotlights>(spec, *variant));
 }

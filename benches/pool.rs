@@ -5,7 +5,8 @@ mod actions;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime};
 use endless_gym::batch::PixelFormat;
 use endless_gym::batch::{Frames, zeroed};
-use endless_gym::envs::{self, EnvSpec};
+use endless_gym::envs::EnvSpec;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 
 use actions::Actions;
@@ -17,7 +18,7 @@ fn measure(
     config: &PoolConfig,
     threads: usize,
 ) {
-    let mut pool = Pool::new(config, &Threads::new(threads).unwrap()).unwrap();
+    let mut pool = Pool::new(memory_gym(), config, &Threads::new(threads).unwrap()).unwrap();
     let mut batch = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::All, &mut batch).unwrap();
     let mut actions = Actions::new(spec, config.num_envs);
@@ -32,7 +33,7 @@ fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
 /// Every id, in and beyond the processor's caches.
 fn step(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("pool/step");
-    for (spec, num_envs) in envs::specs().flat_map(|spec| [64, 1024, 16384].map(|num_envs| (spec, num_envs))) {
+    for (spec, num_envs) in memory_gym().specs().flat_map(|spec| [64, 1024, 16384].map(|num_envs| (spec, num_envs))) {
         measure(&mut group, format!("{}/{num_envs}", spec.id), spec, &config(spec, num_envs), 1);
     }
 }
@@ -46,7 +47,7 @@ fn threads(criterion: &mut Criterion) {
     counts.sort_unstable();
     counts.dedup();
     for id in ["Endless-MortarMayhem-v0", "SearingSpotlights-v0"] {
-        let spec = envs::spec(id).unwrap();
+        let spec = memory_gym().spec(id).unwrap();
         for threads in &counts {
             measure(&mut group, format!("{id}/{threads}"), spec, &config(spec, 4096), *threads);
         }
@@ -56,7 +57,7 @@ fn threads(criterion: &mut Criterion) {
 /// What the formats cost in addition to the original's.
 fn formats(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("pool/formats");
-    let spec = envs::spec("Endless-MysteryPath-v0").unwrap();
+    let spec = memory_gym().spec("Endless-MysteryPath-v0").unwrap();
     let plain = PixelFormat::default();
     for (name, format, stack) in [
         ("standard", plain, 1),
@@ -74,11 +75,11 @@ fn formats(criterion: &mut Criterion) {
 /// How long a periodic checkpoint stalls an engine: copying the states of 1,024 environments.
 fn save(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("pool/save");
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         for stack in [1, 4] {
             let frames = Some(Frames { stack, ..Frames::default() });
             let config = PoolConfig { frames, ..config(spec, 1024) };
-            let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+            let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
             pool.reset(ResetRequest::All, &mut zeroed(pool.layout().blocks())).unwrap();
             let name = format!("{}/stack_{stack}", spec.id);
             group.bench_function(name, |bencher| bencher.iter(|| pool.save().unwrap()));

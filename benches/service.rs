@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use endless_gym::batch::zeroed;
-use endless_gym::envs;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 use endless_gym::service::{ConnectConfig, Trainer};
 
@@ -28,7 +28,7 @@ impl Drop for Engine {
 }
 
 fn service(criterion: &mut Criterion) {
-    let spec = envs::spec(ID).unwrap();
+    let spec = memory_gym().spec(ID).unwrap();
     let mut group = criterion.benchmark_group("service");
     for num_envs in [1, 64, 1024] {
         group.throughput(Throughput::Elements(num_envs as u64));
@@ -36,7 +36,7 @@ fn service(criterion: &mut Criterion) {
 
         // The work itself, to compare with.
         let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(ID, num_envs) };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut batch = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut batch).unwrap();
         group.bench_function(format!("in_process/{num_envs}"), |bencher| {

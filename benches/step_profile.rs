@@ -12,10 +12,11 @@ use std::hint::black_box;
 use std::sync::Arc;
 
 use endless_gym_core::batch::Block;
-use endless_gym_core::envs::mortar_mayhem::MortarMayhem;
-use endless_gym_core::envs::mystery_path::MysteryPath;
-use endless_gym_core::envs::searing_spotlights::SearingSpotlights;
-use endless_gym_core::envs::{self, EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters, SCREEN};
+use endless_gym_core::envs::mortar_mayhem::{self, MortarMayhem};
+use endless_gym_core::envs::mystery_path::{self, MysteryPath};
+use endless_gym_core::envs::searing_spotlights::{self, SearingSpotlights};
+use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters, SCREEN};
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
@@ -115,7 +116,7 @@ type Step = Box<dyn FnMut()>;
 
 fn pool(spec: &'static EnvSpec, num_envs: usize) -> Pool {
     let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) };
-    Pool::new(&config, &Threads::new(1).unwrap()).unwrap()
+    Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap()
 }
 
 /// Memory that a step writes to, in small or in huge pages.
@@ -220,20 +221,23 @@ fn on_request(spec: &'static EnvSpec, num_envs: usize) {
     }
 }
 
+/// The phases of the ids of a family that are wanted; none stands for all.
+fn all_times<E: Environment + 'static>(ids: &'static [(EnvSpec, E::Variant)], wanted: &[&str]) {
+    for (spec, variant) in ids.iter().filter(|(spec, _)| wanted.is_empty() || wanted.contains(&spec.id)) {
+        times::<E>(spec, *variant);
+    }
+}
+
 fn main() {
     // Cargo adds `--bench`.
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     if let ["--on-request", id, num_envs] = arguments[..] {
-        return on_request(envs::spec(id).unwrap(), num_envs.parse().unwrap());
+        return on_request(memory_gym().spec(id).unwrap(), num_envs.parse().unwrap());
     }
     println!("| id | environments | rules | scene | compare | paint | own frames | pool | all | huge pages |");
     println!("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |");
-    for spec in envs::specs().filter(|spec| arguments.is_empty() || arguments.contains(&spec.id)) {
-        match spec.family {
-            Family::MortarMayhem(variant) => times::<MortarMayhem>(spec, variant),
-            Family::MysteryPath(variant) => times::<MysteryPath>(spec, variant),
-            Family::SearingSpotlights(variant) => times::<SearingSpotlights>(spec, variant),
-        }
-    }
+    all_times::<MortarMayhem>(mortar_mayhem::IDS, &arguments);
+    all_times::<MysteryPath>(mystery_path::IDS, &arguments);
+    all_times::<SearingSpotlights>(searing_spotlights::IDS, &arguments);
 }

@@ -2,13 +2,37 @@
 //!
 //! This crate re-exports the public API of the crates that it consists of:
 //!
-//! - [`envs`]: ids, spaces, reset parameters and scripted experts; [`pool`]: many environments in this process; [`batch`]: what a
+//! - [`memory_gym`]: the registry of the ten ids; [`envs`]: spaces, reset parameters and scripted experts; [`pool`]: many environments in this process; [`batch`]: what a
 //!   step returns; [`trace`]: replay of recorded episodes. They are `endless-gym-core`, which does not depend on an operating
 //!   system's services and builds for WebAssembly.
 //! - [`service`]: an engine, its trainer and observers, as processes that share memory. It is `endless-gym-service`.
 //!
 //! The program `endless` is `endless-gym-cli`. What these crates export beyond this list (the rasteriser, the random numbers, the
 //! rules of single environments, the program) serves the project's own tests and benchmarks and may change in any version.
+
+use std::io::Write;
+use std::process::ExitCode;
+
+pub use endless_gym_core::{DEFAULT_ENV_ID, memory_gym};
+
+/// Runs the program `endless` with the environments of `registry` and the arguments of this process. It is the whole of `main` in a
+/// program with environments of its own:
+///
+/// ```no_run
+/// fn main() -> std::process::ExitCode {
+///     endless_gym::program(endless_gym::memory_gym())
+/// }
+/// ```
+pub fn program(registry: &pool::Registry) -> ExitCode {
+    let arguments: Vec<_> = std::env::args_os().skip(1).collect();
+    match std::env::current_exe() {
+        Ok(executable) => endless_gym_cli::main(registry, arguments, &[executable.into()]).into(),
+        Err(error) => {
+            let _ = writeln!(std::io::stderr(), "endless: cannot find the program's own file: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
 
 /// Arrays of a batch in memory.
 pub mod batch {
@@ -22,21 +46,30 @@ pub mod batch {
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{
-        ActionBranch, ActionError, ActionSpace, Choice, Column, DEFAULT_ENV_ID, EnvSpec, Expert, FRAME_BYTES, Family,
-        InfoColumn, InvalidActionSpace, InvalidState, Locomotion, MortarMayhemVariant, MysteryPathVariant, Parameter,
-        ParameterError, ParameterKind, Progress, SCREEN, SearingSpotlightsVariant, UnknownEnvironment, expert, spec,
-        specs, view,
+        ActionBranch, ActionError, ActionSpace, Choice, Column, EnvSpec, Expert, FRAME_BYTES, InfoColumn,
+        InvalidActionSpace, InvalidState, Parameter, ParameterError, ParameterKind, Progress, ResetParameters, SCREEN,
+        Task, Transition, UnknownEnvironment, view,
     };
 }
 
 /// Many environments in this process, stepped in lockstep.
 pub mod pool {
     pub use endless_gym_core::pool::{
-        Autoreset, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError,
-        ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv, Seeding, SnapshotError,
-        Threads, UnknownAutoreset, WrongFrame,
+        Autoreset, DuplicateEnvironment, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool,
+        PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION,
+        SavedEnv, Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
+}
+
+/// numpy's random numbers, bit for bit, for environments of one's own.
+pub mod random {
+    pub use endless_gym_core::random::Generator;
+}
+
+/// A rasteriser that paints exactly the pixels that pygame 2.4 paints, for environments of one's own.
+pub mod raster {
+    pub use endless_gym_core::raster::{Canvas, CornerRadii, Rect, Rgb, Surface};
 }
 
 /// Engines that serve environments in shared memory, their trainers and observers.

@@ -8,6 +8,7 @@ use std::error::Error;
 use std::time::Instant;
 
 use endless_gym::batch::{Batch, zeroed};
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -19,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let id = arguments.next().unwrap_or_else(|| "MortarMayhem-Grid-v0".to_owned());
     let num_envs = arguments.next().map_or(Ok(256), |number| number.parse())?;
 
-    let mut pool = Pool::new(&PoolConfig::new(&id, num_envs), &Threads::new(0)?)?;
+    let mut pool = Pool::new(memory_gym(), &PoolConfig::new(&id, num_envs), &Threads::new(0)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
     pool.reset(ResetRequest::Seed(0), &mut blocks)?;
 

@@ -8,6 +8,7 @@
 use std::error::Error;
 
 use endless_gym::batch::{Batch, Block, zeroed};
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -54,7 +55,7 @@ fn new_pool(num_envs: usize) -> Result<Pool, Box<dyn Error>> {
     // The search uses rewards only, so nothing is drawn.
     config.frames = None;
     config.options = serde_json::from_value(options).map(endless_gym::pool::ResetOptions::Shared)?;
-    Ok(Pool::new(&config, &Threads::new(1)?)?)
+    Ok(Pool::new(memory_gym(), &config, &Threads::new(1)?)?)
 }
 
 /// The action whose random continuations return the most.

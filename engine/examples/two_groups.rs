@@ -8,6 +8,7 @@ use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{ConnectConfig, Engine, EngineConfig, ServiceError, Trainer};
 
@@ -22,7 +23,7 @@ const INFERENCE_TIME: Duration = Duration::from_micros(100);
 fn main() -> Result<(), Box<dyn Error>> {
     // Usually a process of its own: `endless serve --groups 2 --service two-groups ...`.
     let config = EngineConfig::new(SERVICE, PoolConfig::new(ID, NUM_ENVS), 1);
-    let mut engine = Engine::new(&EngineConfig { groups: 2, ..config })?;
+    let mut engine = Engine::new(memory_gym(), &EngineConfig { groups: 2, ..config })?;
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let running = scope.spawn(|| engine.run(&stop));

@@ -4,7 +4,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use endless_gym::batch::zeroed;
-use endless_gym::envs;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, ResetRequest, Seeding};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -43,7 +43,7 @@ fn steps_and_resets_allocate_nothing() {
     if !alone("allocation::steps_and_resets_allocate_nothing") {
         return;
     }
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         // As few as one thread steps, and enough for two.
         for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
             let config = PoolConfig {
@@ -102,7 +102,7 @@ fn replaced_options_leave_no_memory_behind() {
     if !alone("allocation::replaced_options_leave_no_memory_behind") {
         return;
     }
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let mut player = Player::new(&PoolConfig::new(spec.id, 4));
         player.reset(ResetRequest::Seed(1));
         let mut used = |rounds: std::ops::Range<usize>| {

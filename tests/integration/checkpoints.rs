@@ -3,7 +3,8 @@
 use crate::support::player::{Player, random_actions};
 use crate::support::recorded::{options, pixel_format, property_cases};
 use endless_gym::batch::Frames;
-use endless_gym::envs::{EnvSpec, specs};
+use endless_gym::envs::EnvSpec;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest, ResumeError, Seeding, SnapshotError};
 use proptest::prelude::*;
 use rand::SeedableRng;
@@ -62,7 +63,7 @@ fn compare(config: &PoolConfig, before: usize, after: usize) {
 
 #[test]
 fn resumed_environments_continue_identically() {
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         let mut runner = proptest::test_runner::TestRunner::new(property_cases(4));
         let run = runner.run(&(config(spec), 0..90usize), |(config, before)| {
             compare(&config, before, 60);

@@ -7,6 +7,7 @@ use crate::support::player::random_actions;
 use crate::support::recorded::{options, pixel_format, property_cases};
 use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
 use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, SCREEN};
+use endless_gym::memory_gym;
 use endless_gym::pool::{
     Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads, WrongFrame,
 };
@@ -23,12 +24,12 @@ fn config(spec: &EnvSpec) -> PoolConfig {
 }
 
 fn pool(config: &PoolConfig) -> Pool {
-    Pool::new(config, &Threads::new(1).unwrap()).unwrap()
+    Pool::new(memory_gym(), config, &Threads::new(1).unwrap()).unwrap()
 }
 
 /// Plays with several buffers, to which happens what can happen to buffers, and with everything that changes environments.
 fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mut SmallRng) -> Result<(), PoolError> {
-    let spec = pool.spec();
+    let spec = &pool.spec().clone();
     let mut buffers: Vec<Vec<Block>> = vec![zeroed(pool.layout().blocks()); 4];
     pool.reset(ResetRequest::All, &mut buffers[0])?;
     other.reset(ResetRequest::All, &mut buffers[1])?;
@@ -69,7 +70,7 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
 #[test]
 #[ignore = "slow"]
 fn every_environment_is_drawn_alike_in_irregular_buffers() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let mut random = SmallRng::seed_from_u64(1);
         let (mut one, mut other) = (pool(&config(spec)), pool(&config(spec)));
         let played = play_irregularly(&mut one, &mut other, 1000, &mut random);
@@ -81,7 +82,7 @@ fn every_environment_is_drawn_alike_in_irregular_buffers() {
 #[test]
 #[ignore = "slow"]
 fn many_circles_of_light_are_drawn_alike_in_irregular_buffers() {
-    let spec = envs::spec("SearingSpotlights-v0").unwrap();
+    let spec = memory_gym().spec("SearingSpotlights-v0").unwrap();
     for spotlights in [15, 24, 34] {
         let options =
             [("initial_spawns", json!(spotlights)), ("spot_min_speed", json!(0.002)), ("spot_damage", json!(0.0))];
@@ -99,7 +100,7 @@ proptest! {
     #[test]
     #[ignore = "slow"]
     fn environments_of_any_options_are_drawn_alike_in_irregular_buffers(
-        (spec, given, others) in prop::sample::select(envs::specs().collect::<Vec<_>>())
+        (spec, given, others) in prop::sample::select(memory_gym().specs().collect::<Vec<_>>())
             .prop_flat_map(|spec| (Just(spec), options(spec), options(spec))),
         same_step: bool,
         format in pixel_format(),
@@ -124,7 +125,7 @@ proptest! {
 /// A check that never fails would prove nothing.
 #[test]
 fn a_pixel_changed_from_outside_is_found() {
-    let spec = envs::spec("MortarMayhem-Grid-v0").unwrap();
+    let spec = memory_gym().spec("MortarMayhem-Grid-v0").unwrap();
     let mut pool = pool(&config(spec));
     let layout = pool.layout().clone();
     let mut buffer = zeroed(layout.blocks());
@@ -149,7 +150,8 @@ fn a_pixel_changed_from_outside_is_found() {
 
     // Without the check, it stays.
     let mut unchecked =
-        Pool::new(&PoolConfig { check_drawing: false, ..config(spec) }, &Threads::new(1).unwrap()).unwrap();
+        Pool::new(memory_gym(), &PoolConfig { check_drawing: false, ..config(spec) }, &Threads::new(1).unwrap())
+            .unwrap();
     unchecked.reset(ResetRequest::All, &mut buffer).unwrap();
     let before = Batch::new(&layout, &buffer).observation().to_vec();
     corrupt(&mut buffer);

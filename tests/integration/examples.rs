@@ -5,8 +5,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Once;
 
+use endless_gym::envs::ActionSpace;
+use endless_gym::pool::ResetRequest;
+
 use crate::support::place::Place;
-use crate::support::process::{Process, text};
+use crate::support::process::{Process, TIMEOUT, text};
 
 /// Runs an example to its end and returns what it printed.
 fn run(place: &Place, name: &str, arguments: &[&str]) -> String {
@@ -65,4 +68,28 @@ fn a_trainer_and_an_observer_beside_an_engine() {
     engine.interrupt();
     assert_eq!(observed.last().unwrap(), "the engine has ended");
     assert!(observer.wait().success());
+}
+
+#[test]
+fn a_program_serves_an_environment_that_its_trainer_does_not_know() {
+    let place = Place::new();
+    let listed = run(&place, "t_maze", &["list", "TMaze-v0"]);
+    assert!(listed.contains("Remember the cue") && listed.contains("max_steps"), "{listed}");
+    let serve = ["serve", "--env", "TMaze-v0", "--num-envs", "4", "--features", "--service", "maze"];
+    let mut engine = Process::spawn(place.command(example("t_maze")).args(serve).stdout(Stdio::null()));
+    let mut trainer = place.trainer("maze").unwrap();
+    assert_eq!(trainer.specification().action_space, ActionSpace::Discrete(3));
+    trainer.reset(0, ResetRequest::Seed(1)).unwrap();
+    let first = trainer.receive(0, TIMEOUT).unwrap();
+    let cues: Vec<i32> = first.batch().features().chunks_exact(2).map(|row| (row[0] == 1.0).into()).collect();
+    drop(first);
+    for step in 0..=10 {
+        let fill = |actions: &mut [i32]| if step < 10 { actions.fill(2) } else { actions.copy_from_slice(&cues) };
+        trainer.send_with(0, fill).unwrap();
+        let lease = trainer.receive(0, TIMEOUT).unwrap();
+        assert_eq!(lease.batch().terminated(), [u8::from(step == 10); 4]);
+        assert_eq!(lease.batch().reward(), [if step == 10 { 1.0 } else { -0.01 }; 4]);
+    }
+    drop(trainer);
+    engine.interrupt();
 }

@@ -1,17 +1,17 @@
 //! Scripted experts solve what can be solved, from what a frame shows and what they remember.
 
 use crate::support::player::Player;
-use endless_gym::envs;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Experts, PoolConfig, Seeding};
 
 /// Plays `num_envs` environments with the seeds from 0 on, for `steps` steps or until all first episodes have ended. The info
 /// of each first episode that ended.
 fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
-    let spec = envs::spec(id).unwrap();
+    let spec = memory_gym().spec(id).unwrap();
     let config =
         PoolConfig { features: true, seeding: Seeding::Continue { seed: Some(0) }, ..PoolConfig::new(id, num_envs) };
     let mut player = Player::started(&config);
-    let mut experts = Experts::new(spec, num_envs, config.autoreset);
+    let mut experts = Experts::new(memory_gym(), spec.id, num_envs, config.autoreset).unwrap();
     let mut ended = vec![None; num_envs];
     let mut actions = vec![0; num_envs * spec.action_space.branches().len()];
     for _ in 0..steps {
@@ -54,7 +54,7 @@ fn endless_mortar_mayhem_goes_on() {
 
 /// How many of the first episodes with these seeds end with success, each within its step limit.
 fn solved(id: &str, num_envs: usize, steps: usize) -> usize {
-    let success = envs::spec(id).unwrap().info.iter().position(|column| column.name == "success").unwrap();
+    let success = memory_gym().spec(id).unwrap().info.iter().position(|column| column.name == "success").unwrap();
     play(id, num_envs, steps).iter().flatten().filter(|info| info[success] == 1.0).count()
 }
 

@@ -8,7 +8,8 @@ use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::text;
 use endless_gym::batch::{Frames, PixelFormat};
-use endless_gym::envs::{self, view::VIEW_BYTES};
+use endless_gym::envs::view::VIEW_BYTES;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, Experts, PoolConfig, ResetRequest};
 
 const SIDE: usize = 84;
@@ -28,7 +29,7 @@ fn frames(id: &str, seed: u64, max_steps: usize) -> Vec<(Picture, Picture)> {
     let mut player = Player::new(&config);
     player.reset(ResetRequest::Seed(seed));
     let spec = player.pool.spec();
-    let mut experts = Experts::new(spec, 1, config.autoreset);
+    let mut experts = Experts::new(memory_gym(), spec.id, 1, config.autoreset).unwrap();
     let mut action = vec![0; spec.action_space.branches().len()];
     let mut frames = Vec::new();
     loop {
@@ -108,7 +109,7 @@ fn png_films_have_every_pixel_of_every_episode() {
     }
     let decoded = decode_png(&file);
     assert_eq!(decoded.len(), episodes[0].len() + episodes[1].len());
-    let fps = f64::from(envs::spec(id).unwrap().render_fps);
+    let fps = f64::from(memory_gym().spec(id).unwrap().render_fps);
     for (number, ((picture, delay), frame)) in decoded.iter().zip(episodes.iter().flatten()).enumerate() {
         assert!(*picture == both(frame, 2), "picture {number}");
         let is_last = number == episodes[0].len() - 1 || number == decoded.len() - 1;
@@ -149,7 +150,8 @@ fn webp_films_have_every_pixel_of_every_episode() {
             assert!(*picture == both(frame, scale), "{id}, picture {number}");
         }
         // Milliseconds, but the film as a whole is as long as it has to be.
-        let fps = options.get(1).map_or(f64::from(envs::spec(id).unwrap().render_fps), |fps| fps.parse().unwrap());
+        let fps =
+            options.get(1).map_or(f64::from(memory_gym().spec(id).unwrap().render_fps), |fps| fps.parse().unwrap());
         let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
         let expected = decoded.len() as f64 / fps + 2.0;
         assert!((duration - expected).abs() < 0.0006, "{id}: {duration} s, expected {expected} s");
@@ -204,7 +206,7 @@ fn gif_films_are_as_exact_as_their_palettes() {
         }
         // Hundredths of a second, but the film as a whole is as long as it has to be.
         let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
-        let expected = frames.len() as f64 / f64::from(envs::spec(id).unwrap().render_fps) + 1.0;
+        let expected = frames.len() as f64 / f64::from(memory_gym().spec(id).unwrap().render_fps) + 1.0;
         assert!((duration - expected).abs() < 0.006, "{id}: {duration} s, expected {expected} s");
     }
     assert!(exact > 0, "no picture has few colours: {exact}, {near}");
@@ -237,7 +239,7 @@ fn mp4_films_are_encoded_by_ffmpeg() {
     place.script("ffmpeg", "echo \"$@\" > \"$0.arguments\"; while [ $# -gt 1 ]; do shift; done; cat > \"$1\"");
     let written = run();
     assert!(written.status.success(), "{}", text(&written.stderr));
-    let fps = envs::spec(id).unwrap().render_fps as usize;
+    let fps = memory_gym().spec(id).unwrap().render_fps as usize;
     let mut expected: Vec<Picture> = frames(id, 0, 4).iter().map(|frame| both(frame, 2)).collect();
     let last = expected[4].clone();
     expected.extend(std::iter::repeat_n(last, fps));

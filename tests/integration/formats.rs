@@ -5,7 +5,8 @@ use std::collections::VecDeque;
 use crate::support::player::{Player, random_actions};
 use crate::support::recorded::pixel_formats;
 use endless_gym::batch::{BatchSection, Frames, PixelFormat};
-use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, Parameter, SCREEN};
+use endless_gym::envs::{EnvSpec, FRAME_BYTES, Parameter, SCREEN};
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, PoolError, ResetOptions, Seeding};
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
@@ -97,7 +98,7 @@ fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
 #[test]
 #[ignore = "slow"]
 fn every_format_is_a_plain_conversion() {
-    for (number, spec) in envs::specs().enumerate() {
+    for (number, spec) in memory_gym().specs().enumerate() {
         // Each environment takes its turn with some of the formats; all with the paper's grey stacks.
         for format in pixel_formats().filter(|format| usize::from(format.row_major) == number % 2) {
             compare(spec, Frames { format, stack: 1 }, 300);
@@ -106,7 +107,7 @@ fn every_format_is_a_plain_conversion() {
         compare(spec, Frames { format, stack: 4 }, 300);
     }
     for format in pixel_formats() {
-        compare(envs::spec("Endless-MysteryPath-v0").unwrap(), Frames { format, stack: 3 }, 300);
+        compare(memory_gym().spec("Endless-MysteryPath-v0").unwrap(), Frames { format, stack: 3 }, 300);
     }
 }
 
@@ -114,7 +115,8 @@ fn every_format_is_a_plain_conversion() {
 fn a_stack_has_its_limits() {
     for given in [0, 65] {
         let frames = Some(Frames { stack: given, ..Frames::default() });
-        let error = PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", 1) }.validate().unwrap_err();
+        let config = PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", 1) };
+        let error = config.validate(memory_gym().spec("MysteryPath-v0").unwrap()).unwrap_err();
         assert!(matches!(error, PoolError::Stack { given: found } if found == given), "{error}");
     }
 }
@@ -123,7 +125,7 @@ fn a_stack_has_its_limits() {
 #[test]
 fn a_restored_stack_starts_anew() {
     let format = PixelFormat { channels_first: true, ..PixelFormat::default() };
-    let mut player = started(envs::spec("MysteryPath-v0").unwrap(), Frames { format, stack: 2 });
+    let mut player = started(memory_gym().spec("MysteryPath-v0").unwrap(), Frames { format, stack: 2 });
     let snapshot = player.pool.snapshot(0).unwrap();
     (0..3).for_each(|_| player.step_all(1));
     player.pool.restore(1, &snapshot).unwrap();

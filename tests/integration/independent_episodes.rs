@@ -1,8 +1,9 @@
 //! `PoolConfig::independent_episodes`: an episode depends on its seed and its reset parameters alone.
 
 use crate::support::player::Player;
+use endless_gym::envs::EnvSpec;
 use endless_gym::envs::view::VIEW_BYTES;
-use endless_gym::envs::{self, EnvSpec};
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError};
 use proptest::prelude::*;
 use rand::SeedableRng;
@@ -42,7 +43,7 @@ fn config(spec: &EnvSpec, independent_episodes: bool) -> PoolConfig {
 }
 
 fn with_options() -> impl Strategy<Value = (&'static EnvSpec, OptionMap, OptionMap)> {
-    prop::sample::select(envs::specs().collect::<Vec<_>>()).prop_flat_map(|spec| {
+    prop::sample::select(memory_gym().specs().collect::<Vec<_>>()).prop_flat_map(|spec| {
         (Just(spec), crate::support::recorded::options(spec), crate::support::recorded::options(spec))
     })
 }
@@ -76,7 +77,7 @@ fn leaks() -> [(&'static str, OptionMap); 3] {
 #[test]
 fn only_with_the_option_a_new_environment_plays_the_same() {
     for (id, earlier) in leaks() {
-        let spec = envs::spec(id).unwrap();
+        let spec = memory_gym().spec(id).unwrap();
         for independent in [false, true] {
             let [mut fresh, mut used] = [(); 2].map(|()| Player::new(&config(spec, independent)));
             reset(&mut used, 7, &earlier);
@@ -114,7 +115,7 @@ fn short_episodes(spec: &EnvSpec) -> ResetOptions {
 
 #[test]
 fn later_episodes_depend_on_the_seed_and_not_on_what_was_played() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let seeded = |independent, seed| PoolConfig {
             seeding: Seeding::Continue { seed },
             options: short_episodes(spec),
@@ -133,7 +134,7 @@ fn later_episodes_depend_on_the_seed_and_not_on_what_was_played() {
 
 #[test]
 fn snapshots_go_on_with_the_same_seeds() -> Result<(), SnapshotError> {
-    let spec = envs::spec("MortarMayhem-Grid-v0").unwrap();
+    let spec = memory_gym().spec("MortarMayhem-Grid-v0").unwrap();
     let mut first = Player::new(&config(spec, true));
     reset(&mut first, 3, &OptionMap::new());
     let snapshot = first.pool.snapshot(0)?;

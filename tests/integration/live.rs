@@ -10,7 +10,8 @@ use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
 use crate::support::player::Player;
 use crate::support::process::Process;
-use endless_gym::envs::{self, EnvSpec};
+use endless_gym::envs::EnvSpec;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Trace, replay};
 use proptest::prelude::*;
@@ -93,7 +94,7 @@ fn play(spec: &'static EnvSpec, case: &Case) -> Json {
     let mut episodes = Vec::new();
     for seed in std::iter::once(Some(case.first_seed)).chain(case.seeds.iter().copied()) {
         player.reset(seed.map_or(ResetRequest::All, ResetRequest::Seed));
-        let mut expert = envs::expert(spec);
+        let mut expert = memory_gym().expert(spec.id).unwrap();
         let mut actions = Vec::new();
         for _ in 0..MAX_STEPS {
             let batch = player.batch();
@@ -117,7 +118,7 @@ fn play(spec: &'static EnvSpec, case: &Case) -> Json {
 const NEWER: [&str; 3] = ["reward_new_command_success", "reward_path_progress_dense", "coin_enabled"];
 
 fn compare(id: &str) {
-    let spec = envs::spec(id).unwrap();
+    let spec = memory_gym().spec(id).unwrap();
     let asked: Option<usize> = std::env::var("ENDLESS_LIVE_STEPS").ok().map(|text| text.parse().unwrap());
     let wanted = asked.unwrap_or(1500);
     let mut seeds = SmallRng::seed_from_u64(asked.map_or(0, |_| rand::random()));
@@ -134,7 +135,7 @@ fn compare(id: &str) {
                     return Ok(());
                 }
                 let trace: Trace = serde_json::from_value(answer).unwrap();
-                let replay = replay(&trace).unwrap();
+                let replay = replay(memory_gym(), &trace).unwrap();
                 prop_assert_eq!(replay.first, None);
                 steps.set(steps.get() + replay.steps);
                 Ok(())
@@ -162,7 +163,7 @@ macro_rules! live {
         #[test]
         fn no_id_is_forgotten() {
             let mut compared = vec![$($id),*];
-            let mut all: Vec<&str> = envs::specs().map(|spec| spec.id).collect();
+            let mut all: Vec<&str> = memory_gym().specs().map(|spec| spec.id).collect();
             compared.sort_unstable();
             all.sort_unstable();
             assert_eq!(compared, all);

@@ -12,6 +12,7 @@ mod independent_episodes;
 mod live;
 mod meanings;
 mod next_options;
+mod own_environment;
 mod play_page;
 mod pool;
 mod program;

@@ -2,7 +2,8 @@
 
 use crate::support::player::Player;
 use endless_gym::batch::Batch;
-use endless_gym::envs::{self, EnvSpec};
+use endless_gym::envs::EnvSpec;
+use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetOptions, ResetRequest};
 use serde_json::json;
 
@@ -73,7 +74,7 @@ fn direction(name: &str) -> [f32; 2] {
 
 #[test]
 fn every_number_has_a_meaning() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let choices: Vec<_> = spec.actions.iter().map(|branch| branch.choices.len() as i32).collect();
         assert_eq!(choices, spec.action_space.branches(), "{}", spec.id);
         let player = Named::new(spec, 1, json!({}));
@@ -89,7 +90,7 @@ fn every_number_has_a_meaning() {
 
 #[test]
 fn actions_move_the_agent_as_their_names_say() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let is_grid = spec.actions.iter().any(|branch| branch.choices.iter().any(|choice| choice.name == "ahead"));
         let follows_a_path = spec.id == "Endless-MysteryPath-v0";
         let mut moved = 0;
@@ -124,7 +125,7 @@ fn actions_move_the_agent_as_their_names_say() {
 #[test]
 fn on_a_grid_actions_turn_and_walk() {
     let mut walked = 0;
-    for spec in envs::specs().filter(|spec| spec.id.contains("Grid")) {
+    for spec in memory_gym().specs().filter(|spec| spec.id.contains("Grid")) {
         let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
         assert_eq!(names, ["nothing", "left", "right", "ahead"]);
         for seed in 0..20 {
@@ -160,7 +161,7 @@ fn on_a_grid_actions_turn_and_walk() {
 
 #[test]
 fn the_ground_truth_of_endless_mortar_mayhem_is_the_tile_that_does_not_burn() {
-    let spec = envs::spec("Endless-MortarMayhem-v0").unwrap();
+    let spec = memory_gym().spec("Endless-MortarMayhem-v0").unwrap();
     let mut burnt = 0;
     for seed in 0..20 {
         let mut player = Named::new(spec, seed, json!({}));
@@ -179,7 +180,7 @@ fn the_ground_truth_of_endless_mortar_mayhem_is_the_tile_that_does_not_burn() {
 
 #[test]
 fn the_ground_truth_of_endless_searing_spotlights_is_where_agent_and_coin_are() {
-    let spec = envs::spec("Endless-SearingSpotlights-v0").unwrap();
+    let spec = memory_gym().spec("Endless-SearingSpotlights-v0").unwrap();
     let pairs = [("agent_x", "agent_x"), ("agent_y", "agent_y"), ("coin_x", "coin_0_x"), ("coin_y", "coin_0_y")];
     let mut player = Named::new(spec, 3, json!({"agent_visible": true, "coins_visible": true}));
     for step in 0..40 {
@@ -194,7 +195,7 @@ fn the_ground_truth_of_endless_searing_spotlights_is_where_agent_and_coin_are() 
 
 #[test]
 fn the_ground_truth_of_endless_mystery_path_leads_along_it() {
-    let spec = envs::spec("Endless-MysteryPath-v0").unwrap();
+    let spec = memory_gym().spec("Endless-MysteryPath-v0").unwrap();
     let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
     for seed in 0..10 {
         let mut player = Named::new(spec, seed, json!({"agent_speed": 12.0}));

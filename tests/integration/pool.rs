@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use crate::support::player::{Player, random_actions};
 use crate::support::recorded::{options as any_options, property_cases};
 use endless_gym::envs::{self, ActionError};
+use endless_gym::memory_gym;
 use endless_gym::pool::{
     Autoreset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
@@ -37,7 +38,7 @@ fn first_frame(seed: u64) -> Vec<u8> {
 
 #[test]
 fn results_do_not_depend_on_the_number_of_threads() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let config = PoolConfig {
             seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
             features: true,
@@ -270,11 +271,13 @@ fn without_frames_nothing_else_changes() {
 #[test]
 fn wrong_configurations_are_refused() {
     let refused = |config: PoolConfig| {
-        let error = Pool::new(&config, &Threads::new(1).unwrap()).err().unwrap();
-        assert_eq!(config.validate().unwrap_err().to_string(), error.to_string());
+        let error = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).err().unwrap();
+        if let Ok(spec) = memory_gym().spec(&config.id) {
+            assert_eq!(config.validate(spec).unwrap_err().to_string(), error.to_string());
+        }
         error
     };
-    assert!(config(2).validate().is_ok());
+    assert!(config(2).validate(memory_gym().spec(ID).unwrap()).is_ok());
     let with =
         |given: Json| refused(PoolConfig { options: ResetOptions::Shared(options(given)), ..config(2) }).to_string();
     assert!(matches!(refused(PoolConfig::new("Nothing-v0", 1)), PoolError::UnknownEnvironment(_)));
@@ -322,7 +325,7 @@ proptest! {
     /// Any options within the limits, any seed, any actions: nothing panics, and two pools agree.
     #[test]
     fn any_options_within_the_limits_can_be_played(
-        (spec, given) in prop::sample::select(envs::specs().collect::<Vec<_>>())
+        (spec, given) in prop::sample::select(memory_gym().specs().collect::<Vec<_>>())
             .prop_flat_map(|spec| (Just(spec), any_options(spec))),
         seed: u64,
     ) {

@@ -2,7 +2,7 @@
 
 use crate::support::player::{Player, random_actions};
 use endless_gym::batch::Batch;
-use endless_gym::envs::{self, specs};
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Recorder, Trace, replay};
 use rand::rngs::SmallRng;
@@ -22,7 +22,7 @@ fn as_floats(json: Json) -> Json {
 /// What the original returned, played here with its actions and recorded, is the original's file.
 #[test]
 fn a_recording_equals_the_originals() {
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         let expected =
             Trace::open(&crate::support::recorded::reference().join(format!("traces/{}.03.mixed02.json.gz", spec.id)))
                 .unwrap();
@@ -53,7 +53,7 @@ fn a_recording_equals_the_originals() {
 #[test]
 fn unfinished_recordings_are_replayed() {
     let mut random = SmallRng::seed_from_u64(1);
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         for steps in [0, 1, 25] {
             let config = PoolConfig { autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
             let Player { mut pool, mut blocks } = Player::new(&config);
@@ -71,7 +71,7 @@ fn unfinished_recordings_are_replayed() {
             let mut file = Vec::new();
             recorder.write(&mut file).unwrap();
             let mut trace = Trace::read(file.as_slice()).unwrap();
-            let replayed = replay(&trace).unwrap();
+            let replayed = replay(memory_gym(), &trace).unwrap();
             assert_eq!(replayed.differences, 0, "{}: {:?}", spec.id, replayed.first);
             if trace.max_steps.is_some() {
                 trace.max_steps = Some(26);
@@ -84,11 +84,11 @@ fn unfinished_recordings_are_replayed() {
 /// The numbers that a viewer is shown during an episode arrive at those of the final info.
 #[test]
 fn progress_ends_at_the_final_info() {
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         let config = PoolConfig { features: true, autoreset: Autoreset::Disabled, ..PoolConfig::new(spec.id, 1) };
         let Player { mut pool, mut blocks } = Player::new(&config);
         pool.progress(0).unwrap_err();
-        let mut expert = envs::expert(spec);
+        let mut expert = memory_gym().expert(spec.id).unwrap();
         let mut random = SmallRng::seed_from_u64(2);
         // The expert is interrupted by random actions, so that episodes end in all ways.
         for seed in 0..4 {

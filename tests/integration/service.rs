@@ -10,7 +10,8 @@ use crate::support::player::Player;
 use crate::support::process::{TIMEOUT, unshare};
 use crate::support::service::{ID, assert_error, assert_rejected, play, send, set_role, step, try_step};
 use endless_gym::batch::Block;
-use endless_gym::envs::{ActionError, ActionSpace, spec};
+use endless_gym::envs::{ActionError, ActionSpace};
+use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
     ConnectConfig, Engine, EngineStatus, Namespace, Observer, ROOT_VARIABLE, Rejection, ServiceError,
@@ -70,7 +71,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
     let place = Place::new();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
-        let mut engine = Engine::new(&place.engine_config("gym", 2, 1)).unwrap();
+        let mut engine = Engine::new(memory_gym(), &place.engine_config("gym", 2, 1)).unwrap();
         let stop = &stop;
         let running = scope.spawn(move || engine.run(stop).unwrap());
         let mut trainer = place.trainer("gym").unwrap();
@@ -122,7 +123,7 @@ fn a_second_trainer_and_a_second_engine_are_refused() {
     let _trainer = place.trainer("gym").unwrap();
     let own = std::process::id();
     assert_error!(place.trainer("gym"), ServiceError::TrainerExists { pid: Some(pid), .. } if *pid == own);
-    let second = Engine::new(&place.engine_config("gym", 1, 1));
+    let second = Engine::new(memory_gym(), &place.engine_config("gym", 1, 1));
     let error = assert_error!(second, ServiceError::EngineExists { pid: Some(pid), .. } if *pid == engine.id());
     assert!(error.to_string().contains("gym"));
 }
@@ -254,7 +255,7 @@ fn deaths_at_any_moment_are_survived() {
 #[test]
 fn an_engine_that_ends_gives_up_its_name_without_the_lock() {
     let place = Place::new();
-    let engine = Engine::new(&place.engine_config("gym", 1, 1)).unwrap();
+    let engine = Engine::new(memory_gym(), &place.engine_config("gym", 1, 1)).unwrap();
     let lock = File::open(place.root()).unwrap();
     lock.lock().unwrap();
     std::thread::scope(|scope| {
@@ -402,13 +403,24 @@ fn a_malformed_specification_is_an_error_and_not_a_panic() {
         ("groups", ServiceSpecification { groups: 0, ..valid.clone() }),
         ("num_envs", ServiceSpecification { num_envs: 0, ..valid.clone() }),
         ("batches_held", ServiceSpecification { batches_held: 0, ..valid.clone() }),
-        ("Chess-v0", ServiceSpecification { id: "Chess-v0".to_owned(), ..valid.clone() }),
-        ("action", ServiceSpecification { action: action_layout(spec(ID).unwrap(), 2).unwrap(), ..valid.clone() }),
+        (
+            "action",
+            ServiceSpecification {
+                action: action_layout(&memory_gym().spec(ID).unwrap().action_space, 2).unwrap(),
+                ..valid.clone()
+            },
+        ),
         (
             "batch",
-            ServiceSpecification { batch: batch_layout(spec(ID).unwrap(), 2, CONTENTS).unwrap(), ..valid.clone() },
+            ServiceSpecification {
+                batch: batch_layout(memory_gym().spec(ID).unwrap(), 2, CONTENTS).unwrap(),
+                ..valid.clone()
+            },
         ),
-        ("action space", ServiceSpecification { action_space: ActionSpace::Discrete(9), ..valid.clone() }),
+        (
+            "action must be the layout of actions in MultiDiscrete([3, 3, 3])",
+            ServiceSpecification { action_space: ActionSpace::multi_discrete(&[3, 3, 3]), ..valid.clone() },
+        ),
         ("info must name", ServiceSpecification { info: vec![], ..valid.clone() }),
         ("features must name", ServiceSpecification { features: vec!["x".to_owned()], ..valid.clone() }),
         ("service must be `malformed`, got `gym`", published),
@@ -443,7 +455,7 @@ fn a_late_engine_finds_the_successor_of_a_dead_one() {
     let lock = File::open(place.root()).unwrap();
     lock.lock().unwrap();
     std::thread::scope(|scope| {
-        let late = scope.spawn(|| Engine::new(&place.engine_config("gym", 1, 1)).map(drop));
+        let late = scope.spawn(|| Engine::new(memory_gym(), &place.engine_config("gym", 1, 1)).map(drop));
         std::thread::sleep(Duration::from_millis(500));
         // A successor takes the name while the other engine waits.
         let _successor = foreign::engine_of_version(place.namespace(), "gym", 999);
@@ -459,7 +471,7 @@ fn of_several_engines_one_takes_the_name_of_a_dead_one() {
     let place = Place::new();
     remains(&place, "gym");
     std::thread::scope(|scope| {
-        let start = || Engine::new(&place.engine_config("gym", 1, 1));
+        let start = || Engine::new(memory_gym(), &place.engine_config("gym", 1, 1));
         let threads: Vec<_> = (0..4).map(|_| scope.spawn(start)).collect();
         let started: Vec<_> = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
         assert_eq!(started.iter().filter(|engine| engine.is_ok()).count(), 1);

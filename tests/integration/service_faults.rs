@@ -16,6 +16,7 @@ use crate::support::foreign;
 use crate::support::place::Place;
 use crate::support::process::{Process, TIMEOUT, inside_namespace, unshare, wait_until};
 use crate::support::service::{ID, assert_error, play, reset, step};
+use endless_gym::memory_gym;
 use endless_gym::pool::ResetRequest;
 use endless_gym::service::{Engine, LockHolder, Namespace, Observer, ServiceError, running_engines};
 use rustix::process::Signal;
@@ -176,7 +177,7 @@ fn an_engine_whose_directory_is_removed_comes_back() {
 #[test]
 fn an_engine_ends_with_an_error_when_its_directory_is_removed() {
     let place = Place::new();
-    let mut engine = Engine::new(&place.engine_config("gym", 1, 1)).unwrap();
+    let mut engine = Engine::new(memory_gym(), &place.engine_config("gym", 1, 1)).unwrap();
     fs::remove_dir_all(place.root()).unwrap();
     let start = Instant::now();
     assert_error!(engine.run(&AtomicBool::new(false)), ServiceError::RootRemoved { .. });

@@ -8,6 +8,7 @@ use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::TIMEOUT;
 use crate::support::service::{ID, reset, step};
+use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{Engine, EngineConfig, EngineStatus, Observer, ServiceError, Trainer};
 
@@ -77,7 +78,7 @@ fn a_lease_is_valid_while_its_observer_is_paused() {
 fn a_paused_observer_keeps_its_place() {
     let place = Place::new();
     let config = EngineConfig { observers: 2, ..place.engine_config("gym", NUM_ENVS, 1) };
-    let mut engine = Engine::new(&config).unwrap();
+    let mut engine = Engine::new(memory_gym(), &config).unwrap();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         scope.spawn(|| engine.run(&stop).unwrap());

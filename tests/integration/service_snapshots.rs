@@ -8,6 +8,7 @@ use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::TIMEOUT;
 use crate::support::service::{ID, assert_error, assert_rejected, reset};
+use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::service::{Engine, EngineConfig, Rejection, ServiceError, Trainer};
 use endless_gym_core::batch::SNAPSHOT_BYTES;
@@ -138,7 +139,8 @@ fn a_thousand_spotlights_fit() {
     let options = ResetOptions::Shared(options.as_object().unwrap().clone());
     let pool = PoolConfig { options, features: true, frames: None, ..PoolConfig::new("SearingSpotlights-v0", 1) };
     let config = EngineConfig::new("gym", pool, 1);
-    let mut engine = Engine::new(&EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();
+    let mut engine =
+        Engine::new(memory_gym(), &EngineConfig { namespace: place.namespace().clone(), ..config }).unwrap();
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         scope.spawn(|| engine.run(&stop).unwrap());

@@ -1,7 +1,7 @@
 //! Snapshots: a restored environment continues identically in any pool.
 
 use crate::support::player::{Player, random_actions};
-use endless_gym::envs;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetOptions, ResetRequest, SNAPSHOT_VERSION, Seeding, SnapshotError};
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
@@ -13,7 +13,7 @@ fn config(id: &str, seed: u64) -> PoolConfig {
 
 #[test]
 fn a_restored_environment_continues_identically() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         for played in [0, 1, 7, 130] {
             let mut original = Player::started(&config(spec.id, 4));
             let mut random = SmallRng::seed_from_u64(played);

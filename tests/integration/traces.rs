@@ -4,7 +4,7 @@ use std::io::Read;
 
 use crate::support::player::Player;
 use crate::support::recorded::{reference, traces, traces_with_views};
-use endless_gym::envs;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, ResetOptions, ResetRequest};
 use endless_gym::trace::{Trace, TraceError, replay};
 
@@ -13,7 +13,7 @@ fn replay_all(id: &str) {
     let mut views = 0;
     for file in traces(id).into_iter().chain(traces_with_views(id)) {
         let trace = Trace::open(&file).unwrap();
-        let replay = replay(&trace).unwrap();
+        let replay = replay(memory_gym(), &trace).unwrap();
         assert_eq!(replay.first, None, "{}", file.display());
         assert_eq!(replay.differences, 0, "{}", file.display());
         assert_eq!(replay.episodes, trace.episodes.len());
@@ -72,7 +72,7 @@ fn every_kind_of_difference_is_found() {
     for (what, id, file, change) in changes {
         let mut trace = open(id, file);
         change(&mut trace);
-        let first = replay(&trace).unwrap().first.unwrap_or_else(|| panic!("{what} was not compared"));
+        let first = replay(memory_gym(), &trace).unwrap().first.unwrap_or_else(|| panic!("{what} was not compared"));
         assert_eq!((first.what.as_str(), first.episode), (what, 1), "{first}");
     }
 }
@@ -80,7 +80,7 @@ fn every_kind_of_difference_is_found() {
 /// A checksum tells that a frame differs; the recorded frames tell where.
 #[test]
 fn the_first_frames_are_the_same_byte_by_byte() {
-    for spec in envs::specs() {
+    for spec in memory_gym().specs() {
         let trace = Trace::open(&reference().join(format!("traces/{}.04.mixed20.json.gz", spec.id))).unwrap();
         let expected = recorded_frames(spec.id);
         let found = frames(&trace, expected.len());
@@ -194,5 +194,5 @@ fn a_trace_without_its_last_steps_is_an_error() {
 fn a_trace_of_an_unknown_environment_is_an_error() {
     let mut trace = Trace::open(&traces("MortarMayhem-v0")[0]).unwrap();
     trace.env = "NoSuchThing-v0".to_owned();
-    assert!(matches!(replay(&trace), Err(TraceError::Pool(_))));
+    assert!(matches!(replay(memory_gym(), &trace), Err(TraceError::Pool(_))));
 }

@@ -16,8 +16,8 @@ mod single;
 
 use std::ffi::OsString;
 
-use endless_gym::envs;
 use endless_gym::pool::Autoreset;
+use endless_gym::{DEFAULT_ENV_ID, memory_gym};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
@@ -25,14 +25,14 @@ use pyo3::types::PyTuple;
 /// The specifications of all environments, as JSON text.
 #[pyfunction]
 fn specs() -> PyResult<String> {
-    let specs: Vec<_> = envs::specs().collect();
+    let specs: Vec<_> = memory_gym().specs().collect();
     serde_json::to_string(&specs).map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }
 
 /// Runs the program `endless` and returns its exit status. `executable` is the command that starts it in a new process.
 #[pyfunction]
 fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) -> u8 {
-    py.detach(|| endless_gym_cli::main(arguments, &executable))
+    py.detach(|| endless_gym_cli::main(memory_gym(), arguments, &executable))
 }
 
 #[pymodule(name = "_native")]
@@ -40,7 +40,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("AUTORESET_MODES", PyTuple::new(py, Autoreset::ALL.map(Autoreset::name))?)?;
-    module.add("DEFAULT_ENV_ID", envs::DEFAULT_ENV_ID)?;
+    module.add("DEFAULT_ENV_ID", DEFAULT_ENV_ID)?;
     module.add("MAX_ENVS", endless_gym::pool::MAX_ENVS)?;
     module.add("MAX_GROUPS", endless_gym::service::MAX_GROUPS)?;
     module.add("MAX_THREADS", endless_gym::pool::MAX_THREADS)?;

@@ -4,6 +4,7 @@
 
 use endless_gym::batch::Block;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
+use endless_gym::memory_gym;
 use endless_gym::pool::{NextOptions, OptionMap, Pool, PoolConfig, PoolError, Threads};
 use endless_gym::service::ServiceError;
 use numpy::{PyArray1, PyArrayMethods};
@@ -18,7 +19,9 @@ use crate::{arrays, errors};
 /// Checks the configuration of a group, from JSON text, without making environments.
 #[pyfunction]
 pub fn check_pool_config(config: &str) -> PyResult<()> {
-    arguments::json::<PoolConfig>(config)?.validate().map_err(errors::pool)
+    let config: PoolConfig = arguments::json(config)?;
+    let spec = memory_gym().spec(&config.id).map_err(|error| errors::pool(error.into()))?;
+    config.validate(spec).map_err(errors::pool)
 }
 
 /// The environments of one group, and the buffers of its batches.
@@ -60,7 +63,7 @@ impl Pools {
     fn new(configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
         let threads = Threads::new(num_threads).map_err(errors::pool)?;
         let group = |config: &String| {
-            let pool = Pool::new(&arguments::json(config)?, &threads).map_err(errors::pool)?;
+            let pool = Pool::new(memory_gym(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
             Ok(Group { pool, buffers: Buffers::default(), actions: Vec::new() })
         };
         let pools: Vec<Group> = configs.iter().map(group).collect::<PyResult<_>>()?;

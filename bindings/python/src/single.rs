@@ -3,6 +3,7 @@
 use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
 use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
 use endless_gym::envs::{ActionSpace, FRAME_BYTES, SCREEN};
+use endless_gym::memory_gym;
 use endless_gym::pool::{OptionMap, Pool, ResetRequest, SavedEnv, Threads};
 use numpy::{Element, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -30,7 +31,7 @@ impl Single {
     #[new]
     fn new(config: &str) -> PyResult<Self> {
         let threads = Threads::new(1).map_err(errors::pool)?;
-        let pool = Pool::new(&arguments::json(config)?, &threads).map_err(errors::pool)?;
+        let pool = Pool::new(memory_gym(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
         let blocks = zeroed(pool.layout().blocks());
         let action_shape = ActionShape::single(&pool.spec().action_space);
         Ok(Single { pool, blocks, action_shape, action: Vec::new() })

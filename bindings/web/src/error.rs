@@ -1,7 +1,7 @@
 //! The errors of the page's engine. Those of reset parameters, actions and traces are the core's, unchanged.
 
 use endless_gym_core::envs::UnknownEnvironment;
-use endless_gym_core::pool::{ExpertsError, PoolError};
+use endless_gym_core::pool::{ExpertsError, NoExpert, PoolError};
 use endless_gym_core::trace::TraceError;
 use thiserror::Error;
 
@@ -38,6 +38,8 @@ pub enum WebError {
     UnknownEnvironment(#[from] UnknownEnvironment),
     #[error(transparent)]
     Pool(#[from] PoolError),
+    #[error(transparent)]
+    NoExpert(#[from] NoExpert),
     #[error(transparent)]
     Experts(#[from] ExpertsError),
     #[error(transparent)]

@@ -5,6 +5,7 @@ use std::rc::Rc;
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
 use endless_gym_core::envs::{self, Expert};
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::trace::{Recorder, Trace};
 use serde_json::{Map, Value as Json, json};
@@ -63,10 +64,10 @@ impl Game {
             features: true,
             ..PoolConfig::new(id, 1)
         };
-        let pool = Pool::new(&config, &Threads::new(1)?)?;
+        let pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
         let blocks = zeroed(pool.layout().blocks());
         let mut game = Game {
-            expert: envs::expert(pool.spec()),
+            expert: memory_gym().expert(pool.spec().id)?,
             expert_is_in: true,
             agent_memory: None,
             clues: Clues::new(pool.spec()),

@@ -2,6 +2,7 @@
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs;
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Experts, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
 use serde_json::{Value as Json, json};
@@ -31,12 +32,12 @@ impl Group {
             features: expert,
             ..PoolConfig::new(id, num_envs)
         };
-        let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+        let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;
         let spec = pool.spec();
         let policy = match expert {
-            true => Policy::Experts(Experts::new(spec, num_envs, config.autoreset)),
+            true => Policy::Experts(Experts::new(memory_gym(), id, num_envs, config.autoreset)?),
             false => Policy::Random(Generator::from_seed(seed)),
         };
         let actions = vec![0; num_envs * spec.action_space.branches().len()];

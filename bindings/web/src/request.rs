@@ -3,7 +3,8 @@
 use std::collections::HashMap;
 use std::rc::Rc;
 
-use endless_gym_core::envs::{self, EnvSpec};
+use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{OptionMap, PoolConfig, ResetOptions};
 use endless_gym_core::trace::{Trace, replay};
 use serde::Deserialize;
@@ -82,10 +83,10 @@ impl Request {
                 let id = app.game.as_ref().ok_or(WebError::NoGame)?.id();
                 Player::Agent(Rc::clone(app.agents.get(id).ok_or(WebError::NoAgent { id })?))
             }
-            Request::Specs => return Ok(Reply::Json(envs::specs().map(spec).collect())),
+            Request::Specs => return Ok(Reply::Json(memory_gym().specs().map(spec).collect())),
             Request::Check { id, options } => {
                 let options = ResetOptions::Shared(parse(&options));
-                PoolConfig { options, ..PoolConfig::new(&id, 1) }.validate()?;
+                PoolConfig { options, ..PoolConfig::new(&id, 1) }.validate(memory_gym().spec(&id)?)?;
                 return Ok(Reply::Json(Json::Null));
             }
             Request::Start { id, options, seed } => {
@@ -113,7 +114,7 @@ impl Request {
 /// Replays a trace's file, and makes it the game.
 pub fn open(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
     let trace = Trace::read(file)?;
-    let outcome = replay(&trace)?;
+    let outcome = replay(memory_gym(), &trace)?;
     let state = app.game.insert(Game::replay(trace)?).state()?;
     Ok(Reply::Json(json!({
         "episodes": outcome.episodes,
@@ -140,7 +141,7 @@ pub fn step_wall(app: &mut App, count: u32) -> Result<Reply, WebError> {
 }
 
 /// The entry of the table, with the texts that the engine itself uses for limits and defaults.
-fn spec(spec: &'static EnvSpec) -> Json {
+fn spec(spec: &EnvSpec) -> Json {
     let mut value = json!(spec);
     value["action_branches"] = json!(spec.action_space.branches());
     for (parameter, json) in spec.parameters.iter().zip(value["parameters"].as_array_mut().into_iter().flatten()) {

@@ -1,7 +1,8 @@
 //! The interface, as JavaScript uses it.
 
 use super::*;
-use endless_gym_core::envs::{SCREEN, specs};
+use endless_gym_core::envs::SCREEN;
+use endless_gym_core::memory_gym;
 use serde_json::{Value as Json, json};
 
 fn put(bytes: &[u8]) {
@@ -27,7 +28,7 @@ fn start(id: &str, seed: &str) -> Result<Json, String> {
 
 #[test]
 fn every_environment_is_played_saved_and_opened_again() {
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         let mut state = start(spec.id, "7").unwrap();
         assert_eq!(state["seed"], "7");
         while state["done"] == false && state["length"].as_u64() < Some(300) {
@@ -97,7 +98,7 @@ fn the_expert_plays_from_the_first_step_or_not_at_all() {
 #[test]
 fn the_table_has_what_a_form_needs() {
     let table = request(&json!("specs")).unwrap();
-    assert_eq!(table.as_array().unwrap().len(), specs().count());
+    assert_eq!(table.as_array().unwrap().len(), memory_gym().specs().count());
     let parameter = &table[0]["parameters"][4];
     assert_eq!(
         (&parameter["name"], &parameter["type"], &parameter["default_text"], &parameter["allowed"]),
@@ -108,7 +109,8 @@ fn the_table_has_what_a_form_needs() {
 #[test]
 fn a_wall_plays_all_environments_at_once() {
     for expert in [false, true] {
-        let groups: Vec<Json> = specs().map(|spec| json!({"id": spec.id, "num_envs": 3, "options": {}})).collect();
+        let groups: Vec<Json> =
+            memory_gym().specs().map(|spec| json!({"id": spec.id, "num_envs": 3, "options": {}})).collect();
         let wall = json!({"wall": {"groups": groups, "columns": 7, "expert": expert, "seed": "3"}});
         let state = request(&wall).unwrap();
         // 30 environments in rows of 7.

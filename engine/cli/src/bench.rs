@@ -4,9 +4,10 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use endless_gym_core::DEFAULT_ENV_ID;
 use endless_gym_core::batch::{BLOCK_BYTES, Batch, BatchBuffer};
-use endless_gym_core::envs::{self, DEFAULT_ENV_ID, EnvSpec};
-use endless_gym_core::pool::{Pool, ResetRequest, Threads};
+use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::pool::{Pool, Registry, ResetRequest, Threads};
 use endless_gym_service::EngineConfig;
 use serde::Serialize;
 
@@ -97,10 +98,11 @@ struct Round {
 }
 
 /// Runs `endless bench`.
-pub fn run(args: &Args) -> Result<(), Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     options::seconds("--seconds", args.seconds)?;
     let stop = stop::on_signal()?;
-    let specs: Vec<&EnvSpec> = if args.id == "all" { envs::specs().collect() } else { vec![envs::spec(&args.id)?] };
+    let specs: Vec<&EnvSpec> =
+        if args.id == "all" { registry.specs().collect() } else { vec![registry.spec(&args.id)?] };
     let cores = Threads::new(0)?.count();
     let mut methods = vec![Method::InProcess { threads: 1 }];
     if cores > 1 {
@@ -117,7 +119,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         for _ in 0..args.rounds {
             for (method, results) in methods.iter().zip(&mut results) {
                 bar.set_message(format!("{}, {}", spec.id, name(*method)));
-                results.push(measure(args, spec, *method, stop)?);
+                results.push(measure(registry, args, spec, *method, stop)?);
                 if stop.load(Ordering::Relaxed) {
                     return Err("stopped before all measurements were done".into());
                 }
@@ -209,9 +211,15 @@ fn memory(row: &Row) -> String {
 }
 
 /// One round of one method.
-fn measure(args: &Args, spec: &'static EnvSpec, method: Method, stop: &AtomicBool) -> Result<Round, Failure> {
+fn measure(
+    registry: &Registry,
+    args: &Args,
+    spec: &EnvSpec,
+    method: Method,
+    stop: &AtomicBool,
+) -> Result<Round, Failure> {
     match method {
-        Method::InProcess { threads } => in_process(args, spec, threads, stop),
+        Method::InProcess { threads } => in_process(registry, args, spec, threads, stop),
         Method::ServiceReceives => through_service(args, spec, false, stop),
         Method::ServiceReads => through_service(args, spec, true, stop),
         Method::Original => Ok(Round { steps_per_second: original(args, spec)?, ..Round::default() }),
@@ -232,8 +240,14 @@ fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Fai
     Ok((batches * args.num_envs) as f64 / start.elapsed().as_secs_f64())
 }
 
-fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &AtomicBool) -> Result<Round, Failure> {
-    let mut pool = Pool::new(&args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
+fn in_process(
+    registry: &Registry,
+    args: &Args,
+    spec: &EnvSpec,
+    threads: usize,
+    stop: &AtomicBool,
+) -> Result<Round, Failure> {
+    let mut pool = Pool::new(registry, &args.environment.configure(spec.id, args.num_envs)?, &Threads::new(threads)?)?;
     let mut actions = Actions::new(spec, args.num_envs);
     let before = huge_pages::bytes(std::process::id(), huge_pages::PRIVATE);
     let mut blocks = BatchBuffer::new(pool.layout().blocks());
@@ -250,7 +264,7 @@ fn in_process(args: &Args, spec: &'static EnvSpec, threads: usize, stop: &Atomic
     })
 }
 
-fn through_service(args: &Args, spec: &'static EnvSpec, reads: bool, stop: &AtomicBool) -> Result<Round, Failure> {
+fn through_service(args: &Args, spec: &EnvSpec, reads: bool, stop: &AtomicBool) -> Result<Round, Failure> {
     let pool = args.environment.configure(spec.id, args.num_envs)?;
     let mut engine = EngineProcess::start(EngineConfig::new("endless", pool, args.threads))?;
     let mut trainer = engine.connect(stop)?;

@@ -4,8 +4,8 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use endless_gym_core::envs::{self, EnvSpec, Family};
-use endless_gym_core::pool::{Autoreset, Experts, PoolConfig, ResetRequest};
+use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::pool::{Autoreset, Experts, PoolConfig, Registry, ResetRequest};
 use endless_gym_service::EngineConfig;
 use serde_json::{Map, Value as Json, json};
 
@@ -74,16 +74,16 @@ const REFRESH_INTERVAL: Duration = Duration::from_millis(250);
 const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Runs `endless demo`.
-pub fn run(args: &Args) -> Result<(), Failure> {
-    let spec = envs::spec(&args.id)?;
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
+    let spec = registry.spec(&args.id)?;
     let seconds = match (args.seconds, args.view) {
         (None, true) => Duration::MAX,
         (given, _) => options::seconds("--seconds", given.unwrap_or(SECONDS))?,
     };
     let stop = stop::on_signal()?;
-    let num_envs = args.num_envs.unwrap_or(match (spec.family, args.policy) {
-        (Family::SearingSpotlights(_), Policy::Expert) => 16,
-        _ => 512,
+    let num_envs = args.num_envs.unwrap_or(match args.policy {
+        Policy::Expert => 64,
+        Policy::Random => 512,
     });
     let pool = PoolConfig { features: true, ..args.environment.configure(&args.id, num_envs)? };
     let config = EngineConfig { groups: args.groups, ..EngineConfig::new("endless", pool, args.threads) };
@@ -92,7 +92,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let _view = if args.view { Some(Beside::start(engine.service(), args.open)?) } else { None };
 
     let mut random = RandomPolicy::new(spec, 0);
-    let mut experts: Vec<_> = (0..args.groups).map(|_| Experts::new(spec, num_envs, Autoreset::NextStep)).collect();
+    let experts = || Experts::new(registry, spec.id, num_envs, Autoreset::NextStep);
+    let mut experts: Vec<_> = match args.policy {
+        Policy::Expert => (0..args.groups).map(|_| experts()).collect::<Result<_, _>>()?,
+        Policy::Random => Vec::new(),
+    };
     let mut statistics = EpisodeStatistics::new(spec);
     for group in 0..args.groups {
         trainer.reset(group, ResetRequest::All)?;

@@ -2,7 +2,7 @@
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::pool::{Experts, Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym_core::pool::{Experts, Pool, PoolConfig, Registry, ResetRequest, Threads};
 use endless_gym_core::raster::PixelFormat;
 
 use super::failure::Failure;
@@ -24,22 +24,27 @@ pub struct Film {
 
 impl Film {
     /// Starts the first episode of the environment that `config` describes, which its scripted expert plays.
-    pub fn new(config: &PoolConfig) -> Result<Self, Failure> {
-        Film::played_by(config, Policy::Expert, 0)
+    pub fn new(registry: &Registry, config: &PoolConfig) -> Result<Self, Failure> {
+        Film::played_by(registry, config, Policy::Expert, 0)
     }
 
     /// As [`new`](Film::new), with another policy. `action_seed` is the seed of the random actions.
-    pub fn played_by(config: &PoolConfig, policy: Policy, action_seed: u64) -> Result<Self, Failure> {
+    pub fn played_by(
+        registry: &Registry,
+        config: &PoolConfig,
+        policy: Policy,
+        action_seed: u64,
+    ) -> Result<Self, Failure> {
         let format = PixelFormat { row_major: true, ..PixelFormat::default() };
         let frames = Some(Frames { format, stack: 1 });
         let config = PoolConfig { num_envs: 1, total_envs: 1, features: true, frames, ..config.clone() };
-        let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+        let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;
         let spec = pool.spec();
         let actions = vec![0; spec.action_space.branches().len()];
         let player = match policy {
-            Policy::Expert => Player::Expert(Experts::new(spec, 1, config.autoreset)),
+            Policy::Expert => Player::Expert(Experts::new(registry, &config.id, 1, config.autoreset)?),
             Policy::Random => Player::Random(RandomPolicy::new(spec, action_seed)),
         };
         Ok(Film { player, pool, blocks, actions })

@@ -1,5 +1,6 @@
 //! `endless frames`: the raw frames of an expert's episode, for programs that make pictures of them.
 
+use endless_gym_core::pool::Registry;
 use std::io::{self, ErrorKind, Write};
 
 use super::failure::Failure;
@@ -21,8 +22,8 @@ pub struct Args {
 
 /// Runs `endless frames`: for the start and each step of the first episode, writes the observation, uint8 (84, 84, 3), and the
 /// ground-truth view, uint8 (336, 336, 3), both indexed \[row\]\[column\]\[channel\].
-pub fn run(args: &Args) -> Result<(), Failure> {
-    let mut film = Film::new(&args.environment.configure(&args.id, 1)?)?;
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
+    let mut film = Film::new(registry, &args.environment.configure(&args.id, 1)?)?;
     let mut stdout = io::stdout().lock();
     for _ in 0..=args.steps {
         let view = film.ground_truth_view()?;

@@ -31,6 +31,7 @@ mod watch;
 use std::ffi::OsString;
 
 use clap::{Parser, Subcommand};
+use endless_gym_core::pool::Registry;
 
 use failure::Failure;
 
@@ -83,7 +84,7 @@ enum Command {
 /// Exit status of a command that failed, or that found differences.
 const FAILURE: u8 = 1;
 
-/// Runs the program `endless` and returns its exit status.
+/// Runs the program `endless` with the environments of `registry` and returns its exit status.
 ///
 /// `arguments` are the arguments without the program's name. `executable` is the command, with its first arguments, that starts the
 /// program in a new process; `demo` and `bench` start an engine with it. Only the first call of a process sets it.
@@ -96,10 +97,10 @@ const FAILURE: u8 = 1;
 /// `demo`, `serve`, `watch`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
 /// stops the command, and a second one ends the process at once. Do not run two of them at the
 /// same time in one process: a signal, and the start of one of them, affects both.
-pub fn main(arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
+pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
     let arguments = std::iter::once("endless".into()).chain(arguments);
-    match Cli::try_parse_from(arguments).map_err(Failure::from).and_then(run) {
+    match Cli::try_parse_from(arguments).map_err(Failure::from).and_then(|cli| run(registry, cli)) {
         Ok(true) => 0,
         Ok(false) => FAILURE,
         Err(error) => report(&*error),
@@ -123,20 +124,20 @@ fn report(error: &(dyn std::error::Error + 'static)) -> u8 {
 }
 
 /// Runs one command. Returns false if `verify` found a difference.
-fn run(cli: Cli) -> Result<bool, Failure> {
+fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
     logs::start(cli.log.as_deref())?;
     match cli.command.unwrap_or_else(|| Command::Demo(demo::Args::default())) {
-        Command::List(args) => list::run(&args)?,
-        Command::Demo(args) => demo::run(&args)?,
-        Command::Serve(args) => serve::run(&args)?,
+        Command::List(args) => list::run(registry, &args)?,
+        Command::Demo(args) => demo::run(registry, &args)?,
+        Command::Serve(args) => serve::run(registry, &args)?,
         Command::Status(args) => status::run(&args)?,
         Command::Watch(args) => watch::run(&args)?,
         Command::View(args) => view::run(&args)?,
-        Command::Play(args) => play_command::run(&args)?,
-        Command::Record(args) => record::run(&args)?,
-        Command::Bench(args) => bench::run(&args)?,
-        Command::Frames(args) => frames::run(&args)?,
-        Command::Verify(args) => return verify::run(&args),
+        Command::Play(args) => play_command::run(registry, &args)?,
+        Command::Record(args) => record::run(registry, &args)?,
+        Command::Bench(args) => bench::run(registry, &args)?,
+        Command::Frames(args) => frames::run(registry, &args)?,
+        Command::Verify(args) => return verify::run(registry, &args),
     }
     Ok(true)
 }

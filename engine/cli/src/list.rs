@@ -1,6 +1,7 @@
 //! `endless list`.
 
-use endless_gym_core::envs::{self, ActionBranch, EnvSpec, SCREEN};
+use endless_gym_core::envs::{ActionBranch, EnvSpec, SCREEN};
+use endless_gym_core::pool::Registry;
 use serde_json::json;
 
 use super::failure::Failure;
@@ -21,22 +22,22 @@ pub struct Args {
 }
 
 /// Runs `endless list`.
-pub fn run(args: &Args) -> Result<(), Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     match &args.id {
         Some(id) => {
-            let spec = envs::spec(id)?;
+            let spec = registry.spec(id)?;
             match () {
                 _ if args.json => print_json(&as_json(spec)),
                 _ if args.picture.applies() => {
-                    print(format_args!("{}\n{}", picture(spec, output::width())?, description(spec)))
+                    print(format_args!("{}\n{}", picture(registry, spec, output::width())?, description(spec)))
                 }
                 _ => print(description(spec)),
             }
         }
-        None if args.json => print_json(&envs::specs().map(as_json).collect::<Vec<_>>()),
+        None if args.json => print_json(&registry.specs().map(as_json).collect::<Vec<_>>()),
         None => {
             let mut rows = table(["environment", "actions", "observation", "task"]);
-            for spec in envs::specs() {
+            for spec in registry.specs() {
                 rows.add_row([spec.id, &spec.action_space.to_string(), &observation(spec), spec.summary]);
             }
             print(format_args!("{rows}\n\n`endless list ID` describes one environment and its reset parameters."))

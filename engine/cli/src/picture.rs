@@ -4,11 +4,12 @@ use std::io::{self, IsTerminal};
 
 use clap::ValueEnum;
 use endless_gym_core::envs::view::VIEW;
-use endless_gym_core::envs::{EnvSpec, Family, SCREEN};
-use endless_gym_core::pool::{PoolConfig, Seeding};
+use endless_gym_core::envs::{EnvSpec, SCREEN};
+use endless_gym_core::pool::{PoolConfig, Registry, Seeding};
 
 use super::failure::Failure;
 use super::film::Film;
+use super::play::Policy;
 use super::terminal::picture::Pixels;
 
 /// When to print a picture.
@@ -51,12 +52,16 @@ const GAP: usize = 2;
 /// The seed of the episode that is shown: long enough in every environment.
 const SEED: u64 = 15;
 
-/// The ground-truth view at a typical step of an expert's episode, in 42 columns and 22 lines; if 86 columns are available, beside
+/// A step that shows what the environment is about: a command, the path, the spotlights.
+const TYPICAL_STEP: usize = 12;
+
+/// The ground-truth view at a typical step of an episode, which the expert plays if there is one, in 42 columns and 22 lines; if 86 columns are available, beside
 /// the observation.
-pub fn picture(spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
+pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
     let config = PoolConfig { seeding: Seeding::Continue { seed: Some(SEED) }, ..PoolConfig::new(spec.id, 1) };
-    let mut film = Film::new(&config)?;
-    for _ in 0..typical_step(spec) {
+    let policy = if registry.expert(spec.id).is_ok() { Policy::Expert } else { Policy::Random };
+    let mut film = Film::played_by(registry, &config, policy, 0)?;
+    for _ in 0..TYPICAL_STEP {
         film.step()?;
     }
     let reduced = |frame: &[u8], side| Pixels { side, pixels: frame.as_chunks().0.to_vec() }.resized(SIDE);
@@ -65,15 +70,6 @@ pub fn picture(spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
         pictures.insert(0, ("observation", reduced(film.observation(), SCREEN)));
     }
     Ok(half_blocks(&pictures))
-}
-
-/// A step that shows what the environment is about: a command, the path, the spotlights.
-fn typical_step(spec: &EnvSpec) -> usize {
-    match spec.family {
-        Family::MortarMayhem(_) => 0,
-        Family::MysteryPath(_) => 12,
-        Family::SearingSpotlights(_) => 40,
-    }
 }
 
 /// Pictures side by side, below their titles: the upper half of a character in its foreground colour, the lower half in its
@@ -103,9 +99,9 @@ fn half_block_line(rows: &[[u8; 3]]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::envs;
 
     use super::*;
+    use endless_gym_core::memory_gym;
 
     #[test]
     fn colours_need_a_terminal_that_has_them_and_a_user_who_wants_them() {
@@ -125,9 +121,9 @@ mod tests {
 
     #[test]
     fn every_environment_has_a_picture() {
-        for spec in envs::specs() {
-            let narrow = picture(spec, 80).unwrap();
-            let wide = picture(spec, (2 * SIDE + GAP) as u16).unwrap();
+        for spec in memory_gym().specs() {
+            let narrow = picture(memory_gym(), spec, 80).unwrap();
+            let wide = picture(memory_gym(), spec, (2 * SIDE + GAP) as u16).unwrap();
             assert_eq!(narrow.matches('▀').count(), SIDE * SIDE / 2, "{}", spec.id);
             assert_eq!(wide.matches('▀').count(), SIDE * SIDE, "{}", spec.id);
             let colours: std::collections::BTreeSet<&str> = narrow.split('▀').collect();

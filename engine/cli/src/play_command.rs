@@ -1,7 +1,6 @@
 //! `endless play`: an environment for a person, on a page or in the terminal.
 
-use endless_gym_core::envs;
-use endless_gym_core::pool::{PoolConfig, ResetOptions};
+use endless_gym_core::pool::{PoolConfig, Registry, ResetOptions};
 use endless_gym_view::PlayServer;
 
 use super::failure::Failure;
@@ -38,17 +37,17 @@ pub struct Args {
 }
 
 /// Runs `endless play`, until a signal stops it.
-pub fn run(args: &Args) -> Result<(), Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     let options = parameters(&args.options)?;
     if args.terminal.terminal {
-        return terminal::play::run(&args.id, options, args.seed.unwrap_or(0), &args.terminal);
+        return terminal::play::run(registry, &args.id, options, args.seed.unwrap_or(0), &args.terminal);
     }
-    let id = envs::spec(&args.id)?.id;
-    PoolConfig { options: ResetOptions::Shared(options.clone()), ..PoolConfig::new(id, 1) }.validate()?;
+    let spec = registry.spec(&args.id)?;
+    PoolConfig { options: ResetOptions::Shared(options.clone()), ..PoolConfig::new(spec.id, 1) }.validate(spec)?;
     let stop = stop::on_signal()?;
     let server = PlayServer::bind(args.page.port)?;
-    let url = server.url(id, &options, args.seed);
-    print(format_args!("play {id} at {url}\nstop with Ctrl-C"))?;
+    let url = server.url(spec.id, &options, args.seed);
+    print(format_args!("play {} at {url}\nstop with Ctrl-C", spec.id))?;
     if args.page.open {
         open::in_browser(&url);
     }

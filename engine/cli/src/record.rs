@@ -5,8 +5,7 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
 use clap::Parser;
-use endless_gym_core::envs::{self, EnvSpec};
-use endless_gym_core::pool::{PoolConfig, ResetOptions, Seeding};
+use endless_gym_core::pool::{PoolConfig, Registry, ResetOptions, Seeding};
 
 use super::failure::Failure;
 use super::film::Film;
@@ -67,7 +66,7 @@ struct FilmArgs {
 }
 
 /// Runs `endless record`.
-pub fn run(args: &Args) -> Result<(), Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     let is = |argument: &OsString, name: &str| {
         argument.to_str().is_some_and(|given| {
             given.strip_prefix(name).is_some_and(|rest| matches!(rest.as_bytes(), [] | [b'=', ..]))
@@ -81,25 +80,25 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             .into());
     }
     let arguments = std::iter::once("endless record".into()).chain(args.arguments.iter().cloned());
-    film(&FilmArgs::try_parse_from(arguments)?)
+    film(registry, &FilmArgs::try_parse_from(arguments)?)
 }
 
 impl FilmArgs {
     /// The start of an episode.
-    fn start(&self, episode: u64) -> Result<Film, Failure> {
+    fn start(&self, registry: &Registry, episode: u64) -> Result<Film, Failure> {
         let config = PoolConfig {
             options: ResetOptions::Shared(parameters(&self.options)?),
             seeding: Seeding::Continue { seed: Some(self.seed.wrapping_add(episode)) },
             ..PoolConfig::new(&self.id, 1)
         };
-        Film::played_by(&config, self.policy, self.action_seed.wrapping_add(episode))
+        Film::played_by(registry, &config, self.policy, self.action_seed.wrapping_add(episode))
     }
 
     /// Pictures of all episodes.
-    fn count(&self) -> Result<u32, Failure> {
+    fn count(&self, registry: &Registry) -> Result<u32, Failure> {
         let mut count: u32 = 0;
         for episode in 0..self.episodes {
-            let mut film = self.start(episode)?;
+            let mut film = self.start(registry, episode)?;
             let mut steps = 0;
             while steps < self.max_steps && film.step()? {
                 steps += 1;
@@ -111,19 +110,19 @@ impl FilmArgs {
 }
 
 /// Records the film, and prints the return and the length of each episode.
-fn film(args: &FilmArgs) -> Result<(), Failure> {
-    let spec: &EnvSpec = envs::spec(&args.id)?;
+fn film(registry: &Registry, args: &FilmArgs) -> Result<(), Failure> {
+    let spec = registry.spec(&args.id)?;
     // Played twice: the header of the file has the number of pictures.
-    let pictures = if Format::of(&args.film)? == Format::Png { args.count()? } else { 0 };
+    let pictures = if Format::of(&args.film)? == Format::Png { args.count(registry)? } else { 0 };
     let fps = args.fps.unwrap_or(u16::try_from(spec.render_fps)?);
     let shape = Shape { size: args.view.size(), scale: usize::from(args.scale), fps, pictures };
     let stop = stop::on_signal()?;
     // The environment first: what is wrong with its options is to be said before a file exists.
-    let mut next = Some(args.start(0)?);
+    let mut next = Some(args.start(registry, 0)?);
     let mut file = FilmFile::create(&args.film, shape)?;
     let mut played = Vec::new();
     for episode in 0..args.episodes {
-        let mut film = next.take().map_or_else(|| args.start(episode), Ok)?;
+        let mut film = next.take().map_or_else(|| args.start(registry, episode), Ok)?;
         for step in 0..=args.max_steps {
             if stop.load(Ordering::Relaxed) {
                 return Err("stopped, and wrote nothing".into());

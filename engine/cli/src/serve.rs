@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use endless_gym_core::envs::DEFAULT_ENV_ID;
-use endless_gym_core::pool::{Autoreset, PoolConfig};
+use endless_gym_core::DEFAULT_ENV_ID;
+use endless_gym_core::pool::{Autoreset, PoolConfig, Registry};
 use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, ServiceError};
 use serde::Deserialize;
 
@@ -123,7 +123,7 @@ fn read(path: &Path) -> Result<EngineConfig, Failure> {
 }
 
 /// Runs `endless serve`, until a signal stops it.
-pub fn run(args: &Args) -> Result<(), Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     // Before `on_signal`: a signal ends the process while it waits for standard input.
     let mut config = args.config.as_deref().map_or_else(|| args.engine.configure(), read)?;
     let stop = stop::on_signal()?;
@@ -131,7 +131,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         stop::with_parent(stop, parent);
     }
     let metrics = args.metrics.map(Metrics::bind).transpose()?;
-    let mut engine = Engine::new(&config)?;
+    let mut engine = Engine::new(registry, &config)?;
     if args.child.is_none() {
         let (groups, num_envs) = (config.groups, config.pool.num_envs);
         let groups = if groups == 1 { "1 group".to_owned() } else { format!("{groups} groups") };
@@ -163,7 +163,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                 if let Some(checkpoint) = &mut config.checkpoint {
                     checkpoint.resume = true;
                 }
-                engine = Engine::new(&config)?;
+                engine = Engine::new(registry, &config)?;
             }
             finished => break finished?,
         }

@@ -1,5 +1,6 @@
 //! `endless verify`.
 
+use endless_gym_core::pool::Registry;
 use std::path::PathBuf;
 
 use endless_gym_core::trace::{Trace, replay};
@@ -21,13 +22,13 @@ pub struct Args {
 }
 
 /// Runs `endless verify`. Returns whether every trace was replayed without a difference.
-pub fn run(args: &Args) -> Result<bool, Failure> {
+pub fn run(registry: &Registry, args: &Args) -> Result<bool, Failure> {
     let bar = progress(args.files.len() as u64, "replaying {bar:40} {pos}/{len} traces");
     let replays: Vec<_> = args
         .files
         .par_iter()
         .map(|file| {
-            let replayed = Trace::open(file).and_then(|trace| replay(&trace));
+            let replayed = Trace::open(file).and_then(|trace| replay(registry, &trace));
             bar.inc(1);
             (file, replayed)
         })

@@ -8,10 +8,13 @@
 
 pub mod batch;
 pub mod envs;
+mod memory_gym;
 pub mod pool;
 pub mod random;
 pub mod raster;
 pub mod trace;
+
+pub use memory_gym::{DEFAULT_ENV_ID, memory_gym};
 
 #[cfg(test)]
 mod property_cases;

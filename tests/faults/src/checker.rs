@@ -3,7 +3,8 @@
 use std::collections::VecDeque;
 
 use endless_gym_core::batch::{BatchSection, Block, Layout, Section, zeroed};
-use endless_gym_core::envs::{self, ActionSpace};
+use endless_gym_core::envs::ActionSpace;
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{OptionMap, Pool, PoolError, ResetRequest, SnapshotError, Threads};
 use endless_gym_core::random::Generator;
 use endless_gym_service::{BatchLease, ServiceError, ServiceSpecification, Trainer};
@@ -60,7 +61,7 @@ pub struct Twin {
 
 impl Twin {
     pub fn new(shape: &Shape, group: usize) -> Result<Self, PoolError> {
-        let pool = Pool::new(&shape.pool(group), &Threads::new(1)?)?;
+        let pool = Pool::new(memory_gym(), &shape.pool(group), &Threads::new(1)?)?;
         let buffers = (0..3).map(|_| zeroed(pool.layout().blocks())).collect();
         let shows_history = shape.id.contains("SearingSpotlights") || shape.id.contains("Endless-MortarMayhem");
         Ok(Twin { pool, buffers, shows_history, is_exact: true })
@@ -68,7 +69,7 @@ impl Twin {
 
     /// What differs in the specification of an engine.
     pub fn difference(&self, shape: &Shape, specification: &ServiceSpecification) -> Option<String> {
-        let space = envs::spec(&shape.id).map(|spec| &spec.action_space).ok();
+        let space = memory_gym().spec(&shape.id).map(|spec| &spec.action_space).ok();
         let same = specification.batch == *self.pool.layout()
             && Some(&specification.action_space) == space
             && specification.autoreset == shape.autoreset;

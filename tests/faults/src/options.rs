@@ -1,13 +1,14 @@
 //! Random reset parameters within the limits of the parameter tables.
 
-use endless_gym_core::envs::{self, ParameterKind};
+use endless_gym_core::envs::ParameterKind;
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::OptionMap;
 use endless_gym_core::random::Generator;
 use serde_json::Value as Json;
 
 /// Some of an id's parameters, each with a random value; usually one that is not far from the default.
 pub fn random(draws: &mut Generator, id: &str) -> OptionMap {
-    let parameters = envs::spec(id).map(|spec| spec.parameters).unwrap_or_default();
+    let parameters = memory_gym().spec(id).map(|spec| spec.parameters).unwrap_or_default();
     let mut options = OptionMap::new();
     for parameter in parameters {
         if draws.random() < 0.3 {
@@ -53,7 +54,8 @@ mod tests {
         for seed in 0..60 {
             let shape = Shape::random(&mut Generator::from_seed(seed), 6);
             for group in 0..shape.groups {
-                Pool::new(&shape.pool(group), &Threads::new(1).unwrap()).unwrap_or_else(|e| panic!("{shape:?}: {e}"));
+                Pool::new(memory_gym(), &shape.pool(group), &Threads::new(1).unwrap())
+                    .unwrap_or_else(|e| panic!("{shape:?}: {e}"));
             }
         }
     }

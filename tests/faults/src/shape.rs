@@ -1,7 +1,7 @@
 //! What an engine serves: the arguments of `endless serve`, and the pools that must play the same.
 
 use endless_gym_core::batch::Frames;
-use endless_gym_core::envs;
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::PixelFormat;
@@ -30,7 +30,7 @@ pub struct Shape {
 impl Shape {
     /// A random shape: any id and format, options within their limits, at most `most` environments in all groups.
     pub fn random(draws: &mut Generator, most: i64) -> Self {
-        let specs: Vec<_> = envs::specs().map(|spec| spec.id).collect();
+        let specs: Vec<_> = memory_gym().specs().map(|spec| spec.id).collect();
         let id = *draws.choice(&specs);
         Shape::random_of(draws, id, most)
     }

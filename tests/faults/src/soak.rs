@@ -5,7 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::envs;
+use endless_gym_core::memory_gym;
 use endless_gym_core::random::Generator;
 use endless_gym_service::Namespace;
 use serde::Serialize;
@@ -116,7 +116,7 @@ pub fn run(args: &Args) -> Result<(), String> {
     let seed = args.seed.map_or_else(random_seed, Ok)?;
     let stop = stop_on_signal()?;
     println!("seed {seed}");
-    let ids: Vec<&str> = envs::specs().map(|spec| spec.id).collect();
+    let ids: Vec<&str> = memory_gym().specs().map(|spec| spec.id).collect();
     let mut draws = Generator::from_seed(seed);
     let start = Instant::now();
     let mut phases: Vec<Phase> = Vec::new();

@@ -2,6 +2,7 @@
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Frames, zeroed};
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 
 use crate::playing;
@@ -14,7 +15,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let frames = Some(Frames { stack: input.int_in_range(1..=4)?, ..Frames::default() });
     let seeding = Seeding::Continue { seed: Some(3) };
     let config = PoolConfig { frames, seeding, check_drawing: true, ..PoolConfig::new(spec.id, ENVS) };
-    let pool = || Pool::new(&config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
+    let pool = || Pool::new(memory_gym(), &config, &Threads::new(1).expect("one thread")).expect("defaults are valid");
     let mut saving = pool();
     let mut blocks = zeroed(saving.layout().blocks());
     saving.reset(ResetRequest::Seed(1), &mut blocks).expect("a pool can be reset");

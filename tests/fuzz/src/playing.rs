@@ -2,15 +2,16 @@
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Block, zeroed};
+use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::envs::{self, EnvSpec};
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{
     Autoreset, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
 
 /// Any of the ids.
 pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {
-    let specs: Vec<_> = envs::specs().collect();
+    let specs: Vec<_> = memory_gym().specs().collect();
     input.choose(&specs).copied()
 }
 
@@ -25,7 +26,7 @@ pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> 
         check_drawing: true,
         ..PoolConfig::new(spec.id, 1)
     };
-    Pool::new(&config, &Threads::new(1)?)
+    Pool::new(memory_gym(), &config, &Threads::new(1)?)
 }
 
 /// Resets a pool.

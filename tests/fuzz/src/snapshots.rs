@@ -4,7 +4,8 @@ use arbitrary::Unstructured;
 use ciborium::Value;
 use endless_gym_core::batch::{Block, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::envs::{EnvSpec, Family, mortar_mayhem, mystery_path, searing_spotlights};
+use endless_gym_core::envs::{EnvSpec, mortar_mayhem, mystery_path, searing_spotlights};
+use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{
     Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads,
 };
@@ -71,10 +72,10 @@ impl Codec {
     }
 
     fn for_spec(spec: &EnvSpec) -> Self {
-        match spec.family {
-            Family::MortarMayhem(_) => Codec::of::<mortar_mayhem::State>(),
-            Family::MysteryPath(_) => Codec::of::<mystery_path::State>(),
-            Family::SearingSpotlights(_) => Codec::of::<searing_spotlights::State>(),
+        match spec.id {
+            id if id.contains("MortarMayhem") => Codec::of::<mortar_mayhem::State>(),
+            id if id.contains("MysteryPath") => Codec::of::<mystery_path::State>(),
+            _ => Codec::of::<searing_spotlights::State>(),
         }
     }
 }
@@ -104,7 +105,7 @@ impl Game {
             features: true,
             ..PoolConfig::new(spec.id, 1)
         };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
         let random = SmallRng::seed_from_u64(1);

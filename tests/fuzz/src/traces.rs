@@ -1,12 +1,13 @@
 //! Traces: JSON text. A trace plays no more steps than it has bytes.
 
 use arbitrary::{Result, Unstructured};
+use endless_gym_core::memory_gym;
 use endless_gym_core::trace::{Trace, replay};
 
 pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     if let Ok(trace) = serde_json::from_slice::<Trace>(input.bytes(input.len())?) {
         // Any result but a panic.
-        let _ = replay(&trace);
+        let _ = replay(memory_gym(), &trace);
     }
     Ok(())
 }

@@ -2,6 +2,7 @@
 
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::EnvSpec;
+use endless_gym::memory_gym;
 use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
 use rand::RngExt;
 use rand::rngs::SmallRng;
@@ -19,7 +20,7 @@ impl Player {
     }
 
     pub fn with_threads(config: &PoolConfig, threads: usize) -> Self {
-        let pool = Pool::new(config, &Threads::new(threads).unwrap()).unwrap();
+        let pool = Pool::new(memory_gym(), config, &Threads::new(threads).unwrap()).unwrap();
         let blocks = zeroed(pool.layout().blocks());
         Player { pool, blocks }
     }

@@ -7,6 +7,7 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use endless_gym::memory_gym;
 use endless_gym::pool::{PoolConfig, ResetRequest};
 use endless_gym::service::{
     BatchLease, ConnectConfig, Engine, EngineConfig, Namespace, Rejection, ServiceError, Trainer,
@@ -107,7 +108,7 @@ pub fn play_role() {
         ["engine", service, num_envs, groups] => {
             let (num_envs, groups) = (num_envs.parse().unwrap(), groups.parse().unwrap());
             let config = engine_config(&Namespace::default(), service, num_envs, groups);
-            let mut engine = Engine::new(&config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
+            let mut engine = Engine::new(memory_gym(), &config).unwrap_or_else(|e| panic!("{e}: {e:?}"));
             engine.run(&stop_at_end_of_input()).unwrap();
         }
         ["trainer", service] => {

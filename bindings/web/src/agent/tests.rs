@@ -1,6 +1,6 @@
 //! The page's agent against outputs that PyTorch computed, and files that are broken.
 
-use endless_gym_core::envs;
+use endless_gym_core::memory_gym;
 use serde::Deserialize;
 
 use super::*;
@@ -48,7 +48,7 @@ fn the_network_computes_what_pytorch_computes() {
 #[test]
 fn it_fits_its_environment_alone() {
     let agent = Agent::read(AGENT).unwrap();
-    let fitting: Vec<_> = envs::specs().filter(|spec| agent.fits(spec)).map(|spec| spec.id).collect();
+    let fitting: Vec<_> = memory_gym().specs().filter(|spec| agent.fits(spec)).map(|spec| spec.id).collect();
     assert_eq!(fitting, ["MortarMayhem-Grid-v0"]);
 }
 

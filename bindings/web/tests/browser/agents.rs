@@ -1,6 +1,6 @@
 //! Trained agents on the page, and the flash.
 
-use endless_gym_core::envs::specs;
+use endless_gym_core::memory_gym;
 use serde_json::{Value as Json, json};
 
 use crate::chromium::Chromium;
@@ -96,7 +96,7 @@ fn an_agent_plays_from_memory() {
 #[ignore = "needs the built page and Chromium"]
 fn agents_are_there_for_some_environments() {
     let (server, mut browser) = (PageServer::start(), start("no-agents"));
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
         let disabled = browser.value("document.getElementById('agent').ariaDisabled");
         assert_eq!(disabled, (spec.id != ID).to_string(), "{}", spec.id);

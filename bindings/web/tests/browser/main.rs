@@ -8,7 +8,7 @@ mod server;
 use std::path::{Path, PathBuf};
 
 use chromium::Chromium;
-use endless_gym_core::envs::specs;
+use endless_gym_core::memory_gym;
 use endless_gym_core::trace::{Trace, replay};
 use serde_json::{Value as Json, json};
 use server::PageServer;
@@ -51,7 +51,7 @@ fn recorded_episodes_replay_without_a_difference() {
     for (folder, least) in [("traces", 100), ("views", 40)] {
         let files = traces(folder);
         assert!(files.len() >= least, "{} files in {folder}", files.len());
-        for spec in specs() {
+        for spec in memory_gym().specs() {
             let of_id =
                 |path: &&PathBuf| path.file_name().unwrap().to_string_lossy().starts_with(&format!("{}.", spec.id));
             let files: Vec<&PathBuf> = files.iter().filter(of_id).collect();
@@ -80,7 +80,7 @@ fn recorded_episodes_replay_without_a_difference() {
 #[ignore = "needs the built page and Chromium"]
 fn every_environment_is_played_with_the_keyboard() {
     let (server, mut browser) = (PageServer::start(), start("keyboard"));
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=3", spec.id));
         assert_eq!(browser.value(STATE)["id"], spec.id);
         assert_eq!(browser.value(STATE)["length"], 0, "nothing moves before a key");
@@ -167,7 +167,7 @@ fn an_address_names_an_episode() {
 #[ignore = "needs the built page and Chromium"]
 fn the_form_is_the_engines_table() {
     let (server, mut browser) = (PageServer::start(), start("form"));
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
         let names = browser.value("[...document.querySelectorAll('#fields input')].map((input) => input.name)");
         assert_eq!(names, spec.parameters.iter().map(|parameter| parameter.name).collect::<Json>());
@@ -217,7 +217,7 @@ fn a_played_episode_is_saved_verified_and_opened() {
     browser.value("document.getElementById('save').click()");
     let file = browser.download();
     // `endless verify` calls the same.
-    let replayed = replay(&Trace::open(&file).unwrap()).unwrap();
+    let replayed = replay(memory_gym(), &Trace::open(&file).unwrap()).unwrap();
     assert_eq!((replayed.differences, json!(replayed.steps)), (0, played["length"].clone()));
 
     browser.value("endless.play.start({id: 'MortarMayhem-v0', options: {}, seed: '1'})");
@@ -245,7 +245,7 @@ fn a_played_episode_is_saved_verified_and_opened() {
 #[ignore = "needs the built page and Chromium"]
 fn experts_and_walls_play_by_themselves() {
     let (server, mut browser) = (PageServer::start(), start("experts"));
-    for spec in specs() {
+    for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=2", spec.id));
         browser.value("endless.play.setPace(10000)");
         browser.press("KeyE");

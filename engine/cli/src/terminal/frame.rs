@@ -26,6 +26,7 @@ pub fn newest(observation: &[u8], frames: Frames) -> Pixels {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::{Batch, zeroed};
+    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     use endless_gym_core::raster::PixelFormat;
 
@@ -33,7 +34,7 @@ mod tests {
 
     fn observed(frames: Frames) -> Pixels {
         let config = PoolConfig { frames: Some(frames), ..PoolConfig::new("SearingSpotlights-v0", 1) };
-        let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+        let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::Seed(2), &mut blocks).unwrap();
         for _ in 0..5 {

@@ -2,7 +2,9 @@
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use endless_gym_core::pool::{
+    Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
+};
 
 use super::super::failure::Failure;
 use super::frame::newest;
@@ -10,6 +12,7 @@ use super::picture::Pixels;
 
 /// An episode, of an environment of its own, so that it follows from its seed and the actions.
 pub struct Game {
+    registry: Registry,
     pool: Pool,
     blocks: Vec<Block>,
     options: OptionMap,
@@ -18,26 +21,26 @@ pub struct Game {
 
 impl Game {
     /// Starts an episode.
-    pub fn start(id: &str, options: OptionMap, seed: u64) -> Result<Self, Failure> {
+    pub fn start(registry: &Registry, id: &str, options: OptionMap, seed: u64) -> Result<Self, Failure> {
         let config = PoolConfig {
             options: ResetOptions::Shared(options.clone()),
             autoreset: Autoreset::Disabled,
             seeding: Seeding::Continue { seed: Some(seed) },
             ..PoolConfig::new(id, 1)
         };
-        let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+        let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;
-        Ok(Game { pool, blocks, options, seed })
+        Ok(Game { registry: registry.clone(), pool, blocks, options, seed })
     }
 
     /// Starts another episode, with another seed or the same.
     pub fn restart(&mut self, seed: u64) -> Result<(), Failure> {
-        *self = Game::start(self.spec().id, std::mem::take(&mut self.options), seed)?;
+        *self = Game::start(&self.registry, self.spec().id, self.options.clone(), seed)?;
         Ok(())
     }
 
-    pub fn spec(&self) -> &'static EnvSpec {
+    pub fn spec(&self) -> &EnvSpec {
         self.pool.spec()
     }
 

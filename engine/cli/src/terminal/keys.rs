@@ -164,7 +164,7 @@ fn action(spec: &EnvSpec, directions: &[Direction]) -> Vec<i32> {
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::envs::spec;
+    use endless_gym_core::memory_gym;
 
     use super::*;
 
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn directions_are_the_environments_actions() {
-        let act = |id: &str, directions: &[Direction]| action(spec(id).unwrap(), directions);
+        let act = |id: &str, directions: &[Direction]| action(memory_gym().spec(id).unwrap(), directions);
         assert_eq!(act("MortarMayhem-v0", &[]), [0, 0]);
         assert_eq!(act("MortarMayhem-v0", &[Left, Down]), [1, 2]);
         assert_eq!(act("SearingSpotlights-v0", &[Right, Up]), [2, 1]);
@@ -188,7 +188,7 @@ mod tests {
 
     #[test]
     fn a_key_acts_once_and_until_it_is_no_longer_reported() {
-        let (spec, start) = (spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
         assert_eq!(keys.action(spec, after(start, 400)), [1, 0], "a step that comes late");
@@ -206,7 +206,7 @@ mod tests {
 
     #[test]
     fn a_new_direction_replaces_the_old_one_unless_both_come_at_once() {
-        let (spec, start) = (spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
         keys.press(&[Up], start);
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn reported_releases_end_a_movement() {
-        let (spec, start) = (spec("MortarMayhem-v0").unwrap(), Instant::now());
+        let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
         keys.release(&[Left]);

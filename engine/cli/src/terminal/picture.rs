@@ -54,6 +54,7 @@ pub fn fitting(columns: u16, lines: u16) -> usize {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::{Batch, Frames, zeroed};
+    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
@@ -63,7 +64,8 @@ mod tests {
 
     /// A frame of an environment, and its pixels as the original's array has them, indexed \[x\]\[y\].
     fn frame() -> (Pixels, Vec<[u8; 3]>) {
-        let mut pool = Pool::new(&PoolConfig::new("MortarMayhem-v0", 1), &Threads::new(1).unwrap()).unwrap();
+        let mut pool =
+            Pool::new(memory_gym(), &PoolConfig::new("MortarMayhem-v0", 1), &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::Seed(4), &mut blocks).unwrap();
         let observation = Batch::new(pool.layout(), &blocks).observation();

@@ -3,8 +3,7 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::envs;
-use endless_gym_core::pool::OptionMap;
+use endless_gym_core::pool::{OptionMap, Registry};
 use ratatui::Frame;
 use ratatui::crossterm::event::Event;
 use ratatui::layout::Rect;
@@ -53,12 +52,12 @@ struct Player {
 }
 
 /// Plays until a key or a signal ends it.
-pub fn run(id: &str, options: OptionMap, seed: u64, args: &TerminalArgs) -> Result<(), Failure> {
-    let fps = args.fps.unwrap_or(envs::spec(id)?.render_fps);
+pub fn run(registry: &Registry, id: &str, options: OptionMap, seed: u64, args: &TerminalArgs) -> Result<(), Failure> {
+    let fps = args.fps.unwrap_or(registry.spec(id)?.render_fps);
     let hold = args.hold.unwrap_or(if fps > SLOW_FPS { HOLD } else { 0.0 });
     let hold =
         Duration::try_from_secs_f64(hold).map_err(|_| format!("--hold must be finite and 0 or more, got {hold}"))?;
-    let game = Game::start(id, options, seed)?;
+    let game = Game::start(registry, id, options, seed)?;
     check()?;
     let stop = stop::on_signal()?;
     let mut screen = Screen::enter()?;
@@ -170,11 +169,13 @@ mod tests {
     use ratatui::backend::TestBackend;
     use ratatui::style::Color;
 
+    use endless_gym_core::memory_gym;
+
     use super::super::keys::Direction;
     use super::*;
 
     fn player(id: &str) -> Player {
-        let game = Game::start(id, OptionMap::new(), 3).unwrap();
+        let game = Game::start(memory_gym(), id, OptionMap::new(), 3).unwrap();
         let (keys, period) = (Keys::new(Duration::ZERO), Duration::from_millis(1));
         Player { game, keys, is_paused: false, period, due: Instant::now() }
     }

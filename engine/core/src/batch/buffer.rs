@@ -13,9 +13,10 @@ use super::block::{Block, zeroed};
 ///
 /// ```
 /// use endless_gym_core::batch::BatchBuffer;
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
 ///
-/// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 256), &Threads::new(1)?)?;
+/// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 256), &Threads::new(1)?)?;
 /// let mut blocks = BatchBuffer::new(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
 /// # Ok::<(), endless_gym_core::pool::PoolError>(())
@@ -67,7 +68,7 @@ impl DerefMut for BatchBuffer {
 mod mapped {
     use memmap2::{Advice, MmapMut};
 
-    use super::super::block::{BLOCK_BYTES, Block};
+    use crate::batch::block::{BLOCK_BYTES, Block};
 
     /// Size of a huge page on x86-64, and on ARM with pages of 4 KiB.
     const HUGE_PAGE: usize = 2 << 20;
@@ -112,6 +113,7 @@ mod tests {
     use super::super::block::{BLOCK_BYTES, blocks_for};
     use super::super::view::Batch;
     use super::*;
+    use crate::memory_gym;
     use crate::pool::{Pool, PoolConfig, ResetRequest, Threads};
 
     /// Sizes around 4 MiB and around a multiple of a huge page.
@@ -149,7 +151,7 @@ mod tests {
     fn a_pool_writes_the_same_into_a_small_and_a_large_buffer_as_into_a_vec() {
         for num_envs in [2, 256] {
             let config = PoolConfig::new("MortarMayhem-Grid-v0", num_envs);
-            let mut pools = [(); 2].map(|()| Pool::new(&config, &Threads::new(1).unwrap()).unwrap());
+            let mut pools = [(); 2].map(|()| Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap());
             let layout = pools[0].layout().clone();
             let (mut buffer, mut vec) = (BatchBuffer::new(layout.blocks()), zeroed(layout.blocks()));
             pools[0].reset(ResetRequest::Seed(5), &mut buffer).unwrap();

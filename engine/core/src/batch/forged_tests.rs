@@ -4,11 +4,11 @@ use proptest::prelude::*;
 use serde_json::{Value as Json, json};
 
 use super::*;
-use crate::envs;
+use crate::memory_gym;
 
 fn layout(num_envs: usize) -> Layout {
     let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
-    batch_layout(envs::spec("Endless-MortarMayhem-v0").unwrap(), num_envs, contents).unwrap()
+    batch_layout(memory_gym().spec("Endless-MortarMayhem-v0").unwrap(), num_envs, contents).unwrap()
 }
 
 /// What deserialising says of a layout of which a part is replaced.
@@ -89,8 +89,8 @@ fn forged_layouts_are_refused() {
 
 #[test]
 fn messages_that_are_too_short_for_their_bytes_are_refused() {
-    let spec = envs::specs().next().unwrap();
-    let mut json = serde_json::to_value(action_layout(spec, 4).unwrap()).unwrap();
+    let spec = memory_gym().specs().next().unwrap();
+    let mut json = serde_json::to_value(action_layout(&spec.action_space, 4).unwrap()).unwrap();
     json["sections"][3]["shape"] = json!([1000]);
     let error = serde_json::from_value::<ActionLayout>(json).unwrap_err();
     assert_eq!(error.to_string(), "section `options` must have at least 16384 bytes, got 4000");
@@ -203,7 +203,7 @@ proptest! {
         options in 0..8_u8,
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), values()), 1..3),
     ) {
-        let spec = envs::specs().nth(id).unwrap();
+        let spec = memory_gym().specs().nth(id).unwrap();
         let contents = Contents {
             frames: (options & 1 != 0).then(Frames::default),
             features: options & 2 != 0,
@@ -214,7 +214,7 @@ proptest! {
         if let Ok(layout) = serde_json::from_value::<Layout>(forge(serde_json::to_value(&layout).unwrap(), &changes)) {
             use_all(&layout)?;
         }
-        let layout = action_layout(spec, num_envs).unwrap();
+        let layout = action_layout(&spec.action_space, num_envs).unwrap();
         let json = forge(serde_json::to_value(&layout).unwrap(), &changes);
         if let Ok(layout) = serde_json::from_value::<ActionLayout>(json)
             && layout.blocks() <= 1 << 16

@@ -7,7 +7,7 @@ use super::block::{BLOCK_BYTES, Block, blocks_for};
 use super::dtype::{Dtype, Element};
 use super::limits::MAX_ENVS;
 use super::sections::{ActionSection, BatchSection, Contents, RowShape, SectionTable};
-use crate::envs::EnvSpec;
+use crate::envs::{ActionSpace, EnvSpec};
 
 /// Maximum number of dimensions of a section's array, the environment's index included.
 pub const MAX_DIMENSIONS: usize = 8;
@@ -62,10 +62,10 @@ impl<S: SectionTable> Section<S> {
 ///
 /// ```
 /// use endless_gym_core::batch::{BatchSection, Contents, Frames, Layout, batch_layout, zeroed};
-/// use endless_gym_core::envs;
+/// use endless_gym_core::memory_gym;
 ///
 /// let contents = Contents { frames: Some(Frames::default()), ..Contents::default() };
-/// let layout = batch_layout(envs::spec("MysteryPath-v0")?, 16, contents)?;
+/// let layout = batch_layout(memory_gym().spec("MysteryPath-v0")?, 16, contents)?;
 /// let observation = layout.section(BatchSection::Observation).unwrap();
 /// assert_eq!(observation.shape(), [84, 84, 3]);
 ///
@@ -107,9 +107,9 @@ pub fn batch_layout(spec: &EnvSpec, num_envs: usize, contents: Contents) -> Resu
 /// # Errors
 ///
 /// [`LayoutError`] if `num_envs` is out of its range.
-pub fn action_layout(spec: &EnvSpec, num_envs: usize) -> Result<ActionLayout, LayoutError> {
+pub fn action_layout(space: &ActionSpace, num_envs: usize) -> Result<ActionLayout, LayoutError> {
     check_num_envs(num_envs)?;
-    Layout::new(num_envs, ActionSection::ALL.iter().map(|section| (*section, section.row_shape(spec, num_envs))))
+    Layout::new(num_envs, ActionSection::ALL.iter().map(|section| (*section, section.row_shape(space, num_envs))))
 }
 
 impl<S: SectionTable> Layout<S> {
@@ -403,19 +403,19 @@ mod tests {
     use super::super::block::zeroed;
     use super::super::frames::Frames;
     use super::*;
-    use crate::envs;
+    use crate::memory_gym;
 
     fn everything() -> Contents {
         Contents { frames: Some(Frames::default()), features: true, final_observation: true }
     }
 
     fn layout(num_envs: usize) -> Layout {
-        batch_layout(envs::spec("Endless-MortarMayhem-v0").unwrap(), num_envs, everything()).unwrap()
+        batch_layout(memory_gym().spec("Endless-MortarMayhem-v0").unwrap(), num_envs, everything()).unwrap()
     }
 
     #[test]
     fn sections_are_aligned_and_do_not_overlap() {
-        for (spec, num_envs) in envs::specs().zip([1, 3, 64, 1000].into_iter().cycle()) {
+        for (spec, num_envs) in memory_gym().specs().zip([1, 3, 64, 1000].into_iter().cycle()) {
             let layout = batch_layout(spec, num_envs, everything()).unwrap();
             let mut end = 0;
             for section in layout.sections() {
@@ -442,7 +442,7 @@ mod tests {
 
     #[test]
     fn a_missing_section_wrong_type_or_short_batch_reads_as_empty() {
-        let layout = batch_layout(envs::spec("MysteryPath-v0").unwrap(), 4, Contents::default());
+        let layout = batch_layout(memory_gym().spec("MysteryPath-v0").unwrap(), 4, Contents::default());
         let layout = layout.unwrap();
         let batch = zeroed(layout.blocks());
         assert_eq!(layout.read::<f64>(&batch, BatchSection::Reward).len(), 4);
@@ -456,7 +456,7 @@ mod tests {
         let layout = layout(5);
         let text = serde_json::to_string(&layout).unwrap();
         assert_eq!(serde_json::from_str::<Layout>(&text).unwrap(), layout);
-        let actions = action_layout(envs::specs().next().unwrap(), 5).unwrap();
+        let actions = action_layout(&ActionSpace::Discrete(4), 5).unwrap();
         let text = serde_json::to_string(&actions).unwrap();
         assert_eq!(serde_json::from_str::<ActionLayout>(&text).unwrap(), actions);
         assert!(serde_json::from_str::<Layout>(&text).is_err(), "the tables differ");
@@ -464,10 +464,10 @@ mod tests {
 
     #[test]
     fn too_many_and_too_few_environments_are_refused() {
-        let spec = envs::specs().next().unwrap();
+        let spec = memory_gym().specs().next().unwrap();
         for given in [0, MAX_ENVS + 1, usize::MAX] {
             assert_eq!(batch_layout(spec, given, everything()), Err(LayoutError::NumEnvs { given }));
-            assert_eq!(action_layout(spec, given), Err(LayoutError::NumEnvs { given }));
+            assert_eq!(action_layout(&spec.action_space, given), Err(LayoutError::NumEnvs { given }));
         }
         let frames = Some(Frames { stack: usize::MAX, ..Frames::default() });
         let error = batch_layout(spec, 3, Contents { frames, ..everything() });
@@ -476,9 +476,9 @@ mod tests {
 
     #[test]
     fn a_message_takes_the_longest_options_and_snapshots() {
-        let spec = envs::specs().next().unwrap();
+        let spec = memory_gym().specs().next().unwrap();
         for num_envs in [1, 7, 1024, MAX_ENVS] {
-            let layout = action_layout(spec, num_envs).unwrap();
+            let layout = action_layout(&spec.action_space, num_envs).unwrap();
             for (section, bytes) in ActionSection::ALL.iter().filter_map(|section| match section.row() {
                 RowShape::Bytes(bytes) => Some((*section, bytes)),
                 _ => None,

@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::dtype::{Dtype, Element, Sealed};
 use super::frames::Frames;
-use crate::envs::EnvSpec;
+use crate::envs::{ActionSpace, EnvSpec};
 
 /// Maximum length of a message's reset parameters, in bytes of JSON text.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
@@ -281,10 +281,10 @@ impl BatchSection {
 
 impl ActionSection {
     /// Shape of the section's row in a message for `num_envs` environments, which is not 0.
-    pub(super) fn row_shape(self, spec: &EnvSpec, num_envs: usize) -> Vec<usize> {
+    pub(super) fn row_shape(self, space: &ActionSpace, num_envs: usize) -> Vec<usize> {
         match (self, self.row()) {
             (_, RowShape::Bytes(bytes)) => vec![bytes.div_ceil(num_envs)],
-            (ActionSection::Action, _) => vec![spec.action_space.branches().len()],
+            (ActionSection::Action, _) => vec![space.branches().len()],
             _ => vec![],
         }
     }
@@ -293,7 +293,7 @@ impl ActionSection {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::envs;
+    use crate::memory_gym;
 
     #[test]
     fn a_name_finds_its_section() {
@@ -311,7 +311,7 @@ mod tests {
     /// Each `final_*` section has the number type and the shape of the section that it is named after.
     #[test]
     fn final_sections_equal_their_originals() {
-        for spec in envs::specs() {
+        for spec in memory_gym().specs() {
             let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
             for section in BatchSection::ALL {
                 let Some(original) = section.name().strip_prefix("final_") else { continue };
@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn shapes_fit_the_table() {
-        for spec in envs::specs() {
+        for spec in memory_gym().specs() {
             for stack in [1, 4] {
                 let frames = Some(Frames { stack, ..Frames::default() });
                 let contents = Contents { frames, features: true, final_observation: true };
@@ -341,7 +341,7 @@ mod tests {
                 }
             }
             for section in ActionSection::ALL {
-                assert!(section.row().admits(&section.row_shape(spec, 3)), "{section}");
+                assert!(section.row().admits(&section.row_shape(&spec.action_space, 3)), "{section}");
             }
         }
     }

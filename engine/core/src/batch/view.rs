@@ -101,9 +101,10 @@ batch_sections! { batch_view! }
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, BatchSection, zeroed};
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
 ///
-/// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 4), &Threads::new(1)?)?;
+/// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 4), &Threads::new(1)?)?;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(7), &mut blocks)?;
 ///

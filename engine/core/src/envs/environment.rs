@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 
+use super::expert::Expert;
 use super::parameters::ResetParameters;
 use super::progress::Progress;
 use super::screen::SCREEN;
@@ -19,7 +20,7 @@ use crate::raster::Canvas;
 /// episodes. As in the original, some of the state is kept from one episode to the next.
 pub trait Environment: Send + Sync {
     /// What distinguishes the ids of the family.
-    type Variant: Copy + Send + Sync;
+    type Variant: Copy + Send + Sync + 'static;
 
     /// What all environments with the same reset parameters share: the parameters, and the pictures made from them.
     type Assets: Send + Sync;
@@ -97,15 +98,22 @@ pub trait Environment: Send + Sync {
     /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended
     /// the episode.
     fn info(&self, out: &mut [f64]);
+
+    /// A scripted expert, if the family has one.
+    fn expert(_variant: Self::Variant) -> Option<Box<dyn Expert>> {
+        None
+    }
 }
 
 /// What one step returns in addition to the observation.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Transition {
-    /// The reward, in the precision of the original's Python float.
+    /// The reward, in the precision of a Python float.
     pub reward: f64,
-    /// Whether the episode ended. The original reports every end, also that by the step limit, as `terminated`.
+    /// Whether the task ended the episode. Memory Gym reports every end so, also that by the step limit.
     pub terminated: bool,
+    /// Whether something outside of the task ended the episode, such as a limit of steps.
+    pub truncated: bool,
 }
 
 /// A state with a number that is out of its range.

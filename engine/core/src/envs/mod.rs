@@ -1,4 +1,4 @@
-//! The environments: the trait that each family implements, the registry of ids, and the reset parameters.
+//! The environments: the trait that each family implements, their specifications, and the reset parameters.
 
 mod action_space;
 mod character;
@@ -6,24 +6,22 @@ mod character_sprites;
 mod controls;
 mod environment;
 mod expert;
-mod family;
 pub mod mortar_mayhem;
 pub mod mystery_path;
 mod parameters;
 mod progress;
-mod registry;
 mod screen;
 pub mod searing_spotlights;
 mod spec;
+mod task;
 mod vector;
 pub mod view;
 
 pub use action_space::{ActionError, ActionSpace, InvalidActionSpace};
 pub use environment::{Environment, InvalidState, Transition};
 pub use expert::Expert;
-pub use family::{Family, Locomotion, MortarMayhemVariant, MysteryPathVariant, SearingSpotlightsVariant};
 pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
 pub use progress::Progress;
-pub use registry::{DEFAULT_ENV_ID, UnknownEnvironment, expert, spec, specs};
 pub use screen::{FRAME_BYTES, Frame, SCREEN};
-pub use spec::{ActionBranch, Choice, Column, EnvSpec, InfoColumn};
+pub use spec::{ActionBranch, Choice, Column, EnvSpec, InfoColumn, UnknownEnvironment};
+pub use task::{Task, TaskEnv};

@@ -1,9 +1,9 @@
 //! What is fixed about an environment id: spaces, reset parameters, info columns.
 
 use serde::Serialize;
+use thiserror::Error;
 
 use super::action_space::ActionSpace;
-use super::family::Family;
 use super::parameters::Parameter;
 
 /// One branch of an action.
@@ -45,15 +45,12 @@ pub struct InfoColumn {
 }
 
 /// Everything that is fixed about an environment id.
-#[derive(Debug, Serialize)]
+#[derive(Clone, Debug, Serialize)]
 pub struct EnvSpec {
     /// The original's id, such as `MortarMayhem-v0`.
     pub id: &'static str,
     /// The agent's task in one line.
     pub summary: &'static str,
-    /// The family and the variant of its rules.
-    #[serde(skip)]
-    pub family: Family,
     /// The original's action space.
     pub action_space: ActionSpace,
     /// What the numbers of an action mean, in the order of its branches.
@@ -72,4 +69,33 @@ pub struct EnvSpec {
     pub parameters: &'static [Parameter],
     /// Frames per second for a human viewer.
     pub render_fps: u32,
+}
+
+impl EnvSpec {
+    /// An id without reset parameters, infos and features, at 25 frames per second. The agent's task, `summary`, takes one line.
+    pub const fn new(id: &'static str, summary: &'static str, action_space: ActionSpace) -> Self {
+        EnvSpec {
+            id,
+            summary,
+            action_space,
+            actions: &[],
+            vector_observation: 0,
+            ground_truth: &[],
+            ground_truth_is_integer: false,
+            info: &[],
+            features: &[],
+            parameters: &[],
+            render_fps: 25,
+        }
+    }
+}
+
+/// An id that a registry does not have.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("no environment `{id}`; there are {known}")]
+pub struct UnknownEnvironment {
+    /// The given id.
+    pub id: String,
+    /// All known ids, separated by commas.
+    pub known: String,
 }

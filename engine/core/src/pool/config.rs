@@ -8,7 +8,7 @@ use super::error::PoolError;
 use super::seeding::{MAX_TOTAL_ENVS, Seeding};
 use crate::batch::limits::MAX_ENVS;
 use crate::batch::{Contents, Frames, MAX_STACK, batch_layout};
-use crate::envs::{self, ResetParameters};
+use crate::envs::{EnvSpec, ResetParameters};
 
 /// Reset parameters by the original's names, as a JSON object.
 pub type OptionMap = Map<String, Json>;
@@ -156,13 +156,13 @@ impl PoolConfig {
         }
     }
 
-    /// Checks everything, as [`Pool::new`](super::Pool::new) does, without making environments.
+    /// Checks everything, as [`Pool::new`](super::Pool::new) does, without making environments. `spec` is the specification of the
+    /// configured id.
     ///
     /// # Errors
     ///
-    /// [`PoolError`] if the id is unknown, or a reset parameter or a number is out of its range.
-    pub fn validate(&self) -> Result<(), PoolError> {
-        let spec = envs::spec(&self.id)?;
+    /// [`PoolError`] if a reset parameter or a number is out of its range.
+    pub fn validate(&self, spec: &EnvSpec) -> Result<(), PoolError> {
         self.check()?;
         batch_layout(spec, self.num_envs, self.contents())?;
         let check = |given: &OptionMap| ResetParameters::new(spec.id, spec.parameters, given).map(drop);

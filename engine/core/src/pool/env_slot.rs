@@ -8,7 +8,7 @@ use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame, draw_in_full};
 use super::frame_stack::{FrameStack, StackedFrame};
 use super::seeding::Seeds;
 use crate::batch::BatchMut;
-use crate::envs::Environment;
+use crate::envs::{Environment, Transition};
 use crate::random::Generator;
 use crate::raster::PixelFormat;
 
@@ -116,9 +116,9 @@ impl<E: Environment> EnvSlot<E> {
         self.frame_stack.push(|| self.env.scene());
         self.episode_return += transition.reward;
         self.episode_length = self.episode_length.saturating_add(1);
-        self.ended = transition.terminated;
-        self.write_transition(out, row, transition.reward, transition.terminated);
-        if transition.terminated {
+        self.ended = transition.terminated || transition.truncated;
+        self.write_transition(out, row, transition);
+        if self.ended {
             self.env.info(out.info.row(row));
             if autoreset == Autoreset::SameStep {
                 self.write_final_observation(draw, out, row);
@@ -132,15 +132,15 @@ impl<E: Environment> EnvSlot<E> {
 
     /// Writes the row of an environment that did not step, without its frames: the current observation, a reward of 0, no flag.
     pub fn write_start(&self, out: &mut BatchMut<'_>, row: usize) {
-        self.write_transition(out, row, 0.0, false);
+        self.write_transition(out, row, Transition::default());
         out.info.row(row).fill(0.0);
         self.write_numbers(out, row);
     }
 
-    fn write_transition(&self, out: &mut BatchMut<'_>, row: usize, reward: f64, terminated: bool) {
-        out.reward.set(row, reward);
-        out.terminated.set(row, u8::from(terminated));
-        out.truncated.set(row, 0);
+    fn write_transition(&self, out: &mut BatchMut<'_>, row: usize, transition: Transition) {
+        out.reward.set(row, transition.reward);
+        out.terminated.set(row, u8::from(transition.terminated));
+        out.truncated.set(row, u8::from(transition.truncated));
         out.episode_return.set(row, self.episode_return);
         out.episode_length.set(row, self.episode_length);
     }

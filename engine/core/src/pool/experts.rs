@@ -3,18 +3,20 @@
 use thiserror::Error;
 
 use super::autoreset::Autoreset;
+use super::registry::{NoExpert, Registry};
 use crate::batch::Batch;
-use crate::envs::{EnvSpec, Expert, expert};
+use crate::envs::{Expert, UnknownEnvironment};
 
 /// One scripted [`Expert`] for each environment of a pool, or of a group of an engine. They read the feature observation of each batch.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::pool::{Experts, Pool, PoolConfig, ResetRequest, Threads};
 ///
 /// let config = PoolConfig { features: true, ..PoolConfig::new("MortarMayhem-Grid-v0", 4) };
-/// let mut pool = Pool::new(&config, &Threads::new(1)?)?;
-/// let mut experts = Experts::new(pool.spec(), 4, config.autoreset);
+/// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
+/// let mut experts = Experts::new(memory_gym(), &config.id, 4, config.autoreset)?;
 /// let (mut blocks, mut actions) = (zeroed(pool.layout().blocks()), [0; 4]);
 /// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
 /// for _ in 0..118 {
@@ -33,15 +35,21 @@ pub struct Experts {
 }
 
 impl Experts {
-    /// Experts for `num_envs` environments with that autoreset mode.
-    pub fn new(spec: &EnvSpec, num_envs: usize, autoreset: Autoreset) -> Self {
-        Experts {
-            experts: (0..num_envs).map(|_| expert(spec)).collect(),
+    /// Experts for `num_envs` environments of that id with that autoreset mode.
+    ///
+    /// # Errors
+    ///
+    /// [`ExpertsError::UnknownEnvironment`] if the registry does not have the id, and [`ExpertsError::NoExpert`] if its family has
+    /// no expert.
+    pub fn new(registry: &Registry, id: &str, num_envs: usize, autoreset: Autoreset) -> Result<Self, ExpertsError> {
+        let spec = registry.spec(id)?;
+        Ok(Experts {
+            experts: (0..num_envs).map(|_| registry.expert(id)).collect::<Result<_, _>>()?,
             autoreset,
             features: spec.features.len(),
             vector_observation: spec.vector_observation,
             branches: spec.action_space.branches().len(),
-        }
+        })
     }
 
     /// Chooses an action for every observation in `batch`, and writes it to `actions`: one row for each environment, one number for
@@ -78,9 +86,15 @@ impl Experts {
     }
 }
 
-/// A batch that the experts cannot play.
-#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+/// Experts that cannot be made, or a batch that they cannot play.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum ExpertsError {
+    /// The registry does not have the id.
+    #[error(transparent)]
+    UnknownEnvironment(#[from] UnknownEnvironment),
+    /// The id's family has no expert.
+    #[error(transparent)]
+    NoExpert(#[from] NoExpert),
     /// The batch has no features, or is of another id or another number of environments.
     #[error("experts need a batch with the {needed} features of {num_envs} environments, got {given} features")]
     Features {
@@ -105,7 +119,7 @@ pub enum ExpertsError {
 mod tests {
     use super::*;
     use crate::batch::zeroed;
-    use crate::envs::spec;
+    use crate::memory_gym;
     use crate::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 
     const NUM_ENVS: usize = 3;
@@ -121,10 +135,10 @@ mod tests {
 
     /// Plays until every environment has ended [`EPISODES`] episodes.
     fn play(id: &str, autoreset: Autoreset) -> Episodes {
-        let mut pool = Pool::new(&config(id, autoreset), &Threads::new(1).unwrap()).unwrap();
+        let mut pool = Pool::new(memory_gym(), &config(id, autoreset), &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
-        let mut experts = Experts::new(pool.spec(), NUM_ENVS, autoreset);
+        let mut experts = Experts::new(memory_gym(), id, NUM_ENVS, autoreset).unwrap();
         let mut actions = vec![0; NUM_ENVS * pool.spec().action_space.branches().len()];
         let mut episodes = Episodes::default();
         for _ in 0..5000 {
@@ -148,15 +162,16 @@ mod tests {
 
     /// The same episodes, each in an environment of its own, played by a new expert.
     fn alone(id: &str) -> Episodes {
-        let spec = spec(id).unwrap();
+        let spec = memory_gym().spec(id).unwrap();
         std::array::from_fn(|env| {
             let episode = |number: usize| {
                 let config = PoolConfig { num_envs: 1, total_envs: 1, ..config(id, Autoreset::Disabled) };
-                let mut pool = Pool::new(&config, &Threads::new(1).unwrap()).unwrap();
+                let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
                 let mut blocks = zeroed(pool.layout().blocks());
                 let seed = 5 + (number * NUM_ENVS + env) as u64 % 6;
                 pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-                let (mut expert, mut action) = (expert(spec), vec![0; spec.action_space.branches().len()]);
+                let (mut expert, mut action) =
+                    (memory_gym().expert(id).unwrap(), vec![0; spec.action_space.branches().len()]);
                 loop {
                     let batch = Batch::new(pool.layout(), &blocks);
                     if batch.terminated()[0] == 1 {
@@ -184,14 +199,14 @@ mod tests {
     #[test]
     fn batches_and_actions_of_other_sizes_are_errors() {
         let id = "MortarMayhemB-Grid-v0";
-        let pool = |config: &PoolConfig| Pool::new(config, &Threads::new(1).unwrap()).unwrap();
+        let pool = |config: &PoolConfig| Pool::new(memory_gym(), config, &Threads::new(1).unwrap()).unwrap();
         let act = |pool: &Pool, actions: &mut [i32]| {
             let blocks = zeroed(pool.layout().blocks());
-            Experts::new(spec(id).unwrap(), NUM_ENVS, Autoreset::NextStep)
+            Experts::new(memory_gym(), id, NUM_ENVS, Autoreset::NextStep)?
                 .act(&Batch::new(pool.layout(), &blocks), actions)
         };
         let good = config(id, Autoreset::NextStep);
-        let needed = NUM_ENVS * spec(id).unwrap().features.len();
+        let needed = NUM_ENVS * memory_gym().spec(id).unwrap().features.len();
         assert_eq!(act(&pool(&good), &mut [0; NUM_ENVS]), Ok(()));
         assert_eq!(act(&pool(&good), &mut [0; 2]), Err(ExpertsError::Actions { given: 2, needed: NUM_ENVS }));
         let plain = PoolConfig { features: false, ..good.clone() };

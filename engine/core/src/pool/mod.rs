@@ -15,6 +15,7 @@ mod experts;
 mod frame_stack;
 #[expect(clippy::module_inception, reason = "the file of the type `Pool`")]
 mod pool;
+mod registry;
 mod seeding;
 mod snapshot;
 mod sync;
@@ -29,6 +30,7 @@ pub use episodes::{NextOptions, RunningEpisode};
 pub use error::PoolError;
 pub use experts::{Experts, ExpertsError};
 pub use pool::Pool;
+pub use registry::{DuplicateEnvironment, NoExpert, Registry};
 pub use seeding::Seeding;
 pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};
 pub use threads::Threads;

@@ -1,21 +1,21 @@
 //! The pool: environments, threads, and the buffers that they write into.
 
+use std::sync::Arc;
+
 use super::autoreset::Autoreset;
 use super::buffers::Buffers;
 use super::config::{OptionMap, PoolConfig, ResetRequest};
 use super::drawn_scene::{DrawSettings, WrongFrame};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
+use super::registry::{Entry, Registry};
 use super::seeding::PoolEntropy;
 use super::snapshot::{ResumeError, SavedEnv, SnapshotError};
 use super::threads::Threads;
-use super::typed_envs::{AnyEnvs, WriteContext, typed_envs};
+use super::typed_envs::{AnyEnvs, WriteContext};
 use crate::batch::{BatchMut, Block, Layout, batch_layout};
-use crate::envs::mortar_mayhem::MortarMayhem;
-use crate::envs::mystery_path::MysteryPath;
-use crate::envs::searing_spotlights::SearingSpotlights;
 use crate::envs::view::VIEW_BYTES;
-use crate::envs::{self, EnvSpec, Family, Progress, SCREEN};
+use crate::envs::{EnvSpec, Progress, SCREEN};
 use crate::raster::PixelFormat;
 
 /// Environments of one id in lockstep.
@@ -25,9 +25,10 @@ use crate::raster::PixelFormat;
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
 ///
-/// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 8), &Threads::new(1)?)?;
+/// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 8), &Threads::new(1)?)?;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
 ///
@@ -41,7 +42,7 @@ use crate::raster::PixelFormat;
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Pool {
-    spec: &'static EnvSpec,
+    entry: Arc<Entry>,
     layout: Layout,
     envs: Box<dyn AnyEnvs>,
     buffers: Buffers,
@@ -59,20 +60,14 @@ impl Pool {
     /// # Errors
     ///
     /// [`PoolError`] if the id is unknown, or a reset parameter or a number of `config` is out of its range.
-    pub fn new(config: &PoolConfig, threads: &Threads) -> Result<Self, PoolError> {
-        let spec = envs::spec(&config.id)?;
+    pub fn new(registry: &Registry, config: &PoolConfig, threads: &Threads) -> Result<Self, PoolError> {
+        let entry = registry.entry(&config.id)?;
         config.check()?;
-        let layout = batch_layout(spec, config.num_envs, config.contents())?;
+        let layout = batch_layout(&entry.spec, config.num_envs, config.contents())?;
         let entropy = PoolEntropy::draw(&config.seeding)?;
-        let envs: Box<dyn AnyEnvs> = match spec.family {
-            Family::MortarMayhem(variant) => Box::new(typed_envs::<MortarMayhem>(spec, variant, config, entropy)?),
-            Family::MysteryPath(variant) => Box::new(typed_envs::<MysteryPath>(spec, variant, config, entropy)?),
-            Family::SearingSpotlights(variant) => {
-                Box::new(typed_envs::<SearingSpotlights>(spec, variant, config, entropy)?)
-            }
-        };
+        let envs = entry.envs(config, entropy)?;
         Ok(Pool {
-            spec,
+            entry: Arc::clone(entry),
             layout,
             envs,
             buffers: Buffers::new(entropy.identity()),
@@ -86,8 +81,8 @@ impl Pool {
     }
 
     /// The specification of the environment id.
-    pub fn spec(&self) -> &'static EnvSpec {
-        self.spec
+    pub fn spec(&self) -> &EnvSpec {
+        &self.entry.spec
     }
 
     /// The layout of this pool's batches.
@@ -151,7 +146,7 @@ impl Pool {
         if !self.was_reset {
             return Err(PoolError::NotReset);
         }
-        self.spec.action_space.check(self.layout.num_envs(), actions)?;
+        self.entry.spec.action_space.check(self.layout.num_envs(), actions)?;
         let autoreset = self.autoreset;
         self.write(batch, |envs, context, out| envs.step(context, autoreset, actions, out))
     }
@@ -188,9 +183,10 @@ impl Pool {
     ///
     /// ```
     /// use endless_gym_core::batch::zeroed;
+    /// use endless_gym_core::memory_gym;
     /// use endless_gym_core::pool::{NextOptions, Pool, PoolConfig, ResetRequest, Threads};
     ///
-    /// let mut pool = Pool::new(&PoolConfig::new("MortarMayhem-Grid-v0", 4), &Threads::new(1)?)?;
+    /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MortarMayhem-Grid-v0", 4), &Threads::new(1)?)?;
     /// let mut blocks = zeroed(pool.layout().blocks());
     /// let options = serde_json::from_str(r#"{"command_count": [1]}"#)?;
     /// pool.set_options(&[NextOptions { options, envs: vec![0, 3] }])?;
@@ -236,8 +232,9 @@ impl Pool {
     ///
     /// ```
     /// # use endless_gym_core::batch::{Batch, zeroed};
+    /// # use endless_gym_core::memory_gym;
     /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
-    /// let mut pool = Pool::new(&PoolConfig::new("MysteryPath-v0", 2), &Threads::new(1)?)?;
+    /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-v0", 2), &Threads::new(1)?)?;
     /// let mut blocks = zeroed(pool.layout().blocks());
     /// pool.reset(ResetRequest::Seed(3), &mut blocks)?;
     /// let snapshot = pool.snapshot(0)?;
@@ -279,14 +276,15 @@ impl Pool {
     ///
     /// ```
     /// # use endless_gym_core::batch::zeroed;
+    /// # use endless_gym_core::memory_gym;
     /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     /// let config = PoolConfig::new("MysteryPath-v0", 2);
-    /// let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+    /// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
     /// let mut blocks = zeroed(pool.layout().blocks());
     /// pool.reset(ResetRequest::Seed(3), &mut blocks)?;
     /// let saved = pool.save()?.expect("the environments have been reset");
     ///
-    /// let mut successor = Pool::new(&config, &Threads::new(1)?)?;
+    /// let mut successor = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
     /// successor.resume(&saved)?;
     /// successor.step(&[1, 0, 2, 2], &mut blocks)?;
     /// # Ok::<(), Box<dyn std::error::Error>>(())

@@ -87,13 +87,13 @@ pub(super) struct TypedEnvs<E: Environment> {
     drawn: Vec<Vec<DrawnScene<E>>>,
     /// Frames in an observation.
     stack: usize,
-    spec: &'static EnvSpec,
+    spec: EnvSpec,
     variant: E::Variant,
 }
 
 /// Makes the environments of one family; those with the same options share their assets.
 pub(super) fn typed_envs<E: Environment>(
-    spec: &'static EnvSpec,
+    spec: &EnvSpec,
     variant: E::Variant,
     config: &PoolConfig,
     entropy: PoolEntropy,
@@ -131,7 +131,7 @@ pub(super) fn typed_envs<E: Environment>(
         }
         EnvSlot::new(assets, options, seeds, entropy.environment(number), stack, config.independent_episodes)
     });
-    Ok(TypedEnvs { slots: slots.collect(), drawn: Vec::new(), stack, spec, variant })
+    Ok(TypedEnvs { slots: slots.collect(), drawn: Vec::new(), stack, spec: spec.clone(), variant })
 }
 
 impl<E: Environment> TypedEnvs<E> {

@@ -15,11 +15,12 @@ use crate::pool::{OptionMap, Pool};
 ///
 /// ```
 /// use endless_gym_core::batch::zeroed;
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::pool::{Autoreset, Pool, PoolConfig, ResetRequest, Threads};
 /// use endless_gym_core::trace::{Recorder, Trace, replay};
 ///
 /// let config = PoolConfig { autoreset: Autoreset::Disabled, ..PoolConfig::new("MysteryPath-v0", 1) };
-/// let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+/// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// let mut recorder = Recorder::new("MysteryPath-v0", &Default::default());
 /// pool.reset(ResetRequest::Seed(3), &mut blocks)?;
@@ -30,7 +31,7 @@ use crate::pool::{OptionMap, Pool};
 /// }
 /// let mut file = Vec::new();
 /// recorder.write(&mut file)?;
-/// assert_eq!(replay(&Trace::read(file.as_slice())?)?.differences, 0);
+/// assert_eq!(replay(memory_gym(), &Trace::read(file.as_slice())?)?.differences, 0);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Debug)]

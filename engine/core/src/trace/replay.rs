@@ -7,7 +7,7 @@ use serde_json::{Map, Value as Json};
 use super::format::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
 use crate::envs::view::VIEW_BYTES;
-use crate::pool::{Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
+use crate::pool::{Autoreset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
 
 /// The outcome of a replay.
 #[derive(Debug, Default)]
@@ -69,19 +69,20 @@ impl Replay {
 /// [`TraceError::Pool`] if the trace's environment, reset parameters or actions are not valid.
 ///
 /// ```
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::trace::{Trace, replay};
 ///
 /// let text = r#"{"env": "MysteryPath-Grid-v0", "options": {}, "episodes": [
 ///     {"seed": 1, "reset_crc": 0, "reset_info": {}, "steps": [[0, 0.0, false, 0, {}]]}]}"#;
 /// let trace: Trace = serde_json::from_str(text)?;
-/// let outcome = replay(&trace)?;
+/// let outcome = replay(memory_gym(), &trace)?;
 /// assert_eq!((outcome.episodes, outcome.steps), (1, 1));
 /// // The two checksums of observations are wrong.
 /// assert_eq!(outcome.differences, 2);
 /// assert_eq!(outcome.first.unwrap().what, "observation checksum");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
-pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
+pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> {
     let config = PoolConfig {
         options: ResetOptions::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
@@ -90,7 +91,7 @@ pub fn replay(trace: &Trace) -> Result<Replay, TraceError> {
         seeding: Seeding::Continue { seed: Some(0) },
         ..PoolConfig::new(&trace.env, 1)
     };
-    let mut pool = Pool::new(&config, &Threads::new(1)?)?;
+    let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
     let mut view = vec![0; VIEW_BYTES];
     let mut replay = Replay::default();

@@ -138,6 +138,7 @@ fn create<T>(
 mod tests {
     use std::sync::mpsc::channel;
 
+    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::PoolConfig;
 
     use super::*;
@@ -151,7 +152,8 @@ mod tests {
         let namespace = Namespace::at(format!("/tmp/endless-rest-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);
-        let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), observers: 0, ..config }).unwrap();
+        let engine =
+            Engine::new(memory_gym(), &EngineConfig { namespace: namespace.clone(), observers: 0, ..config }).unwrap();
         let (to_main, ready) = channel();
         let (to_rest, end) = channel::<()>();
         let (root, specification) = (&namespace, &engine.specification().clone());

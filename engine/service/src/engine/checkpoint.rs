@@ -377,6 +377,7 @@ impl Drop for CheckpointLock {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::zeroed;
+    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     use proptest::prelude::*;
 
@@ -385,7 +386,8 @@ mod tests {
     /// A head and the file of a checkpoint of two groups, one of which was not reset.
     fn checkpoint(name: &str) -> (CheckpointHead, Vec<u8>) {
         let path = std::env::temp_dir().join(format!("endless-checkpoint-{name}-{}", std::process::id()));
-        let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
+        let mut pool =
+            Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
         pool.reset(ResetRequest::Seed(1), &mut zeroed(pool.layout().blocks())).unwrap();
         let groups = vec![SavedGroup { step: 7, envs: pool.save().unwrap() }, SavedGroup { step: 0, envs: None }];
         let head = CheckpointHead {
@@ -449,7 +451,7 @@ mod tests {
             let checksum = crc32fast::hash(&bytes[PREAMBLE..]);
             bytes[8..PREAMBLE].copy_from_slice(&checksum.to_le_bytes());
             if let Ok(groups) = decode(Path::new("file"), &bytes, &head) {
-                let mut pool = Pool::new(&PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
+                let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
                 for group in groups {
                     let _ = group.envs.map(|envs| pool.resume(&envs));
                 }

@@ -355,13 +355,13 @@ fn copy<T: Copy>(to: &mut Vec<T>, from: &[T]) {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::{action_layout, zeroed};
-    use endless_gym_core::envs;
+    use endless_gym_core::envs::ActionSpace;
 
     use super::*;
 
     #[test]
     fn a_request_that_changes_after_it_was_read_has_no_effect() {
-        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1).unwrap();
+        let layout = action_layout(&ActionSpace::Discrete(4), 1).unwrap();
         let mut payload = zeroed(layout.blocks());
         let mut data = RequestData::default();
         let header = |kind: RequestKind, bytes| RequestHeader {
@@ -386,7 +386,7 @@ mod tests {
 
     #[test]
     fn a_length_beyond_the_payload_reads_nothing() {
-        let layout = action_layout(envs::spec("MortarMayhem-Grid-v0").unwrap(), 1).unwrap();
+        let layout = action_layout(&ActionSpace::Discrete(4), 1).unwrap();
         let payload = zeroed(layout.blocks());
         let header =
             RequestHeader { layout_version: LAYOUT_VERSION, kind: 2, bytes: u64::MAX, ..RequestHeader::default() };

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::{Block, LAYOUT_VERSION, action_layout};
-use endless_gym_core::pool::{Pool, PoolError, ResetOptions, Threads};
+use endless_gym_core::pool::{Pool, PoolError, Registry, ResetOptions, Threads};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 
@@ -50,6 +50,7 @@ const START_ATTEMPTS: usize = 3;
 /// use std::sync::atomic::{AtomicBool, Ordering};
 /// use std::time::Duration;
 ///
+/// use endless_gym_core::memory_gym;
 /// use endless_gym_core::pool::{PoolConfig, ResetRequest};
 /// use endless_gym_service::{ConnectConfig, Engine, EngineConfig, Namespace, Trainer};
 ///
@@ -60,7 +61,7 @@ const START_ATTEMPTS: usize = 3;
 /// # */
 /// let pool = PoolConfig::new("MortarMayhem-Grid-v0", 4);
 /// let config = EngineConfig { namespace: namespace.clone(), ..EngineConfig::new("example", pool, 1) };
-/// let mut engine = Engine::new(&config)?;
+/// let mut engine = Engine::new(memory_gym(), &config)?;
 /// let stop = AtomicBool::new(false);
 ///
 /// std::thread::scope(|scope| {
@@ -109,12 +110,12 @@ impl Engine {
     /// the engine's files are removed while it starts, [`ServiceError::NamespaceLocked`] if another process holds the namespace's
     /// lock for too long, [`ServiceError::Checkpoint`] for a checkpoint that exists, cannot be written, or cannot be resumed from,
     /// and [`ServiceError::Middleware`] for other errors of iceoryx2.
-    pub fn new(config: &EngineConfig) -> Result<Self, ServiceError> {
+    pub fn new(registry: &Registry, config: &EngineConfig) -> Result<Self, ServiceError> {
         config.check()?;
         let mut node = NamespaceNode::join(&config.namespace, START_PATIENCE)?;
         discovery::refuse_second_engine(&node, &config.service, &node.lock()?)?;
         let (pools, threads) = (config.pools()?, Threads::new(config.threads)?);
-        let pools = || pools.iter().map(|pool| Pool::new(pool, &threads)).collect::<Result<Vec<_>, _>>();
+        let pools = || pools.iter().map(|pool| Pool::new(registry, pool, &threads)).collect::<Result<Vec<_>, _>>();
         let mut attempt = 1;
         loop {
             match Self::start(config, node, pools()?) {
@@ -366,7 +367,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
         num_envs: config.pool.num_envs,
         first_env: config.pool.first_env,
         batch: pool.layout().clone(),
-        action: action_layout(spec, config.pool.num_envs)?,
+        action: action_layout(&spec.action_space, config.pool.num_envs)?,
         frames: config.pool.frames,
         action_space: spec.action_space.clone(),
         info: spec.info.iter().map(|column| column.name.to_owned()).collect(),
@@ -385,6 +386,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
 
 #[cfg(test)]
 mod tests {
+    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::PoolConfig;
 
     use super::*;
@@ -395,7 +397,7 @@ mod tests {
         let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);
-        let engine = Engine::new(&EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
+        let engine = Engine::new(memory_gym(), &EngineConfig { namespace: namespace.clone(), ..config }).unwrap();
         let check = || Engine::check_published(&engine.node, engine.specification());
         check().unwrap();
         let services = namespace.root().join("services");

@@ -1,7 +1,7 @@
 //! The specification of an engine: what trainers and observers must know before they connect.
 
 use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, Section, action_layout};
-use endless_gym_core::envs::{self, ActionSpace};
+use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::pool::{Autoreset, MAX_ENVS};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
@@ -80,10 +80,9 @@ impl ServiceSpecification {
                 return Err(format!("{name} must be {lowest} to {highest}, got {given}"));
             }
         }
-        let spec = envs::spec(&self.id).map_err(|e| e.to_string())?;
-        let action = action_layout(spec, self.num_envs).map_err(|e| e.to_string())?;
-        if self.action != action || self.action_space != spec.action_space {
-            return Err(format!("action layout or action space is not that of {}", self.id));
+        let action = action_layout(&self.action_space, self.num_envs).map_err(|e| e.to_string())?;
+        if self.action != action {
+            return Err(format!("action must be the layout of actions in {}", self.action_space));
         }
         if self.batch.num_envs() != self.num_envs {
             return Err(format!("batch must have {} environments, got {}", self.num_envs, self.batch.num_envs()));

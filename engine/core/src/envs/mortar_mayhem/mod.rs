@@ -17,11 +17,12 @@ pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
 pub use config::Config;
 pub use drawing::{Assets, Scene};
 pub use parameters::{Locomotion, Parameters, Variant};
-pub use registry::SPECS;
+pub use registry::IDS;
 pub use state::State;
 
 use super::character_sprites::CharacterSprites;
 use super::environment::{Environment, InvalidState, Transition};
+use super::expert::Expert;
 use super::parameters::ResetParameters;
 use super::progress::Progress;
 use crate::random::Generator;
@@ -127,5 +128,9 @@ impl Environment for MortarMayhem {
     fn info(&self, out: &mut [f64]) {
         let endless = self.assets.config.variant.endless;
         out.copy_from_slice(&if endless { self.state.endless_info() } else { self.state.finite_info() });
+    }
+
+    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+        Some(Box::new(expert::MortarExpert::new(variant)))
     }
 }

@@ -1,10 +1,33 @@
-//! The reset parameters of Mortar Mayhem as typed values, and their limits.
+//! The reset parameters of Mortar Mayhem as typed values, their limits, and the variants of its ids.
 //!
 //! Source: `default_reset_parameters` and `process_reset_params` of the original.
 
 use super::commands::COMMANDS;
-pub use crate::envs::family::{Locomotion, MortarMayhemVariant as Variant};
 use crate::envs::parameters::ResetParameters;
+
+/// What distinguishes the ids of Mortar Mayhem.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Variant {
+    /// How the agent moves.
+    pub locomotion: Locomotion,
+    /// The commands are provided as a vector observation and never shown.
+    pub commands_given: bool,
+    /// The sequence of commands grows until the agent fails.
+    pub endless: bool,
+    /// The agent starts up to two pixels off its tile's centre.
+    pub start_offset: bool,
+}
+
+/// How the agent of Mortar Mayhem moves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Locomotion {
+    /// By `agent_speed` in eight directions, limited by the arena's border.
+    Free,
+    /// By `agent_speed` in eight directions; leaving the screen on one side leads to the other.
+    Wrapping,
+    /// Turns and walks from tile to tile.
+    Grid,
+}
 
 /// Largest scale of the agent: a radius of 100 pixels.
 pub const MAX_AGENT_SCALE: f64 = 4.0;

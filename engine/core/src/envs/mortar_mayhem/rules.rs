@@ -114,7 +114,7 @@ impl State {
 
     /// Plays one step.
     pub(super) fn step(&mut self, config: &Config, action: &[i32], random: &mut Generator) -> Transition {
-        let mut transition = Transition { reward: 0.0, terminated: false };
+        let mut transition = Transition::default();
         self.first_frame = false;
         self.success = false;
         if self.display.is_over() {

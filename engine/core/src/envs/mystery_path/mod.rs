@@ -34,11 +34,12 @@ pub use config::Config;
 pub use drawing::Assets;
 pub use endless::Direction;
 pub use parameters::{Parameters, Variant};
-pub use registry::SPECS;
+pub use registry::IDS;
 pub use scene::Scene;
 pub use state::State;
 
 use super::environment::{Environment, InvalidState, Transition};
+use super::expert::Expert;
 use super::parameters::ResetParameters;
 use super::progress::Progress;
 use crate::random::Generator;
@@ -129,5 +130,9 @@ impl Environment for MysteryPath {
             Variant::Free | Variant::Grid => out.copy_from_slice(&self.state.finite_info()),
             Variant::Endless => out.copy_from_slice(&self.state.endless_info()),
         }
+    }
+
+    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+        Some(Box::new(expert::PathExpert::new(variant)))
     }
 }

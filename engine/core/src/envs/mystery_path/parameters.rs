@@ -1,9 +1,19 @@
-//! The reset parameters of Mystery Path as typed values, and their limits.
+//! The reset parameters of Mystery Path as typed values, their limits, and the variants of its ids.
 //!
 //! Source: `default_reset_parameters` and `process_reset_params` of the original.
 
-pub use crate::envs::family::MysteryPathVariant as Variant;
 use crate::envs::parameters::ResetParameters;
+
+/// What distinguishes the ids of Mystery Path.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Variant {
+    /// One screen with a goal; the agent moves by `agent_speed` in eight directions, limited by the screen's border.
+    Free,
+    /// One screen with a goal; the agent turns and walks from tile to tile.
+    Grid,
+    /// An endless path to the right, along which the screen scrolls; the agent moves right, up or down.
+    Endless,
+}
 
 /// The original's default scale of the agent: a radius of 6 pixels.
 pub const DEFAULT_AGENT_SCALE: f64 = 0.25;

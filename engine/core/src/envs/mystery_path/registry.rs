@@ -7,7 +7,6 @@ use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
 use crate::envs::action_space::ActionSpace;
 use crate::envs::controls::{FOLLOW, MOVE, TURN_AND_WALK};
-use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
 use crate::envs::screen::SCREEN;
 use crate::envs::spec::{Column, EnvSpec, InfoColumn};
@@ -138,47 +137,53 @@ const GROUND_TRUTH: &[Column] = &[
 ];
 
 /// The three ids of the family.
-pub const SPECS: &[EnvSpec] = &[
-    EnvSpec {
-        id: "MysteryPath-v0",
-        summary: "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
-        family: Family::MysteryPath(Variant::Free),
-        action_space: ActionSpace::multi_discrete(&[3, 3]),
-        actions: MOVE,
-        vector_observation: 0,
-        ground_truth: &[],
-        ground_truth_is_integer: false,
-        info: FINITE_INFO,
-        features: FINITE_FEATURES,
-        parameters: MYSTERY_PATH,
-        render_fps: 25,
-    },
-    EnvSpec {
-        id: "MysteryPath-Grid-v0",
-        summary: "Mystery Path with turning and walking from tile to tile",
-        family: Family::MysteryPath(Variant::Grid),
-        action_space: ActionSpace::Discrete(4),
-        actions: TURN_AND_WALK,
-        vector_observation: 0,
-        ground_truth: &[],
-        ground_truth_is_integer: false,
-        info: FINITE_INFO,
-        features: FINITE_FEATURES,
-        parameters: MYSTERY_PATH_GRID,
-        render_fps: 3,
-    },
-    EnvSpec {
-        id: "Endless-MysteryPath-v0",
-        summary: "An invisible path without end; falling off before the farthest point, or twice at one tile, ends it",
-        family: Family::MysteryPath(Variant::Endless),
-        action_space: ActionSpace::Discrete(4),
-        actions: FOLLOW,
-        vector_observation: 0,
-        ground_truth: GROUND_TRUTH,
-        ground_truth_is_integer: true,
-        info: ENDLESS_INFO,
-        features: ENDLESS_FEATURES,
-        parameters: ENDLESS_MYSTERY_PATH,
-        render_fps: 25,
-    },
+pub const IDS: &[(EnvSpec, Variant)] = &[
+    (
+        EnvSpec {
+            id: "MysteryPath-v0",
+            summary: "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
+            action_space: ActionSpace::multi_discrete(&[3, 3]),
+            actions: MOVE,
+            vector_observation: 0,
+            ground_truth: &[],
+            ground_truth_is_integer: false,
+            info: FINITE_INFO,
+            features: FINITE_FEATURES,
+            parameters: MYSTERY_PATH,
+            render_fps: 25,
+        },
+        Variant::Free,
+    ),
+    (
+        EnvSpec {
+            id: "MysteryPath-Grid-v0",
+            summary: "Mystery Path with turning and walking from tile to tile",
+            action_space: ActionSpace::Discrete(4),
+            actions: TURN_AND_WALK,
+            vector_observation: 0,
+            ground_truth: &[],
+            ground_truth_is_integer: false,
+            info: FINITE_INFO,
+            features: FINITE_FEATURES,
+            parameters: MYSTERY_PATH_GRID,
+            render_fps: 3,
+        },
+        Variant::Grid,
+    ),
+    (
+        EnvSpec {
+            id: "Endless-MysteryPath-v0",
+            summary: "An invisible path without end; falling off before the farthest point, or twice at one tile, ends it",
+            action_space: ActionSpace::Discrete(4),
+            actions: FOLLOW,
+            vector_observation: 0,
+            ground_truth: GROUND_TRUTH,
+            ground_truth_is_integer: true,
+            info: ENDLESS_INFO,
+            features: ENDLESS_FEATURES,
+            parameters: ENDLESS_MYSTERY_PATH,
+            render_fps: 25,
+        },
+        Variant::Endless,
+    ),
 ];

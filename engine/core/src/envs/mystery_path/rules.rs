@@ -48,7 +48,7 @@ impl State {
     pub(super) fn step(&mut self, config: &Config, action: &[i32], random: &mut Generator) -> Transition {
         let parameters = &config.parameters;
         let endless = config.variant == Variant::Endless;
-        let mut transition = Transition { reward: 0.0, terminated: false };
+        let mut transition = Transition::default();
         self.move_agent(config, action);
         self.tile = tile_at(self.agent.position);
         if endless {

@@ -6,8 +6,8 @@ use serde_json::{Map, Value as Json, json};
 use super::config::TILE;
 use super::features::{BACKGROUND, FALLEN, PAST_PATH, PAST_SHIFT, STAMINA};
 use super::path::{GRID, Tile};
-use super::{MysteryPath, SPECS, State, Variant};
-use crate::envs::{EnvSpec, Environment, FRAME_BYTES, Family, ResetParameters, SCREEN, Transition};
+use super::{IDS, MysteryPath, State, Variant};
+use crate::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters, SCREEN, Transition};
 use crate::random::Generator;
 
 /// Actions of the endless id.
@@ -24,11 +24,10 @@ struct Game {
 
 impl Game {
     fn new(number: usize, options: &Json, seed: u64) -> Self {
-        let spec = &SPECS[number];
-        let Family::MysteryPath(variant) = spec.family else { panic!("{}", spec.id) };
+        let (spec, variant) = &IDS[number];
         let given: Map<String, Json> = options.as_object().unwrap().clone();
         let parameters = ResetParameters::new(spec.id, spec.parameters, &given).unwrap();
-        let assets = Arc::new(MysteryPath::assets(variant, &parameters));
+        let assets = Arc::new(MysteryPath::assets(*variant, &parameters));
         let mut game = Game { spec, env: MysteryPath::new(&assets), random: Generator::from_seed(seed) };
         game.env.reset(&assets, &mut game.random);
         game
@@ -61,7 +60,7 @@ impl Game {
 
     /// Moves to a neighbouring tile of the path or off it, and sums up the rewards.
     fn walk_to(&mut self, (x, y): Tile) -> Transition {
-        let mut sum = Transition { reward: 0.0, terminated: false };
+        let mut sum = Transition::default();
         while self.state().tile != (x, y) && !self.state().off_path && !sum.terminated {
             let (from_x, from_y) = self.state().tile;
             let towards = |offset: i32| [1, 0, 2][(offset.signum() + 1) as usize];
@@ -119,7 +118,7 @@ fn a_fall_shows_a_cross_and_leads_back() {
         let mut game = Game::new(0, &options, seed);
         let start = game.state().agent.position;
         let off = game.beside(0).unwrap();
-        assert_eq!(game.walk_to(off), Transition { reward: -1.0, terminated: false });
+        assert_eq!(game.walk_to(off), Transition { reward: -1.0, ..Transition::default() });
         assert_eq!(game.features()[FALLEN], f32::from(u8::from(visual_feedback)));
         let is_red = |frame: &[u8]| frame.as_chunks::<3>().0.contains(&[255, 0, 0]);
         assert_eq!(is_red(&game.frame()), visual_feedback);
@@ -225,7 +224,7 @@ fn features_show_the_past_path_where_the_picture_shows_it() {
 
 #[test]
 fn a_restored_state_continues_identically() {
-    for number in 0..SPECS.len() {
+    for number in 0..IDS.len() {
         let mut game = Game::new(number, &json!({}), 9);
         let branches = game.spec.action_space.branches();
         let action = |step: i32| branches.iter().map(|n| step * 7 / 3 % n).collect::<Vec<i32>>();
@@ -246,7 +245,7 @@ fn a_restored_state_continues_identically() {
 
 #[test]
 fn column_names_are_unique() {
-    for spec in SPECS {
+    for (spec, _) in IDS {
         let mut names: Vec<&str> = spec.features.iter().map(|column| column.name).collect();
         assert!(names.iter().all(|name| !name.is_empty()));
         names.sort_unstable();
@@ -273,7 +272,7 @@ proptest! {
             "show_background": show, "show_stamina": show, "show_goal": show, "show_origin": show,
         });
         let mut options = Map::new();
-        for parameter in SPECS[number].parameters {
+        for parameter in IDS[number].0.parameters {
             options.extend(all.get(parameter.name).map(|value| (parameter.name.to_owned(), value.clone())));
         }
         let mut game = Game::new(number, &Json::Object(options), seed);

@@ -50,11 +50,12 @@ use std::sync::Arc;
 pub use config::Config;
 pub use parameters::{MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters, Variant};
 pub use pictures::Assets;
-pub use registry::SPECS;
+pub use registry::IDS;
 pub use scene::Scene;
 pub use state::State;
 
 use super::environment::{Environment, InvalidState, Transition};
+use super::expert::Expert;
 use super::parameters::ResetParameters;
 use super::progress::Progress;
 use crate::random::Generator;
@@ -146,5 +147,9 @@ impl Environment for SearingSpotlights {
         } else {
             out.copy_from_slice(&self.state.finite_info(parameters));
         }
+    }
+
+    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+        Some(Box::new(expert::SpotlightsExpert::new(variant)))
     }
 }

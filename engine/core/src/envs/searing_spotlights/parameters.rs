@@ -1,9 +1,15 @@
-//! The reset parameters of Searing Spotlights as typed values, and their limits.
+//! The reset parameters of Searing Spotlights as typed values, their limits, and the variants of its ids.
 //!
 //! Source: `default_reset_parameters` of the original.
 
-pub use crate::envs::family::SearingSpotlightsVariant as Variant;
 use crate::envs::parameters::ResetParameters;
+
+/// What distinguishes the ids of Searing Spotlights.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Variant {
+    /// A collected coin is replaced by a new one, and there is no exit.
+    pub endless: bool,
+}
 
 /// Largest number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another
 /// one leaves.

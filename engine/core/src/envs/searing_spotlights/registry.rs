@@ -7,7 +7,6 @@ use super::features::FEATURES;
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use crate::envs::action_space::ActionSpace;
 use crate::envs::controls::MOVE;
-use crate::envs::family::Family;
 use crate::envs::parameters::Parameter;
 use crate::envs::spec::{Column, EnvSpec, InfoColumn};
 
@@ -227,33 +226,37 @@ const GROUND_TRUTH: &[Column] = &[
 ];
 
 /// The two ids of the family.
-pub const SPECS: &[EnvSpec] = &[
-    EnvSpec {
-        id: "SearingSpotlights-v0",
-        summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
-        family: Family::SearingSpotlights(Variant { endless: false }),
-        action_space: ActionSpace::multi_discrete(&[3, 3]),
-        actions: MOVE,
-        vector_observation: 0,
-        ground_truth: &[],
-        ground_truth_is_integer: false,
-        info: FINITE_INFO,
-        features: FEATURES,
-        parameters: SEARING_SPOTLIGHTS,
-        render_fps: 25,
-    },
-    EnvSpec {
-        id: "Endless-SearingSpotlights-v0",
-        summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
-        family: Family::SearingSpotlights(Variant { endless: true }),
-        action_space: ActionSpace::multi_discrete(&[3, 3]),
-        actions: MOVE,
-        vector_observation: 0,
-        ground_truth: GROUND_TRUTH,
-        ground_truth_is_integer: false,
-        info: ENDLESS_INFO,
-        features: FEATURES,
-        parameters: ENDLESS_SEARING_SPOTLIGHTS,
-        render_fps: 25,
-    },
+pub const IDS: &[(EnvSpec, Variant)] = &[
+    (
+        EnvSpec {
+            id: "SearingSpotlights-v0",
+            summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
+            action_space: ActionSpace::multi_discrete(&[3, 3]),
+            actions: MOVE,
+            vector_observation: 0,
+            ground_truth: &[],
+            ground_truth_is_integer: false,
+            info: FINITE_INFO,
+            features: FEATURES,
+            parameters: SEARING_SPOTLIGHTS,
+            render_fps: 25,
+        },
+        Variant { endless: false },
+    ),
+    (
+        EnvSpec {
+            id: "Endless-SearingSpotlights-v0",
+            summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
+            action_space: ActionSpace::multi_discrete(&[3, 3]),
+            actions: MOVE,
+            vector_observation: 0,
+            ground_truth: GROUND_TRUTH,
+            ground_truth_is_integer: false,
+            info: ENDLESS_INFO,
+            features: FEATURES,
+            parameters: ENDLESS_SEARING_SPOTLIGHTS,
+            render_fps: 25,
+        },
+        Variant { endless: true },
+    ),
 ];

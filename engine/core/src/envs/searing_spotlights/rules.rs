@@ -122,7 +122,7 @@ impl State {
 
         self.shown_reward_positive = self.last_reward_positive;
         self.last_reward_positive = reward > 0.0;
-        Transition { reward, terminated }
+        Transition { reward, terminated, truncated: false }
     }
 
     /// Increases the darkness until it exceeds the threshold.

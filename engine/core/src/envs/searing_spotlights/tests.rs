@@ -6,13 +6,13 @@ use proptest::prelude::*;
 use serde_json::{Map, Value as Json, json};
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLIGHT};
-use super::{Assets, MAX_SPOTLIGHTS, SPECS, SearingSpotlights, State, Variant};
+use super::{Assets, IDS, MAX_SPOTLIGHTS, SearingSpotlights, State, Variant};
 use crate::envs::{EnvSpec, Environment, FRAME_BYTES, Parameter, ParameterKind, ResetParameters, SCREEN};
 use crate::random::Generator;
 use crate::raster::{Canvas, Surface};
 
-const FINITE: &EnvSpec = &SPECS[0];
-const ENDLESS: &EnvSpec = &SPECS[1];
+const FINITE: &EnvSpec = &IDS[0].0;
+const ENDLESS: &EnvSpec = &IDS[1].0;
 
 fn assets(spec: &'static EnvSpec, options: &Map<String, Json>) -> Arc<Assets> {
     let parameters = ResetParameters::new(spec.id, spec.parameters, options).unwrap();
@@ -263,7 +263,7 @@ fn repainted_frame_equals_frame_painted_in_full() {
         json!({"initial_spawns": 12, "spot_min_radius": 1.0, "spot_max_radius": 90.0, "spot_damage": 0.3}),
         json!({"initial_spawns": 6, "spot_min_speed": 0.01, "spot_max_speed": 0.1, "num_spawns": 1000}),
     ];
-    for spec in SPECS {
+    for (spec, _) in IDS {
         for (view, light) in views.iter().flat_map(|view| lights.iter().map(move |light| (view, light))) {
             let mut options = view.as_object().unwrap().clone();
             options.extend(light.as_object().unwrap().clone());

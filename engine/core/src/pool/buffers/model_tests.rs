@@ -4,7 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::batch::{Contents, batch_layout, zeroed};
-use crate::envs;
+use crate::memory_gym;
 use crate::property_cases::property_cases;
 
 /// What happens to the buffers of two pools.
@@ -74,7 +74,7 @@ impl Model {
 
 fn layout() -> Layout {
     let contents = Contents::default();
-    batch_layout(envs::specs().next().unwrap(), 1, contents).unwrap()
+    batch_layout(memory_gym().specs().next().unwrap(), 1, contents).unwrap()
 }
 
 #[test]

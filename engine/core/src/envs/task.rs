@@ -1,0 +1,192 @@
+//! The small trait for an environment of one's own.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use serde::{Serialize, de::DeserializeOwned};
+
+use super::environment::{Environment, InvalidState, Transition};
+use super::parameters::ResetParameters;
+use super::progress::Progress;
+use super::spec::EnvSpec;
+use crate::random::Generator;
+use crate::raster::Canvas;
+
+/// The rules of one id, and what they show: all that an environment needs in order to run in a pool or an engine.
+///
+/// A value is the state of one environment: what a snapshot stores, and what [`paint`](Task::paint) shows. One value plays many
+/// episodes; [`Default`] makes it, and [`reset`](Task::reset) comes before every other call. Everything random comes from the given
+/// generator, so that an episode follows from its seed, its reset parameters and the actions.
+///
+/// A family that shares rules among ids, keeps pictures, or repaints only what changed implements [`Environment`] instead.
+///
+/// ```
+/// use endless_gym_core::batch::{Batch, zeroed};
+/// use endless_gym_core::envs::{ActionSpace, Column, EnvSpec, ResetParameters, Task, Transition};
+/// use endless_gym_core::pool::{Pool, PoolConfig, Registry, ResetRequest, Threads};
+/// use endless_gym_core::random::Generator;
+/// use serde::{Deserialize, Serialize};
+///
+/// /// Repeat the number that was shown first.
+/// #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+/// struct Repeat {
+///     number: i32,
+///     step: usize,
+/// }
+///
+/// impl Task for Repeat {
+///     type Parameters = ();
+///
+///     fn spec() -> EnvSpec {
+///         const FEATURES: &[Column] = &[Column { name: "number", description: "the number, in the first step" }];
+///         EnvSpec { features: FEATURES, ..EnvSpec::new("Repeat-v0", "Repeat the first number", ActionSpace::Discrete(4)) }
+///     }
+///
+///     fn parameters(_: &ResetParameters) {}
+///
+///     fn reset(&mut self, _: &(), random: &mut Generator) {
+///         *self = Repeat { number: random.integers(0, 4) as i32, step: 0 };
+///     }
+///
+///     fn step(&mut self, _: &(), action: &[i32], _: &mut Generator) -> Transition {
+///         self.step += 1;
+///         let reward = if action[0] == self.number { 1.0 } else { 0.0 };
+///         Transition { reward, truncated: self.step == 10, ..Transition::default() }
+///     }
+///
+///     fn features(&self, _: &(), out: &mut [f32]) {
+///         out[0] = if self.step == 0 { self.number as f32 } else { 0.0 };
+///     }
+/// }
+///
+/// let registry = Registry::new().with::<Repeat>()?;
+/// let config = PoolConfig { features: true, frames: None, ..PoolConfig::new("Repeat-v0", 8) };
+/// let mut pool = Pool::new(&registry, &config, &Threads::new(1)?)?;
+/// let mut blocks = zeroed(pool.layout().blocks());
+/// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
+/// let numbers: Vec<i32> = Batch::new(pool.layout(), &blocks).features().iter().map(|number| *number as i32).collect();
+/// for _ in 0..10 {
+///     pool.step(&numbers, &mut blocks)?;
+/// }
+/// let batch = Batch::new(pool.layout(), &blocks);
+/// assert_eq!((batch.episode_return(), batch.truncated()), ([10.0; 8].as_slice(), [1; 8].as_slice()));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwned + Send + Sync + 'static {
+    /// Reset parameters as typed values, which the environments that were given the same ones share.
+    type Parameters: Send + Sync;
+
+    /// Id, spaces, tables of reset parameters, features and infos.
+    fn spec() -> EnvSpec;
+
+    /// The typed reset parameters. `given` is complete, and every value is within its limits.
+    fn parameters(given: &ResetParameters) -> Self::Parameters;
+
+    /// Starts an episode.
+    fn reset(&mut self, parameters: &Self::Parameters, random: &mut Generator);
+
+    /// Plays one step. `action` has one number for each branch of the action space, each within its range.
+    fn step(&mut self, parameters: &Self::Parameters, action: &[i32], random: &mut Generator) -> Transition;
+
+    /// Writes the feature observation, float32 in the order of [`EnvSpec::features`].
+    fn features(&self, _parameters: &Self::Parameters, _out: &mut [f32]) {}
+
+    /// Draws the frame on a black canvas.
+    fn paint(&self, _parameters: &Self::Parameters, _canvas: &mut Canvas<'_>) {}
+
+    /// Writes the ground truth, float64 in the order of [`EnvSpec::ground_truth`].
+    fn ground_truth(&self, _parameters: &Self::Parameters, _out: &mut [f64]) {}
+
+    /// Writes the final info, float64 in the order of [`EnvSpec::info`]. Valid after the step that ended the episode.
+    fn info(&self, _parameters: &Self::Parameters, _out: &mut [f64]) {}
+
+    /// Progress of the episode, for a human viewer.
+    fn progress(&self) -> Vec<Progress> {
+        Vec::new()
+    }
+
+    /// Whether a restored state is one that the rules can reach, so that no later call panics. A snapshot may be forged.
+    fn is_valid(&self, _parameters: &Self::Parameters) -> bool {
+        true
+    }
+}
+
+/// A [`Task`] as an [`Environment`]: its scene is its state, and a frame is painted anew when the state has changed.
+#[derive(Clone, Debug)]
+pub struct TaskEnv<T: Task> {
+    parameters: Arc<T::Parameters>,
+    task: T,
+}
+
+impl<T: Task> Environment for TaskEnv<T> {
+    type Variant = ();
+    type Assets = T::Parameters;
+    type State = T;
+    type Scene = T;
+
+    fn assets((): (), parameters: &ResetParameters) -> T::Parameters {
+        T::parameters(parameters)
+    }
+
+    fn new(assets: &Arc<T::Parameters>) -> Self {
+        TaskEnv { parameters: Arc::clone(assets), task: T::default() }
+    }
+
+    fn reset(&mut self, assets: &Arc<T::Parameters>, random: &mut Generator) {
+        self.parameters = Arc::clone(assets);
+        self.task.reset(assets, random);
+    }
+
+    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
+        self.task.step(&self.parameters, action, random)
+    }
+
+    fn shared(&self) -> &Arc<T::Parameters> {
+        &self.parameters
+    }
+
+    fn scene(&self) -> T {
+        self.task.clone()
+    }
+
+    fn paint(assets: &T::Parameters, scene: &T, canvas: &mut Canvas<'_>) {
+        canvas.fill([0; 3]);
+        scene.paint(assets, canvas);
+    }
+
+    fn repaint(assets: &T::Parameters, _shown: &T, scene: &T, canvas: &mut Canvas<'_>) {
+        Self::paint(assets, scene, canvas);
+    }
+
+    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
+        Self::paint(&self.parameters, &self.task, canvas);
+    }
+
+    fn features(&self, out: &mut [f32]) {
+        self.task.features(&self.parameters, out);
+    }
+
+    fn ground_truth(&self, out: &mut [f64]) {
+        self.task.ground_truth(&self.parameters, out);
+    }
+
+    fn state(&self) -> &T {
+        &self.task
+    }
+
+    fn restore(&mut self, assets: &Arc<T::Parameters>, state: T) -> Result<(), InvalidState> {
+        if !state.is_valid(assets) {
+            return Err(InvalidState);
+        }
+        *self = TaskEnv { parameters: Arc::clone(assets), task: state };
+        Ok(())
+    }
+
+    fn progress(&self) -> Vec<Progress> {
+        self.task.progress()
+    }
+
+    fn info(&self, out: &mut [f64]) {
+        self.task.info(&self.parameters, out);
+    }
+}

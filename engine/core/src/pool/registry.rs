@@ -1,0 +1,141 @@
+//! The environments that a program knows.
+
+use std::fmt;
+use std::sync::Arc;
+
+use thiserror::Error;
+
+use super::config::PoolConfig;
+use super::error::PoolError;
+use super::seeding::PoolEntropy;
+use super::typed_envs::{AnyEnvs, typed_envs};
+use crate::envs::{EnvSpec, Environment, Expert, Task, TaskEnv, UnknownEnvironment};
+
+/// Environment ids with their implementations. Pools, engines and commands look ids up in the registry that they are given.
+///
+/// A clone shares the implementations.
+#[derive(Clone, Default)]
+pub struct Registry {
+    entries: Vec<Arc<Entry>>,
+}
+
+impl Registry {
+    /// A registry without environments.
+    pub fn new() -> Self {
+        Registry::default()
+    }
+
+    /// Adds an id, played by the family `E` with that variant of its rules.
+    ///
+    /// # Errors
+    ///
+    /// [`DuplicateEnvironment`] if the registry has the id already.
+    pub fn register<E: Environment + 'static>(
+        &mut self,
+        spec: EnvSpec,
+        variant: E::Variant,
+    ) -> Result<(), DuplicateEnvironment> {
+        if self.specs().any(|known| known.id == spec.id) {
+            return Err(DuplicateEnvironment { id: spec.id.to_owned() });
+        }
+        self.entries.push(Arc::new(Entry { spec, family: Box::new(Family::<E> { variant }) }));
+        Ok(())
+    }
+
+    /// The registry with the id of a task in addition.
+    ///
+    /// # Errors
+    ///
+    /// [`DuplicateEnvironment`] if the registry has the id already.
+    pub fn with<T: Task>(mut self) -> Result<Self, DuplicateEnvironment> {
+        self.register::<TaskEnv<T>>(T::spec(), ())?;
+        Ok(self)
+    }
+
+    /// The specification of every id, in the order of registration.
+    pub fn specs(&self) -> impl Iterator<Item = &EnvSpec> {
+        self.entries.iter().map(|entry| &entry.spec)
+    }
+
+    /// The specification of an id.
+    ///
+    /// # Errors
+    ///
+    /// [`UnknownEnvironment`] if the registry does not have the id.
+    pub fn spec(&self, id: &str) -> Result<&EnvSpec, UnknownEnvironment> {
+        Ok(&self.entry(id)?.spec)
+    }
+
+    /// A scripted expert for an id.
+    ///
+    /// # Errors
+    ///
+    /// [`NoExpert`] if the registry does not have the id, or its family has no expert.
+    pub fn expert(&self, id: &str) -> Result<Box<dyn Expert>, NoExpert> {
+        let expert = self.entry(id).ok().and_then(|entry| entry.family.expert());
+        expert.ok_or_else(|| NoExpert { id: id.to_owned() })
+    }
+
+    pub(super) fn entry(&self, id: &str) -> Result<&Arc<Entry>, UnknownEnvironment> {
+        self.entries.iter().find(|entry| entry.spec.id == id).ok_or_else(|| UnknownEnvironment {
+            id: id.to_owned(),
+            known: self.specs().map(|spec| spec.id).collect::<Vec<_>>().join(", "),
+        })
+    }
+}
+
+impl fmt::Debug for Registry {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_list().entries(self.specs().map(|spec| spec.id)).finish()
+    }
+}
+
+/// An id and its implementation.
+pub(super) struct Entry {
+    pub spec: EnvSpec,
+    family: Box<dyn AnyFamily>,
+}
+
+impl Entry {
+    /// Makes the environments of a pool.
+    pub fn envs(&self, config: &PoolConfig, entropy: PoolEntropy) -> Result<Box<dyn AnyEnvs>, PoolError> {
+        self.family.envs(&self.spec, config, entropy)
+    }
+}
+
+/// A family with the variant of one id.
+trait AnyFamily: Send + Sync {
+    fn envs(&self, spec: &EnvSpec, config: &PoolConfig, entropy: PoolEntropy) -> Result<Box<dyn AnyEnvs>, PoolError>;
+
+    fn expert(&self) -> Option<Box<dyn Expert>>;
+}
+
+struct Family<E: Environment> {
+    variant: E::Variant,
+}
+
+impl<E: Environment + 'static> AnyFamily for Family<E> {
+    fn envs(&self, spec: &EnvSpec, config: &PoolConfig, entropy: PoolEntropy) -> Result<Box<dyn AnyEnvs>, PoolError> {
+        Ok(Box::new(typed_envs::<E>(spec, self.variant, config, entropy)?))
+    }
+
+    fn expert(&self) -> Option<Box<dyn Expert>> {
+        E::expert(self.variant)
+    }
+}
+
+/// An id that a registry has already.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("the registry has an environment `{id}` already")]
+pub struct DuplicateEnvironment {
+    /// The id.
+    pub id: String,
+}
+
+/// An id without a scripted expert.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("`{id}` has no scripted expert")]
+pub struct NoExpert {
+    /// The id.
+    pub id: String,
+}
