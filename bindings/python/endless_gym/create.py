@@ -12,7 +12,7 @@ from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Optio
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.results import Results
-from endless_gym.specs import Frames, ObservationName, json_text, spec
+from endless_gym.specs import Frames, ObservationName, described_spec, json_text
 from endless_gym.vector import EndlessVectorEnv
 
 
@@ -151,7 +151,7 @@ def connect(
 
 def specified_results(specification: Mapping[str, Any], copy: bool) -> Results:
     """The results of an engine's batches, from its specification."""
-    described, frames = spec(specification["id"]), Frames.from_specification(specification["frames"])
+    described, frames = described_spec(specification["environment"]), Frames.from_specification(specification["frames"])
     mode = MODES[specification["autoreset"]]
     return Results(described, specification["batch"], specification["num_envs"], frames, mode, copy)
 

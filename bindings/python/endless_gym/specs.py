@@ -166,7 +166,7 @@ class Spec:
 @cache
 def all_specs() -> dict[str, Spec]:
     """All environments by their ids."""
-    return {described["id"]: _spec(described) for described in json.loads(_native.specs())}
+    return {described["id"]: described_spec(described) for described in json.loads(_native.specs())}
 
 
 def spec(id: str) -> Spec:
@@ -217,7 +217,8 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"reset parameters must be numbers, booleans, strings or lists, got {value!r}")
 
 
-def _spec(described: dict[str, Any]) -> Spec:
+def described_spec(described: dict[str, Any]) -> Spec:
+    """The specification that an engine publishes, or that the native module lists."""
     ((kind, choices),) = described["action_space"].items()
     multi_discrete = kind == "MultiDiscrete"
     return Spec(

@@ -7,6 +7,7 @@ use endless_gym_core::batch::{Block, LAYOUT_VERSION, action_layout};
 use endless_gym_core::pool::{Pool, PoolError, Registry, ResetOptions, Threads};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
+use serde_json::json;
 
 use crate::engine::checkpoint::{CheckpointHead, Checkpointer};
 use crate::engine::config::EngineConfig;
@@ -363,6 +364,7 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
         engine_pid: std::process::id(),
         incarnation: rand::random(),
         id: spec.id.to_owned(),
+        environment: json!(spec),
         groups: config.groups,
         num_envs: config.pool.num_envs,
         first_env: config.pool.first_env,

@@ -24,6 +24,9 @@ pub struct ServiceSpecification {
     pub incarnation: u64,
     /// Environment id.
     pub id: String,
+    /// The id's [`EnvSpec`](endless_gym_core::envs::EnvSpec): spaces, columns with their meanings, and reset parameters with their
+    /// limits, so that a client can use an environment that its own build does not have.
+    pub environment: Json,
     /// Number of groups, which are stepped independently of each other.
     pub groups: usize,
     /// Environments in each group.
