@@ -211,14 +211,14 @@ def _plain_block(block: Block, x: torch.Tensor, tokens: list[torch.Tensor], ages
     attended = torch.zeros_like(x)
     if tokens:
         normal, query = block.norm_tokens(torch.stack(tokens)), projected(attention.queries, block.norm_query(x))
-        scores = torch.einsum("hs,ths->th", query, projected(attention.keys, normal))
+        scores = torch.einsum("hf,thf->th", query, projected(attention.keys, normal))
         if attention.relative:
             distances = torch.stack([_sinusoid(age, len(x)) for age in ages])
-            scores += torch.einsum("hs,ths->th", attention.content_bias[:, 0], projected(attention.keys, normal))
+            scores += torch.einsum("hf,thf->th", attention.content_bias[:, 0], projected(attention.keys, normal))
             biased = query + attention.distance_bias[:, 0]
-            scores += torch.einsum("hs,ths->th", biased, projected(attention.distances, distances))
+            scores += torch.einsum("hf,thf->th", biased, projected(attention.distances, distances))
         weights = torch.softmax(scores / math.sqrt(len(x)), dim=0)
-        attended = torch.einsum("th,ths->hs", weights, projected(attention.values, normal)).flatten()
+        attended = torch.einsum("th,thf->hf", weights, projected(attention.values, normal)).flatten()
     attended = attention.fc_out(attended)
     # `test_agents_authors.py` tests the gates.
     x = x + attended if block.gate_attention is None else block.gate_attention(x, attended)
