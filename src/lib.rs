@@ -2,13 +2,14 @@
 //!
 //! This crate re-exports the public API of the crates that it consists of:
 //!
-//! - [`memory_gym`]: the registry of the ten ids; [`envs`]: spaces, reset parameters and scripted experts; [`pool`]: many environments in this process; [`batch`]: what a
-//!   step returns; [`trace`]: replay of recorded episodes. They are `endless-gym-core`, which does not depend on an operating
-//!   system's services and builds for WebAssembly.
+//! - [`memory_gym`]: the registry of the ten ids; [`envs`]: spaces, reset parameters, scripted experts, and the trait
+//!   [`Task`](envs::Task) for environments of one's own, which draw with [`raster`] and [`random`]; [`pool`]: many environments in
+//!   this process; [`batch`]: what a step returns; [`trace`]: replay of recorded episodes. They are `endless-gym-core`, which does
+//!   not depend on an operating system's services and builds for WebAssembly.
 //! - [`service`]: an engine, its trainer and observers, as processes that share memory. It is `endless-gym-service`.
 //!
-//! The program `endless` is `endless-gym-cli`. What these crates export beyond this list (the rasteriser, the random numbers, the
-//! rules of single environments, the program) serves the project's own tests and benchmarks and may change in any version.
+//! The program `endless` is `endless-gym-cli`; [`program`] runs it. What these crates export beyond this list (sprites and dirty
+//! rectangles, the rules of single environments) serves the project's own tests and benchmarks and may change in any version.
 
 use std::io::Write;
 use std::process::ExitCode;

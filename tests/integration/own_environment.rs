@@ -4,16 +4,17 @@
 #[allow(dead_code)]
 mod t_maze;
 
-use endless_gym::batch::{Batch, Block, Frames, PixelFormat, zeroed};
+use endless_gym::batch::{Frames, PixelFormat};
 use endless_gym::envs::InvalidState;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
     Autoreset, DuplicateEnvironment, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, SnapshotError, Threads,
 };
+use rand::SeedableRng;
 use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
 use serde_json::json;
 
+use crate::support::player::Player;
 use t_maze::TMaze;
 
 const ID: &str = "TMaze-v0";
@@ -31,27 +32,21 @@ fn config(autoreset: Autoreset) -> PoolConfig {
     PoolConfig { options, autoreset, features: true, check_drawing: true, ..PoolConfig::new(ID, NUM_ENVS) }
 }
 
-fn pool(config: &PoolConfig, threads: usize) -> (Pool, Vec<Block>) {
-    let pool = Pool::new(&registry(), config, &Threads::new(threads).unwrap()).unwrap();
-    let blocks = zeroed(pool.layout().blocks());
-    (pool, blocks)
+fn player(config: &PoolConfig, threads: usize) -> Player {
+    Player::in_registry(&registry(), config, threads)
 }
 
-/// Walks to the junction and turns to the side of the cue, or to the other side.
-fn play(autoreset: Autoreset, turns_right: bool) -> Vec<f64> {
-    let (mut pool, mut blocks) = pool(&config(autoreset), 1);
-    pool.reset(ResetRequest::Seed(1), &mut blocks).unwrap();
-    let cues: Vec<i32> =
-        Batch::new(pool.layout(), &blocks).features().chunks_exact(2).map(|row| (row[0] == 1.0).into()).collect();
+/// Walks to the junction and turns to the side of the cue or, without memory, to the other side. Returns the rewards.
+fn play(autoreset: Autoreset, remembers: bool) -> Vec<f64> {
+    let mut player = player(&config(autoreset), 1);
+    player.reset(ResetRequest::Seed(1));
+    let cues: Vec<i32> = player.batch().features().chunks_exact(2).map(|row| (row[0] == 1.0).into()).collect();
     assert!(cues.contains(&0) && cues.contains(&1));
-    for _ in 0..3 {
-        pool.step(&[AHEAD; NUM_ENVS], &mut blocks).unwrap();
-    }
-    let turns: Vec<i32> = cues.iter().map(|cue| if turns_right { *cue } else { 1 - cue }).collect();
-    pool.step(&turns, &mut blocks).unwrap();
-    let batch = Batch::new(pool.layout(), &blocks);
+    (0..3).for_each(|_| player.step_all(AHEAD));
+    player.step(&cues.iter().map(|cue| if remembers { *cue } else { 1 - cue }).collect::<Vec<_>>());
+    let batch = player.batch();
     assert_eq!((batch.terminated(), batch.truncated()), ([1; NUM_ENVS].as_slice(), [0; NUM_ENVS].as_slice()));
-    assert_eq!(batch.info(), [f64::from(u8::from(turns_right)); NUM_ENVS]);
+    assert_eq!(batch.info(), [f64::from(u8::from(remembers)); NUM_ENVS]);
     batch.reward().to_vec()
 }
 
@@ -66,69 +61,69 @@ fn every_autoreset_mode_plays_a_task() {
 #[test]
 fn truncation_ends_an_episode_and_is_told_from_termination() {
     for autoreset in Autoreset::ALL {
-        let (mut pool, mut blocks) = pool(&config(autoreset), 1);
-        pool.reset(ResetRequest::All, &mut blocks).unwrap();
+        let mut player = player(&config(autoreset), 1);
+        player.reset(ResetRequest::All);
         for step in 1..=8 {
-            pool.step(&[AHEAD; NUM_ENVS], &mut blocks).unwrap();
-            let batch = Batch::new(pool.layout(), &blocks);
-            assert_eq!(batch.truncated(), [u8::from(step == 8); NUM_ENVS], "{autoreset}, step {step}");
-            assert_eq!(batch.terminated(), [0; NUM_ENVS]);
+            player.step_all(AHEAD);
+            assert_eq!(player.batch().truncated(), [u8::from(step == 8); NUM_ENVS], "{autoreset}, step {step}");
+            assert_eq!(player.batch().terminated(), [0; NUM_ENVS]);
         }
-        let junction = Batch::new(pool.layout(), &blocks).features()[1];
+        let junction = player.batch().features()[1];
         assert_eq!(junction == 0.0, autoreset == Autoreset::SameStep, "the next episode has started in the same step");
     }
 }
 
-/// Steps and draws in that format; the pool compares each frame with one that is drawn in full.
-fn rows(frames: Frames, threads: usize) -> Vec<Vec<u8>> {
-    let (mut pool, mut blocks) = pool(&PoolConfig { frames: Some(frames), ..config(Autoreset::NextStep) }, threads);
+/// The observations of 60 steps; the pool compares each frame with one that is drawn in full.
+fn observations(frames: Frames, threads: usize) -> Vec<Vec<u8>> {
+    let mut player = player(&PoolConfig { frames: Some(frames), ..config(Autoreset::NextStep) }, threads);
     let mut random = SmallRng::seed_from_u64(3);
-    pool.reset(ResetRequest::Seed(5), &mut blocks).unwrap();
-    (0..60)
-        .map(|_| {
-            let actions: Vec<i32> = (0..NUM_ENVS).map(|_| random.random_range(0..3)).collect();
-            pool.step(&actions, &mut blocks).unwrap();
-            Batch::new(pool.layout(), &blocks).observation().to_vec()
-        })
-        .collect()
+    player.reset(ResetRequest::Seed(5));
+    let mut step = |_| {
+        player.step_at_random(&mut random);
+        player.batch().observation().to_vec()
+    };
+    (0..60).map(&mut step).collect()
 }
 
 #[test]
 fn frames_are_right_in_every_format_for_every_number_of_threads() {
     let gray = PixelFormat { grayscale: true, channels_first: true, row_major: true };
     for frames in [Frames::default(), Frames { format: gray, stack: 3 }] {
-        let alone = rows(frames, 1);
+        let alone = observations(frames, 1);
         assert!(alone.iter().any(|frame| *frame != alone[0]));
-        assert!(alone == rows(frames, 2), "{frames:?}");
+        assert!(alone == observations(frames, 2), "{frames:?}");
     }
 }
 
 #[test]
 fn a_snapshot_continues_identically_and_a_forged_one_is_refused() {
-    let (mut pool, mut blocks) = pool(&config(Autoreset::NextStep), 1);
-    pool.reset(ResetRequest::Seed(2), &mut blocks).unwrap();
-    pool.step(&[AHEAD; NUM_ENVS], &mut blocks).unwrap();
-    let snapshots: Vec<Vec<u8>> = (0..NUM_ENVS).map(|env| pool.snapshot(env).unwrap()).collect();
-    let mut play = |pool: &mut Pool| -> Vec<f64> {
-        let mut step = |actions| {
-            pool.step(actions, &mut blocks).unwrap();
-            Batch::new(pool.layout(), &blocks).reward().to_vec()
+    let mut player = player(&config(Autoreset::NextStep), 1);
+    player.reset(ResetRequest::Seed(2));
+    player.step_all(AHEAD);
+    let snapshots: Vec<Vec<u8>> = (0..NUM_ENVS).map(|env| player.pool.snapshot(env).unwrap()).collect();
+    let play = |player: &mut Player| -> Vec<f64> {
+        let mut step = |action| {
+            player.step_all(action);
+            player.batch().reward().to_vec()
         };
-        [[AHEAD; NUM_ENVS], [AHEAD; NUM_ENVS], [1; NUM_ENVS], [AHEAD; NUM_ENVS]].iter().flat_map(|a| step(a)).collect()
+        [AHEAD, AHEAD, 1, AHEAD].into_iter().flat_map(&mut step).collect()
     };
-    let first = play(&mut pool);
-    snapshots.iter().enumerate().for_each(|(env, snapshot)| pool.restore(env, snapshot).unwrap());
-    assert_eq!(play(&mut pool), first);
+    let restore = |player: &mut Player| {
+        snapshots.iter().enumerate().for_each(|(env, snapshot)| player.pool.restore(env, snapshot).unwrap());
+    };
+    let first = play(&mut player);
+    restore(&mut player);
+    assert_eq!(play(&mut player), first);
 
     // At the third cell of a maze that is shorter: the number in the snapshot's reset parameters is another.
-    snapshots.iter().enumerate().for_each(|(env, snapshot)| pool.restore(env, snapshot).unwrap());
-    pool.step(&[AHEAD; NUM_ENVS], &mut blocks).unwrap();
-    let mut forged = pool.snapshot(0).unwrap();
+    restore(&mut player);
+    player.step_all(AHEAD);
+    let mut forged = player.pool.snapshot(0).unwrap();
     let length = forged.windows(10).position(|window| window == br#""length":3"#).unwrap() + 9;
     forged[length] = b'1';
     let checksum = crc32fast::hash(&forged[12..]).to_le_bytes();
     forged[8..12].copy_from_slice(&checksum);
-    assert_eq!(pool.restore(0, &forged), Err(SnapshotError::State(InvalidState)));
+    assert_eq!(player.pool.restore(0, &forged), Err(SnapshotError::State(InvalidState)));
 }
 
 #[test]

@@ -26,7 +26,7 @@ pub struct Args {
     /// Policy that chooses the actions.
     #[arg(long, value_enum, default_value = "expert")]
     policy: Policy,
-    /// Environments in each group [default: 512; 16 for the expert of Searing Spotlights, which plans ahead].
+    /// Environments in each group [default: 512; 64 with experts].
     #[arg(long)]
     num_envs: Option<usize>,
     /// Groups of environments; the engine steps one while the policy acts in another.

@@ -55,8 +55,8 @@ const SEED: u64 = 15;
 /// A step that shows what the environment is about: a command, the path, the spotlights.
 const TYPICAL_STEP: usize = 12;
 
-/// The ground-truth view at a typical step of an episode, which the expert plays if there is one, in 42 columns and 22 lines; if 86 columns are available, beside
-/// the observation.
+/// The ground-truth view at a typical step of an episode, in 42 columns and 22 lines; if 86 columns are available, beside the
+/// observation. The expert plays the episode, or random actions where there is none.
 pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
     let config = PoolConfig { seeding: Seeding::Continue { seed: Some(SEED) }, ..PoolConfig::new(spec.id, 1) };
     let policy = if registry.expert(spec.id).is_ok() { Policy::Expert } else { Policy::Random };

@@ -3,7 +3,7 @@
 use endless_gym::batch::{Batch, Block, zeroed};
 use endless_gym::envs::EnvSpec;
 use endless_gym::memory_gym;
-use endless_gym::pool::{Pool, PoolConfig, ResetRequest, Threads};
+use endless_gym::pool::{Pool, PoolConfig, Registry, ResetRequest, Threads};
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
@@ -20,7 +20,11 @@ impl Player {
     }
 
     pub fn with_threads(config: &PoolConfig, threads: usize) -> Self {
-        let pool = Pool::new(memory_gym(), config, &Threads::new(threads).unwrap()).unwrap();
+        Player::in_registry(memory_gym(), config, threads)
+    }
+
+    pub fn in_registry(registry: &Registry, config: &PoolConfig, threads: usize) -> Self {
+        let pool = Pool::new(registry, config, &Threads::new(threads).unwrap()).unwrap();
         let blocks = zeroed(pool.layout().blocks());
         Player { pool, blocks }
     }

@@ -6,7 +6,7 @@
 //!
 //! # Stability
 //!
-//! [`EntropyError`] is part of the crate's interface. All else is public for the benchmarks and for
+//! [`Generator`] and [`EntropyError`] are part of the crate's interface. All else is public for the benchmarks and for
 //! [`Environment`](crate::envs::Environment), and may change in any version.
 
 mod entropy;

@@ -15,8 +15,9 @@
 //!
 //! # Stability
 //!
-//! [`PixelFormat`] is part of the crate's interface. All else is public for the benchmarks and for
-//! [`Environment`](crate::envs::Environment), and may change in any version.
+//! [`PixelFormat`], and what a [`Task`](crate::envs::Task) draws with ([`Canvas`], [`Rect`], [`CornerRadii`], [`Rgb`], [`Surface`]), are
+//! part of the crate's interface. All else is public for the benchmarks and for [`Environment`](crate::envs::Environment), and may
+//! change in any version.
 
 mod blit;
 mod canvas;

@@ -451,7 +451,8 @@ mod tests {
             let checksum = crc32fast::hash(&bytes[PREAMBLE..]);
             bytes[8..PREAMBLE].copy_from_slice(&checksum.to_le_bytes());
             if let Ok(groups) = decode(Path::new("file"), &bytes, &head) {
-                let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 2), &Threads::new(1).unwrap()).unwrap();
+                let config = PoolConfig::new("MysteryPath-Grid-v0", 2);
+                let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
                 for group in groups {
                     let _ = group.envs.map(|envs| pool.resume(&envs));
                 }

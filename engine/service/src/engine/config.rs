@@ -197,6 +197,13 @@ mod tests {
     }
 
     #[test]
+    fn too_many_environments_are_an_error() {
+        let pool = PoolConfig::new("MortarMayhem-Grid-v0", usize::MAX);
+        let pools = EngineConfig { pool, groups: 2, ..config() }.pools();
+        assert!(matches!(pools, Err(PoolError::NumEnvs { given: usize::MAX })));
+    }
+
+    #[test]
     fn environments_are_counted_over_the_groups() {
         let pools = EngineConfig { groups: 3, ..config() }.pools().unwrap();
         let numbers: Vec<_> = pools.iter().map(|pool| (pool.first_env, pool.num_envs, pool.total_envs)).collect();
