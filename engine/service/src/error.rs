@@ -71,7 +71,8 @@ pub enum ServiceError {
         /// The process that holds the lock, if it can be found.
         holder: Option<LockHolder>,
     },
-    /// There is an engine of that name, and it cannot be used: it is starting or ending, or parts of it were removed.
+    /// An engine of that name is running but cannot be used: it is starting or ending, or some of its files were
+    /// removed.
     #[error("engine `{service}` is running and cannot be reached; try again, and restart it if the error stays")]
     EngineUnreachable {
         /// The engine's name.
@@ -187,7 +188,7 @@ pub enum ServiceError {
          fewer groups or observers"
     )]
     DescriptorLimit {
-        /// Descriptors that are needed, with those that are open.
+        /// Descriptors that are needed, including those already open.
         needed: u64,
         /// The limit (`RLIMIT_NOFILE`).
         limit: u64,
@@ -202,7 +203,7 @@ pub enum ServiceError {
         /// Number of groups of the engine.
         groups: usize,
     },
-    /// Actions of a wrong number or out of range. No environment has been stepped.
+    /// The number of actions is wrong, or an action is out of range. No environment has been stepped.
     #[error(transparent)]
     Action(#[from] ActionError),
     /// A reset has too few or too many flags or seeds.
@@ -276,12 +277,12 @@ pub enum ServiceError {
         /// The engine's name.
         service: String,
     },
-    /// The engine was replaced by one that serves something else.
+    /// The engine was replaced by one that serves different environments.
     #[error("engine `{service}` was restarted with another {what}; create a new connection")]
     SpecificationChanged {
         /// The engine's name.
         service: String,
-        /// The first property that differs.
+        /// The first property that differs between the two.
         what: &'static str,
     },
     /// The engine rejected a request. No environment has changed.
@@ -382,7 +383,7 @@ fn megabytes(bytes: u64) -> u64 {
     bytes.div_ceil(1_000_000)
 }
 
-/// What an engine was doing when an answer, or a batch that is observed, did not arrive in time.
+/// What an engine was doing when an answer or an observed batch did not arrive in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EngineActivity {
     /// Its process is running; its status cannot be read.
@@ -398,14 +399,14 @@ pub enum EngineActivity {
         /// Process id of the engine.
         process: u32,
     },
-    /// It executes nothing and has not taken the request: its process is stopped or gets no processor time.
+    /// It is idle and has not taken the request: its process is stopped or gets no CPU time.
     NotTaken {
         /// Process id of the engine.
         process: u32,
     },
     /// It has answered the request; the answer can be received.
     Answered,
-    /// It executes nothing, and there is no request for the group that is observed.
+    /// It is idle, and there is no request for the observed group.
     Idle {
         /// The group.
         group: usize,
@@ -443,7 +444,7 @@ impl fmt::Display for EngineActivity {
     }
 }
 
-/// Version of the format of a checkpoint. It changes with every change to the content.
+/// Version of the checkpoint format. It changes with every change to the content.
 pub const CHECKPOINT_VERSION: u32 = 1;
 
 /// A checkpoint that cannot be saved or used.
@@ -452,7 +453,7 @@ pub enum CheckpointError {
     /// The interval is zero.
     #[error("the interval between checkpoints must be positive")]
     Interval,
-    /// There is a file, and the engine was not asked to resume.
+    /// The file exists, and the engine was not asked to resume.
     #[error(
         "checkpoint {} exists; resume from it (`--resume`), move it away, or choose another file",
         path.display()
@@ -515,7 +516,7 @@ pub enum CheckpointError {
         /// What is wrong.
         reason: String,
     },
-    /// The checkpoint is of other environments.
+    /// The checkpoint was saved by an engine with other environments.
     #[error("checkpoint {} was saved with {what} {saved}, and the engine has {given}", path.display())]
     Mismatch {
         /// The file.
@@ -546,7 +547,7 @@ pub enum CheckpointError {
     /// The engine has no file to save to.
     #[error("the engine has no checkpoint file; start it with one (`--checkpoint FILE`)")]
     NoFile,
-    /// No group was reset, so there is nothing to save.
+    /// No group has been reset, so there is nothing to save.
     #[error("there is nothing to save before the first reset")]
     NotReset,
 }

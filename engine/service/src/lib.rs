@@ -1,8 +1,8 @@
 //! Memory Gym environments in shared memory: an engine, its trainer and its observers.
 //!
-//! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** receive the same
-//! batches. They are processes of one user on one host and find each other in a [`Namespace`]. The transport is iceoryx2: a
-//! message is written once, into the memory where its receiver reads it.
+//! An **engine** serves groups of environments under a name. A **trainer** steps them, and **observers** receive the
+//! same batches. They are processes of one user on one host and find each other in a [`Namespace`]. The transport is
+//! iceoryx2: the sender writes a message once, into the memory where the receiver reads it.
 //!
 //! # Services
 //!
@@ -13,62 +13,65 @@
 //! | `endless-gym/NAME/INCARNATION/to_engine` | event | trainer → engine | number of a group with a request |
 //! | `endless-gym/NAME/INCARNATION/to_trainer` | event | engine → trainer | number of a group with a response |
 //!
-//! The incarnation is a random number that an engine draws when it starts, so that an engine shares no service with a dead
-//! predecessor of the same name. The [`ServiceSpecification`] is JSON text in the engine's status file in
-//! `/dev/shm`, `NAME.INCARNATION.status` behind the namespace's prefix, which the engine locks (`flock`) for its life.
+//! The incarnation is a random number drawn when an engine starts, so that it shares no service with a dead predecessor
+//! of the same name. The [`ServiceSpecification`] is JSON text in the engine's status file,
+//! `/dev/shm/PREFIXNAME.INCARNATION.status` with the namespace's prefix. The engine holds an `flock` on this file until
+//! it ends.
 //!
 //! # Messages
 //!
-//! The payload of `act` and `obs` is `[Block]`, in the layouts of the specification. The user headers hold the remaining fields:
+//! The payload of `act` and `obs` is `[Block]`, laid out as the specification says. The user headers hold the other
+//! fields:
 //!
 //! | header | fields |
 //! | --- | --- |
 //! | request | layout version, kind (step, reset all, reset with a seed, reset each, snapshot, restore, checkpoint, options of next episodes, running episodes), incarnation, trainer, request number, seed, environment, length of the options or of the snapshot, process id of the trainer, batches held |
-//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of a snapshot, of a text about episodes or of a rejection |
+//! | response | layout version, group, incarnation, step, trainer and number of the answered request, status, length of the snapshot, the text about episodes or the rejection |
 //!
 //! # Protocol
 //!
 //! | situation | behaviour |
 //! | --- | --- |
 //! | the engine receives a request | it sends exactly one response of the same group: a batch, a snapshot or a rejection; a rejected request changes no environment |
-//! | the trainer requests a snapshot, a restore, or something about episodes | the response holds a snapshot, a text or nothing in place of a batch; observers skip it, and may miss the batch before it |
+//! | the trainer requests a snapshot, a restore, or something about episodes | the response holds a snapshot, a text or nothing instead of a batch; observers skip it, and may miss the batch before it |
 //! | a group has a pending answer | the trainer must receive it before its next request to this group; other groups are independent |
-//! | two engines are given one checkpoint file | the second one ends with [`CheckpointError::InUse`], which names the first one's process |
-//! | a new trainer connects | it must reset all environments of a group before it steps them, or adopt their episodes by a reset of none ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each) with flags of 0), which returns the current batch |
-//! | the engine has a checkpoint file | it saves all environments periodically, when it stops, and when the trainer asks for it; a new engine continues from there identically |
+//! | two engines are given the same checkpoint file | the second one fails with [`CheckpointError::InUse`], which names the first one's process |
+//! | a new trainer connects | it must reset all environments of a group before it steps them, or adopt their episodes with a reset of no environment ([`ResetRequest::Each`](endless_gym_core::pool::ResetRequest::Each) with flags of 0), which returns the current batch |
+//! | the engine has a checkpoint file | it saves all environments periodically, when it stops, and when the trainer requests it; a new engine that resumes from the file continues identically |
 //! | a second trainer connects | it is refused, because `act` accepts one publisher |
-//! | a trainer dies | the engine removes its resources when idle, or the next trainer does when it connects |
-//! | an engine dies or ends | the liveness check of its trainer and its observers reports it; a trainer may reconnect to a new engine |
-//! | an observer is slow | it misses batches: its queue has one place, which is overwritten |
-//! | an observer is paused | it has no port and receives nothing; its place and its memory remain its own |
-//! | an observer resumes while the trainer pauses | the idle engine sends the last batch of the group again, with the same header; the trainer skips it, since it answers no pending request, and an observer does not return a step twice |
-//! | an observer holds batches | it has reserved their memory in the engine's segment when it connected, or was refused; engine and trainer have reserved theirs when the engine started |
+//! | a trainer dies | its resources are removed by the engine when idle, or by the next trainer when it connects |
+//! | an engine dies or ends | its trainer and its observers detect it with their liveness checks; a trainer may reconnect to a new engine |
+//! | an observer is slow | it misses batches: its queue holds one batch, which newer ones overwrite |
+//! | an observer is paused | it has no port and receives nothing; its slot and its memory stay reserved |
+//! | an observer resumes while the trainer pauses | the idle engine sends the last batch of the group again, with the same header; the trainer skips it, since it answers no pending request, and no observer returns a step twice |
+//! | an observer holds batches | their memory in the engine's segment was reserved when it connected (otherwise it is refused); that of engine and trainer, when the engine started |
 //! | a request names another incarnation | the engine ignores it |
-//! | any process wants to know what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects no other process |
-//! | an engine dies and its name is taken again | its specification is removed under the lock of the namespace, so that a successor's is never removed |
+//! | a process asks what an engine is doing | it reads the engine's [`EngineStatus`] from a file in shared memory, which affects no other process |
+//! | an engine dies and a new one takes its name | the old specification is removed under the namespace's lock, so that the new one's is never removed |
 //!
-//! # Faults of the surroundings
+//! # Faults outside the engine
 //!
 //! | situation | behaviour |
 //! | --- | --- |
-//! | `/dev/shm` is full, or too few file descriptors may be opened | [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] before iceoryx2 creates anything; the soft limit of descriptors is raised if the hard limit permits it |
-//! | another process takes the last of `/dev/shm` while a process connects or starts | SIGBUS may end it, since iceoryx2 allocates no memory in advance; what is connected has its memory |
-//! | a process dies while it creates something | the next process that has the locks removes it, whatever its age; while another process creates something, or is stopped at it, nothing incomplete is removed |
-//! | dead processes fill `/dev/shm`, or their directory was removed | the next process that joins a namespace of the same path removes what no process uses, by the locks of the prefixes |
-//! | a process is stopped while it holds the namespace's lock | the others wait: an engine 30 s to start, a trainer or observer as long as its timeout and at least 5 s, and up to six times that while one process takes it after another; after a second they log who holds it, and [`ServiceError::NamespaceLocked`] names it |
-//! | two directories have the same path (containers that share `/dev/shm` and not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
+//! | `/dev/shm` is full, or the limit of file descriptors is too low | [`ServiceError::SharedMemoryTooSmall`] or [`ServiceError::DescriptorLimit`] before iceoryx2 creates anything; the soft limit of descriptors is raised if the hard limit permits it |
+//! | another process uses up `/dev/shm` while a process connects or starts | SIGBUS may kill the connecting process, since iceoryx2 allocates no memory in advance; processes that are connected already have their memory |
+//! | a process dies while it creates something | the next process that gets the locks removes it, however recent it is; nothing incomplete is removed while a living process creates something, even if that process is stopped |
+//! | dead processes fill `/dev/shm`, or their directory was removed | the next process that joins a namespace of the same path removes what no process uses, which it knows from the locks of the prefixes |
+//! | a process is stopped while it holds the namespace's lock | the others wait: a starting engine 30 s, a trainer or observer its timeout but at least 5 s, and up to six times as long while the lock changes hands; after a second they log the holder, and [`ServiceError::NamespaceLocked`] names it |
+//! | two directories have the same path (containers that share `/dev/shm` but not `/tmp`) | they are two namespaces, whose segments have different random prefixes |
 //! | the namespace's directory is removed or replaced | within a second [`Engine::run`] ends with [`ServiceError::RootRemoved`], and `endless serve` starts again in a new directory; trainers and observers get the same error and may reconnect; the episodes are lost |
-//! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix, otherwise [`ServiceError::ForeignSegment`]; no segment that stays is accessible to other users |
-//! | a process forks | liveness is that of the process that connected; a child that it forked neither keeps it alive nor releases what it holds |
+//! | another user creates segments with the names of a namespace | a namespace without processes gets another prefix; otherwise the call fails with [`ServiceError::ForeignSegment`]; other users have access to no lasting segment |
+//! | a process forks | only the process that connected counts as alive; a forked child neither keeps it alive nor releases what it holds |
 //! | an engine's files are removed while it starts | it checks after publishing that it can be found, starts again up to twice, and then ends with [`ServiceError::EngineUnreachable`] |
 //!
 //! # How often a request is executed
 //!
-//! A request steps or resets a group, restores an environment, or takes a snapshot. The trainer numbers its requests, the engine
-//! numbers the batches of a group ([`BatchLease::step`]), and its status says which request it has taken, answered and executed.
-//! An engine executes each request that it takes once and sends one response; no message is repeated.
+//! A request steps or resets a group, restores an environment, or takes a snapshot. The trainer numbers its requests,
+//! the engine numbers the batches of a group ([`BatchLease::step`]), and its status says which request it last took,
+//! answered and executed. An engine executes each request that it takes once and sends one response; requests are never
+//! resent.
 //!
-//! For `set_options` and `running_episodes` the table says what it says for `restore` and `snapshot`.
+//! `set_options` behaves like `restore` in the table, and `running_episodes` like `snapshot`.
 //!
 //! | call | failure | the request was executed | what to do |
 //! | --- | --- | --- | --- |
@@ -76,18 +79,18 @@
 //! | `receive`, `snapshot`, `restore` | [`ServiceError::Rejected`] | never | |
 //! | | [`ServiceError::TimedOut`], a signal, an exception in Python | once, as long as the engine lives | call again; the answer stays pending |
 //! | | [`ServiceError::TooManyBatchesHeld`] | once | drop a lease, call again |
-//! | | [`ServiceError::EngineLost`], [`ServiceError::EngineRestarted`] | as [`reconnect`](Trainer::reconnect) says | reconnect |
+//! | | [`ServiceError::EngineLost`], [`ServiceError::EngineRestarted`] | see [`reconnect`](Trainer::reconnect) | reconnect |
 //! | `snapshot`, `restore` | another request follows a [`ServiceError::TimedOut`] | once, before that request | |
 //! | `reconnect` | the engine is the same | [`LastRequest::Pending`]: once | receive the pending answers, and go on |
-//! | | the engine is another run | [`LastRequest::Played`]: once; [`LastRequest::NotPlayed`]: never; [`LastRequest::Unknown`]: cannot be known | reset; or go on from the new engine's [`step`](GroupReconnection::step), if it resumed from a checkpoint |
-//! | drop of the trainer, its death | a request without an answer | once or never; the status's [`step`](GroupStatus::step) tells | the next trainer must reset or adopt the environments |
+//! | | the engine was restarted | [`LastRequest::Played`]: once; [`LastRequest::NotPlayed`]: never; [`LastRequest::Unknown`]: cannot be known | reset; or go on from the new engine's [`step`](GroupReconnection::step), if it resumed from a checkpoint |
+//! | the trainer is dropped or dies | a request without an answer | once or never; the status's [`step`](GroupStatus::step) tells | the next trainer must reset or adopt the environments |
 //!
-//! The state of the environments ends with their engine. Whatever a dead engine executed after its last checkpoint is lost; the
-//! step number in which a resumed engine goes on says what to repeat.
+//! The state of the environments ends with their engine. Whatever it executed after its last checkpoint is lost; the
+//! step number at which a resumed engine continues tells what to repeat.
 
 mod error;
 
-/// What processes of one namespace share: its directory, its locks, and the removal of what dead processes left.
+/// What the processes of a namespace share: its directory, its locks, and the cleanup after dead processes.
 mod namespace {
     pub(crate) mod cleanup;
     pub(crate) mod descriptors;
@@ -114,7 +117,6 @@ mod protocol {
     pub(crate) mod wait;
 }
 
-/// The engine.
 mod engine {
     pub(crate) mod checkpoint;
     pub(crate) mod config;

@@ -13,7 +13,7 @@ use crate::protocol::specification::ServiceSpecification;
 /// How often a process looks for an engine that is not running yet.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
-/// How long a process at least waits for an engine that is starting or ending.
+/// How long a process waits at least for an engine that is starting or ending.
 const TRANSITION_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The engine to which a trainer or an observer connects.
@@ -100,7 +100,7 @@ fn find(node: &NamespaceNode, config: &ConnectConfig) -> Result<ServiceSpecifica
     }
     let running = discovery::list(node);
     if running.contains(&service) {
-        // It has started since it was looked for, or it is ending.
+        // The engine started after the first look-up, or it is ending.
         return Err(ServiceError::EngineUnreachable { service });
     }
     Err(ServiceError::UnknownEngine { service, root: config.namespace.root().to_owned(), running })
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn timeouts_that_are_not_finite_or_negative_are_errors() {
+    fn negative_and_non_finite_timeouts_are_errors() {
         for (given, shown) in [(-1.0, "-1"), (-0.001, "-0.001"), (f64::NAN, "NaN"), (f64::INFINITY, "inf")] {
             let text = timeout_from_seconds(given).unwrap_err().to_string();
             assert_eq!(text, format!("timeout must be finite and not negative, got {shown}"));

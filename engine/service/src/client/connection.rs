@@ -20,10 +20,10 @@ use crate::protocol::status_file::{self, StatusReader};
 /// Chunks of a request publisher: one that the engine reads, one in its queue, one being written.
 const REQUEST_CHUNKS: usize = 3;
 
-/// How long a trainer waits for the removal of a dead trainer's ports, which is the engine's work if it cannot do it itself.
+/// How long a trainer waits until a dead trainer's ports are removed, by itself or by the engine.
 const REMOVAL_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// How often it looks.
+/// How often it checks for that.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A trainer's ports to one run of an engine.
@@ -32,10 +32,10 @@ pub(crate) struct EngineConnection {
     pub to_trainer: Listener<Ipc>,
     /// By group.
     pub responses: Vec<Arc<ResponsePort>>,
-    /// By group. Dropped after the other ports: a process that gets them is the next trainer.
+    /// By group. Dropped after the other ports, since the process that gets them is the next trainer.
     pub requests: Vec<RequestPublisher>,
     pub node: Arc<NamespaceNode>,
-    /// The engine's status, also after its end; `None` if it cannot be read.
+    /// The engine's status, readable even after its end; `None` if it cannot be read.
     pub status: Option<StatusReader>,
     engine: UniqueNodeId,
 }
@@ -49,7 +49,7 @@ impl EngineConnection {
                 let services = EngineServices { node, names, mode: OpenMode::Open };
                 let groups = 0..specification.groups;
                 descriptors::reserve(descriptors::of_trainer(specification.groups))?;
-                // The owner of the first publisher is the trainer, so the publishers come first.
+                // Publishers first: whoever owns the first one is the trainer.
                 let requests: Vec<_> = groups
                     .clone()
                     .map(|group| request_publisher(&services, group, specification))
@@ -61,7 +61,7 @@ impl EngineConnection {
                     let to_trainer = ports::listener(&services.events("to_trainer", specification.groups)?)?;
                     Ok((responses, to_engine, to_trainer))
                 };
-                // A dead trainer's ports are removed one after the other, so these may still be there.
+                // A dead trainer's ports are removed one by one, so these may still exist.
                 let (responses, to_engine, to_trainer) = create(&services, specification, others, || None)?;
                 Ok((requests, responses, to_engine, to_trainer))
             })?;
@@ -103,8 +103,8 @@ fn response_port(
     })
 }
 
-/// Creates ports of which an engine has one. Those of a dead trainer exist until a process removes them. `owner` is the node that has
-/// them, if it is known: one that is running is another trainer.
+/// Creates ports of which an engine allows one each. Waits while a dead trainer's still exist. `owner` returns the node
+/// that has them, if known; if that node is running, it is another trainer.
 fn create<T>(
     services: &EngineServices<'_>,
     specification: &ServiceSpecification,
@@ -114,14 +114,14 @@ fn create<T>(
     let start = Instant::now();
     loop {
         let creating = services.node.creating()?;
-        // Observers reserve memory, but not while other ports are being created.
+        // Checked under the lock, under which no observer can reserve memory.
         memory::check_free(memory::MARGIN)?;
         match ports() {
             Ok(ports) => return Ok(ports),
             Err(PortError::Other(e)) => return Err(e),
             Err(PortError::LimitReached) => {}
         }
-        // While this process creates ports, none can be removed.
+        // No dead node's ports can be removed while the creation lock is held.
         drop(creating);
         let owner = owner();
         let is_alive = owner.is_some_and(|owner| services.node.is_alive(owner));
@@ -146,9 +146,9 @@ mod tests {
     use crate::engine::serving::Engine;
     use crate::namespace::directory::Namespace;
 
-    /// The ports of a dead trainer are removed one by one, the publishers perhaps first.
+    /// A dead trainer's ports are removed one by one, possibly the publishers first.
     #[test]
-    fn a_trainer_waits_for_the_rest_of_a_dead_one() {
+    fn a_trainer_waits_until_all_ports_of_a_dead_one_are_removed() {
         let namespace = Namespace::at(format!("/tmp/endless-rest-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);

@@ -20,16 +20,16 @@ use crate::protocol::specification::ServiceSpecification;
 
 /// A lease on a group's batch in shared memory.
 ///
-/// The batch is read where the engine wrote it, without a copy. The engine does not write to its memory until the lease is
-/// dropped. [`batches_held`](ServiceSpecification::batches_held) leases of a group may be held at a time.
+/// The batch is read in place, without a copy. The engine does not write to its memory until the lease is dropped.
+/// [`batches_held`](ServiceSpecification::batches_held) leases of a group may be held at a time.
 pub struct BatchLease {
-    // Dropped before the port through which it was received.
+    // Dropped before the port that received it.
     _sample: ForkGuard<Sample<Ipc, [PayloadBlock], ResponseHeader>>,
     payload: Payload,
     group: usize,
     step: u64,
     specification: Arc<ServiceSpecification>,
-    // The engine reclaims the chunks of a port that is closed, so the port must live as long as the lease.
+    // The engine reclaims the chunks of a closed port, so the port must outlive the lease.
     _port: Arc<ResponsePort>,
 }
 
@@ -37,19 +37,19 @@ pub struct BatchLease {
 // when it is dropped, which requires ownership.
 unsafe impl Sync for BatchLease {}
 
-/// Address and length of a received payload. The length was checked when the message was received: iceoryx2 keeps it in shared
-/// memory and reads it again in every call of `Sample::payload`, and the sender can change it at any time.
+/// Address and length of a received payload. The length is checked once, on receipt: iceoryx2 rereads it from shared
+/// memory in every call of `Sample::payload`, where the sender can change it at any time.
 #[derive(Clone, Copy)]
 struct Payload {
     start: NonNull<Block>,
     blocks: usize,
 }
 
-// SAFETY: it is an address in shared memory, which is the same in all threads.
+// SAFETY: an address in shared memory is the same in all threads.
 unsafe impl Send for Payload {}
 
 impl Payload {
-    /// At most `longest` blocks: a forged length may reach beyond the mapped memory.
+    /// Cuts the payload at `longest` blocks, since a forged length may reach beyond the mapped memory.
     fn new(payload: &[PayloadBlock], longest: usize) -> Self {
         let blocks: &[Block] = bytemuck::cast_slice(payload);
         Payload { start: NonNull::from(blocks).cast(), blocks: blocks.len().min(longest) }
@@ -154,7 +154,7 @@ impl ResponseService {
         Ok(ResponseService { service: ForkGuard::new(service), group, engine, node: Arc::clone(node) })
     }
 
-    /// A port, which receives what is sent from now on. For that of an observer that has paused, an idle engine sends the last batch
+    /// Creates a port, which receives what is sent from now on. If `is_resumed`, an idle engine sends the last batch
     /// again.
     pub(crate) fn port(
         &self,
@@ -205,7 +205,7 @@ impl ResponsePort {
 
     /// Whether there is a message.
     pub(crate) fn has_response(&self) -> bool {
-        // As for `receive`, an engine that cannot be reached has sent nothing.
+        // As in `receive`, an engine that cannot be reached has sent nothing.
         self.subscriber.has_samples().unwrap_or(false)
     }
 
@@ -220,7 +220,7 @@ impl ResponsePort {
             Err(ReceiveError::ExceedsMaxBorrows) => {
                 return Err(ServiceError::TooManyBatchesHeld { group: self.group, limit: specification.batches_held });
             }
-            // The engine is dead. The liveness check of the trainer or observer reports it.
+            // The engine is dead, which the liveness check of the trainer or observer reports.
             Err(ReceiveError::ConnectionFailure(e)) => {
                 tracing::debug!(error = %e, "cannot receive from the engine");
                 return Ok(None);

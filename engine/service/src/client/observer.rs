@@ -23,7 +23,7 @@ use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, ObserverRecord, StatusFile, StatusReader, now};
 use crate::protocol::wait::LIVENESS_INTERVAL;
 
-/// The files of the engine's status and of the observer's own.
+/// The status files of the engine and the observer.
 const STATUS_DESCRIPTORS: usize = 2;
 
 /// How often a waiting observer polls.
@@ -31,9 +31,9 @@ const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
 /// Reads the batches of one group while a trainer steps it.
 ///
-/// The engine does not wait for observers. An observer sees the newest batch and misses those before it that it did not receive
-/// in time. Before it connects, the shared memory for the batches that it may hold is reserved, so that what it holds is never
-/// missing to the engine.
+/// The engine does not wait for observers. An observer sees the newest batch and misses older ones that it did not
+/// receive in time. Shared memory for the batches that it may hold is reserved when it connects, so that the engine
+/// never runs out.
 ///
 /// ```no_run
 /// use std::time::Duration;
@@ -51,7 +51,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(1);
 pub struct Observer {
     /// `None` while this observer is paused.
     port: Option<Arc<ResponsePort>>,
-    /// The last port, which exists until the last lease that was received through it is dropped.
+    /// The last port, which lives until the last lease received through it is dropped.
     last_port: Weak<ResponsePort>,
     service: ResponseService,
     group: usize,
@@ -85,7 +85,7 @@ impl Observer {
             let names = ServiceNames::new(&service, specification.incarnation);
             let services = EngineServices { node, names, mode: OpenMode::Open };
             descriptors::reserve(descriptors::of_trainer(1) + STATUS_DESCRIPTORS)?;
-            // One observer at a time, so that each counts those before it.
+            // One observer connects at a time, so that each counts those before it.
             let _lock = node.lock()?;
             reserve_for_observer(&services, group, specification)?;
             let service = ResponseService::open(&services, node, group, specification)?;
@@ -115,10 +115,10 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held, and
-    /// [`ServiceError::IncompatibleTypes`] for a malformed message. After a [pause](Observer::pause) also
-    /// [`ServiceError::SharedMemoryTooSmall`], [`ServiceError::RootRemoved`] and [`ServiceError::Middleware`], if this observer cannot
-    /// receive again.
+    /// [`ServiceError::TooManyBatchesHeld`] if [`batches_held`](ServiceSpecification::batches_held) leases are held,
+    /// and [`ServiceError::IncompatibleTypes`] for a malformed message. After a [pause](Observer::pause), also
+    /// [`ServiceError::SharedMemoryTooSmall`], [`ServiceError::RootRemoved`] or [`ServiceError::Middleware`] if this
+    /// observer cannot resume.
     pub fn newest(&mut self) -> Result<Option<BatchLease>, ServiceError> {
         let Some(port) = self.connected()? else { return Ok(None) };
         let batch = port.receive(&self.specification)?.and_then(Response::into_batch);
@@ -126,13 +126,13 @@ impl Observer {
         let batch = batch.filter(|batch| self.last_step != Some(batch.step()));
         self.last_step = batch.as_ref().map(BatchLease::step).or(self.last_step);
         if let (Some(status), Some(_)) = (&mut self.status, &batch) {
-            // Each lease holds the port, and so do this observer and this call.
+            // Each lease holds a reference to the port, and so do this observer and this call.
             status.received(Arc::strong_count(&port) - 2);
         }
         Ok(batch)
     }
 
-    /// The port, made anew after a pause; `None` if it cannot be made yet.
+    /// The port, created again after a pause; `None` if that is not possible yet.
     fn connected(&mut self) -> Result<Option<Arc<ResponsePort>>, ServiceError> {
         let port = match self.port.take().or_else(|| self.last_port.upgrade()) {
             Some(port) => port,
@@ -141,7 +141,7 @@ impl Observer {
                 memory::check_free(memory::MARGIN)?;
                 match self.service.port(&self.specification, true) {
                     Ok(port) => Arc::new(port),
-                    // The place of this observer is taken by what a dead process has left.
+                    // A dead process's port occupies this observer's slot.
                     Err(ServiceError::TooManyObservers { .. }) => {
                         drop(creating);
                         self.node.remove_dead_nodes();
@@ -156,15 +156,16 @@ impl Observer {
         Ok(Some(port))
     }
 
-    /// Receives nothing until the next call of [`newest`](Observer::newest) or [`next`](Observer::next), which ask for the next batch
-    /// that the engine writes. If the trainer pauses, the engine sends the last one again within two tenths of a second. The
-    /// place of the observer and the memory that is reserved for it remain.
+    /// Stops receiving until the next call of [`newest`](Observer::newest) or [`next`](Observer::next), which return
+    /// the next batch that the engine writes. If the trainer pauses, the engine sends the last one again within 0.2 s.
+    /// The observer keeps its slot and its reserved memory.
     ///
-    /// The queue of an observer that is not paused always holds the newest batch, so that the engine cannot write the next one to
-    /// the same memory, which is in its cache. A paused observer costs the engine nothing. A lease that is held remains valid, and
-    /// the pause begins when it is dropped.
+    /// The queue of an active observer always holds the newest batch, so that the engine cannot reuse that memory,
+    /// which is in its cache, for the next one. A paused observer costs the engine nothing. Leases stay valid, and the
+    /// pause begins when the last one is dropped.
     pub fn pause(&mut self) {
-        // A paused observer is counted by its status. Without memory for a new port, it keeps the one that it has.
+        // A paused observer is counted by its status, so it needs one. Without memory for a new port, it keeps its
+        // port.
         if self.status.is_some() && memory::check_free(memory::MARGIN).is_ok() {
             self.port = None;
         }
@@ -175,19 +176,19 @@ impl Observer {
         self.port.is_none() && self.last_port.strong_count() == 0
     }
 
-    /// Number of batches that the group has returned, as [`BatchLease::step`] of the newest one, from the engine's status; `None` if
-    /// that cannot be read. Costs the engine nothing, also while this observer is paused.
+    /// Number of batches that the group has returned, which is the newest one's [`BatchLease::step`], from the engine's
+    /// status; `None` if that cannot be read. Costs the engine nothing and works while this observer is paused.
     pub fn step(&self) -> Option<u64> {
         self.engine.as_ref().and_then(|engine| engine.group(self.group)).map(|group| group.step)
     }
 
-    /// Whether [`newest`](Observer::newest) would return a batch: whether the engine has written one since the last call. Nothing
-    /// is received. False while this observer is [paused](Observer::pause).
+    /// Whether [`newest`](Observer::newest) would return a batch, that is, whether the engine has written one since the
+    /// last call. Receives nothing. False while this observer is [paused](Observer::pause).
     pub fn has_newer(&self) -> bool {
         self.port.as_ref().is_some_and(|port| port.has_response())
     }
 
-    /// Checks that the engine runs.
+    /// Checks that the engine is running.
     ///
     /// # Errors
     ///
@@ -206,16 +207,17 @@ impl Observer {
     ///
     /// # Errors
     ///
-    /// [`ServiceError::TimedOut`] if there was no batch in time, which says what the engine was doing, [`ServiceError::EngineLost`]
-    /// within half a second after the engine's process has ended, [`ServiceError::RootRemoved`] if the namespace's directory was
-    /// removed, and the errors of [`newest`](Observer::newest).
+    /// [`ServiceError::TimedOut`] if there was no batch in time (it says what the engine was doing),
+    /// [`ServiceError::EngineLost`] within half a second after the engine's process has ended,
+    /// [`ServiceError::RootRemoved`] if the namespace's directory was removed, and the errors of
+    /// [`newest`](Observer::newest).
     pub fn next(&mut self, timeout: Duration) -> Result<BatchLease, ServiceError> {
         let start = Instant::now();
         let mut last_check = start;
         loop {
             let is_over = start.elapsed() >= timeout;
             let is_due = is_over || last_check.elapsed() >= LIVENESS_INTERVAL;
-            // Before the poll, which then also finds the last batch of an engine that has ended.
+            // Check before polling, so that the poll still finds the last batch of an engine that has ended.
             let alive = if is_due { self.check_alive() } else { Ok(()) };
             if let Some(lease) = self.newest()? {
                 return Ok(lease);
@@ -234,10 +236,10 @@ impl Observer {
     }
 }
 
-/// How long one group is waited for before the others are looked at again.
+/// How long to wait for one group before polling the others again.
 const TURN: Duration = Duration::from_millis(5);
 
-/// Reads the batches of all groups of an engine, or of one of them, while a trainer steps it, and counts the batches that it missed.
+/// Reads the batches of one or all groups of an engine while a trainer steps them, and counts the missed batches.
 ///
 /// ```no_run
 /// use std::time::Duration;
@@ -256,7 +258,7 @@ pub struct Observers {
     observers: Vec<Observer>,
     /// The step of the last batch of each observer.
     steps: Vec<Option<u64>>,
-    /// The observer that is looked at first, so that a fast group does not hide the others.
+    /// The observer that is polled first, so that a fast group does not starve the others.
     turn: usize,
 }
 
@@ -265,7 +267,7 @@ pub struct Observers {
 pub struct Observed {
     /// The batch.
     pub lease: BatchLease,
-    /// Batches of its group between the one that was observed before and this one; 0 for the first.
+    /// Batches of its group between the previously observed one and this one; 0 for the first.
     pub missed: u64,
 }
 
@@ -336,9 +338,9 @@ pub(crate) struct ObserverStatusWriter {
 }
 
 impl ObserverStatusWriter {
-    /// `None` if there is no memory or descriptor for it: an observer works without.
+    /// `None` if there is no memory or descriptor for it: an observer works without a status.
     pub(crate) fn create(node: &NamespaceNode, specification: &ServiceSpecification, group: usize) -> Option<Self> {
-        // A file that another process finds empty is removed, unless this process is creating something.
+        // Under the creation lock, since another process would remove the file while it is empty.
         let _creating = node.creating().ok()?;
         let record = ObserverRecord { process: std::process::id(), group: group as u32, ..ObserverRecord::default() };
         let path = status_file::observer_path(node.prefix(), specification.incarnation, rand::random());
@@ -347,7 +349,7 @@ impl ObserverStatusWriter {
         created.ok().map(|file| ObserverStatusWriter { file, record })
     }
 
-    /// A batch was received; with it, `held` are held.
+    /// A batch was received; `held` batches are held, including this one.
     pub(crate) fn received(&mut self, held: usize) {
         let ObserverRecord { batches, .. } = self.record;
         self.record = ObserverRecord { batches: batches + 1, last_batch: now(), held: held as u32, ..self.record };
@@ -355,8 +357,8 @@ impl ObserverStatusWriter {
     }
 }
 
-/// Allocates the memory of the batches that one more observer of a group may hold. The caller holds the namespace's lock, so that
-/// no other observer connects meanwhile.
+/// Allocates memory for the batches that one more observer of a group may hold. The caller holds the namespace's lock,
+/// so that no other observer connects meanwhile.
 pub(crate) fn reserve_for_observer(
     services: &EngineServices<'_>,
     group: usize,
@@ -370,7 +372,8 @@ pub(crate) fn reserve_for_observer(
         ports += usize::from(Some(subscriber.node_id) != trainer);
         CallbackProgression::Continue
     });
-    // An observer that is paused has a status and no port. A dead one may have a port, and one without a status has one, too.
+    // A paused observer has a status but no port. A dead observer may have left a port, and one without a status also
+    // has a port.
     let statuses = status_file::running_observers(services.node.prefix(), specification.incarnation);
     let statuses = statuses.iter().filter(|observer| observer.group as usize == group).count();
     let observers = 1 + statuses.max(ports);
@@ -390,7 +393,7 @@ pub(crate) fn reserve_for_observer(
     let chunk = (chunk_blocks(&specification.batch) * BLOCK_BYTES) as u64;
     let failed = |e: std::io::Error| ServiceError::middleware("cannot reserve shared memory")(e);
     let bytes = segment.metadata().map_err(failed)?.len().saturating_sub(chunk * unused as u64).max(1);
-    // What is allocated already, in the file system's blocks of 512 bytes. The observer's own port needs memory, too.
+    // `blocks` counts what is already allocated, in units of 512 bytes. The observer's port needs memory, too.
     let allocated = segment.metadata().map_err(failed)?.blocks().saturating_mul(512);
     memory::check_free(bytes.saturating_sub(allocated).saturating_add(memory::MARGIN))?;
     match rustix::fs::fallocate(&segment, FallocateFlags::KEEP_SIZE, 0, bytes) {

@@ -1,9 +1,9 @@
-//! The requests of a trainer that have not been answered yet, and what is known of the last ones.
+//! A trainer's pending requests, and what is known about its last ones.
 
 use crate::protocol::message::RequestKind;
 use crate::protocol::status_file::GroupRecord;
 
-/// What is requested.
+/// A request of a trainer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Request {
     pub kind: RequestKind,
@@ -21,13 +21,13 @@ impl Request {
     }
 }
 
-/// By group, the request that has not been answered yet, and the last request.
+/// By group, the pending request and what became of the last one.
 #[derive(Clone, Debug)]
 pub(crate) struct PendingRequests(Vec<GroupRequests>);
 
 #[derive(Clone, Copy, Debug)]
 struct GroupRequests {
-    /// Number and content of the request that has not been answered yet.
+    /// Number and content of the pending request.
     pending: Option<(u64, Request)>,
     last: LastRequest,
 }
@@ -87,7 +87,7 @@ impl PendingRequests {
 /// What [`Trainer::reconnect`](crate::Trainer::reconnect) found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Reconnection {
-    /// Whether the engine is another run than before. Otherwise the connection was kept.
+    /// Whether the engine was restarted. Otherwise the connection was kept.
     pub restarted: bool,
     /// Identifies the run of the engine that is connected now.
     pub incarnation: u64,
@@ -98,11 +98,11 @@ pub struct Reconnection {
 /// What [`Trainer::reconnect`](crate::Trainer::reconnect) found out about a group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GroupReconnection {
-    /// Batches that the group has returned in the engine that is connected now. An engine that resumed from a checkpoint counts on
-    /// from there. `None` if its status cannot be read.
+    /// Batches that the group has returned in the current engine. An engine that resumed from a checkpoint continues
+    /// its count. `None` if its status cannot be read.
     pub step: Option<u64>,
-    /// Batches that the group had returned in the engine that ended; `None` if the engine is the same, or if its status cannot be
-    /// read.
+    /// Batches that the group had returned in the engine that ended; `None` if the engine is the same or its status
+    /// cannot be read.
     pub lost_step: Option<u64>,
     /// What became of the trainer's last request to the group.
     pub last_request: LastRequest,
@@ -111,9 +111,9 @@ pub struct GroupReconnection {
 /// What became of a trainer's last request to a group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LastRequest {
-    /// There was none since the trainer connected to that run of the engine.
+    /// The trainer has sent none since it connected to that run of the engine.
     None,
-    /// The engine is running, and the answer has not been received. It can be received, and the request is executed once.
+    /// The engine is running, and the answer can still be received. The request is executed once.
     Pending,
     /// It was executed once.
     Played,
@@ -124,7 +124,8 @@ pub enum LastRequest {
 }
 
 impl LastRequest {
-    /// What became of the pending request `number` of `trainer`, by the last status of an engine that has ended.
+    /// What became of the pending request `number` of `trainer`, according to the last status of an engine that has
+    /// ended.
     pub(crate) fn of_dead_engine(status: Option<GroupRecord>, trainer: u64, number: u64) -> Self {
         match status {
             None => LastRequest::Unknown,

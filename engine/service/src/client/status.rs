@@ -1,4 +1,4 @@
-//! What an engine is doing, as other processes see it.
+//! The status of an engine, as other processes see it.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fs;
@@ -47,7 +47,7 @@ pub struct EngineStatus {
 /// The status of one group of an engine.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupStatus {
-    /// Batches that the group has returned, as [`BatchLease::step`](crate::BatchLease::step).
+    /// Batches that the group has returned; see [`BatchLease::step`](crate::BatchLease::step).
     pub step: u64,
     /// Batches that this run of the engine has sent, including those of resets.
     pub batches: u64,
@@ -67,9 +67,9 @@ pub struct GroupStatus {
     pub held: u32,
     /// The group's observers, sorted by process id.
     pub observers: Vec<ObserverStatus>,
-    /// Number of the last request that the engine has taken, and of the last that it has answered.
+    /// Number of the last request that the engine has taken.
     pub last_taken: u64,
-    /// See [`last_taken`](GroupStatus::last_taken).
+    /// Number of the last request that the engine has answered.
     pub last_answered: u64,
     /// Kind of the last request: `step`, `reset`, `snapshot`, `restore` or `checkpoint`; `None` before the first.
     pub kind: Option<&'static str>,
@@ -107,7 +107,8 @@ fn optional_seconds<S: serde::Serializer>(duration: &Option<Duration>, serialize
 impl EngineStatus {
     /// The status of all running engines of a namespace, sorted by name.
     ///
-    /// Creates and removes nothing, also where the namespace's directory does not exist. Engines of another version are left out.
+    /// Creates and removes nothing, even if the namespace's directory does not exist. Engines of another version are
+    /// left out.
     pub fn all(namespace: &Namespace) -> Vec<Self> {
         let Some(identity) = Identity::existing(namespace) else { return Vec::new() };
         let prefix = identity.prefix();
@@ -206,7 +207,7 @@ fn since(moment: u64, now: u64) -> Option<Duration> {
     (moment != 0).then(|| Duration::from_nanos(now.saturating_sub(moment)))
 }
 
-/// What the engine does while a trainer waits for the answer to its request `number` to `group`.
+/// What the engine is doing while a trainer waits for the answer to its request `number` to `group`.
 pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize, number: u64) -> EngineActivity {
     let Some((status, engine)) = status.and_then(|status| Some((status, status.engine()?))) else {
         return EngineActivity::Unknown;
@@ -224,7 +225,7 @@ pub(crate) fn activity(status: Option<&StatusReader>, trainer: u64, group: usize
     EngineActivity::NotTaken { process: engine.head.process }
 }
 
-/// What the engine does while an observer waits for a batch of a group.
+/// What the engine is doing while an observer waits for a batch of a group.
 pub(crate) fn observed_activity(status: Option<&StatusReader>, group: usize) -> EngineActivity {
     // No trainer has the number 0.
     match activity(status, 0, group, u64::MAX) {
@@ -237,10 +238,10 @@ pub(crate) fn observed_activity(status: Option<&StatusReader>, group: usize) -> 
     }
 }
 
-/// The processes that are connected to an engine, by their ids.
+/// The process ids of an engine's clients.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct EngineProcesses {
-    /// The trainer. Several only while one takes the place of another.
+    /// The trainer. More than one only while one replaces another.
     pub trainers: BTreeSet<u32>,
     /// The observers of all groups.
     pub observers: BTreeSet<u32>,
@@ -252,7 +253,7 @@ impl EngineStatus {
         let Some(identity) = Identity::existing(namespace) else { return EngineProcesses::default() };
         let Ok(config) = namespace.config(identity.prefix()) else { return EngineProcesses::default() };
         let prefix = format!("{SERVICE_PREFIX}{}/{:016x}/", self.service, self.incarnation);
-        // The nodes of other processes than the engine's, by service, and their process ids.
+        // The nodes of all processes but the engine, by service, and their process ids.
         let (mut requests, mut responses) = (HashSet::new(), HashSet::new());
         let mut process_ids = HashMap::new();
         let listed = Ipc::list(&config, |service| {
@@ -306,7 +307,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_records_are_a_status(
+        fn arbitrary_records_make_a_printable_status(
             engine in record::<EngineRecord>(),
             groups in prop::collection::vec(record::<GroupRecord>(), 0..4),
             observers in prop::collection::vec(record::<ObserverRecord>(), 0..4),

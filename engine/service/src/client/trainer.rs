@@ -1,4 +1,4 @@
-//! The trainer: sends actions to an engine and receives batches, which it reads where the engine wrote them.
+//! The trainer: sends actions to an engine and receives batches, which it reads in place.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -86,13 +86,13 @@ impl Trainer {
     /// Connects to an engine of the same name that replaces a lost one. Waits for it up to `timeout`. It must serve the same
     /// environments in the same layout, and each group must be reset before it is stepped.
     ///
-    /// If the current engine is running, the connection and the pending answers are kept: nothing is executed twice, and what was
-    /// sent can be received. The result says which of the two was the case, and for each group what became of the last request;
-    /// the crate's documentation has a table.
+    /// If the current engine is still running, the connection and the pending answers are kept: nothing is executed
+    /// twice, and pending answers can be received. The result says which of the two happened, and what became of the
+    /// last request to each group; see the table in the crate's documentation.
     ///
     /// # Errors
     ///
-    /// [`ServiceError::SpecificationChanged`] if the new engine serves something else, and the errors of
+    /// [`ServiceError::SpecificationChanged`] if the new engine serves different environments, and the errors of
     /// [`connect`](Trainer::connect).
     pub fn reconnect(&mut self, timeout: Duration) -> Result<Reconnection, ServiceError> {
         let restarted = !self.connection.is_engine_alive();
@@ -145,8 +145,8 @@ impl Trainer {
         self.reset_with(group, request, None)
     }
 
-    /// Like [`reset`](Trainer::reset), with new reset parameters for the environments that start an episode, which apply to all
-    /// their later episodes; see [`Pool::reset_with`](endless_gym_core::pool::Pool::reset_with).
+    /// Like [`reset`](Trainer::reset), with new reset parameters for the environments that start an episode. They apply
+    /// to all later episodes as well; see [`Pool::reset_with`](endless_gym_core::pool::Pool::reset_with).
     ///
     /// # Errors
     ///
@@ -195,7 +195,7 @@ impl Trainer {
     /// request. No error steps an environment.
     pub fn send(&mut self, group: usize, actions: &[i32]) -> Result<(), ServiceError> {
         let specification = Arc::clone(&self.specification);
-        // The order of the checks: number of actions, pending answer, range.
+        // Order of the checks: number of actions, pending answer, range.
         let checked = specification.action_space.check(specification.num_envs, actions);
         if let Err(error @ ActionError::Count { .. }) = checked {
             return Err(error.into());
@@ -258,7 +258,8 @@ impl Trainer {
         response.into_batch().ok_or_else(|| self.incompatible())
     }
 
-    /// The first response to a pending request of `groups`, of those that return batches or of those that do not.
+    /// The first response to a pending request of `groups`: of requests that return batches, or (`!batches`) of the
+    /// others.
     fn receive_response(
         &mut self,
         groups: Range<usize>,
@@ -297,7 +298,7 @@ impl Trainer {
         }
     }
 
-    /// What the engine does while this trainer waits for an answer from one of `groups`.
+    /// What the engine is doing while this trainer waits for an answer from one of `groups`.
     fn activity(&self, mut groups: Range<usize>, batches: bool) -> EngineActivity {
         let waiting = groups.find_map(|group| self.pending.number(group, batches).map(|number| (group, number)));
         waiting.map_or(EngineActivity::Unknown, |(group, number)| {
@@ -314,8 +315,8 @@ impl Trainer {
         Err(ServiceError::NoSuchGroup { service, given: group, groups })
     }
 
-    /// Writes a request in shared memory and sends it. `write` fills the payload and returns the length of its options or
-    /// snapshot in bytes.
+    /// Writes a request to shared memory and sends it. `write` fills the payload and returns the length of its options
+    /// or snapshot in bytes.
     fn post(
         &mut self,
         group: usize,
@@ -376,15 +377,16 @@ impl Trainer {
     }
 }
 
-/// Most environments in one item of a message: with options of [`OPTIONS_BYTES`] their numbers fit a message.
+/// Maximum number of environments in one item of a message: their numbers and options of [`OPTIONS_BYTES`] fit in a
+/// message.
 const ENVS_PER_ITEM: usize = 16_384;
 
 impl Trainer {
-    /// Sets the reset parameters of environments' next episodes and all later ones; see
+    /// Sets the reset parameters for the next and all later episodes of some environments; see
     /// [`Pool::set_options`](endless_gym_core::pool::Pool::set_options). It may precede the first reset.
     ///
-    /// After [`ServiceError::TimedOut`], the same call may be repeated; the engine may still set the options, but not after a
-    /// later request.
+    /// After [`ServiceError::TimedOut`], the call may be repeated; the engine may still set the options, but not after
+    /// a later request.
     ///
     /// # Errors
     ///
@@ -410,8 +412,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// What the running episodes of environments follow from, in the order of their numbers. This trainer must have reset the
-    /// group before.
+    /// Returns the seeds and reset parameters of the environments' running episodes, in the order of the environments'
+    /// numbers. This trainer must have reset the group before.
     ///
     /// # Errors
     ///
@@ -438,7 +440,7 @@ impl Trainer {
             };
             let request = Request { checksum: crc32fast::hash(&mask), ..Request::new(RequestKind::Episodes) };
             let text = self.transfer(group, request, timeout, write)?;
-            // As many as fit a response, at least one.
+            // As many as fit in a response, at least one.
             let received: Vec<RunningEpisode> = serde_json::from_slice(&text).map_err(|_| self.incompatible())?;
             let before = missing.len();
             for episode in &received {
@@ -453,7 +455,7 @@ impl Trainer {
     }
 }
 
-/// The items as JSON lists, each of which fits a message.
+/// The items as JSON lists, each of which fits in a message.
 fn messages(sets: &[NextOptions]) -> Result<Vec<Vec<u8>>, ServiceError> {
     let mut messages: Vec<Vec<u8>> = Vec::new();
     for set in sets {
@@ -528,8 +530,9 @@ impl Trainer {
         self.transfer_bytes(group, Request { env, ..Request::new(RequestKind::Restore) }, snapshot, timeout)
     }
 
-    /// Saves all environments of the engine to its checkpoint file, and returns the step of each group that was saved. The file is
-    /// on the disk when this returns. Groups whose answers are pending are saved before or after their step, as their number says.
+    /// Saves all environments of the engine to its checkpoint file and returns the saved step of each group. The file
+    /// is on disk when this returns. A group with a pending answer may be saved before or after that step; its number
+    /// tells which.
     ///
     /// After [`ServiceError::TimedOut`], the same call continues to wait.
     ///
@@ -542,7 +545,7 @@ impl Trainer {
         Ok(steps.chunks_exact(size_of::<u64>()).map(bytemuck::pod_read_unaligned).collect())
     }
 
-    /// As [`transfer`](Self::transfer), with these bytes in the payload's `snapshot`, for an answer without content.
+    /// Like [`transfer`](Self::transfer), with these bytes in the payload's `snapshot`, for an answer without content.
     fn transfer_bytes(
         &mut self,
         group: usize,

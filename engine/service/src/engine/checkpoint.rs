@@ -1,8 +1,8 @@
-//! The file from which an engine continues the environments of an earlier one.
+//! Checkpoint files: an engine saves its environments, and a later engine resumes from them.
 //!
-//! A checkpoint is `EGYC`, the format's version (u32), the CRC-32 of what follows (u32), both little-endian, and then the content
-//! in [postcard](https://postcard.jamesmunns.com)'s encoding: what the environments are, as JSON text, and for each group its step and
-//! its environments' states.
+//! A checkpoint is `EGYC`, the format's version (u32), the CRC-32 of the content (u32), both little-endian, and then
+//! the content in [postcard](https://postcard.jamesmunns.com)'s encoding: a JSON text that describes the environments,
+//! and for each group its step and its environments' states.
 
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Read, Write};
@@ -36,7 +36,7 @@ pub(crate) struct CheckpointHead {
     autoreset: String,
     frames: Option<Frames>,
     features: bool,
-    /// The source of the seeds, without the seed that it started from: its state is part of the environments' states.
+    /// The source of the seeds, without its initial seed: its current state is part of the environments' states.
     seeding: String,
     options: Vec<Map<String, Json>>,
 }
@@ -55,7 +55,7 @@ impl CheckpointHead {
                 )
             }
         };
-        // Part of the text, so that the format is that of earlier checkpoints.
+        // Part of the text, so that the format of earlier checkpoints stays valid.
         let independent = if config.pool.independent_episodes { ", independent episodes" } else { "" };
         CheckpointHead {
             package: PACKAGE_VERSION.to_owned(),
@@ -104,7 +104,7 @@ struct Content {
     groups: Vec<SavedGroup>,
 }
 
-/// Writes a checkpoint and replaces an earlier one when it is complete and on the disk.
+/// Writes a checkpoint. It replaces an earlier one only when it is complete and on disk.
 pub(crate) fn write(path: &Path, head: &CheckpointHead, groups: Vec<SavedGroup>) -> Result<(), CheckpointError> {
     let failed = |reason: String| CheckpointError::Write { path: path.to_owned(), reason };
     let head = serde_json::to_string(head).map_err(|e| failed(e.to_string()))?;
@@ -123,7 +123,7 @@ pub(crate) fn write(path: &Path, head: &CheckpointHead, groups: Vec<SavedGroup>)
     })
 }
 
-/// Checks that a checkpoint can be written, so that this is not found out at the first one.
+/// Checks early that a checkpoint can be written.
 pub(crate) fn check_writable(path: &Path) -> Result<(), CheckpointError> {
     let new = new_path(path);
     let created = if path.is_dir() { Err(ErrorKind::IsADirectory.into()) } else { File::create(&new).map(drop) };
@@ -132,7 +132,7 @@ pub(crate) fn check_writable(path: &Path) -> Result<(), CheckpointError> {
         .map_err(|e| CheckpointError::Write { path: path.to_owned(), reason: e.to_string() })
 }
 
-/// Reads the groups of a checkpoint that was saved with this head; `None` if there is no file.
+/// Reads the groups of a checkpoint saved with this head; `None` if there is no file.
 pub(crate) fn read(path: &Path, head: &CheckpointHead) -> Result<Option<Vec<SavedGroup>>, CheckpointError> {
     let bytes = match fs::read(path) {
         Ok(bytes) => bytes,
@@ -181,8 +181,8 @@ fn directory(path: &Path) -> &Path {
     path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Saves the environments of an engine. A periodic checkpoint stalls the engine only while their states are copied: another thread
-/// encodes and writes them.
+/// Saves the environments of an engine. A periodic checkpoint stalls the engine only while it copies their states:
+/// another thread encodes and writes them.
 #[derive(Debug)]
 pub(crate) struct Checkpointer {
     config: CheckpointConfig,
@@ -191,7 +191,7 @@ pub(crate) struct Checkpointer {
     /// Whether a request was executed since the last checkpoint.
     changed: bool,
     writing: Option<JoinHandle<Result<(), CheckpointError>>>,
-    // Released when nothing is written any more.
+    // Released after the last write.
     _lock: CheckpointLock,
 }
 
@@ -241,7 +241,7 @@ impl Checkpointer {
         self.changed = true;
     }
 
-    /// Saves in the background if it is time to.
+    /// Saves in the background if a checkpoint is due.
     pub(crate) fn poll(&mut self, groups: &[Group], status: &mut StatusWriter) {
         if self.writing.as_ref().is_some_and(JoinHandle::is_finished)
             && let Err(e) = self.finish(status)
@@ -267,7 +267,7 @@ impl Checkpointer {
         }
     }
 
-    /// Saves now, and returns when the checkpoint is on the disk.
+    /// Saves now, and returns when the checkpoint is on disk.
     pub(crate) fn save(&mut self, groups: &[Group], status: &mut StatusWriter) -> Result<(), CheckpointError> {
         if let Err(e) = self.finish(status) {
             tracing::warn!(error = %e, "cannot save a checkpoint");
@@ -305,7 +305,7 @@ impl Checkpointer {
 
 impl Drop for Checkpointer {
     fn drop(&mut self) {
-        // Otherwise the end of the process would interrupt the thread.
+        // The end of the process would interrupt the thread.
         if let Some(writing) = self.writing.take() {
             let _ = writing.join();
         }
@@ -323,8 +323,8 @@ fn save(groups: &[Group], status: &StatusWriter) -> Result<Vec<SavedGroup>, Chec
     if saved.iter().all(|group| group.envs.is_none()) { Err(CheckpointError::NotReset) } else { Ok(saved) }
 }
 
-/// An engine's right to save to a checkpoint file: an `flock` on `FILE.lock`, since `FILE` itself is replaced by every save. The kernel
-/// releases it when the process dies; the file that then stays is taken over by the next engine.
+/// An engine's right to save to a checkpoint file: an `flock` on `FILE.lock`, since `FILE` itself is replaced by every
+/// save. The kernel releases it when the process dies; the next engine then takes over the lock file.
 #[derive(Debug)]
 pub(crate) struct CheckpointLock {
     file: File,
@@ -353,7 +353,7 @@ impl CheckpointLock {
                     return Err(CheckpointError::InUse { path: checkpoint.to_owned(), process });
                 }
             }
-            // Otherwise an engine that ended has removed it in the meantime.
+            // If they differ, an engine that ended has removed the file in the meantime.
             if locked_file::is_same(&file, &path) {
                 let process = std::process::id();
                 file.set_len(0).and_then(|()| writeln!(file, "{process}")).map_err(failed)?;
@@ -365,7 +365,7 @@ impl CheckpointLock {
 
 impl Drop for CheckpointLock {
     fn drop(&mut self) {
-        // In a forked process, the lock is the parent's.
+        // A forked child must not release its parent's lock.
         if self.process == std::process::id() {
             let _ = fs::remove_file(&self.path);
             // Closing the file is not enough: a forked child shares the lock.
@@ -434,9 +434,9 @@ mod tests {
             prop_assert!(decode(Path::new("file"), &bytes, &head).is_err());
         }
 
-        /// With a checksum that matches, so that the decoder sees the content.
+        /// With a matching checksum, so that the content reaches the decoder.
         #[test]
-        fn a_forged_checkpoint_is_no_panic(
+        fn a_forged_checkpoint_does_not_panic(
             changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..9),
             length in any::<prop::sample::Index>(),
             cut: bool,
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn foreign_files_and_other_environments_are_named() {
+    fn errors_tell_foreign_files_from_checkpoints_of_other_environments() {
         let (head, bytes) = checkpoint("foreign");
         let message =
             |bytes: &[u8], head: &CheckpointHead| decode(Path::new("/a/b"), bytes, head).unwrap_err().to_string();
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_that_cannot_be_written_is_found_out_at_once() {
+    fn an_unwritable_path_is_an_error_before_the_first_checkpoint() {
         for (path, part) in [("/nowhere/file", "No such file"), ("/dev", "directory")] {
             let text = check_writable(Path::new(path)).unwrap_err().to_string();
             assert!(text.contains(path) && text.contains(part), "{text}");
@@ -487,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn a_checkpoint_has_one_engine_at_a_time() {
+    fn only_one_engine_at_a_time_uses_a_checkpoint() {
         let folder = std::env::temp_dir().join(format!("endless-checkpoint-lock-{}", std::process::id()));
         fs::create_dir(&folder).unwrap();
         let path = folder.join("run.ckpt");
@@ -504,7 +504,7 @@ mod tests {
         drop(lock);
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
 
-        // What a dead engine left, which may be longer than what is written.
+        // A dead engine's lock file, longer than what replaces it.
         fs::write(folder.join("run.ckpt.lock"), "4294967295000\n").unwrap();
         drop(CheckpointLock::acquire(&path).unwrap());
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);

@@ -12,8 +12,8 @@ use crate::protocol::limits::{MAX_BATCHES_HELD, MAX_GROUPS, MAX_OBSERVERS};
 
 /// Configuration of an engine: what it serves, and under which name.
 ///
-/// Its JSON has the names of the fields. Only `pool` is required, other fields have the defaults of [`new`](Self::new) with the name
-/// `endless`, and an unknown field is an error.
+/// Its JSON form uses the field names. Only `pool` is required; the other fields default to those of [`new`](Self::new)
+/// with the name `endless`. An unknown field is an error.
 ///
 /// ```
 /// use endless_gym_service::EngineConfig;
@@ -38,12 +38,12 @@ pub struct EngineConfig {
     /// The namespace in which trainers find the engine. In JSON, it is the path of its root directory.
     #[serde(default)]
     pub namespace: Namespace,
-    /// The environments of one group. `first_env` is the number of the first group's first environment. `total_envs` counts the
-    /// environments of all groups and engines; `first_env + num_envs`, the default, stands for those of this engine alone.
-    /// [`ResetOptions::Each`] holds the reset parameters of all groups, one group after the other.
+    /// The environments of one group. `first_env` is the number of the first group's first environment. `total_envs`
+    /// counts the environments of all groups and engines; the default, `first_env + num_envs`, means that this is the
+    /// only engine. [`ResetOptions::Each`] holds the reset parameters of all groups, one group after the other.
     pub pool: PoolConfig,
-    /// Number of groups, 1 to [`MAX_GROUPS`]. Each is stepped when its actions arrive, so that a trainer can work on one group
-    /// while the engine steps another.
+    /// Number of groups, 1 to [`MAX_GROUPS`]. A group is stepped when its actions arrive, so that a trainer can work on
+    /// one group while the engine steps another.
     #[serde(default = "default_groups")]
     pub groups: usize,
     /// Number of threads that step the environments of all groups; 0 for one per core.
@@ -56,7 +56,7 @@ pub struct EngineConfig {
     /// Observers of a group that may be connected at a time, 0 to 16. They use memory only while they are connected.
     #[serde(default = "default_observers")]
     pub observers: usize,
-    /// The file to which the engine saves its environments, and from which it may continue; `None` for none.
+    /// The file to which the engine saves its environments, and from which it may resume; `None` for none.
     #[serde(default)]
     pub checkpoint: Option<CheckpointConfig>,
 }
@@ -136,18 +136,19 @@ impl EngineConfig {
     }
 }
 
-/// Where an engine saves its environments, and whether it continues from there.
+/// Where an engine saves its environments, and whether it resumes from there.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CheckpointConfig {
-    /// The file. A new checkpoint is written beside it, as `FILE.new`, and replaces it when it is complete and on the disk. As long as
-    /// the engine exists, it holds a lock on `FILE.lock`, so that no other engine saves to the same file.
+    /// The file. A new checkpoint is written to `FILE.new` and replaces it when it is complete and on disk. The engine
+    /// holds a lock on `FILE.lock` for its lifetime, so that no other engine saves to the same file.
     pub path: PathBuf,
-    /// How often the engine saves while it runs; `None` saves only when the engine stops and when a trainer asks for it.
+    /// How often the engine saves while it runs; `None` saves only when the engine stops and when a trainer requests
+    /// it.
     #[serde(default, rename = "every_seconds", serialize_with = "write_seconds", deserialize_with = "read_seconds")]
     pub every: Option<Duration>,
-    /// Whether the engine continues from the file if it exists. Otherwise a file that exists is an error, so that it is not
-    /// overwritten by mistake.
+    /// Whether the engine resumes from the file if it exists. If `false`, an existing file is an error, so that it is
+    /// not overwritten by mistake.
     #[serde(default)]
     pub resume: bool,
 }
@@ -163,7 +164,7 @@ fn read_seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Dur
 }
 
 impl CheckpointConfig {
-    /// Saves to `path` when the engine stops and when a trainer asks for it, and does not continue from there.
+    /// Saves to `path` when the engine stops and when a trainer requests it, and does not resume from it.
     pub fn new(path: impl Into<PathBuf>) -> Self {
         CheckpointConfig { path: path.into(), every: None, resume: false }
     }
@@ -204,14 +205,14 @@ mod tests {
     }
 
     #[test]
-    fn environments_are_counted_over_the_groups() {
+    fn environments_are_numbered_across_groups() {
         let pools = EngineConfig { groups: 3, ..config() }.pools().unwrap();
         let numbers: Vec<_> = pools.iter().map(|pool| (pool.first_env, pool.num_envs, pool.total_envs)).collect();
         assert_eq!(numbers, [(0, 2, 6), (2, 2, 6), (4, 2, 6)]);
     }
 
     #[test]
-    fn environments_are_counted_over_several_engines() {
+    fn environments_are_numbered_across_engines() {
         let numbered = |first_env, total_envs| {
             let pool = PoolConfig { first_env, total_envs, ..config().pool };
             let pools = EngineConfig { pool, groups: 2, ..config() }.pools().unwrap();
@@ -219,7 +220,7 @@ mod tests {
         };
         assert_eq!(numbered(4, 12), [(4, 12), (6, 12)]);
         assert_eq!(numbered(4, 6), [(4, 8), (6, 8)]);
-        // Too few in all, which the pools refuse.
+        // A total that is too small, which the pools refuse.
         assert_eq!(numbered(4, 7), [(4, 7), (6, 7)]);
     }
 }

@@ -29,7 +29,7 @@ pub(crate) enum Outcome {
     Snapshot { bytes: usize },
 }
 
-/// A batch that was sent, and is still where it was written.
+/// A batch that was sent and is still in memory.
 #[derive(Clone, Copy)]
 struct SentBatch {
     header: ResponseHeader,
@@ -44,9 +44,9 @@ pub(crate) struct Group {
     responses: ResponsePublisher,
     memory: PrefaultedChunks,
     response_service: BlockService<ResponseHeader>,
-    /// The batch that was sent last, until the next chunk is written.
+    /// The last batch sent, until the next chunk is written.
     last: Option<SentBatch>,
-    /// The ports of observers that had resumed when the engine was last idle.
+    /// The ports of resumed observers that the engine found when it was last idle.
     resumed: Vec<u128>,
     request: RequestData,
     /// The trainer that last reset all environments.
@@ -102,8 +102,8 @@ impl Group {
         batch.send()
     }
 
-    /// Sends the last batch again if an observer has resumed since: while the trainer pauses, there is no other for it. All who have
-    /// it ignore it by its numbers.
+    /// Sends the last batch again if an observer has resumed since: while the trainer pauses, it would get no other.
+    /// Processes that have the batch recognise it by its numbers and ignore it.
     pub(crate) fn repeat_batch(&mut self) {
         let mut resumed = Vec::new();
         self.response_service.dynamic_config().list_subscribers(|subscriber| {
@@ -121,11 +121,11 @@ impl Group {
         };
         *batch.user_header_mut() = last.header;
         let payload: &mut [Block] = bytemuck::cast_slice_mut(batch.payload_mut());
-        // Usually it is the same chunk, unless the trainer holds it.
+        // It is the same chunk unless some process still holds it.
         if payload.as_ptr().addr() != last.address {
-            // SAFETY: the address is that of a chunk of the publisher's segment, which has this size and stays mapped. Only `loan`
-            // gives access for writing; it has given another chunk, and none since that one was sent. Every byte pattern is a
-            // valid block.
+            // SAFETY: the address is that of a chunk of the publisher's segment, which has this size and stays mapped.
+            // Only `loan` gives write access; it returned another chunk now, and none since that one was sent. Every
+            // byte pattern is a valid block.
             let written = unsafe {
                 std::slice::from_raw_parts(std::ptr::with_exposed_provenance::<Block>(last.address), payload.len())
             };
@@ -156,7 +156,8 @@ impl Group {
         payload: &[Block],
     ) -> Result<RequestKind, Rejected> {
         let kind = self.request.read(layout, header, payload)?;
-        // A new trainer must not step the episodes of another one by mistake. It may adopt them, by a reset of no environment.
+        // A new trainer must not step another one's episodes by mistake, but may adopt them with a reset of no
+        // environment.
         let is_allowed = match kind {
             RequestKind::Step | RequestKind::Snapshot | RequestKind::Restore | RequestKind::Episodes => false,
             RequestKind::ResetEach => {
@@ -195,7 +196,7 @@ impl Group {
             RequestKind::ResetEach => self.pool.reset_with(ResetRequest::Each { reset, seed }, options, batch),
             RequestKind::SetOptions => self.pool.set_options(next_options),
             RequestKind::Episodes => return self.write_episodes(payload),
-            // The engine executes it.
+            // Executed by the engine.
             RequestKind::Checkpoint => return Ok(Outcome::Snapshot { bytes: 0 }),
         };
         done.map_err(|e| match e {
@@ -226,19 +227,19 @@ impl Group {
         self.pool.resume(saved)
     }
 
-    /// Prepares `payload` for other content than a batch.
+    /// Prepares `payload` for content other than a batch.
     pub(crate) fn forget_frames(&self, payload: &mut [Block]) {
         self.pool.layout().forget_frames(payload);
     }
 
-    /// Writes the explanation of a rejection over the batch in `payload`, and returns its length in bytes.
+    /// Overwrites the batch in `payload` with the explanation of a rejection, and returns its length in bytes.
     pub(crate) fn write_rejection(&self, payload: &mut [Block], text: &str) -> usize {
         self.forget_frames(payload);
         write_text(payload, text)
     }
 
-    /// Writes what the running episodes of the requested environments follow from over the batch in `payload`, as JSON text: those
-    /// of as many environments as fit, at least one.
+    /// Overwrites the batch in `payload` with the seeds and reset parameters of the requested environments' running
+    /// episodes, as JSON text: as many as fit, at least one.
     fn write_episodes(&self, payload: &mut [Block]) -> Result<Outcome, Rejected> {
         self.forget_frames(payload);
         let text: &mut [u8] = bytemuck::cast_slice_mut(payload);
@@ -246,7 +247,7 @@ impl Group {
         for env in (0..self.request.reset.len()).filter(|env| self.request.reset[*env] != 0) {
             let episode = self.pool.running_episode(env).map_err(|e| (Rejection::NotReset, e.to_string()))?;
             let item = serde_json::to_vec(&episode).map_err(|e| (Rejection::Pool, e.to_string()))?;
-            // A separator before it, and a bracket behind the last.
+            // A separator before it, and a bracket after the last.
             if end + item.len() + 2 > text.len() {
                 break;
             }
@@ -262,7 +263,7 @@ impl Group {
         Ok(Outcome::Snapshot { bytes: end + 1 })
     }
 
-    /// Writes a snapshot of an environment over the batch in `payload`.
+    /// Overwrites the batch in `payload` with a snapshot of an environment.
     fn write_snapshot(&self, env: usize, payload: &mut [Block]) -> Result<Outcome, Rejected> {
         let snapshot = self.pool.snapshot(env).map_err(|e| (Rejection::Snapshot, e.to_string()))?;
         if snapshot.len() > SNAPSHOT_BYTES {
@@ -278,8 +279,8 @@ impl Group {
     }
 }
 
-/// The payload of the current request, copied out of shared memory: the trainer cannot change it after the check. The buffers are
-/// reused, so that a step does not allocate.
+/// The payload of the current request, copied out of shared memory so that the trainer cannot change it after the
+/// check. The buffers are reused, so that a step does not allocate.
 #[derive(Debug, Default)]
 struct RequestData {
     action: Vec<i32>,
@@ -360,7 +361,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_request_that_changes_after_it_was_read_has_no_effect() {
+    fn changing_a_request_after_it_was_read_has_no_effect() {
         let layout = action_layout(&ActionSpace::Discrete(4), 1).unwrap();
         let mut payload = zeroed(layout.blocks());
         let mut data = RequestData::default();

@@ -24,13 +24,13 @@ use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames, chunk
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::wait::wait;
 
-/// How long an idle engine parks at most, which is also how long it takes to notice its stop flag.
+/// Longest time an idle engine parks, and so the longest it takes to notice its stop flag.
 const IDLE_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// How often an idle engine looks for dead processes.
 const CLEANUP_INTERVAL: Duration = Duration::from_millis(500);
 
-/// How long an engine that stops looks whether its trainer ends, too.
+/// How long a stopping engine waits for its trainer to end as well.
 const LAST_CLEANUP: Duration = Duration::from_millis(100);
 
 /// How often an engine checks that it can still be found.
@@ -39,10 +39,10 @@ const CHECK_INTERVAL: Duration = Duration::from_millis(500);
 /// How often an engine refreshes the times of the namespace's files.
 const REFRESH_INTERVAL: Duration = Duration::from_secs(3600);
 
-/// How long an engine that starts waits for the namespace's lock.
+/// How long a starting engine waits for the namespace's lock.
 const START_PATIENCE: Duration = Duration::from_secs(30);
 
-/// How often an engine tries to start whose files are removed meanwhile.
+/// How many times an engine tries to start if its files are removed meanwhile.
 const START_ATTEMPTS: usize = 3;
 
 /// Serves groups of environments to a trainer and to observers in other processes.
@@ -88,7 +88,7 @@ const START_ATTEMPTS: usize = 3;
 pub struct Engine {
     // Dropped first: a process that finds the specification expects all services.
     status: StatusWriter,
-    // Ports must be dropped before the node.
+    // Ports are dropped before the node.
     groups: Vec<Group>,
     to_trainer: Notifier<Ipc>,
     to_engine: Listener<Ipc>,
@@ -98,8 +98,8 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// Creates the environments and takes the engine's name. Trainers can connect, and are answered while [`run`](Engine::run)
-    /// runs.
+    /// Creates the environments and takes the engine's name. Trainers can connect from now on, and are served by
+    /// [`run`](Engine::run).
     ///
     /// # Errors
     ///
@@ -120,7 +120,7 @@ impl Engine {
         let mut attempt = 1;
         loop {
             match Self::start(config, node, pools()?) {
-                // Something has removed the engine's files.
+                // Another program removed the engine's files.
                 Err(ServiceError::EngineUnreachable { .. } | ServiceError::EngineRestarted { .. })
                     if attempt < START_ATTEMPTS => {}
                 Err(ServiceError::EngineRestarted { service }) => {
@@ -193,19 +193,19 @@ impl Engine {
         &self.specification
     }
 
-    /// Batches that each group has returned, counted on from the checkpoint that the engine resumed from.
+    /// Batches that each group has returned, including those before the checkpoint that the engine resumed from.
     pub fn steps(&self) -> Vec<u64> {
         (0..self.groups.len()).map(|group| self.status.step(group)).collect()
     }
 
-    /// Serves requests until `stop` is set. Returns within two tenths of a second after that, or when the last checkpoint is saved.
+    /// Serves requests until `stop` is set. Returns within 0.2 s after that, or when the last checkpoint is saved.
     ///
     /// # Errors
     ///
-    /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, so that no trainer finds the engine
-    /// any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine cannot continue. Faults of a trainer
-    /// are no errors: its requests are rejected. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; an earlier
-    /// one that cannot is logged, and tried again later.
+    /// [`ServiceError::RootRemoved`] within a second after the namespace's directory was removed, since no trainer can
+    /// find the engine any more. [`ServiceError::Middleware`] or [`ServiceError::SharedMemoryTooSmall`] if the engine
+    /// cannot continue. [`ServiceError::Checkpoint`] if the last checkpoint cannot be saved; earlier failures are
+    /// logged and tried again later. A trainer's faults are not errors: its requests are rejected.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<EngineSummary, ServiceError> {
         let (mut last_request, mut last_cleanup) = (Instant::now(), Instant::now());
         let (mut last_check, mut last_refresh) = (Instant::now(), Instant::now());
@@ -220,7 +220,7 @@ impl Engine {
                 }
             }
             let Engine { groups, to_engine, .. } = self;
-            // Round robin: the group after the last one is polled first, so that no group starves.
+            // Round robin, so that no group starves.
             let request = wait(to_engine, IDLE_TIMEOUT, last_request, || {
                 let (first, last) = groups.split_at(next);
                 let in_turn = last.iter().zip(next..).chain(first.iter().zip(0..));
@@ -276,7 +276,7 @@ impl Engine {
         }
         let group = &mut self.groups[number];
         let read = group.read(&self.specification.action, &request, bytemuck::cast_slice(sample.payload()));
-        // The chunk returns to the trainer before the step.
+        // Returns the chunk to the trainer before the step.
         drop(sample);
         let mut batch = group.loan()?;
         let read_kind = read.as_ref().ok().copied();
@@ -307,7 +307,7 @@ impl Engine {
             Ok(Outcome::Snapshot { bytes }) => header.set_snapshot(*bytes),
             Err((reason, _)) => header.set_rejection(*reason, text),
         }
-        // Before the response, so that a trainer that has received it reads a status that includes it.
+        // Before the response is sent, so that a trainer that has it sees it in the status.
         self.status.end(number, step, outcome.as_ref().ok());
         // A trainer that dies at this moment must not end the engine.
         let sent = match outcome {
@@ -339,8 +339,8 @@ impl Engine {
         Ok(Outcome::Snapshot { bytes: size_of_val(&*steps) })
     }
 
-    /// Removes the resources of a trainer that ends together with the engine: often the engine stops since its trainer was killed,
-    /// and no process remains that would find what that has left.
+    /// Removes the resources of a trainer that ends together with the engine: an engine often stops because its trainer
+    /// was killed, and then no other process would clean up after it.
     fn remove_ending_trainer(&self) {
         let ServiceSpecification { service, incarnation, groups, .. } = &self.specification;
         let names = ServiceNames::new(service, *incarnation);
@@ -395,7 +395,7 @@ mod tests {
     use crate::namespace::directory::Namespace;
 
     #[test]
-    fn an_engine_that_cannot_be_found_is_noticed() {
+    fn an_engine_notices_that_its_services_cannot_be_found() {
         let namespace = Namespace::at(format!("/tmp/endless-found-{}", std::process::id()));
         let pool = PoolConfig::new("MortarMayhem-Grid-v0", 1);
         let config = EngineConfig::new("gym", pool, 1);

@@ -10,7 +10,7 @@ use crate::protocol::message::RequestHeader;
 use crate::protocol::specification::ServiceSpecification;
 use crate::protocol::status_file::{self, EngineHead, EngineRecord, GroupRecord, MAGIC, StatusFile, now, padded};
 
-/// Keeps the records of an engine and publishes every change. Publishing takes some dozens of nanoseconds.
+/// Keeps the records of an engine and publishes every change, which takes tens of nanoseconds.
 #[derive(Debug)]
 pub(crate) struct StatusWriter {
     file: StatusFile,
@@ -20,8 +20,8 @@ pub(crate) struct StatusWriter {
 }
 
 impl StatusWriter {
-    /// The status and the specification of an engine that starts; [`publish`](Self::publish) lets others find them. `prefix` is
-    /// that of the files of its namespace.
+    /// Writes the status and the specification of a starting engine; [`publish`](Self::publish) lets others find them.
+    /// `prefix` is that of the namespace's files.
     pub(crate) fn create(prefix: &str, specification: &ServiceSpecification) -> Result<Self, ServiceError> {
         let (service, incarnation) = (&specification.service, specification.incarnation);
         let text = serde_json::to_vec(specification);
@@ -66,7 +66,7 @@ impl StatusWriter {
         self.file.write_group(group, record);
     }
 
-    /// A request was taken. Returns whether it is the first of its trainer.
+    /// A request was taken. Returns whether it is its trainer's first.
     pub(crate) fn begin(&mut self, group: usize, request: &RequestHeader) -> bool {
         let is_new = self.groups[group].trainer != request.trainer;
         self.update_group(group, |record| {

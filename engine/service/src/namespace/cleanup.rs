@@ -1,17 +1,17 @@
-//! Removes resources that iceoryx2 cannot remove: those of processes that died while they joined or left a namespace.
+//! Removes resources that iceoryx2 cannot remove, left by processes that died while they joined or left a namespace.
 //!
-//! iceoryx2 removes the resources of a dead process by the records that the process kept. A process that is killed between two
-//! steps of its start or end leaves resources that iceoryx2 ignores or waits for forever:
+//! iceoryx2 finds the resources of a dead process in the records that the process kept. A process killed while it
+//! starts or ends leaves resources that iceoryx2 ignores or waits for forever:
 //!
-//! - **unsized segments**: created, but not resized yet. iceoryx2 waits without a timeout for the size, so they are removed
-//!   first;
+//! - **unsized segments**: created, but not resized yet. iceoryx2 waits for the size without a timeout, so they are
+//!   removed first;
 //! - **incomplete nodes and services**: a node without details, or a service whose static configuration is not finished;
-//! - **orphans**: segments and sockets that no record names. They are recognised once a namespace has no nodes;
+//! - **orphans**: segments and sockets in no record, which can be recognised once a namespace has no nodes;
 //! - **the node counter**: a segment that iceoryx2 needs while it creates a node, and leaves behind.
 //!
-//! A living process may be in the same state for any time, for it may be stopped. Nodes are created under the namespace's lock,
-//! services and ports under the creation lock ([`crate::namespace::identity`]); the functions take the locks that prove that no process which
-//! lives is creating what they remove.
+//! A living process may stay in such a state indefinitely if it is stopped. Nodes are created under the namespace's
+//! lock, services and ports under the creation lock ([`crate::namespace::identity`]). Each function takes the locks
+//! that prove that no living process is creating what it removes.
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
@@ -59,9 +59,9 @@ pub(crate) fn foreign_segment(config: &Config) -> Option<(PathBuf, u32)> {
     })
 }
 
-/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and creates a new one each time: a node's id also
-/// contains its process id and its start time. All users may write to the counter, and one that a process left which died in
-/// between is unusable, so it exists only while a node is created.
+/// Removes the node counter. iceoryx2 needs it only while it creates a node, under the lock, and recreates it if it is
+/// missing; node ids stay unique, since they also contain the process id and the start time. The counter is writable by
+/// all users, and one left by a process that died halfway is unusable, so it is kept only while a node is created.
 pub(crate) fn remove_counter(config: &Config, _lock: &NamespaceLock) -> Result<(), ServiceError> {
     for path in segments(config).filter(|path| path.as_os_str().as_bytes().ends_with(b".global_mgmt")) {
         match fs::remove_file(&path) {
@@ -121,7 +121,7 @@ pub(crate) fn remove_orphans(config: &Config, _lock: &NamespaceLock, _all: &Excl
         return false;
     }
     remove_files(config);
-    // They stay if they are not empty.
+    // Directories that are not empty stay.
     let _ =
         (fs::remove_dir(directory(&config.global.service_dir())), fs::remove_dir(directory(&config.global.node_dir())));
     true
@@ -160,7 +160,8 @@ pub(crate) fn refresh(config: &Config) {
     }
 }
 
-/// The number of the node that a file or directory belongs to: `NUMBER`, or `PREFIX NUMBER .node_monitor...`.
+/// The number of the node that a file or directory belongs to, from its name: `NUMBER`, or the prefix, `NUMBER` and
+/// `.node_monitor...`.
 fn node_number(path: &Path, prefix: &[u8]) -> Option<String> {
     let name = path.file_name()?.as_bytes();
     let name = std::str::from_utf8(name.strip_prefix(prefix).unwrap_or(name)).ok()?;
@@ -199,7 +200,7 @@ mod tests {
     use crate::namespace::directory::Namespace;
     use crate::namespace::identity::Identity;
 
-    /// A namespace in a directory of its own, without nodes.
+    /// A new namespace without nodes.
     fn empty_namespace(name: &str) -> (Namespace, Config, Identity, NamespaceLock) {
         let namespace = Namespace::at(format!("/tmp/endless-sweep-{name}-{}", std::process::id()));
         namespace.prepare().unwrap();
@@ -228,9 +229,9 @@ mod tests {
         assert_eq!(number("notes.txt"), None);
     }
 
-    /// Files of age zero: what is removed does not depend on the clock.
+    /// All files are new: removal does not depend on their age.
     #[test]
-    fn incomplete_resources_are_removed_under_the_locks_that_prove_it() {
+    fn incomplete_resources_are_removed_under_the_locks() {
         let (namespace, config, identity, lock) = empty_namespace("stub");
         let [services, nodes] = ["services", "nodes"].map(|name| namespace.root().join(name));
         let [finished, begun] = [("a", 0o400), ("b", 0o600)].map(|(name, mode)| file(&services, &config, name, mode));

@@ -1,16 +1,17 @@
-//! File descriptors: making sure that there are enough before iceoryx2 opens them.
+//! Makes sure that there are enough file descriptors before iceoryx2 opens them.
 //!
-//! iceoryx2 opens descriptors for services, segments and sockets, also later, when another process connects. Without a free one a
-//! port is created and never delivers anything. A process therefore reserves what it may need when it starts.
+//! iceoryx2 opens descriptors for services, segments and sockets, some of them later, when another process connects.
+//! Without a free descriptor, a port is created but never delivers anything. A process therefore reserves all it may
+//! need when it starts.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::error::ServiceError;
 
-/// Descriptors of a process to join a namespace and to look for an engine.
+/// Descriptors that a process needs to join a namespace and look for an engine.
 pub(crate) const NODE: usize = 16;
 
-/// Descriptors of an engine with that many groups and observers in each group.
+/// Descriptors of an engine with that many groups, and observers in each group.
 pub(crate) fn of_engine(groups: usize, observers: usize) -> usize {
     NODE + 24 + groups * (12 + 2 * observers)
 }

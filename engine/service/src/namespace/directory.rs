@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::ServiceError;
 
-/// The iceoryx2 service type. Its ports and samples may be moved to and dropped in any thread, which a binding to a garbage
-/// collected language needs. It costs half a microsecond a step compared with the single-threaded type.
+/// The iceoryx2 service type. Its ports and samples may be moved to and dropped in any thread, as bindings to a
+/// garbage-collected language require. Compared with the single-threaded type, it costs half a microsecond per step.
 pub(crate) type Ipc = ipc_threadsafe::Service;
 
 /// Environment variable that overrides the root directory of the default [`Namespace`].
@@ -27,8 +27,9 @@ const MAX_ROOT: usize = 107 - 1 - MAX_PREFIX - 49;
 /// Length in bytes of the prefix of all sockets and segments: [`Namespace::prefix`], random characters, `_`.
 pub(crate) const MAX_PREFIX: usize = 16;
 
-/// A root directory for sockets and small files, and a prefix for shared memory segments. Engines, trainers and observers find
-/// each other only within the same namespace: the same directory, by whatever path, not only the same path.
+/// A root directory for sockets and small files, and a prefix for shared memory segments. Engines, trainers and
+/// observers find each other only in the same namespace, that is, in the same directory; the same path in another
+/// container does not suffice.
 ///
 /// The default root is `/tmp/endless-gym-<uid>`, or the directory in the environment variable `ENDLESS_GYM_ROOT`. It belongs to
 /// one user and is not writable by others. It does not depend on the login session, because engines outlive logins.
@@ -82,9 +83,9 @@ impl Namespace {
         &self.root
     }
 
-    /// How the names of all shared memory segments in `/dev/shm` begin. It is derived from the path. Five random characters
-    /// follow, which the first process that joins draws and the last one that leaves discards: two directories of the same path,
-    /// in two containers that share `/dev/shm`, never share a segment.
+    /// The start of the names of all shared memory segments in `/dev/shm`, derived from the path. Five random
+    /// characters follow, drawn by the first process that joins and discarded by the last one that leaves, so that two
+    /// directories of the same path, in two containers that share `/dev/shm`, never share a segment.
     pub fn prefix(&self) -> &str {
         &self.prefix
     }

@@ -1,12 +1,13 @@
 //! The identity of a namespace: a file in its root directory with the prefix of its shared memory segments.
 //!
-//! The prefix is random, so that no two directories share segments, not even two directories of the same path (in two containers
-//! that share `/dev/shm` and not `/tmp`), and so that another user cannot create a segment before we do. The first process that
-//! joins writes the file and the last one that leaves removes it, both under the namespace's lock.
+//! The prefix is random, so that no two directories share segments, even if they have the same path (in two containers
+//! that share `/dev/shm` but not `/tmp`), and so that another user cannot guess the name of a segment and create it
+//! first. The first process that joins writes the file and the last one that leaves removes it, both under the
+//! namespace's lock.
 //!
-//! The file also carries the **creation lock**: a process holds it shared while it creates services and ports. The process that holds
-//! it exclusively together with the namespace's lock knows that every incomplete resource belongs to a dead process, however long a
-//! living one is stopped.
+//! The file also carries the **creation lock**: a process holds it shared while it creates services and ports. A
+//! process that holds it exclusively, together with the namespace's lock, knows that every incomplete resource belongs
+//! to a dead process, not to a stopped one.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -68,8 +69,8 @@ impl Identity {
         &self.prefix
     }
 
-    /// Fails if the root directory or the file was removed or replaced since this process joined. A file that cannot be read, such
-    /// as for lack of a descriptor, counts as the same.
+    /// Fails if the root directory or the file was removed or replaced since this process joined. A file that cannot be
+    /// read, for example for lack of a descriptor, counts as unchanged.
     pub(crate) fn check(&self) -> Result<(), ServiceError> {
         match read(&self.root) {
             Ok(Some(found)) if found == *self => Ok(()),
@@ -124,7 +125,7 @@ impl Drop for CreationLock {
 #[derive(Debug)]
 pub(crate) struct ExclusiveCreation(#[expect(dead_code, reason = "held until it is dropped")] CreationLock);
 
-/// The identity in `root`; `None` if there is none that is complete.
+/// The identity in `root`; `None` if it is missing or incomplete.
 fn read(root: &Path) -> io::Result<Option<Identity>> {
     let file = match File::open(root.join(FILE)) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),

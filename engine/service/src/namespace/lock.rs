@@ -1,16 +1,17 @@
 //! The lock of a namespace, which serialises everything that creates or removes a node, or takes an engine's name:
 //!
 //! - join the namespace: read or create its identity, and create a node;
-//! - look for a running engine of a name, and publish another one's specification;
+//! - check that no engine of a name is running, and publish a new one's specification;
 //! - leave the namespace;
 //! - remove the resources of dead nodes and orphans, which is skipped if the lock is not free.
 //!
-//! The lock is an advisory `flock` on the namespace's directory: it leaves no file behind, and the kernel releases it when its holder dies.
+//! It is an advisory `flock` on the namespace's directory: it leaves no file behind, and the kernel releases it when
+//! its holder dies.
 //!
-//! It is held for milliseconds. A holder that is stopped (SIGSTOP, a debugger, a frozen container) may be in the middle of a
-//! removal, so its lock is never broken: the others wait for as long as their caller does, continue within a millisecond when it
-//! is free, and name the holder in a warning after a second and in their error. Where several processes hold it in turn, as on a busy
-//! machine, the others wait longer: only a holder that stays is an error.
+//! It is held for milliseconds. A stopped holder (SIGSTOP, a debugger, a frozen container) may be in the middle of a
+//! removal, so its lock is never broken: the others wait as long as their caller allows, continue within a millisecond
+//! after its release, and name the holder in a warning after a second and in their error. If several processes hold it
+//! in turn, as on a busy machine, the others wait longer: only a holder that keeps it is an error.
 
 use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
@@ -21,7 +22,7 @@ use std::time::{Duration, Instant};
 use crate::error::ServiceError;
 use crate::namespace::process::{self, LockHolder};
 
-/// How long a process waits for the lock at least before it reports an error.
+/// Shortest wait for the lock before a process reports an error.
 pub(crate) const LOCK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// How long a process waits before it warns.
@@ -29,14 +30,14 @@ const WARNING_AFTER: Duration = Duration::from_secs(1);
 
 const RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
-/// How often a waiter looks who holds the lock.
+/// How often a waiter checks who holds the lock.
 const HOLDER_INTERVAL: Duration = Duration::from_millis(250);
 
-/// How many times its timeout a process waits in all while one holder follows another.
+/// Longest total wait while the lock changes hands, in multiples of the timeout.
 const LONGEST_WAIT: u32 = 6;
 
-/// The lock while it is held. Every acquisition opens the directory again, so that threads of one process exclude each other too.
-/// A thread must not acquire it twice.
+/// The lock while it is held. Every acquisition opens the directory again, so that the threads of a process exclude
+/// each other, too. A thread must not acquire it twice.
 pub(crate) struct NamespaceLock(File);
 
 impl NamespaceLock {
@@ -96,11 +97,11 @@ impl Drop for NamespaceLock {
     }
 }
 
-/// How long a process waits, by the time since it began to wait.
+/// Decides how long a process waits. Times are since it began to wait.
 #[derive(Debug)]
 struct Patience {
     timeout: Duration,
-    /// The last holder that was seen, since when, and when it was looked for.
+    /// The last holder that was seen.
     holder: Option<u32>,
     since: Duration,
     looked: Duration,
@@ -111,12 +112,12 @@ impl Patience {
         Patience { timeout, holder: None, since: Duration::ZERO, looked: Duration::ZERO }
     }
 
-    /// Whether one holder has had the lock for the whole timeout, as far as was seen, or the wait has taken too long in all.
+    /// Whether one holder was seen to keep the lock for the whole timeout, or the wait has taken too long in total.
     fn is_over(&mut self, now: Duration, holder: impl FnOnce() -> Option<LockHolder>) -> bool {
         if now >= self.looked + HOLDER_INTERVAL {
             let pid = holder().map(|holder| holder.pid);
             if pid != self.holder {
-                // The first holder that is seen may have held it from the beginning.
+                // The first holder seen may have had it from the beginning.
                 self.since = if self.looked.is_zero() { Duration::ZERO } else { now };
                 self.holder = pid;
             }
@@ -126,8 +127,8 @@ impl Patience {
     }
 }
 
-/// The process that holds the lock on `directory`, from `/proc/locks`; `None` if it cannot be found, such as one that died after it
-/// forked a child, which then shares the lock.
+/// The process that holds the lock on `directory`, from `/proc/locks`; `None` if it cannot be found, for example
+/// because it died and left the lock to a child that it had forked.
 fn holder(directory: &File) -> Option<LockHolder> {
     let data = directory.metadata().ok()?;
     let (major, minor) = (rustix::fs::major(data.dev()), rustix::fs::minor(data.dev()));
@@ -146,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_a_holder_that_stays_exhausts_the_patience() {
+    fn only_a_holder_that_keeps_the_lock_exhausts_the_patience() {
         let first_error = |pid: fn(u64) -> u32| {
             let mut patience = Patience::new(LOCK_TIMEOUT);
             (0..100_000).find(|now| {

@@ -1,7 +1,8 @@
 //! The processes that use a prefix of segments: each holds a shared lock on a file of that prefix in `/dev/shm`.
 //!
-//! The namespace's directory says which processes use it, but it may have been removed, or be in another container. A process that gets
-//! the lock of a prefix exclusively knows that no process uses it any more, and may remove its segments.
+//! The namespace's directory lists its processes, but it may have been removed or be in another container. A process
+//! that gets the exclusive lock of a prefix knows that no other process uses the prefix any more, and may remove its
+//! segments.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -16,12 +17,13 @@ use crate::namespace::segments;
 /// What follows the prefix in the name of the file.
 const SUFFIX: &str = ".members";
 
-/// A process's use of a prefix. Forked children share it.
+/// Marks this process as a user of a prefix. Forked children share it.
 #[derive(Debug)]
 pub(crate) struct Membership(#[expect(dead_code, reason = "held until it is dropped")] File);
 
 impl Membership {
-    /// Joins the processes that use the prefix. The namespace's lock keeps others from taking the new file for an unsized segment.
+    /// Joins the users of the prefix. The namespace's lock keeps others from taking the new file for an unsized
+    /// segment.
     pub(crate) fn join(prefix: &str, _lock: &NamespaceLock) -> Result<Self, ServiceError> {
         let path = file_of(prefix);
         let failed = |e: std::io::Error| {
@@ -31,10 +33,10 @@ impl Membership {
             let mut file = open(&path, true).map_err(failed)?;
             file.lock_shared().map_err(failed)?;
             if file.metadata().map_err(failed)?.len() == 0 {
-                // A file of zero bytes is removed as an unsized segment.
+                // An empty file would be removed as an unsized segment.
                 file.write_all(b"\n").map_err(failed)?;
             }
-            // Otherwise another process has removed it in the meantime.
+            // If they differ, another process has removed the file in the meantime.
             if is_same(&file, &path) {
                 return Ok(Membership(file));
             }
@@ -42,7 +44,7 @@ impl Membership {
     }
 }
 
-/// Removes the segments of all prefixes of a namespace's path that no process uses, except for the prefix `own`.
+/// Removes the segments of all unused prefixes of a namespace's path, except for the prefix `own`.
 pub(crate) fn remove_abandoned(namespace: &Namespace, own: Option<&str>) {
     for path in segments::named(namespace.prefix(), SUFFIX) {
         let name = path.file_name().and_then(|name| name.to_str()?.strip_suffix(SUFFIX));
@@ -62,7 +64,7 @@ pub(crate) fn remove_if_unused(prefix: &str) -> bool {
         tracing::debug!(path = %segment.display(), "removing a segment that no process uses");
         let _ = fs::remove_file(segment);
     }
-    // Last: as long as it is there, another process can continue what this one leaves.
+    // Last: as long as this file exists, another process can finish an interrupted removal.
     fs::remove_file(path).is_ok()
 }
 

@@ -1,8 +1,8 @@
-//! Prefaulting of shared memory: making sure that it is available before it is written to.
+//! Prefaulting: makes sure that shared memory is available before it is written to.
 //!
-//! A segment in `/dev/shm` may be larger than the space that is left there. The process is then killed by SIGBUS when it first
-//! writes to a page for which there is no memory, possibly hours after its start. Each chunk is therefore prefaulted before its
-//! first use, and missing memory is an error.
+//! A segment in `/dev/shm` may be larger than the free space there. SIGBUS then kills the process when it first writes
+//! to a page that has no memory, possibly hours after its start. Each chunk is therefore prefaulted before its first
+//! use, and missing memory is an error.
 
 use std::mem::MaybeUninit;
 
@@ -53,7 +53,7 @@ impl PrefaultedChunks {
     }
 }
 
-/// The error if `needed` bytes cannot be had.
+/// The error if `needed` bytes are not available.
 pub(crate) fn too_small(needed: u64) -> ServiceError {
     ServiceError::SharedMemoryTooSmall { needed, available: available().unwrap_or(0), path: DIRECTORY }
 }

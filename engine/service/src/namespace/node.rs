@@ -22,10 +22,10 @@ use crate::namespace::lock::{LOCK_TIMEOUT, NamespaceLock};
 use crate::namespace::members::{self, Membership};
 use crate::namespace::{cleanup, descriptors, memory, process, segments};
 
-/// How often a process tries to join a namespace whose directory is removed meanwhile.
+/// How many times a process tries to join a namespace whose directory is removed meanwhile.
 const JOIN_ATTEMPTS: usize = 5;
 
-/// How long a process that leaves the namespace waits for the lock.
+/// How long a process waits for the lock when it leaves the namespace.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// This process's node in a namespace. Must be dropped after all ports that were created with it.
@@ -58,7 +58,7 @@ impl NamespaceNode {
 
     fn join_locked(namespace: &Namespace, patience: Duration, lock: &NamespaceLock) -> Result<Self, ServiceError> {
         if memory::check_free(memory::NODE_BYTES).is_err() {
-            // Dead processes may take it, and iceoryx2 cannot remove them without memory.
+            // Dead processes may occupy the memory, and iceoryx2 needs some to remove them.
             members::remove_abandoned(namespace, None);
             if let Some(identity) =
                 Identity::existing(namespace).filter(|identity| !members::is_used(identity.prefix()))
@@ -114,7 +114,8 @@ impl NamespaceNode {
         }
     }
 
-    /// Sets the times of all files of the namespace to now, since programs that clean up `/tmp` remove what is days old.
+    /// Sets the times of all files of the namespace to now, since programs that clean up `/tmp` remove files that are
+    /// days old.
     pub(crate) fn refresh_files(&self) {
         cleanup::refresh(self.config());
     }
@@ -131,9 +132,9 @@ impl NamespaceNode {
         0
     }
 
-    /// Removes the resources of processes that have died, and those that they had not completed. Returns the number of processes.
+    /// Removes the complete and incomplete resources of processes that have died. Returns the number of processes.
     pub(crate) fn clean(&self, lock: &NamespaceLock) -> usize {
-        // The nodes are listed before the segments are examined: all that these processes leave is there by then.
+        // Listed before the segments are examined, so that everything these processes left is there by then.
         let dead = self.dead_nodes();
         let all = self.identity.try_exclusive(lock);
         if let Some(all) = &all {
@@ -141,12 +142,13 @@ impl NamespaceNode {
         }
         let mut removed = 0;
         for node in dead.into_iter().filter(|node| node.details().is_some()) {
-            // iceoryx2 waits forever for the size of an unsized segment, and a process that creates one may be killed at any time.
+            // Checked for each node, since iceoryx2 waits forever for the size of an unsized segment, and a process may
+            // leave one at any time.
             if cleanup::has_unsized_segments(self.config()) {
                 break;
             }
             let process = node.details().as_ref().map(|details| details.process_id().value());
-            // iceoryx2 creates a node to tell others of the removal, which writes to shared memory.
+            // To announce the removal, iceoryx2 creates a node, which needs shared memory.
             if let Err(e) = memory::check_free(memory::NODE_BYTES) {
                 tracing::debug!(process, error = %e, "cannot remove the resources of a process that has died yet");
                 break;
@@ -189,9 +191,9 @@ impl NamespaceNode {
         }
     }
 
-    /// Whether a node that counts as running belongs to a dead process of which this one was forked, or that was forked of the
-    /// same. iceoryx2 identifies a process by a number that forked processes inherit, and takes the nodes of all of them for its
-    /// own.
+    /// Whether a node that counts as running belongs to a dead parent of this process, or to a dead child of the same
+    /// parent. iceoryx2 identifies a process by a number that forked processes inherit, so it takes the nodes of all of
+    /// them for those of this process.
     fn is_dead_relative(&self, node: UniqueNodeId, details: Option<&NodeDetails>) -> bool {
         let Some(pid) = details.and_then(|details| u32::try_from(details.process_id().value()).ok()) else {
             return false;
@@ -243,7 +245,7 @@ impl Drop for NamespaceNode {
         {
             self.identity.remove(lock, &all);
         }
-        // No process will join under this prefix again.
+        // No process can join under this prefix again.
         if let Err(ServiceError::RootRemoved { .. }) = lock {
             drop(self.membership.take());
             members::remove_if_unused(self.identity.prefix());
@@ -251,8 +253,8 @@ impl Drop for NamespaceNode {
     }
 }
 
-/// The identity of the namespace and iceoryx2's configuration. A namespace whose prefix another user has used gets another one,
-/// unless processes use it.
+/// The identity of the namespace and iceoryx2's configuration. If another user has used the namespace's prefix, the
+/// namespace gets a new one, unless processes use it.
 fn own_identity(namespace: &Namespace, lock: &NamespaceLock) -> Result<(Identity, Config), ServiceError> {
     let mut renewed = false;
     loop {

@@ -3,7 +3,7 @@
 /// The state of a process as in `/proc/PID/stat`, such as `R`, `S` or `T`; `None` if there is no such process.
 pub(crate) fn state(pid: u32) -> Option<char> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // It follows the program's name, which is in parentheses.
+    // The state follows the program's name, which is in parentheses.
     stat.rsplit_once(") ")?.1.chars().next()
 }
 

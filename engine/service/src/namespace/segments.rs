@@ -8,7 +8,7 @@ use rustix::fs::{FlockOperation, OFlags, flock};
 
 pub(crate) const DIRECTORY: &str = "/dev/shm";
 
-/// End of the names of the status files of engines, and of observers.
+/// Suffixes of the status files of engines and of observers.
 pub(crate) const STATUS_SUFFIX: &str = ".status";
 pub(crate) const OBSERVER_SUFFIX: &str = ".observer";
 
@@ -35,7 +35,7 @@ pub(crate) fn open_status(path: &Path) -> Option<File> {
 
 /// Whether the process that writes a status file is running: it holds an exclusive lock on the file.
 pub(crate) fn has_writer(status: &File) -> bool {
-    // Shared: with an exclusive lock, this process would look like the writer to others.
+    // A shared lock: with an exclusive one, others would take this process for the writer.
     let is_locked = flock(status, FlockOperation::NonBlockingLockShared).is_err();
     if !is_locked {
         let _ = flock(status, FlockOperation::Unlock);

@@ -1,8 +1,9 @@
 //! Finding engines by their status files, which hold their specifications; see [`crate::protocol::status_file`].
 //!
-//! An engine owns its name as long as it has a status file of that name. It takes the name under the namespace's lock, so that of two
-//! engines that start at a time one finds the other's file. Reading needs no lock: a file appears complete and never changes its
-//! specification, and its name contains the incarnation, so that nobody removes a successor's.
+//! An engine owns its name as long as it has a status file of that name. It takes the name under the namespace's lock,
+//! so that of two engines that start at the same time, one finds the other's file. Reading needs no lock: a file
+//! appears complete and never changes its specification, and its name contains the incarnation, so that nobody removes
+//! a successor's.
 
 use std::time::Duration;
 
@@ -34,7 +35,7 @@ pub(crate) fn refuse_second_engine(
 pub(crate) fn read(node: &NamespaceNode, service: &str) -> Result<Option<ServiceSpecification>, ServiceError> {
     check_name(service)?;
     let Some(engine) = running(node, service) else { return Ok(None) };
-    // Without a head, it is being removed.
+    // Without a head, the engine is being removed.
     let Some(head) = engine.head() else { return Ok(None) };
     if head.layout_version != LAYOUT_VERSION {
         let (layout, package) = (head.layout_version.to_string(), unpadded(&head.package));

@@ -1,4 +1,4 @@
-//! The largest numbers that an engine can have.
+//! Limits of an engine.
 
 /// Maximum number of groups of an engine.
 pub const MAX_GROUPS: usize = 64;

@@ -1,7 +1,7 @@
 //! The headers of requests and responses. The payload of both is `[Block]`: actions, a batch or a snapshot.
 //!
-//! A header in shared memory may be changed by its sender at any time. A receiver must copy it once with [`copied`], check the
-//! copy, and use nothing but the copy.
+//! A sender can change a header in shared memory at any time. A receiver must copy it once with [`copied`], check the
+//! copy, and use only the copy.
 
 use bytemuck::{Pod, Zeroable};
 use endless_gym_core::batch::{Block, LAYOUT_VERSION};
@@ -23,8 +23,8 @@ unsafe impl ZeroCopySend for PayloadBlock {
 
 /// Copies a header out of shared memory.
 pub(crate) fn copied<H: Copy>(header: &H) -> H {
-    // SAFETY: a reference is valid for reads and aligned, and `H` is `Copy`. The read is volatile, so that the compiler does not
-    // replace a use of the copy by another read of shared memory.
+    // SAFETY: a reference is valid for reads and aligned, and `H` is `Copy`. The read is volatile, so that the compiler
+    // does not replace uses of the copy with further reads of shared memory.
     unsafe { std::ptr::read_volatile(header) }
 }
 
@@ -45,9 +45,9 @@ pub(crate) enum RequestKind {
     Restore,
     /// Save all groups to the engine's checkpoint file and return their steps.
     Checkpoint,
-    /// Set the options of environments' next episodes from the JSON text in the payload's `snapshot`.
+    /// Set the options of next episodes from the JSON text in the payload's `snapshot`.
     SetOptions,
-    /// Return what the running episodes of the environments in the payload's `reset` follow from.
+    /// Return the seeds and options of the running episodes of the environments in the payload's `reset`.
     Episodes,
 }
 
@@ -69,7 +69,7 @@ impl RequestKind {
         self as u32 + 1
     }
 
-    /// The kind in a word, for people.
+    /// A word for the kind, for people.
     pub(crate) fn name(self) -> &'static str {
         match self {
             RequestKind::Step => "step",
@@ -93,7 +93,7 @@ impl RequestKind {
         matches!(self, Step | ResetAll | ResetSeed | ResetEach)
     }
 
-    /// Whether executing it leaves all environments as they were.
+    /// Whether it leaves all environments unchanged.
     pub(crate) fn changes_nothing(self) -> bool {
         matches!(self, RequestKind::Snapshot | RequestKind::Checkpoint | RequestKind::Episodes)
     }
@@ -129,7 +129,7 @@ pub(crate) struct RequestHeader {
 /// Status of a response that holds a batch.
 const BATCH: u32 = 0;
 
-/// Status of a response whose payload starts with a snapshot, or with other bytes that are no batch. All other numbers are
+/// Status of a response whose payload starts with a snapshot or other bytes that are not a batch. All other numbers are
 /// rejections.
 const SNAPSHOT: u32 = u32::MAX;
 

@@ -29,15 +29,15 @@ pub(crate) type ResponseSubscriber = Subscriber<Ipc, [PayloadBlock], ResponseHea
 /// Nodes that may open a service at a time: the engine, its trainer, observers, and processes that are about to be refused.
 const MAX_NODES: usize = 64;
 
-/// Names of one engine's services. They contain the incarnation, so that a restarted engine shares nothing with the services that
-/// a dead one left.
+/// Names of one engine's services. They contain the incarnation, so that a restarted engine shares no service with a
+/// dead one.
 #[derive(Clone, Debug)]
 pub(crate) struct ServiceNames {
     service: String,
     incarnation: u64,
 }
 
-/// Name of the port of an observer that has paused. Others have none.
+/// Name of the port of an observer that resumed after a pause. Other ports have no name.
 pub(crate) const RESUMED: &str = "resumed";
 
 /// Prefix of the names of all services.
@@ -171,7 +171,7 @@ enum OpenFailure {
     Other(String),
 }
 
-/// Divides the errors of opening a service; the other variants say that the messages have another type.
+/// Classifies the errors of opening a service; `other_type` are the variants for messages of another type.
 macro_rules! open_failure {
     ($error:ident, $($other_type:ident)|+) => {
         impl From<$error> for OpenFailure {
@@ -206,7 +206,7 @@ pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
         .initial_max_slice_len(blocks)
         .allocation_strategy(AllocationStrategy::Static)
         .backpressure_strategy(BackpressureStrategy::DiscardData)
-        // Loans beyond one serve only to prefault the chunks below; they need no chunks of their own.
+        // More than one loan is needed only to prefault the chunks below, so the extra loans get no additional chunks.
         .max_loaned_samples(prefaulted)
         .override_sample_preallocation(move |chunks| chunks - (prefaulted - 1))
         .create()?;
@@ -218,7 +218,7 @@ pub(crate) fn publisher<H: Default + std::fmt::Debug + ZeroCopySend>(
         memory.prefault(loan.payload_mut())?;
         loans.push(loan);
     }
-    // The list of free chunks is a stack; after this the first chunk is on top again.
+    // The list of free chunks is a stack: return them in reverse order, so that the first chunk is on top again.
     while loans.pop().is_some() {}
     Ok((publisher, memory))
 }
@@ -237,7 +237,7 @@ impl From<ServiceError> for PortError {
     }
 }
 
-/// Tells the limit from the other errors of creating a port.
+/// Tells a reached limit from the other errors of creating a port.
 macro_rules! port_error {
     ($error:ident, $limit:ident, $action:literal) => {
         impl From<$error> for PortError {
@@ -256,7 +256,7 @@ port_error!(NotifierCreateError, ExceedsMaxSupportedNotifiers, "cannot create a 
 port_error!(ListenerCreateError, ExceedsMaxSupportedListeners, "cannot create a listener");
 
 impl PortError {
-    /// The error where no other process can have such a port.
+    /// Turns it into a service error where no other process can have such a port.
     pub(crate) fn unexpected(self, port: &str) -> ServiceError {
         match self {
             PortError::Other(e) => e,

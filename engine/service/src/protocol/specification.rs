@@ -1,4 +1,4 @@
-//! The specification of an engine: what trainers and observers must know before they connect.
+//! The specification of an engine, which trainers and observers read before they connect.
 
 use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, Section, action_layout};
 use endless_gym_core::envs::ActionSpace;
@@ -24,8 +24,8 @@ pub struct ServiceSpecification {
     pub incarnation: u64,
     /// Environment id.
     pub id: String,
-    /// The id's [`EnvSpec`](endless_gym_core::envs::EnvSpec): spaces, columns with their meanings, and reset parameters with their
-    /// limits, so that a client can use an environment that its own build does not have.
+    /// The id's [`EnvSpec`](endless_gym_core::envs::EnvSpec): spaces, columns with their meanings, and reset parameters
+    /// with their limits. With it, a client can use environments that its build does not include.
     pub environment: Json,
     /// Number of groups, which are stepped independently of each other.
     pub groups: usize,
@@ -51,7 +51,7 @@ pub struct ServiceSpecification {
     /// [`PoolConfig::independent_episodes`](endless_gym_core::pool::PoolConfig::independent_episodes).
     #[serde(default)]
     pub independent_episodes: bool,
-    /// When a new episode starts after the end of one.
+    /// When a new episode starts after one has ended.
     pub autoreset: Autoreset,
     /// Nominal rendering rate in frames per second (`metadata["render_fps"]`).
     pub render_fps: u32,
@@ -66,8 +66,7 @@ impl ServiceSpecification {
         LeaseLimits { batches_held: self.batches_held, observers: self.observers }
     }
 
-    /// Checks what a malformed specification could break in a trainer of the engine `service`. Returns the reason if it is
-    /// invalid.
+    /// Checks the fields on which a trainer of the engine `service` relies. Returns the reason if one is invalid.
     pub(crate) fn check(&self, service: &str) -> Result<(), String> {
         if self.service != service {
             return Err(format!("service must be `{service}`, got `{}`", self.service));
@@ -100,7 +99,7 @@ impl ServiceSpecification {
         Ok(())
     }
 
-    /// The first property in which `other` differs such that a trainer of this engine cannot continue with that one.
+    /// The first property whose difference in `other` keeps a trainer of this engine from continuing with that one.
     pub(crate) fn difference(&self, other: &ServiceSpecification) -> Option<&'static str> {
         let same = [
             ("environment", self.id == other.id),

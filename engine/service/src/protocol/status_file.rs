@@ -1,14 +1,14 @@
-//! The files in shared memory that hold the status of an engine, with its specification, and of its observers.
+//! The status files in shared memory: an engine's, with its specification, and its observers'.
 //!
-//! The engine or the observer maps its file and is its only writer. Readers read it with `pread` and map nothing, so that nothing that a
-//! writer does can harm them. Each record is preceded by a sequence number, which is odd while the record is being written (a sequence
-//! lock).
+//! The engine or observer maps its file and is its only writer. Readers use `pread` instead of a mapping, so that a
+//! writer cannot harm them. Each record is preceded by a sequence number, which is odd while the record is being
+//! written (a sequence lock).
 //!
-//! The writer holds an `flock` on the file from before it has its name until its process ends. A file without that lock belongs to
-//! a dead process and may be removed, independent of process ids, which another container would not see.
+//! The writer holds an `flock` on the file from before the file gets its name until its process ends. A file without
+//! that lock belongs to a dead process and may be removed. This needs no process ids, which differ between containers.
 //!
-//! A process that truncated the file would end its writer by SIGBUS, as with every segment of shared memory. The file is read-only,
-//! so that this does not happen by mistake; root, and a process of the same user that changes the mode first, still can.
+//! If another process truncates the file, SIGBUS kills the writer, as with every shared memory segment. The file is
+//! read-only to prevent accidents; root, or a process of the same user that changes the mode first, can still do it.
 
 use std::fs::{self, File};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
@@ -29,7 +29,7 @@ use crate::protocol::message::RequestKind;
 
 const WORD: usize = size_of::<u64>();
 
-/// Words from one record to the next, with its sequence number: whole cache lines.
+/// Words of each record, including its sequence number: whole cache lines.
 const ENGINE_WORDS: usize = 32;
 const GROUP_WORDS: usize = 24;
 const OBSERVER_WORDS: usize = 8;
@@ -37,7 +37,7 @@ const _: () = assert!(size_of::<EngineHead>() < size_of::<EngineRecord>());
 const _: () = assert!(size_of::<EngineRecord>() / WORD < ENGINE_WORDS && size_of::<GroupRecord>() / WORD < GROUP_WORDS);
 const _: () = assert!(size_of::<ObserverRecord>() / WORD < OBSERVER_WORDS);
 
-/// How often a reader tries to read a record that is being written.
+/// How many times a reader tries to read a record that is being written.
 const READ_ATTEMPTS: usize = 100;
 
 /// The file of an engine's status.
@@ -45,7 +45,7 @@ pub(crate) fn path(prefix: &str, service: &str, incarnation: u64) -> PathBuf {
     segments::path(&format!("{prefix}{service}.{incarnation:016x}{STATUS_SUFFIX}"))
 }
 
-/// The file of an observer of an engine, with a random number.
+/// The file of an engine's observer. `number` is random.
 pub(crate) fn observer_path(prefix: &str, incarnation: u64, number: u64) -> PathBuf {
     segments::path(&format!("{prefix}{incarnation:016x}.{number:016x}{OBSERVER_SUFFIX}"))
 }
@@ -74,7 +74,7 @@ fn words(groups: usize) -> usize {
     ENGINE_WORDS + groups * GROUP_WORDS
 }
 
-/// The status file of an engine or an observer in this process. It is removed when this is dropped.
+/// The status file of an engine or an observer in this process. Dropping it removes the file.
 #[derive(Debug)]
 pub(crate) struct StatusFile {
     start: NonNull<AtomicU64>,
@@ -92,8 +92,8 @@ unsafe impl Send for StatusFile {}
 unsafe impl Sync for StatusFile {}
 
 impl StatusFile {
-    /// Creates the file of an engine with these records and the text of its specification, which readers find after
-    /// [`publish`](Self::publish) only.
+    /// Creates the file of an engine with these records and the text of its specification. Readers find it only after
+    /// [`publish`](Self::publish).
     pub(crate) fn create(
         path: &Path,
         engine: &EngineRecord,
@@ -110,7 +110,7 @@ impl StatusFile {
         Ok(file)
     }
 
-    /// Gives the file its name. It is complete and locked by then.
+    /// Gives the file its name; by then it is complete and locked.
     pub(crate) fn publish(&mut self, path: &Path) -> Result<(), ServiceError> {
         fs::rename(&self.path, path)
             .map_err(|e| ServiceError::middleware("cannot publish the status")(format!("{}: {e}", path.display())))?;
@@ -129,7 +129,7 @@ impl StatusFile {
             .open(&unnamed)
             .map_err(|e| failed(&format_args!("{}: {e}", unnamed.display())))?;
         let prepared = flock(&file, FlockOperation::NonBlockingLockExclusive)
-            // Without allocation, writing to the mapping of a file for which there is no memory raises SIGBUS.
+            // Without allocation, writing to the mapping raises SIGBUS when there is no memory.
             .and_then(|()| fallocate(&file, FallocateFlags::empty(), 0, (words * WORD + text.len()) as u64))
             .and_then(|()| {
                 // SAFETY: a new mapping at an address that the system chooses.
@@ -178,7 +178,7 @@ impl StatusFile {
 
 impl Drop for StatusFile {
     fn drop(&mut self) {
-        // In a forked process, the file is the parent's.
+        // A forked child must not remove its parent's file.
         if self.process == std::process::id() {
             let _ = fs::remove_file(&self.path);
         }
@@ -187,7 +187,7 @@ impl Drop for StatusFile {
     }
 }
 
-/// Reads the status of an engine or an observer in another process, also after its end.
+/// Reads the status of an engine or an observer in another process, even after its end.
 #[derive(Debug)]
 pub(crate) struct StatusReader {
     file: File,
@@ -267,7 +267,8 @@ impl StatusReader {
 /// First word of a status file.
 pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"EGYMSTAT");
 
-/// How to read the rest of an engine's file. Its form must never change, so that every version recognises an engine of another.
+/// How to read the rest of an engine's file. Its layout must never change, so that every version recognises engines of
+/// all others.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct EngineHead {
@@ -280,7 +281,7 @@ pub(crate) struct EngineHead {
     pub specification_bytes: u64,
 }
 
-/// What concerns the whole engine. Times are in nanoseconds of CLOCK_MONOTONIC, 0 for none.
+/// The status of the whole engine. Times are in nanoseconds of CLOCK_MONOTONIC, 0 for none.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct EngineRecord {
@@ -293,7 +294,7 @@ pub(crate) struct EngineRecord {
     pub dropped: u64,
     /// Dead processes whose resources the engine removed.
     pub recoveries: u64,
-    /// Checkpoints saved, and when the last one was.
+    /// Checkpoints saved, and the time of the last one.
     pub checkpoints: u64,
     pub last_checkpoint: u64,
     /// Environment id and engine name, padded with zeros.
@@ -309,7 +310,7 @@ impl EngineRecord {
     }
 }
 
-/// What concerns one group. Times are as in [`EngineRecord`].
+/// The status of one group. Times are as in [`EngineRecord`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct GroupRecord {
@@ -333,7 +334,7 @@ pub(crate) struct GroupRecord {
     pub undelivered: u64,
     /// Code of the last request's [`RequestKind`].
     pub kind: u32,
-    /// Process id of the trainer, as it gave it.
+    /// Process id of the trainer, as reported by it.
     pub trainer_process: u32,
     /// Batches that the trainer held when it sent the last request.
     pub held: u32,
@@ -347,11 +348,11 @@ impl GroupRecord {
     }
 }
 
-/// What concerns one observer. Times are as in [`EngineRecord`].
+/// The status of one observer. Times are as in [`EngineRecord`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct ObserverRecord {
-    /// Process id, as the observer gives it.
+    /// Process id, as reported by the observer.
     pub process: u32,
     pub group: u32,
     /// Batches received.
@@ -370,7 +371,7 @@ pub(crate) fn now() -> u64 {
     seconds.saturating_mul(1_000_000_000).saturating_add(u64::try_from(time.tv_nsec).unwrap_or(0)).max(1)
 }
 
-/// Text as a field that is padded with zeros.
+/// Text padded with zeros to the size of a field.
 pub(crate) fn padded<const N: usize>(text: &str) -> [u8; N] {
     let mut bytes = [0; N];
     bytes.iter_mut().zip(text.bytes()).for_each(|(to, from)| *to = from);
@@ -440,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_status_of_a_running_engine_is_refused_or_removed() {
+    fn files_that_are_not_the_status_of_a_running_process_are_refused_or_removed() {
         let prefix = format!("endless-status-odd-{}_", std::process::id());
         let running = path(&prefix, "running", 1);
         let file = published(&running, 1);

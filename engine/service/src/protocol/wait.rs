@@ -1,11 +1,11 @@
 //! Waiting for a message: spin, then yield, then park until an event or a timeout.
 //!
-//! The order is based on measurements. Spinning receives a message that arrives within a few microseconds. Spinning longer slows
-//! the sender down if both processes share a core, so the waiter then yields. Parking comes last, because waking a parked waiter
+//! The order is based on measurements. Spinning catches messages that arrive within a few microseconds. Longer spinning
+//! slows down a sender on the same core, so the waiter then yields. Parking comes last, because waking a parked waiter
 //! costs the sender a system call.
 //!
-//! A waiter that receives its message before it parks leaves the event set. The sender's next notification finds the event set
-//! and returns without a system call, so a busy pair of processes does not enter the kernel.
+//! A waiter that receives its message before it parks leaves the event set. The sender's next notification then returns
+//! without a system call, so a busy pair of processes never enters the kernel.
 
 use std::time::{Duration, Instant};
 
@@ -14,7 +14,7 @@ use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use crate::error::ServiceError;
 use crate::namespace::directory::Ipc;
 
-/// Liveness interval: how long a trainer or an observer waits for a message before it checks whether the engine is running.
+/// How long a trainer or an observer waits for a message before it checks whether the engine is running.
 pub(crate) const LIVENESS_INTERVAL: Duration = Duration::from_millis(200);
 
 /// How long a waiter spins.
@@ -26,9 +26,9 @@ const YIELD: Duration = Duration::from_millis(3);
 /// Shortest timeout of a parked waiter. iceoryx2 passes whole microseconds to the kernel, which takes 0 for no timeout.
 const SHORTEST_PARK: Duration = Duration::from_micros(1);
 
-/// Calls `poll` until it returns a value or `timeout` has passed, and parks on `listener` between the calls. Spinning and
-/// yielding end a fixed time after `since`, the time of the last message, so that repeated calls without a message park at once.
-/// A signal ends the wait like the timeout.
+/// Calls `poll` until it returns a value or `timeout` has passed, and parks on `listener` between the calls. Spinning
+/// and yielding end a fixed time after `since`, the time of the last message, so that repeated calls without a message
+/// park at once. A signal ends the wait as the timeout does.
 pub(crate) fn wait<T>(
     listener: &Listener<Ipc>,
     timeout: Duration,
@@ -73,7 +73,7 @@ mod tests {
     use crate::protocol::ports::{self, EngineServices, OpenMode, ServiceNames};
 
     #[test]
-    fn a_timeout_below_a_microsecond_is_not_forever() {
+    fn a_timeout_below_a_microsecond_does_not_block_forever() {
         let root = format!("/tmp/endless-wait-{}", std::process::id());
         let node = NamespaceNode::join(&Namespace::at(&root), Duration::ZERO).unwrap();
         let services = EngineServices { node: &node, names: ServiceNames::new("wait", 1), mode: OpenMode::Create };
