@@ -1,4 +1,4 @@
-//! The Memory Gym environments, bit for bit, at memory speed.
+//! The Memory Gym environments, bit-exact and fast.
 //!
 //! The modules follow the data: [`random`] and [`raster`] serve [`envs`], the rules and pictures of the environments; [`batch`]
 //! describes the memory layout of one step of many environments; [`pool`] steps them in lockstep; [`trace`] replays recorded

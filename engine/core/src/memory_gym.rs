@@ -1,4 +1,4 @@
-//! The ten ids of Memory Gym.
+//! The ten environment ids of Memory Gym.
 
 use std::sync::LazyLock;
 
@@ -11,7 +11,7 @@ use crate::pool::Registry;
 /// The environment id that commands and training programs use by default.
 pub const DEFAULT_ENV_ID: &str = "Endless-MortarMayhem-v0";
 
-/// A registry of the ten ids of Memory Gym, in the order in which `endless list` shows them.
+/// The registry of the ten Memory Gym ids, in the order that `endless list` shows.
 ///
 /// ```
 /// let ids: Vec<_> = endless_gym_core::memory_gym().specs().map(|spec| spec.id).collect();
@@ -30,6 +30,6 @@ pub fn memory_gym() -> &'static Registry {
 
 fn add<E: Environment + 'static>(registry: &mut Registry, ids: &[(EnvSpec, E::Variant)]) {
     for (spec, variant) in ids {
-        registry.register::<E>(spec.clone(), *variant).expect("an id differs from all others");
+        registry.register::<E>(spec.clone(), *variant).expect("ids are unique");
     }
 }

@@ -23,12 +23,12 @@ use thiserror::Error;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "&'static str")]
 pub enum Autoreset {
-    /// In the step after: that step ignores its action, and returns the new episode's first observation with a reward of 0.
+    /// In the following step, which ignores its action and returns the new episode's first observation with a reward of 0.
     #[default]
     NextStep,
-    /// In the same step: the observation is already the new episode's; reward, flags and info are the old one's.
+    /// In the same step: the observation is the new episode's first; reward, flags and info belong to the old episode.
     SameStep,
-    /// Never: the trainer resets with [`Pool::reset`](super::Pool::reset). Until then the episode continues, as in the original.
+    /// Never: the trainer calls [`Pool::reset`](super::Pool::reset). Until then the episode continues, as in the original.
     Disabled,
 }
 
@@ -36,7 +36,7 @@ impl Autoreset {
     /// All modes.
     pub const ALL: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled];
 
-    /// The mode's name: Gymnasium's in lower case.
+    /// Gymnasium's name of the mode, in lower case.
     pub const fn name(self) -> &'static str {
         match self {
             Autoreset::NextStep => "next_step",
@@ -45,7 +45,7 @@ impl Autoreset {
         }
     }
 
-    /// One line of help on the mode.
+    /// A one-line description for help texts.
     pub const fn summary(self) -> &'static str {
         match self {
             Autoreset::NextStep => "Start the next episode in the step after the one that ended it",
@@ -84,7 +84,7 @@ impl From<Autoreset> for &'static str {
     }
 }
 
-/// A name that no autoreset mode has.
+/// No autoreset mode has this name.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("autoreset must be {}, got `{given}`", names())]
 pub struct UnknownAutoreset {
@@ -92,7 +92,7 @@ pub struct UnknownAutoreset {
     pub given: String,
 }
 
-/// All names in a sentence.
+/// All names, listed for a sentence.
 fn names() -> String {
     let names = Autoreset::ALL.map(|mode| format!("`{mode}`"));
     let [others @ .., last] = &names;

@@ -1,23 +1,23 @@
-//! The buffers that a pool has written into, and which of them still hold the pool's last write.
+//! Tracks the buffers that a pool has written into, and which of them still hold its last write into them.
 //!
-//! A buffer is recognised by the generation stamp in its memory and not by its address. Memory that was recycled, copied, mapped
-//! again or written to by another pool has another stamp than the pool's record says, or none, and is drawn in full. As with buffer
+//! A buffer is identified by the generation stamp in its memory, not by its address. If memory was recycled, copied, remapped
+//! or written by another pool, its stamp is missing or differs from the pool's record, and it is drawn in full. As with buffer
 //! age (`EGL_EXT_buffer_age`), a buffer that is several writes old is updated from its own last content.
 
 use std::sync::atomic::{Ordering, fence};
 
 use crate::batch::{Block, Layout, Stamp};
 
-/// Maximum number of buffers that are recorded at a time. A trainer and its observers hold fewer.
+/// Maximum number of recorded buffers. A trainer and its observers hold fewer.
 const MAX_BUFFERS: usize = 32;
 
-/// The generation of a record that is being written. No stamp has it, and the record is the first to be replaced.
+/// The generation of a record during a write. No stamp has it, and such a record is the first to be replaced.
 const UNFINISHED: u64 = 0;
 
 /// The records of a pool's buffers.
 #[derive(Debug)]
 pub(super) struct Buffers {
-    /// The pool's random identity, in its stamps.
+    /// The pool's random identity, which is part of its stamps.
     pool: u64,
     /// For each buffer, the generation of the last write into it, or [`UNFINISHED`].
     writes: Vec<u64>,
@@ -37,13 +37,13 @@ pub(super) struct Buffer {
 impl Buffers {
     /// No records. `identity` distinguishes this pool's stamps from those of other pools.
     pub fn new(identity: u64) -> Self {
-        // All zeros are no stamp.
+        // An all-zero stamp means no stamp.
         Buffers { pool: identity | 1, writes: Vec::new(), last_write: UNFINISHED }
     }
 
-    /// Returns the record of the buffer of the next write, a new one if it has none, and removes the buffer's stamp. Until
-    /// [`finish`](Buffers::finish) no buffer is current for that record, since its drawn scenes change during the write: neither
-    /// this one, nor a copy of it, nor the one that the record belonged to before.
+    /// Returns the record of the buffer of the next write, a new one if it has none, and removes the buffer's stamp. The
+    /// record's drawn scenes change during the write, so no buffer is current for it until [`finish`](Buffers::finish): neither
+    /// this one, nor a copy of it, nor the buffer that the record belonged to before.
     pub fn begin(&mut self, layout: &Layout, batch: &mut [Block]) -> Buffer {
         let stamp = Stamp::read(layout, batch);
         let index = usize::try_from(stamp.buffer).ok().filter(|_| stamp.pool == self.pool);
@@ -51,7 +51,7 @@ impl Buffers {
         let buffer = current.map_or_else(|| self.take_record(), |index| Buffer { index, current: true });
         self.writes[buffer.index] = UNFINISHED;
         layout.forget_frames(batch);
-        // If this process ends during the write, the stamp must be gone before the first pixel has changed.
+        // If this process dies during the write, the stamp must be gone before the first pixel changes.
         fence(Ordering::SeqCst);
         buffer
     }
@@ -115,7 +115,7 @@ mod tests {
         assert!(!write(&mut buffers, &layout, &mut batch).current);
         let mut copy = batch.clone();
         assert!(write(&mut buffers, &layout, &mut batch).current);
-        assert!(!write(&mut buffers, &layout, &mut copy).current, "the record is of the original's second write");
+        assert!(!write(&mut buffers, &layout, &mut copy).current, "the record belongs to the original's second write");
         let mut later = batch.clone();
         assert!(write(&mut buffers, &layout, &mut later).current, "a copy of the last write is current");
         assert!(!write(&mut buffers, &layout, &mut batch).current, "but only one of the two");

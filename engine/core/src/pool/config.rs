@@ -49,7 +49,7 @@ impl TryFrom<Json> for ResetOptions {
 
 /// Configuration of a pool.
 ///
-/// Its JSON has the names of the fields. Only `id` and `num_envs` are required, other fields have the defaults of
+/// In JSON, the keys are the names of the fields. Only `id` and `num_envs` are required; the other fields default to those of
 /// [`new`](Self::new), and an unknown field is an error. `"frames": null` omits the frames.
 ///
 /// ```
@@ -82,18 +82,22 @@ pub struct PoolConfig {
     /// When the next episode starts after one has ended.
     #[serde(default)]
     pub autoreset: Autoreset,
-    /// Whether same-step autoreset keeps the last observation of an episode, in the `final_*` sections. Without effect in other
-    /// modes.
+    /// Whether same-step autoreset keeps the last observation of an episode, in the `final_*` sections. It has no effect in
+    /// other modes.
     #[serde(default)]
     pub final_observation: bool,
     /// Source of the episodes' seeds.
     #[serde(default)]
     pub seeding: Seeding,
-    /// Whether an episode depends only on its seed and its reset parameters. If not, as in the original, some environments show what
-    /// an earlier episode left (the character of Endless Mortar Mayhem, the lit circles and the background of Searing Spotlights),
-    /// and with [`Seeding::Continue`] an episode continues the generator of the one before. If so, every episode starts as in a new
-    /// environment, [`Seeding::Continue`] draws a seed for each later episode from `SeedSequence(seed, spawn_key=(0,))`, where `seed`
-    /// is the one that the environment was last given, and resets allocate memory.
+    /// Whether an episode depends only on its seed and its reset parameters.
+    ///
+    /// If false, as in the original, some environments show what an earlier episode left (the character of Endless Mortar
+    /// Mayhem, the lit circles and the background of Searing Spotlights), and with [`Seeding::Continue`] an episode continues
+    /// the previous one's generator.
+    ///
+    /// If true, every episode starts as in a new environment, and resets allocate memory. [`Seeding::Continue`] then draws a
+    /// seed for each later episode from `SeedSequence(seed, spawn_key=(0,))`, where `seed` is the last seed that the
+    /// environment was given.
     #[serde(default)]
     pub independent_episodes: bool,
     /// Format of the frames; `None` omits them, and nothing is drawn.
@@ -102,15 +106,15 @@ pub struct PoolConfig {
     /// Whether the batch has the feature observation.
     #[serde(default)]
     pub features: bool,
-    /// Whether every frame is drawn a second time, in full, and compared; a difference is [`PoolError::WrongFrame`]. For tests.
+    /// Whether to draw every frame a second time, in full, and compare; a difference is [`PoolError::WrongFrame`]. For tests.
     #[serde(default)]
     pub check_drawing: bool,
-    /// Number of this pool's first environment among all environments, for [`seeding`](Self::seeding) and [`ResetRequest::Seed`]:
-    /// an engine that serves several groups numbers the environments of all groups consecutively.
+    /// Number of this pool's first environment among all environments, for [`seeding`](Self::seeding) and
+    /// [`ResetRequest::Seed`]. An engine numbers the environments of all its groups consecutively.
     #[serde(default)]
     pub first_env: usize,
-    /// Number of environments in all pools together, for [`seeding`](Self::seeding): `first_env + num_envs` to 2^32 - 1. In JSON, the
-    /// default is `first_env + num_envs`.
+    /// Total number of environments in all pools, for [`seeding`](Self::seeding): `first_env + num_envs` to 2^32 - 1. In JSON,
+    /// the default is `first_env + num_envs`.
     #[serde(default)]
     pub total_envs: usize,
 }
@@ -119,7 +123,7 @@ fn default_frames() -> Option<Frames> {
     Some(Frames::default())
 }
 
-// The derived functions, and the one default that depends on other fields.
+// `remote = "Self"` derives inherent functions. These add the one default that depends on other fields.
 impl<'de> Deserialize<'de> for PoolConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let mut config = PoolConfig::deserialize(deserializer)?;
@@ -137,8 +141,8 @@ impl Serialize for PoolConfig {
 }
 
 impl PoolConfig {
-    /// `num_envs` environments of that id with the defaults: default reset parameters, next-step autoreset, seeds from entropy,
-    /// frames as the original's.
+    /// `num_envs` environments of `id` with the defaults: default reset parameters, next-step autoreset, seeds from entropy,
+    /// and the original's frames.
     pub fn new(id: &str, num_envs: usize) -> Self {
         PoolConfig {
             id: id.to_owned(),
@@ -156,12 +160,12 @@ impl PoolConfig {
         }
     }
 
-    /// Checks everything, as [`Pool::new`](super::Pool::new) does, without making environments. `spec` is the specification of the
-    /// configured id.
+    /// Checks everything that [`Pool::new`](super::Pool::new) checks, without creating environments. `spec` is the
+    /// specification of `id`.
     ///
     /// # Errors
     ///
-    /// [`PoolError`] if a reset parameter or a number is out of its range.
+    /// [`PoolError`] if a reset parameter or a number is out of range.
     pub fn validate(&self, spec: &EnvSpec) -> Result<(), PoolError> {
         self.check()?;
         batch_layout(spec, self.num_envs, self.contents())?;
@@ -174,7 +178,7 @@ impl PoolConfig {
         }
     }
 
-    /// Checks all but the id and the reset parameters.
+    /// Checks everything except the id and the reset parameters.
     pub(super) fn check(&self) -> Result<(), PoolError> {
         if !(1..=MAX_ENVS).contains(&self.num_envs) {
             return Err(PoolError::NumEnvs { given: self.num_envs });
@@ -222,12 +226,12 @@ pub enum ResetRequest<'a> {
     /// All; environment `i` of the pool is seeded with `seed + first_env + i` (wrapping), where `first_env` is
     /// [`PoolConfig::first_env`].
     Seed(u64),
-    /// Per environment, by `reset`.
+    /// As given for each environment.
     Each {
-        /// For each environment: 0 does not reset it, 1 starts an episode with the next seed of [`Seeding`], 2 starts one with
-        /// its item of `seed`. Other values count as 2.
+        /// For each environment: 0 does not reset it, 1 starts an episode with the next seed of [`Seeding`], and 2 starts one
+        /// with its item of `seed`. Other values count as 2.
         reset: &'a [u8],
-        /// For each environment a seed, which is used where `reset` is 2.
+        /// A seed for each environment, used where `reset` is 2.
         seed: &'a [u64],
     },
 }
@@ -249,7 +253,7 @@ mod tests {
     use super::*;
     use crate::raster::PixelFormat;
 
-    /// The error of a configuration with the field `name` of that value.
+    /// The error for a configuration whose field `name` is `value`.
     fn error(name: &str, value: Json) -> String {
         let mut given = json!({"id": "MortarMayhem-v0", "num_envs": 2});
         given[name] = value;

@@ -1,4 +1,4 @@
-//! The division of a batch among threads.
+//! Divides a batch among threads.
 
 use std::ops::RangeInclusive;
 use std::sync::PoisonError;
@@ -12,20 +12,20 @@ use super::threads::Threads;
 use crate::batch::BatchMut;
 use crate::envs::Environment;
 
-/// Environments that a thread takes at a time: few, so that threads finish at about the same time, and enough that taking them
-/// costs little.
+/// Environments that a thread takes at a time: few enough that threads finish at about the same time, and many enough that
+/// taking them costs little.
 const ENVS_IN_PIECE: RangeInclusive<usize> = 8..=16;
 
-/// Pieces of a share, where the limits of [`ENVS_IN_PIECE`] allow it.
+/// Pieces in a share, within the limits of [`ENVS_IN_PIECE`].
 const PIECES_OF_SHARE: usize = 8;
 
-/// Minimum number of environments for each thread.
+/// Minimum number of environments per thread.
 const ENVS_FOR_THREAD: usize = 16;
 
-/// Minimum number of environments for more than one thread. Fewer are finished before a worker has joined.
+/// Minimum number of environments for using workers. The calling thread finishes fewer before a worker joins.
 const ENVS_FOR_THREADS: usize = 64;
 
-/// Shares that need no allocation.
+/// Number of shares that need no allocation.
 const SHARES_ON_STACK: usize = 16;
 
 /// Consecutive environments, with their drawn scenes and their rows of the batch.
@@ -33,14 +33,14 @@ pub(super) struct EnvRange<'a, E: Environment> {
     /// Number of the first environment.
     pub first: usize,
     pub slots: &'a mut [EnvSlot<E>],
-    /// For each environment, as many as there are frames in an observation.
+    /// One scene for each frame of each environment's observation.
     pub drawn: &'a mut [DrawnScene<E>],
     /// Frames in an observation.
     pub stack: usize,
     pub out: BatchMut<'a>,
 }
 
-/// What is left of the environments that one thread starts with, on cache lines of its own. `None` if nothing is left.
+/// The remaining environments of one thread's share; `None` if none are left. Aligned so that shares do not share cache lines.
 #[repr(align(128))]
 struct Share<'a, E: Environment>(Mutex<Option<EnvRange<'a, E>>>);
 
@@ -65,10 +65,10 @@ impl<'a, E: Environment> Share<'a, E> {
 }
 
 impl<'a, E: Environment> EnvRange<'a, E> {
-    /// Calls `work` with all of the range, piece by piece, in the calling thread and in the workers that join. Each thread starts
-    /// with a share of its own, the same in every step, so that an environment's memory mostly stays in the cache of one core. A
-    /// thread that has finished its share takes pieces from the ends of the others. Returns the error of the environment with the
-    /// lowest number.
+    /// Calls `work` with the whole range, piece by piece, in the calling thread and in the workers that join. Each thread
+    /// starts with the same share in every step, so that an environment's memory mostly stays in the cache of one core. A
+    /// thread that has finished its share takes pieces from the ends of the others. Returns the error of the environment with
+    /// the lowest number.
     pub fn for_each_piece(
         self,
         threads: &Threads,
@@ -81,7 +81,8 @@ impl<'a, E: Environment> EnvRange<'a, E> {
         self.for_each_piece_on(threads, count, work)
     }
 
-    /// As [`for_each_piece`](Self::for_each_piece) with `count` threads. Not inlined, since the shares take kilobytes of the stack.
+    /// Like [`for_each_piece`](Self::for_each_piece), with `count` threads. Not inlined, since the shares take kilobytes of
+    /// stack.
     #[inline(never)]
     fn for_each_piece_on(
         self,
@@ -113,7 +114,7 @@ impl<'a, E: Environment> EnvRange<'a, E> {
         outcome.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Divides the range before its environment number `middle`.
+    /// Splits the range before its `middle`-th environment.
     fn split_at(self, middle: usize) -> (Self, Self) {
         let (first, stack) = (self.first, self.stack);
         let (left_slots, right_slots) = self.slots.split_at_mut(middle);

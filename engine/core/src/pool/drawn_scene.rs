@@ -1,4 +1,4 @@
-//! The scene that was last drawn into each frame of a buffer, and the update of the frame to another scene.
+//! Tracks the scene that was last drawn into each frame of a buffer, and updates the frame to another scene.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -11,10 +11,10 @@ use crate::raster::{Canvas, DirtySurface, PixelFormat};
 /// Settings for drawing frames.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct DrawSettings {
-    /// Whether the buffer is as the pool last wrote it, so that its drawn scenes are what its frames show.
+    /// Whether the buffer still holds the pool's last write, so that its frames show the drawn scenes.
     pub current: bool,
     pub format: PixelFormat,
-    /// Whether every frame is compared with one that is drawn in full.
+    /// Whether to compare every frame with the same frame drawn in full.
     pub check: bool,
 }
 
@@ -28,8 +28,8 @@ impl<E: Environment> DrawnScene<E> {
         DrawnScene(None)
     }
 
-    /// Updates `frame` to `scene`: repaints what differs from the drawn scene, or draws in full if the frame's content is unknown or
-    /// was drawn with other assets.
+    /// Updates `frame` to `scene`: repaints what differs from the drawn scene, or draws in full if the frame's content is
+    /// unknown or was drawn with other assets.
     pub fn update(
         &mut self,
         assets: &Arc<E::Assets>,
@@ -45,7 +45,7 @@ impl<E: Environment> DrawnScene<E> {
                 if settings.check {
                     compare::<E>(assets, Some(drawn), &scene, settings.format, frame)?;
                 }
-                // Faster than an assignment, for which a large scene is copied by a call of memcpy.
+                // Faster than an assignment, which calls memcpy for a large scene.
                 std::mem::swap(drawn, &mut scene);
             }
             drawn => {
@@ -71,11 +71,11 @@ pub(super) fn draw_in_full<E: Environment>(
 }
 
 thread_local! {
-    /// The surface for frames in a format that a canvas cannot be laid over.
+    /// The surface for frames in a format that a canvas cannot paint directly.
     static SURFACE: RefCell<DirtySurface> = RefCell::new(DirtySurface::new(SCREEN, SCREEN));
 }
 
-/// Calls `paint` for a frame in that format. Only painted pixels change.
+/// Calls `paint` with a canvas for `frame`. Only painted pixels change.
 fn paint_on(frame: &mut [u8], format: PixelFormat, paint: impl FnOnce(&mut Canvas<'_>)) {
     if format.is_canvas() {
         return paint(&mut Canvas::new(frame, SCREEN, SCREEN));
@@ -86,7 +86,7 @@ fn paint_on(frame: &mut [u8], format: PixelFormat, paint: impl FnOnce(&mut Canva
     });
 }
 
-/// Compares a frame with one that is drawn in full.
+/// Compares a frame with the same frame drawn in full.
 fn compare<E: Environment>(
     assets: &E::Assets,
     drawn: Option<&E::Scene>,
@@ -109,7 +109,7 @@ fn compare<E: Environment>(
     }
 }
 
-/// An updated frame differs from the same frame drawn in full: a mistake in this crate, or the frame was changed without a call of
+/// An updated frame differs from the same frame drawn in full: a bug in this crate, or the frame was changed without a call to
 /// [`Layout::forget_frames`](crate::batch::Layout::forget_frames).
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error(
@@ -121,12 +121,12 @@ pub struct WrongFrame {
     pub env: usize,
     /// (x, y) of the first pixel that differs.
     pub pixel: (usize, usize),
-    /// The byte of a frame that is drawn in full.
+    /// The byte of the frame drawn in full.
     pub expected: u8,
     /// The byte of the updated frame.
     pub found: u8,
-    /// The scene that the frame showed before, or `unknown`, in the notation of `Debug`.
+    /// The scene that the frame showed before, or `unknown`, formatted with `Debug`.
     pub before: String,
-    /// The scene that the frame should show, in the notation of `Debug`.
+    /// The scene that the frame should show, formatted with `Debug`.
     pub scene: String,
 }

@@ -12,7 +12,7 @@ use crate::envs::{Environment, Transition};
 use crate::random::Generator;
 use crate::raster::PixelFormat;
 
-/// An environment with its generator, its seeds, and the sums of its episode.
+/// An environment with its generator, its seeds, and the return and length of its episode.
 pub(super) struct EnvSlot<E: Environment> {
     pub env: E,
     /// The assets for the next episode, unless `next` replaces them.
@@ -24,17 +24,17 @@ pub(super) struct EnvSlot<E: Environment> {
     pub frame_stack: FrameStack<E::Scene>,
     /// Whether the last step ended the episode. With next-step autoreset, the next step then starts another.
     pub ended: bool,
-    /// Whether an episode starts as in a new environment.
+    /// Whether every episode starts as in a new environment.
     independent_episodes: bool,
-    /// The reset parameters as they were given, which `assets` were made from.
+    /// The reset parameters, as given, from which `assets` were made.
     pub options: Arc<OptionMap>,
-    /// Other assets and options from the next episode on.
+    /// New assets and options, used from the next episode on.
     pub next: Option<OptionSet<E>>,
     /// The seed that the running episode started with, unless it continued the generator.
     pub episode_seed: Option<u64>,
 }
 
-/// Reset parameters as they were given, and the assets made from them.
+/// Assets, and the reset parameters, as given, from which they were made.
 pub(super) type OptionSet<E> = (Arc<<E as Environment>::Assets>, Arc<OptionMap>);
 
 impl<E: Environment> EnvSlot<E> {
@@ -64,7 +64,7 @@ impl<E: Environment> EnvSlot<E> {
         }
     }
 
-    /// Starts an episode with that seed, or with the next one of the environment's own.
+    /// Starts an episode with `seed`, or else with the environment's next seed.
     pub fn start_episode(&mut self, seed: Option<u64>) {
         if let Some(seed) = seed {
             self.seeds.restart(seed);
@@ -99,7 +99,7 @@ impl<E: Environment> EnvSlot<E> {
         }
     }
 
-    /// Plays a step, or in next-step autoreset starts the next episode, and writes the environment's row without its frames.
+    /// Plays a step, or with next-step autoreset starts the next episode, and writes the environment's row except its frames.
     pub fn step(
         &mut self,
         autoreset: Autoreset,
@@ -130,7 +130,8 @@ impl<E: Environment> EnvSlot<E> {
         self.write_numbers(out, row);
     }
 
-    /// Writes the row of an environment that did not step, without its frames: the current observation, a reward of 0, no flag.
+    /// Writes the row of an environment that did not step, except its frames: the current observation, a reward of 0, and no
+    /// flags.
     pub fn write_start(&self, out: &mut BatchMut<'_>, row: usize) {
         self.write_transition(out, row, Transition::default());
         out.info.row(row).fill(0.0);
@@ -152,7 +153,7 @@ impl<E: Environment> EnvSlot<E> {
         write_if_present(out.ground_truth.row(row), |r| self.env.ground_truth(r));
     }
 
-    /// Updates the frames of the observation. `drawn` has the scene that was last drawn into each of them.
+    /// Updates the frames of the observation. `drawn` holds the scene that was last drawn into each frame.
     #[inline]
     pub fn draw(
         &self,

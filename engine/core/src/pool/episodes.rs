@@ -1,4 +1,4 @@
-//! Reset parameters of next episodes, and the seeds and reset parameters of running ones.
+//! Reset parameters for next episodes, and the seeds and reset parameters of running episodes.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +7,7 @@ use super::config::OptionMap;
 /// Reset parameters for the next episodes of some environments.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct NextOptions {
-    /// Reset parameters by the original's names; the rest have their defaults.
+    /// Reset parameters by the original's names; omitted ones have their defaults.
     pub options: OptionMap,
     /// Numbers of the environments in their pool.
     pub envs: Vec<usize>,
@@ -18,10 +18,10 @@ pub struct NextOptions {
 pub struct RunningEpisode {
     /// Number of the environment in its pool.
     pub env: usize,
-    /// The seed that the episode started with; `None` if it continued the generator of the episode before, or if the environment was
-    /// seeded from entropy.
+    /// The seed that the episode started with; `None` if it continued the previous episode's generator, or if the environment
+    /// was seeded from entropy.
     pub seed: Option<u64>,
-    /// The reset parameters that were given for the episode; the rest have their defaults.
+    /// The reset parameters that were given for the episode; omitted ones have their defaults.
     pub options: OptionMap,
     /// Whether the last step ended the episode. With next-step autoreset, the next step then starts another.
     pub ended: bool,

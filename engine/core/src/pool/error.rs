@@ -10,21 +10,21 @@ use crate::envs::view::VIEW_BYTES;
 use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
 use crate::random::EntropyError;
 
-/// A pool that cannot be made, or a call that it cannot carry out.
+/// A pool cannot be created, or a call fails.
 ///
 /// Except for [`PoolError::WrongFrame`], an error changes no environment and no batch.
 #[derive(Debug, Error)]
 pub enum PoolError {
-    /// No environment has that id.
+    /// The registry has no environment with this id.
     #[error(transparent)]
     UnknownEnvironment(#[from] UnknownEnvironment),
-    /// Reset parameters for all environments are not valid.
+    /// The reset parameters for all environments are invalid.
     #[error(transparent)]
     Parameters(#[from] ParameterError),
-    /// An episode without a seed needs entropy, and there is none.
+    /// An episode without a seed needs entropy, and none is available.
     #[error(transparent)]
     Entropy(#[from] EntropyError),
-    /// Reset parameters of one environment are not valid.
+    /// The reset parameters of one environment are invalid.
     #[error("options of environment {env}: {source}")]
     ParametersOf {
         /// Number of the environment, counted over all pools.
@@ -40,13 +40,13 @@ pub enum PoolError {
         /// Number of environments in the pool.
         num_envs: usize,
     },
-    /// No environment, or too many.
+    /// There are no environments, or too many.
     #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]
     NumEnvs {
         /// The number that was given.
         given: usize,
     },
-    /// The pool's environments are not among all environments, or those are too many.
+    /// `total_envs` is less than `first_env + num_envs`, or too large.
     #[error(
         "total_envs must be first_env + num_envs to {MAX_TOTAL_ENVS}, got {total_envs} with first_env {first_env} and num_envs {num_envs}"
     )]
@@ -58,13 +58,13 @@ pub enum PoolError {
         /// Number of environments in all pools together.
         total_envs: usize,
     },
-    /// No frame in an observation, or too many.
+    /// An observation has no frame, or too many.
     #[error("frame stack must be 1 to {MAX_STACK}, got {given}")]
     Stack {
         /// The number of frames that was given.
         given: usize,
     },
-    /// The batch of such a pool would not fit the address space.
+    /// The pool's batch would not fit into the address space.
     #[error(transparent)]
     Layout(#[from] LayoutError),
     /// The list of seeds is empty.
@@ -98,10 +98,10 @@ pub enum PoolError {
     /// A call that needs running episodes came before the first reset of all environments.
     #[error("all environments must be reset before any other call")]
     NotReset,
-    /// Actions of a wrong number or out of range.
+    /// There are too few or too many actions, or one is out of range.
     #[error(transparent)]
     Action(#[from] ActionError),
-    /// A reset request has a wrong number of flags or seeds.
+    /// A reset request has the wrong number of flags or seeds.
     #[error("a reset request must have {num_envs} flags and {num_envs} seeds, got {flags} and {seeds}")]
     ResetCount {
         /// Number of flags that were given.
@@ -111,7 +111,7 @@ pub enum PoolError {
         /// Number of environments in the pool.
         num_envs: usize,
     },
-    /// The pool has no environment of that number.
+    /// The pool has no environment with this number.
     #[error("env must be 0 to {}, got {given}", num_envs - 1)]
     NoSuchEnv {
         /// The number that was given.
@@ -119,15 +119,16 @@ pub enum PoolError {
         /// Number of environments in the pool.
         num_envs: usize,
     },
-    /// Memory for a ground-truth view has a wrong size.
+    /// Memory for a ground-truth view has the wrong size.
     #[error("a ground-truth view must have {VIEW_BYTES} bytes, got {given}")]
     ViewSize {
         /// The number of bytes that was given.
         given: usize,
     },
-    /// With [`check_drawing`](super::PoolConfig::check_drawing) only: a frame differs from one that is drawn in full.
+    /// Only with [`check_drawing`](super::PoolConfig::check_drawing): an updated frame differs from the same frame drawn in
+    /// full.
     ///
-    /// All or some of the environments have advanced, and the batch is incomplete. It has no generation stamp, so the next write into
+    /// Some or all environments have advanced, and the batch is incomplete. It has no generation stamp, so the next write into
     /// it draws in full.
     #[error(transparent)]
     WrongFrame(#[from] WrongFrame),

@@ -7,7 +7,8 @@ use super::registry::{NoExpert, Registry};
 use crate::batch::Batch;
 use crate::envs::{Expert, UnknownEnvironment};
 
-/// One scripted [`Expert`] for each environment of a pool, or of a group of an engine. They read the feature observation of each batch.
+/// One scripted [`Expert`] for each environment of a pool, or of an engine's group. They read the feature observation of each
+/// batch.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
@@ -35,7 +36,7 @@ pub struct Experts {
 }
 
 impl Experts {
-    /// Experts for `num_envs` environments of that id with that autoreset mode.
+    /// Experts for `num_envs` environments of `id` in the given autoreset mode.
     ///
     /// # Errors
     ///
@@ -52,12 +53,12 @@ impl Experts {
         })
     }
 
-    /// Chooses an action for every observation in `batch`, and writes it to `actions`: one row for each environment, one number for
-    /// each branch of the action space. It must be called once for each batch, since the experts remember what they saw.
+    /// Chooses an action for every observation in `batch` and writes it to `actions`: one row for each environment, one number
+    /// for each branch of the action space. Call it once for each batch, since the experts remember what they saw.
     ///
     /// # Errors
     ///
-    /// [`ExpertsError`] if the batch has no features or is of another number of environments, or if `actions` has a wrong length.
+    /// [`ExpertsError`] if the batch has no features or another number of environments, or if `actions` has the wrong length.
     /// On an error, no expert acts.
     pub fn act(&mut self, batch: &Batch<'_>, actions: &mut [i32]) -> Result<(), ExpertsError> {
         let (features, vectors) = (batch.features(), batch.vector_observation());
@@ -74,7 +75,7 @@ impl Experts {
         }
         let rows = self.experts.iter_mut().zip(actions.chunks_exact_mut(self.branches));
         for (env, (expert, action)) in rows.enumerate() {
-            // With same-step autoreset, the row in which an episode ends has the first observation of the next one.
+            // With same-step autoreset, the row of an episode's last step has the first observation of the next episode.
             let ended = terminated[env] == 1 || truncated[env] == 1;
             if lengths[env] == 0 || ended && self.autoreset == Autoreset::SameStep {
                 expert.reset();
@@ -86,7 +87,7 @@ impl Experts {
     }
 }
 
-/// Experts that cannot be made, or a batch that they cannot play.
+/// Experts cannot be created, or cannot play a batch.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum ExpertsError {
     /// The registry does not have the id.
@@ -95,7 +96,7 @@ pub enum ExpertsError {
     /// The id's family has no expert.
     #[error(transparent)]
     NoExpert(#[from] NoExpert),
-    /// The batch has no features, or is of another id or another number of environments.
+    /// The batch has no features, or belongs to another id or another number of environments.
     #[error("experts need a batch with the {needed} features of {num_envs} environments, got {given} features")]
     Features {
         /// Features that the batch has.
@@ -105,7 +106,7 @@ pub enum ExpertsError {
         /// Number of environments that the experts play.
         num_envs: usize,
     },
-    /// Memory for the actions has a wrong length.
+    /// Memory for the actions has the wrong length.
     #[error("the actions of the experts are {needed} numbers, got memory for {given}")]
     Actions {
         /// Length of the memory.
@@ -133,7 +134,7 @@ mod tests {
         PoolConfig { features: true, frames: None, autoreset, seeding, ..PoolConfig::new(id, NUM_ENVS) }
     }
 
-    /// Plays until every environment has ended [`EPISODES`] episodes.
+    /// Plays until every environment has finished [`EPISODES`] episodes.
     fn play(id: &str, autoreset: Autoreset) -> Episodes {
         let mut pool = Pool::new(memory_gym(), &config(id, autoreset), &Threads::new(1).unwrap()).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
@@ -160,7 +161,7 @@ mod tests {
         episodes
     }
 
-    /// The same episodes, each in an environment of its own, played by a new expert.
+    /// The same episodes, each played by a new expert in a new environment.
     fn alone(id: &str) -> Episodes {
         let spec = memory_gym().spec(id).unwrap();
         std::array::from_fn(|env| {
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn every_episode_is_played_as_by_a_new_expert_in_every_mode() {
+    fn experts_act_like_new_ones_in_every_episode_and_autoreset_mode() {
         for id in ["MortarMayhem-Grid-v0", "MortarMayhemB-Grid-v0", "MysteryPath-Grid-v0"] {
             let expected = alone(id);
             assert!(expected.iter().flatten().all(|(total, length)| *total > 0.0 && *length > 5), "{id}: {expected:?}");
@@ -197,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn batches_and_actions_of_other_sizes_are_errors() {
+    fn batches_and_actions_of_the_wrong_size_are_rejected() {
         let id = "MortarMayhemB-Grid-v0";
         let pool = |config: &PoolConfig| Pool::new(memory_gym(), config, &Threads::new(1).unwrap()).unwrap();
         let act = |pool: &Pool, actions: &mut [i32]| {

@@ -1,4 +1,4 @@
-//! The last frames of an episode, for observations of several frames.
+//! The last frames of an episode, for stacked observations.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -6,13 +6,13 @@ use std::sync::Arc;
 /// A frame of an observation.
 #[derive(Clone, Debug)]
 pub(super) enum StackedFrame<S> {
-    /// What it shows.
+    /// A frame given by its scene.
     Scene(S),
-    /// Its pixels in the pool's format, where the scene is not known: a checkpoint stores frames and no scenes.
+    /// A frame given by its pixels in the pool's format: a checkpoint stores frames, not scenes.
     Pixels(Arc<[u8]>),
 }
 
-/// The last frames of an episode, oldest first. Nothing is kept for observations of one frame.
+/// The last frames of an episode, oldest first. Empty for observations of one frame.
 #[derive(Clone, Debug)]
 pub(super) struct FrameStack<S> {
     frames: VecDeque<StackedFrame<S>>,
@@ -38,7 +38,7 @@ impl<S: Clone> FrameStack<S> {
         }
     }
 
-    /// Replaces the oldest frame by a new scene.
+    /// Replaces the oldest frame with a new scene.
     pub fn push(&mut self, scene: impl FnOnce() -> S) {
         if self.length > 1 {
             self.frames.pop_front();
@@ -46,19 +46,20 @@ impl<S: Clone> FrameStack<S> {
         }
     }
 
-    /// Replaces all frames but the newest by frames of these pixels.
+    /// Replaces all frames except the newest with frames of these pixels.
     pub fn set_earlier(&mut self, frames: impl Iterator<Item = Arc<[u8]>>) {
         for (to, pixels) in self.frames.iter_mut().take(self.length - 1).zip(frames) {
             *to = StackedFrame::Pixels(pixels);
         }
     }
 
-    /// All frames but the newest.
+    /// All frames except the newest.
     pub fn earlier(&self) -> impl Iterator<Item = &StackedFrame<S>> {
         self.frames.iter().take(self.length - 1)
     }
 
-    /// The observation's frames, oldest first. `last` returns the newest scene, which an observation of one frame has.
+    /// The observation's frames, oldest first. `last` returns the newest scene; it is called for observations of one frame
+    /// only.
     pub fn frames(&self, last: impl FnOnce() -> S) -> impl Iterator<Item = StackedFrame<S>> {
         let last = (self.length == 1).then(|| StackedFrame::Scene(last()));
         self.frames.iter().cloned().chain(last)

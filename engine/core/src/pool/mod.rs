@@ -1,7 +1,6 @@
 //! Many environments of one id, stepped in lockstep by the calling thread and worker threads.
 //!
-//! [`Pool`] owns the environments and writes batches, [`PoolConfig`] configures it, and [`Threads`] are the threads that it may
-//! use.
+//! [`Pool`] owns the environments and writes batches, [`PoolConfig`] configures it, and [`Threads`] are the threads it runs on.
 
 mod autoreset;
 mod buffers;

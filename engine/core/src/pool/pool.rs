@@ -18,10 +18,10 @@ use crate::envs::view::VIEW_BYTES;
 use crate::envs::{EnvSpec, Progress, SCREEN};
 use crate::raster::PixelFormat;
 
-/// Environments of one id in lockstep.
+/// Environments of one id, stepped in lockstep.
 ///
-/// Every call that advances the environments writes a batch, [`Layout::blocks`] blocks, into memory of the caller; if a buffer is
-/// reused, only changed pixels are written.
+/// Every call that advances the environments writes a batch of [`Layout::blocks`] blocks into the caller's memory. In a buffer
+/// that the pool has written before, it writes only changed pixels.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
@@ -55,11 +55,11 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Makes the environments. [`reset`](Pool::reset) starts their first episodes.
+    /// Creates the environments. [`reset`](Pool::reset) starts their first episodes.
     ///
     /// # Errors
     ///
-    /// [`PoolError`] if the id is unknown, or a reset parameter or a number of `config` is out of its range.
+    /// [`PoolError`] if the id is unknown, or if a reset parameter or a number in `config` is out of range.
     pub fn new(registry: &Registry, config: &PoolConfig, threads: &Threads) -> Result<Self, PoolError> {
         let entry = registry.entry(&config.id)?;
         config.check()?;
@@ -90,22 +90,23 @@ impl Pool {
         &self.layout
     }
 
-    /// Starts episodes and writes every environment's row: the current observation, a reward of 0, no flag.
+    /// Starts episodes and writes every environment's row: the current observation, a reward of 0, and no flags.
     ///
     /// # Errors
     ///
-    /// As [`reset_with`](Pool::reset_with).
+    /// See [`reset_with`](Pool::reset_with).
     pub fn reset(&mut self, request: ResetRequest<'_>, batch: &mut [Block]) -> Result<(), PoolError> {
         self.reset_with(request, None, batch)
     }
 
-    /// As [`reset`](Pool::reset), with other reset parameters: the environments that start an episode play it and all later ones
-    /// with `options`, by the original's names, and the defaults for the rest. `None` keeps each environment's own.
+    /// Like [`reset`](Pool::reset), with new reset parameters: the environments that start an episode play it and all later
+    /// ones with `options`. Its keys are the original's names; omitted parameters have their defaults. `None` keeps each
+    /// environment's current parameters.
     ///
     /// # Errors
     ///
-    /// [`PoolError`] if `request` has a wrong number of flags or seeds, if the first reset leaves environments out, if an option
-    /// is not valid, or if `batch` is too short. Except for [`PoolError::WrongFrame`], an error changes no environment.
+    /// [`PoolError`] if `request` has the wrong number of flags or seeds, if the first reset omits an environment, if an option
+    /// is invalid, or if `batch` is too short. Except for [`PoolError::WrongFrame`], an error changes no environment.
     pub fn reset_with(
         &mut self,
         request: ResetRequest<'_>,
@@ -128,7 +129,7 @@ impl Pool {
         }
         self.check_batch(batch)?;
         if let Some(options) = options {
-            // After all other checks, so that an error changes no environment.
+            // Comes after all other checks, so that an error changes no environment.
             self.envs.set_options_of(request, options)?;
         }
         self.write(batch, |envs, context, out| envs.reset(context, request, out))?;
@@ -136,11 +137,11 @@ impl Pool {
         Ok(())
     }
 
-    /// Plays one step of every environment. `actions` has `num_envs` rows of one number for each branch of the action space.
+    /// Steps every environment once. `actions` has `num_envs` rows with one number for each branch of the action space.
     ///
     /// # Errors
     ///
-    /// [`PoolError`] if the environments were not reset yet, if `actions` has a wrong length or a number out of range, or if
+    /// [`PoolError`] if the environments have not been reset, if `actions` has the wrong length or a number out of range, or if
     /// `batch` is too short. Except for [`PoolError::WrongFrame`], an error advances no environment.
     pub fn step(&mut self, actions: &[i32], batch: &mut [Block]) -> Result<(), PoolError> {
         if !self.was_reset {
@@ -151,13 +152,13 @@ impl Pool {
         self.write(batch, |envs, context, out| envs.step(context, autoreset, actions, out))
     }
 
-    /// Refuses a batch that is too short.
+    /// Rejects a batch that is too short.
     fn check_batch(&self, batch: &[Block]) -> Result<(), PoolError> {
         let (given, needed) = (batch.len(), self.layout.blocks());
         if given < needed { Err(PoolError::BatchTooShort { given, needed }) } else { Ok(()) }
     }
 
-    /// Calls `write` with the batch's rows, between removing the buffer's generation stamp and setting the new one.
+    /// Removes the buffer's generation stamp, calls `write` with the batch's rows, and stamps the buffer again.
     fn write(
         &mut self,
         batch: &mut [Block],
@@ -174,12 +175,12 @@ impl Pool {
         Ok(())
     }
 
-    /// Sets the reset parameters of environments' next episodes and all later ones, however these begin. Running episodes do not
-    /// change. An environment that several items name gets the options of the last.
+    /// Sets reset parameters for the next and all later episodes of some environments, however those episodes start. Running
+    /// episodes do not change. If several items name the same environment, the last one wins.
     ///
     /// # Errors
     ///
-    /// [`PoolError::NoSuchEnv`], or [`PoolError::Parameters`] if an option is not valid. An error changes no environment.
+    /// [`PoolError::NoSuchEnv`], or [`PoolError::Parameters`] if an option is invalid. An error changes no environment.
     ///
     /// ```
     /// use endless_gym_core::batch::zeroed;
@@ -204,7 +205,7 @@ impl Pool {
         Ok(self.envs.set_options(sets)?)
     }
 
-    /// Seed and reset parameters of the running episode of an environment.
+    /// The seed and reset parameters of an environment's running episode.
     ///
     /// # Errors
     ///
@@ -214,17 +215,17 @@ impl Pool {
         Ok(self.envs.running_episode(env))
     }
 
-    /// Writes every environment's row without starting an episode: the current observation, a reward of 0, no flag.
+    /// Writes every environment's row without starting an episode: the current observation, a reward of 0, and no flags.
     ///
     /// # Errors
     ///
-    /// As [`reset`](Pool::reset).
+    /// See [`reset`](Pool::reset).
     pub fn observe(&mut self, batch: &mut [Block]) -> Result<(), PoolError> {
         let num_envs = self.layout.num_envs();
         self.reset(ResetRequest::Each { reset: &vec![0; num_envs], seed: &vec![0; num_envs] }, batch)
     }
 
-    /// The whole state of one environment, its generator included, for [`restore`](Pool::restore).
+    /// The complete state of one environment, including its generator, for [`restore`](Pool::restore).
     ///
     /// # Errors
     ///
@@ -253,22 +254,22 @@ impl Pool {
         if self.was_reset { self.envs.snapshot(env) } else { Err(SnapshotError::NotReset) }
     }
 
-    /// Puts an environment into the state of a snapshot of the same environment id, which may come from another pool with other
-    /// reset parameters. The episode continues identically. [`observe`](Pool::observe) writes its observation.
+    /// Restores an environment from a snapshot of the same id, which may come from another pool with other reset parameters.
+    /// The episode continues identically. [`observe`](Pool::observe) writes its observation.
     ///
-    /// The seeds of later episodes are the snapshot's too if both pools have the same kind of [`Seeding`](super::Seeding). An
-    /// observation of several frames repeats the snapshot's frame, as at the start of an episode.
+    /// The seeds of later episodes also continue from the snapshot if both pools have the same kind of
+    /// [`Seeding`](super::Seeding). A stacked observation repeats the snapshot's frame, as at the start of an episode.
     ///
     /// # Errors
     ///
-    /// [`SnapshotError`] if there is no such environment, if the environments were not reset yet, or if `snapshot` is not a valid
-    /// one of this environment id. An error does not change the environment.
+    /// [`SnapshotError`] if there is no such environment, if the environments have not been reset, or if `snapshot` is not a
+    /// valid snapshot of this id. An error does not change the environment.
     pub fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError> {
         self.check_env(env)?;
         if self.was_reset { self.envs.restore(env, snapshot) } else { Err(SnapshotError::NotReset) }
     }
 
-    /// The state of all environments, from which [`resume`](Pool::resume) continues identically; `None` before their first reset.
+    /// The state of all environments, from which [`resume`](Pool::resume) continues identically; `None` before the first reset.
     ///
     /// # Errors
     ///
@@ -300,11 +301,13 @@ impl Pool {
         (0..self.layout.num_envs()).map(save).collect::<Result<_, _>>().map(Some)
     }
 
-    /// Continues from what [`save`](Pool::save) returned in a pool of the same configuration, except that its seeds may differ.
+    /// Continues from the state that [`save`](Pool::save) returned in a pool of the same configuration, except that its seeds
+    /// may differ.
     ///
     /// # Errors
     ///
-    /// [`ResumeError`] if the number of environments differs, or if a state is not valid; the environments before it have changed.
+    /// [`ResumeError`] if the number of environments differs, or if a state is invalid; the environments before it have then
+    /// changed.
     pub fn resume(&mut self, saved: &[SavedEnv]) -> Result<(), ResumeError> {
         let num_envs = self.layout.num_envs();
         if saved.len() != num_envs {
@@ -364,9 +367,9 @@ impl Pool {
         Ok(())
     }
 
-    /// Sets the animations of an environment's ground-truth view as if [`ground_truth_view`](Self::ground_truth_view) had been called
-    /// once for each earlier observation of the episode, so that the next view shows the current step. Observations do not depend on
-    /// it.
+    /// Sets the animations of an environment's ground-truth view as if [`ground_truth_view`](Self::ground_truth_view) had been
+    /// called once for each earlier observation of the episode, so that the next view shows the current step. Observations are
+    /// unaffected.
     ///
     /// # Errors
     ///

@@ -11,9 +11,9 @@ use super::seeding::PoolEntropy;
 use super::typed_envs::{AnyEnvs, typed_envs};
 use crate::envs::{EnvSpec, Environment, Expert, Task, TaskEnv, UnknownEnvironment};
 
-/// Environment ids with their implementations. Pools, engines and commands look ids up in the registry that they are given.
+/// Environment ids with their implementations. Pools, engines and commands look up ids in the registry that they are given.
 ///
-/// A clone shares the implementations.
+/// Clones share the implementations.
 #[derive(Clone, Default)]
 pub struct Registry {
     entries: Vec<Arc<Entry>>,
@@ -25,7 +25,7 @@ impl Registry {
         Registry::default()
     }
 
-    /// Adds an id, played by the family `E` with that variant of its rules.
+    /// Adds an id that the family `E` implements with the given variant of its rules.
     ///
     /// # Errors
     ///
@@ -42,7 +42,7 @@ impl Registry {
         Ok(())
     }
 
-    /// The registry with the id of a task in addition.
+    /// Adds the id of a task and returns the registry.
     ///
     /// # Errors
     ///
@@ -124,7 +124,7 @@ impl<E: Environment + 'static> AnyFamily for Family<E> {
     }
 }
 
-/// An id that a registry has already.
+/// The registry already has this id.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("the registry has an environment `{id}` already")]
 pub struct DuplicateEnvironment {

@@ -6,10 +6,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::random::{EntropyError, Generator, SeedSequence, entropy};
 
-/// Maximum number of environments in all pools together: the number of an environment is one word of a spawn key.
+/// Maximum total number of environments in all pools: an environment's number is one 32-bit word of a spawn key.
 pub(super) const MAX_TOTAL_ENVS: usize = u32::MAX as usize;
 
-/// The source of the episodes' seeds. Environments are numbered over all groups of an engine, so that results depend neither on
+/// The source of the episodes' seeds. Environments are numbered across all groups of an engine, so results depend neither on
 /// the number of threads nor on the division into groups.
 ///
 /// In JSON: `{"continue": {"seed": 1}}`, `{"range": {"start": 0, "end": 100000, "step": 1, "seed": 1}}` or `{"list": [3, 4]}`, where
@@ -17,12 +17,12 @@ pub(super) const MAX_TOTAL_ENVS: usize = u32::MAX as usize;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Seeding {
-    /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as the original's does
-    /// when it is reset without a seed.
+    /// Environment `i` is seeded once with `seed + i`, and every later episode continues its generator, as in the original when
+    /// it is reset without a seed.
     ///
-    /// An environment that is reset with a seed `s` of its own continues from there, whatever the policy: with `Continue` its later
-    /// episodes continue the generator of `s`, with `Range` they draw with `SeedSequence(s, spawn_key=(0,))`, and with `List` they
-    /// start again with the environment's first item.
+    /// Under any policy, a reset with an explicit seed `s` restarts the environment's seeds: with `Continue` its later episodes
+    /// continue the generator of `s`, with `Range` they draw with `SeedSequence(s, spawn_key=(0,))`, and with `List` they start
+    /// again at the environment's first item.
     Continue {
         /// The seed of environment 0; `None` seeds each environment from the operating system's entropy.
         #[serde(default)]
@@ -38,8 +38,8 @@ pub enum Seeding {
         /// The difference between two seeds, 1 or more; 1 by default.
         #[serde(default = "one")]
         step: u64,
-        /// Seed of the draws: environment `i` draws with `SeedSequence(seed, spawn_key=(i,))`. `None` takes the operating system's
-        /// entropy.
+        /// Seed of the draws: environment `i` draws with `SeedSequence(seed, spawn_key=(i,))`. `None` uses the operating
+        /// system's entropy.
         #[serde(default)]
         seed: Option<u64>,
     },
@@ -59,19 +59,19 @@ fn one() -> u64 {
 }
 
 impl Seeding {
-    /// Whether every episode follows from given seeds, so that no entropy is needed.
+    /// Whether every episode has a given seed, so that no entropy is needed.
     fn is_seeded(&self) -> bool {
         !matches!(self, Seeding::Continue { seed: None } | Seeding::Range { seed: None, .. })
     }
 }
 
-/// The entropy of a pool. One draw from the operating system serves all environments: each has a stream of its own by a spawn key, as
-/// with numpy's `SeedSequence.spawn`.
+/// The entropy of a pool. One draw from the operating system serves all environments: each derives its stream by a spawn key,
+/// as with numpy's `SeedSequence.spawn`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PoolEntropy(SeedSequence);
 
 impl PoolEntropy {
-    /// Draws entropy. Without a source of entropy, a pool needs [`Seeding`] that seeds every episode.
+    /// Draws entropy. Fails only if there is no source of entropy and `seeding` needs one.
     pub(super) fn draw(seeding: &Seeding) -> Result<Self, EntropyError> {
         let bits = match entropy() {
             Err(error) if !seeding.is_seeded() => return Err(error),
@@ -90,7 +90,7 @@ impl PoolEntropy {
         Generator::from_seed_sequence(&self.0.with_spawn_key(&[env as u32, 1]))
     }
 
-    /// A number that differs from those of all other pools of this process and, with entropy, of other processes.
+    /// A number that is unique among the pools of this process and, with entropy, across processes.
     pub(super) fn identity(self) -> u64 {
         static POOLS: AtomicU32 = AtomicU32::new(0);
         let number = POOLS.fetch_add(1, Ordering::Relaxed);
@@ -116,7 +116,7 @@ pub(super) enum Seeds {
         first: Option<u64>,
         draws: Generator,
     },
-    /// The indices are below the length of the list.
+    /// Indices are less than the length of the list.
     List {
         seeds: std::sync::Arc<[u64]>,
         first: usize,
@@ -154,7 +154,7 @@ impl Seeds {
         }
     }
 
-    /// The seeds of environment number `env` if no episode may continue the generator of the one before.
+    /// The seeds of environment number `env` when no episode may continue the previous one's generator.
     pub(super) fn independent(self, env: usize, unseeded: PoolEntropy) -> Self {
         match self {
             Seeds::Continue { first } => {
@@ -179,7 +179,7 @@ impl Seeds {
         }
     }
 
-    /// Starts again from a seed that was given to a reset, so that all later episodes follow from it alone.
+    /// Restarts from a seed that was given to a reset, which alone determines the seeds of later episodes.
     pub(super) fn restart(&mut self, seed: u64) {
         match self {
             Seeds::Continue { first } => *first = None,
@@ -202,7 +202,7 @@ impl Seeds {
         }
     }
 
-    /// Continues the snapshot's seeds. Nothing changes if the snapshot's kind of [`Seeding`] is another.
+    /// Continues the snapshot's seeds. Does nothing if the snapshot has another kind of [`Seeding`].
     pub(super) fn restore(&mut self, saved: SavedSeeds) {
         match (self, saved) {
             (Seeds::Continue { first }, SavedSeeds::Continue { first: saved }) => *first = saved,
@@ -217,7 +217,7 @@ impl Seeds {
     }
 }
 
-/// The generator that draws the seeds of the episodes after the one with that seed.
+/// The generator that draws the seeds of the episodes that follow one with `seed`.
 fn later_seeds(seed: u64) -> Generator {
     Generator::from_seed_sequence(&SeedSequence::new(seed).with_spawn_key(&[0]))
 }

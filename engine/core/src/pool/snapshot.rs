@@ -1,8 +1,8 @@
-//! The whole state of one environment as bytes.
+//! The complete state of one environment as bytes.
 //!
-//! A snapshot is `EGYM`, the format's version (u32), the CRC-32 of what follows (u32), both little-endian, and then the
-//! environment in [postcard](https://postcard.jamesmunns.com)'s encoding: id, reset parameters as JSON, seed, generator, seeding,
-//! sums of the running episode, and the family's state.
+//! A snapshot starts with `EGYM`, the version of the format (u32), and the CRC-32 of the content (u32), both little-endian. The
+//! content is encoded with [postcard](https://postcard.jamesmunns.com): id, reset parameters as JSON, seed, generator, seeding,
+//! return and length of the running episode, and the family's state.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -24,7 +24,7 @@ pub(super) struct Saved<S> {
     pub id: String,
     /// The reset parameters that were given, as a JSON object.
     pub options: String,
-    /// Those of the next episode, if they are others.
+    /// The reset parameters of the next episode, if others were set.
     pub next_options: Option<String>,
     /// The seed that the running episode started with.
     pub episode_seed: Option<u64>,
@@ -69,10 +69,10 @@ impl<S: DeserializeOwned> Saved<S> {
     }
 }
 
-/// A snapshot that cannot be taken or restored. The environment has not changed.
+/// A snapshot cannot be taken or restored. The environment has not changed.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    /// The pool has no environment of that number.
+    /// The pool has no environment with this number.
     #[error("env must be 0 to {}, got {given}", num_envs - 1)]
     NoSuchEnv {
         /// The number that was given.
@@ -83,10 +83,10 @@ pub enum SnapshotError {
     /// The environments have no state before their first reset.
     #[error("all environments must be reset before a snapshot is taken or restored")]
     NotReset,
-    /// The bytes are too few, or do not start with `EGYM`.
+    /// There are too few bytes, or they do not start with `EGYM`.
     #[error("the bytes are not a snapshot")]
     NoSnapshot,
-    /// The snapshot was taken by a version of this crate with another format.
+    /// The snapshot was taken by a version of this crate with another snapshot format.
     #[error("the snapshot must be of version {SNAPSHOT_VERSION}, got version {given}; take it again")]
     Version {
         /// The snapshot's version.
@@ -98,7 +98,7 @@ pub enum SnapshotError {
     /// The content cannot be encoded or decoded.
     #[error("the snapshot's content cannot be read: {0}")]
     Content(String),
-    /// The snapshot is of another environment id.
+    /// The snapshot belongs to another environment id.
     #[error("the snapshot must be of {expected}, got {given}")]
     OtherEnvironment {
         /// The snapshot's environment id.
@@ -106,7 +106,7 @@ pub enum SnapshotError {
         /// The pool's environment id.
         expected: &'static str,
     },
-    /// The earlier frames of a stacked observation, which a checkpoint stores beside the snapshot, have a wrong length.
+    /// The earlier frames of a stacked observation, which a checkpoint stores beside the snapshot, have the wrong length.
     #[error("the earlier frames must have {expected} bytes, got {given}")]
     EarlierFrames {
         /// Bytes that were given.
@@ -114,10 +114,10 @@ pub enum SnapshotError {
         /// Bytes that the pool's observation needs.
         expected: usize,
     },
-    /// The snapshot's reset parameters are not valid.
+    /// The snapshot's reset parameters are invalid.
     #[error("the snapshot's reset parameters: {0}")]
     Parameters(#[from] ParameterError),
-    /// The snapshot's state is not a possible one of its environment.
+    /// The environment cannot be in the snapshot's state.
     #[error("the snapshot's content is not valid: {0}")]
     State(#[from] InvalidState),
 }
@@ -128,7 +128,7 @@ pub struct SavedEnv {
     /// The environment's snapshot.
     #[serde(with = "serde_bytes")]
     pub snapshot: Vec<u8>,
-    /// The frames of a stacked observation but the newest, oldest first, in the pool's format.
+    /// All frames of a stacked observation except the newest, oldest first, in the pool's format.
     #[serde(with = "serde_bytes")]
     pub earlier_frames: Vec<u8>,
 }
@@ -144,7 +144,7 @@ pub enum ResumeError {
         /// Environments of the pool.
         num_envs: usize,
     },
-    /// The state of an environment is not valid.
+    /// The state of an environment is invalid.
     #[error("environment {env}: {source}")]
     Environment {
         /// Number of the environment in its pool.

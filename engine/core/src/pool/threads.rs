@@ -1,4 +1,4 @@
-//! How many threads step a pool's environments.
+//! The threads that step a pool's environments.
 
 #[cfg(feature = "threads")]
 #[allow(unsafe_code)] // The crate's only module with unsafe code: see its SAFETY comment.
@@ -19,7 +19,7 @@ pub struct Threads {
 
 #[cfg(feature = "threads")]
 impl Threads {
-    /// `count` threads, the calling one included, at most [`MAX_THREADS`]; 0 means one for each core.
+    /// `count` threads, including the calling one, at most [`MAX_THREADS`]; 0 means one for each core.
     ///
     /// # Errors
     ///
@@ -38,13 +38,13 @@ impl Threads {
         Ok(Threads { workers: workers.map(std::sync::Arc::new) })
     }
 
-    /// Threads that step environments at the same time, the calling one included.
+    /// Number of threads that step environments at the same time, including the calling one.
     pub fn count(&self) -> usize {
         1 + self.workers.as_ref().map_or(0, |workers| workers.count())
     }
 
     /// Calls `work(0)` in this thread and, at the same time, `work(n)` for each `n` of `1..=helpers` whose worker joins before
-    /// the calling thread is done. Returns when all calls have returned; a panic in any of them continues here.
+    /// the calling thread is done. Returns when all calls have returned; a panic in any of them resumes here.
     pub(super) fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
         match &self.workers {
             Some(workers) if helpers > 0 => workers.run(helpers, work),
@@ -68,7 +68,7 @@ impl Threads {
         Ok(Threads {})
     }
 
-    /// Threads that step environments at the same time: 1.
+    /// Number of threads that step environments at the same time: 1.
     pub fn count(&self) -> usize {
         1
     }

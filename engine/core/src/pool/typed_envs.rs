@@ -20,7 +20,7 @@ use crate::batch::BatchMut;
 use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters, view};
 use crate::raster::PixelFormat;
 
-/// What a write of a batch needs besides the environments.
+/// Arguments for writing a batch.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct WriteContext<'a> {
     pub threads: &'a Threads,
@@ -29,7 +29,7 @@ pub(super) struct WriteContext<'a> {
     pub draw: DrawSettings,
 }
 
-/// The environments of a pool, of any family. One virtual call serves a whole batch.
+/// The environments of a pool, of any family. One virtual call handles a whole batch.
 pub(super) trait AnyEnvs: Send + Sync {
     /// Steps all environments.
     fn step(
@@ -48,10 +48,10 @@ pub(super) trait AnyEnvs: Send + Sync {
         out: BatchMut<'_>,
     ) -> Result<(), WrongFrame>;
 
-    /// Sets other reset parameters for environments, from their next episode on. Their numbers must be in range.
+    /// Sets reset parameters for environments, from their next episode on. The environments' numbers must be in range.
     fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError>;
 
-    /// As [`set_options`](Self::set_options), for the environments that `request` resets.
+    /// Like [`set_options`](Self::set_options), for the environments that `request` resets.
     fn set_options_of(&mut self, request: ResetRequest<'_>, options: &OptionMap) -> Result<(), ParameterError>;
 
     /// Seed and reset parameters of an environment's running episode.
@@ -60,14 +60,14 @@ pub(super) trait AnyEnvs: Send + Sync {
     /// The whole state of one environment.
     fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError>;
 
-    /// Replaces one environment's state by a snapshot's.
+    /// Replaces one environment's state with a snapshot's.
     fn restore(&mut self, env: usize, snapshot: &[u8]) -> Result<(), SnapshotError>;
 
-    /// The frames of one environment's observation but the newest, each of `frame_bytes` bytes; empty for an observation of one
-    /// frame.
+    /// All frames of one environment's observation except the newest, each of `frame_bytes` bytes; empty for an observation of
+    /// one frame.
     fn earlier_frames(&self, env: usize, format: PixelFormat, frame_bytes: usize) -> Vec<u8>;
 
-    /// Replaces these frames.
+    /// Replaces all frames of one environment's observation except the newest.
     fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError>;
 
     /// Progress of one environment's episode.
@@ -76,7 +76,7 @@ pub(super) trait AnyEnvs: Send + Sync {
     /// Draws one environment's ground-truth view.
     fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
 
-    /// Sets the animations of that view to the current step.
+    /// Sets the animations of one environment's ground-truth view to the current step.
     fn align_ground_truth_view(&mut self, env: usize);
 }
 
@@ -91,14 +91,14 @@ pub(super) struct TypedEnvs<E: Environment> {
     variant: E::Variant,
 }
 
-/// Makes the environments of one family; those with the same options share their assets.
+/// Creates the environments of one family; those with the same options share their assets.
 pub(super) fn typed_envs<E: Environment>(
     spec: &EnvSpec,
     variant: E::Variant,
     config: &PoolConfig,
     entropy: PoolEntropy,
 ) -> Result<TypedEnvs<E>, PoolError> {
-    // The options of an environment, and what is made from them.
+    // An environment's options, and the assets made from them.
     let make = |given: &OptionMap| -> Result<(Arc<OptionMap>, Arc<E::Assets>), ParameterError> {
         let parameters = ResetParameters::new(spec.id, spec.parameters, given)?;
         Ok((Arc::new(given.clone()), Arc::new(E::assets(variant, &parameters))))
@@ -212,7 +212,7 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
     }
 
     fn set_options(&mut self, sets: &[NextOptions]) -> Result<(), ParameterError> {
-        // All are made before the first is set, so that an error changes no environment.
+        // Makes all before it sets the first, so that an error changes no environment.
         let made: Vec<_> = sets.iter().map(|set| self.with_options(&set.options)).collect::<Result<_, _>>()?;
         for (set, (assets, options)) in sets.iter().zip(made) {
             for env in &set.envs {
@@ -239,7 +239,7 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
 
     fn snapshot(&self, env: usize) -> Result<Vec<u8>, SnapshotError> {
         let slot = &self.slots[env];
-        // The state is borrowed when it is saved and owned when it is restored; its encoding is the same.
+        // Saving borrows the state and restoring owns it; the encoding is the same.
         Saved {
             id: self.spec.id.to_owned(),
             options: text(&slot.options),

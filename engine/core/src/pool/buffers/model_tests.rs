@@ -1,4 +1,5 @@
-//! A buffer is current only if it shows the scenes of its record: after every short sequence of events, and after long random ones.
+//! Checks that a current buffer shows the scenes of its record, after every short sequence of events and after long random
+//! ones.
 
 use proptest::prelude::*;
 
@@ -16,11 +17,11 @@ enum Event {
     Interrupted { pool: usize, buffer: usize },
     /// The memory of a buffer is copied over another's.
     Copy { from: usize, to: usize },
-    /// The frames are changed from outside, and the pool is told.
+    /// The frames are changed from outside, with a call of `forget_frames`.
     Forget { buffer: usize },
 }
 
-/// Buffers whose first number stands for their pixels, and pools whose drawn scenes are such numbers.
+/// The first number of each buffer stands for its pixels, and each pool's drawn scenes are such numbers.
 struct Model {
     layout: Layout,
     pools: [(Buffers, Vec<u64>); 2],
@@ -66,7 +67,7 @@ impl Model {
         let (buffers, scenes) = &mut self.pools[pool];
         let record = buffers.begin(&self.layout, &mut self.buffers[buffer]);
         scenes.resize(scenes.len().max(record.index + 1), 0);
-        assert!(!record.current || scenes[record.index] == pixels, "a buffer with other pixels than its record's");
+        assert!(!record.current || scenes[record.index] == pixels, "a current buffer shows other scenes");
         assert_eq!(Stamp::read(&self.layout, &self.buffers[buffer]), Stamp::default());
         record
     }
@@ -78,7 +79,7 @@ fn layout() -> Layout {
 }
 
 #[test]
-fn no_short_sequence_makes_a_buffer_with_other_pixels_current() {
+fn current_buffers_show_their_records_after_every_short_sequence() {
     const LENGTH: u32 = 5;
     let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
     let events: Vec<Event> = pairs
@@ -110,7 +111,7 @@ proptest! {
     #![proptest_config(property_cases(200))]
 
     #[test]
-    fn no_sequence_with_more_buffers_than_records_makes_a_buffer_with_other_pixels_current(
+    fn current_buffers_show_their_records_with_more_buffers_than_records(
         events in prop::collection::vec(event(), 1..400),
     ) {
         let mut model = Model::new(&layout(), MAX_BUFFERS + 4);

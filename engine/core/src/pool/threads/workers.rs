@@ -1,11 +1,10 @@
 //! Worker threads that join the calling thread in a step.
 //!
-//! A step takes tens of microseconds, less than waking a thread takes. So the caller starts at once and waits only for workers
-//! that have joined: a running worker joins, one that wakes too late finds the call closed. After a call, a worker spins, then
+//! A step takes tens of microseconds, less than waking a thread. So the caller starts at once and waits only for workers that
+//! have joined: a running worker joins, and one that wakes too late finds the call closed. After a call, a worker spins, then
 //! yields, then parks.
 //!
-//! With many workers nothing is done for one after the other: each joins by a flag of its own, and wakes a few others, which wake
-//! others in turn.
+//! To scale to many workers, each joins by its own flag and wakes a few others, which wake others in turn.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -19,10 +18,10 @@ use crate::pool::sync::threads::{
 };
 use crate::pool::sync::{Mutex, lock};
 
-/// Workers that each thread wakes.
+/// Number of workers that each thread wakes.
 const WAKES: usize = 3;
 
-/// Threads that wait for calls. They end when this is dropped.
+/// Threads that wait for calls. They exit when this is dropped.
 #[derive(Debug)]
 pub(super) struct Workers {
     shared: Arc<Shared>,
@@ -30,10 +29,10 @@ pub(super) struct Workers {
     turn: Mutex<()>,
 }
 
-/// A function of the thread's number. It is borrowed for the time of one call.
+/// A function of the thread's number, borrowed for one call.
 type Task = &'static (dyn Fn(usize) + Sync);
 
-/// What the caller and its workers share. What different threads write lies on separate cache lines.
+/// State shared by the caller and its workers. Fields that different threads write lie on separate cache lines.
 struct Shared {
     /// Generation counter of calls: incremented when a call opens and when it closes, so odd while workers may join.
     generation: CachePadded<AtomicU64>,
@@ -79,7 +78,7 @@ impl Workers {
         Ok(workers)
     }
 
-    /// How many workers there are.
+    /// Number of workers.
     pub(super) fn count(&self) -> usize {
         self.shared.joined.len()
     }
@@ -87,8 +86,8 @@ impl Workers {
     /// See [`Threads::run`](super::Threads::run).
     pub(super) fn run(&self, helpers: usize, work: &(dyn Fn(usize) + Sync)) {
         let _turn = lock(&self.turn);
-        // SAFETY: only the lifetime changes. Workers copy the reference only after they have joined an open call, and dropping `Call`
-        // closes the call and waits until no worker has joined before this function returns or unwinds.
+        // SAFETY: only the lifetime changes. Workers copy the reference only after they have joined an open call. Dropping
+        // `Call` closes the call and waits for all workers that have joined, before this function returns or unwinds.
         let mut task = unsafe { std::mem::transmute::<&(dyn Fn(usize) + Sync), Task>(work) };
         let call = Call::open(&self.shared, &mut task, helpers.min(self.count()));
         self.shared.wake(0, call.helpers);
@@ -139,7 +138,7 @@ impl Drop for Call<'_> {
     }
 }
 
-/// A worker's flag, until it has finished.
+/// A worker's flag, cleared on drop.
 struct Joined<'a>(&'a AtomicBool);
 
 impl Drop for Joined<'_> {
@@ -168,14 +167,14 @@ impl Shared {
         }
     }
 
-    /// Wakes the workers, of those that may join, that are this thread's to wake.
+    /// Wakes this thread's share of the workers that may join.
     fn wake(&self, number: usize, helpers: usize) {
         let first = (number * WAKES).min(helpers);
         self.unparkers[first..(first + WAKES).min(helpers)].iter().for_each(Unparker::unpark);
     }
 
-    /// Waits for a call other than `last` and returns its generation; `None` after `stop`. The worker parks
-    /// [`PARK_AFTER`] after `since`, the last time that it was called.
+    /// Waits for a call other than `last` and returns its generation; `None` after `stop`. The worker parks when [`PARK_AFTER`]
+    /// has passed since `since`, its last call.
     fn next_call(&self, last: u64, since: Instant, parker: &Parker) -> Option<u64> {
         let backoff = Backoff::new();
         while !self.stop.load(Ordering::SeqCst) {
@@ -192,7 +191,7 @@ impl Shared {
         None
     }
 
-    /// The task of the call of that generation, if it still is open; the worker then has joined.
+    /// Joins the call of that generation and returns its task, if the call is still open.
     fn join(&self, number: usize, generation: u64) -> Option<(Task, Joined<'_>)> {
         let flag = &self.joined[number - 1];
         flag.store(true, Ordering::Relaxed);
@@ -201,8 +200,8 @@ impl Shared {
         if self.generation.load(Ordering::Relaxed) != generation {
             return None;
         }
-        // SAFETY: the call is open, and the caller that closes it sees the flag after its own fence. So it waits for this worker, and
-        // until then the task lies in its stack frame.
+        // SAFETY: the call is open, and the caller that closes it sees the flag after its own fence. So it waits for this
+        // worker, and until then the task stays in its stack frame.
         let task = unsafe { *self.task.load(Ordering::Acquire) };
         Some((task, joined))
     }

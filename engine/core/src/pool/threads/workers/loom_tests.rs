@@ -1,8 +1,8 @@
-//! The worker threads under loom: every interleaving up to a number of preemptions, and every value that an atomic load may
-//! return by the memory model. `cargo xtask test --only loom` runs these models.
+//! The worker threads under loom: every interleaving up to a number of preemptions, and every value that the memory model
+//! allows an atomic load to return. `cargo xtask test --only loom` runs these models.
 //!
-//! A worker that sleeps through a call for good, or does not end after the pool of threads is dropped, is a deadlock, which loom
-//! reports. A write of a worker that is not visible when the call returns is a causality violation.
+//! loom reports a deadlock if a worker never wakes for a call, or does not exit after the threads are dropped. It reports a
+//! causality violation if a worker's write is not visible when the call returns.
 
 use loom::cell::UnsafeCell;
 use loom::model::Builder;
@@ -14,7 +14,7 @@ use crate::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 
 const ID: &str = "MysteryPath-Grid-v0";
 
-/// Pieces of work. A mutable access beside any other access, or without an order to it, fails the model.
+/// Pieces of work. An unsynchronised mutable access fails the model.
 struct Pieces {
     left: Mutex<Vec<usize>>,
     done: Vec<UnsafeCell<usize>>,
@@ -66,7 +66,7 @@ fn loom_a_second_call_wakes_parked_workers_and_is_not_joined_by_the_first_ones()
     model(3, || {
         let workers = Workers::new(1).unwrap();
         for _ in 0..2 {
-            // Freed after its call: a worker that joined late would use it.
+            // Freed after its call, so a worker that joined late would use freed memory.
             let pieces = Pieces::new(2);
             workers.run(1, &|_| pieces.work());
             pieces.check();
@@ -113,7 +113,7 @@ fn loom_two_callers_take_turns() {
     });
 }
 
-/// The caller waits for the worker: if the call did not wake it, this is a deadlock.
+/// The caller waits for the worker, so a call that does not wake it is a deadlock.
 #[test]
 fn loom_a_call_wakes_a_parked_worker() {
     model(3, || {
@@ -135,7 +135,7 @@ fn loom_workers_end_without_a_call() {
     model(3, || drop(Workers::new(2).unwrap()));
 }
 
-/// The division of a batch: the same batch as by the calling thread alone.
+/// Two threads write the same batch as the calling thread alone.
 #[test]
 fn loom_a_pool_steps_every_environment_once() {
     fn play(threads: &Threads) -> Vec<u8> {
