@@ -85,7 +85,8 @@ struct Measurement {
     highest: f64,
     /// Bytes of one batch.
     batch_bytes: Option<usize>,
-    /// Bytes of batches in huge pages, of all batches of the engine with the service. `None` if the system does not report them.
+    /// Bytes of batches that are in huge pages; with the service, of all the engine's batches. `None` if the system
+    /// does not report them.
     huge_page_bytes: Option<u64>,
 }
 
@@ -194,7 +195,8 @@ fn show(args: &Args, rows: &[Row]) -> Result<(), Failure> {
     ))
 }
 
-/// How much memory the batches of the first measurement in process, and of the first with the service, have in huge pages.
+/// How much of the batches' memory was in huge pages in the first in-process measurement and the first with the
+/// service.
 fn memory(row: &Row) -> String {
     let megabytes = |bytes: Option<u64>| {
         bytes.map_or("an unknown number of".to_owned(), |bytes| format!("{:.1}", bytes as f64 / 1e6))
@@ -226,7 +228,7 @@ fn measure(
     }
 }
 
-/// Calls `step` for `--seconds` after some calls to warm up, and returns the steps per second of all environments.
+/// Calls `step` for `--seconds` after a few warm-up calls, and returns the steps per second of all environments.
 fn time(args: &Args, stop: &AtomicBool, mut step: impl FnMut() -> Result<(), Failure>) -> Result<f64, Failure> {
     const WARM_UP: usize = 20;
     for _ in 0..WARM_UP {
@@ -277,7 +279,7 @@ fn through_service(args: &Args, spec: &EnvSpec, reads: bool, stop: &AtomicBool) 
         if reads {
             std::hint::black_box(sum(&received.batch()));
         }
-        // Released before the next step, so that the engine writes to memory that is still in its cache.
+        // Release the lease before the next step, so that the engine writes to memory that is still in its cache.
         drop(received);
         trainer.send(0, actions.next())?;
         Ok(())
@@ -285,7 +287,7 @@ fn through_service(args: &Args, spec: &EnvSpec, reads: bool, stop: &AtomicBool) 
     Ok(Round { steps_per_second, batch_bytes, huge_page_bytes: huge_pages::bytes(engine.id(), huge_pages::SHARED) })
 }
 
-/// Random actions that are drawn before the measurement, as `original.py` does.
+/// Random actions drawn before the measurement, as in `original.py`.
 struct Actions {
     numbers: Vec<i32>,
     /// Numbers in the action of one environment.
@@ -313,8 +315,8 @@ impl Actions {
     }
 }
 
-/// The sum of all bytes of a batch, read as 64-bit words: a cache line in each round of the loop, since the speed of a shorter one
-/// depends on where the linker puts it. A batch is a whole number of cache lines.
+/// The sum of a batch's bytes, read as 64-bit words. Each iteration reads a cache line, since the speed of a shorter
+/// loop depends on its address. A batch is a whole number of cache lines.
 fn sum(batch: &Batch<'_>) -> u64 {
     let words: &[u64] = bytemuck::cast_slice(batch.bytes());
     let sums =

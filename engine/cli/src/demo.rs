@@ -29,7 +29,7 @@ pub struct Args {
     /// Environments in each group [default: 512; 64 with experts].
     #[arg(long)]
     num_envs: Option<usize>,
-    /// Groups of environments; the engine steps one while the policy acts in another.
+    /// Groups of environments; the engine steps one group while the policy acts in another.
     #[arg(long, default_value_t = 2)]
     groups: usize,
     /// Threads of the engine; 0 for one per core.

@@ -19,7 +19,7 @@ const START_TIMEOUT: Duration = Duration::from_secs(30);
 /// Longest time that an engine may take to end before it is killed.
 const END_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Longest wait for the engine between two checks of the stop flag and of the engine's process.
+/// Longest wait for the engine between checks of the stop flag and of the engine's process.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Maximum length of an engine's message in bytes; the rest of its standard error is discarded.
@@ -36,7 +36,7 @@ pub fn set_executable(command: &[OsString]) {
 /// A child process that serves environments. It ends when this value is dropped, and when this process dies.
 pub struct EngineProcess {
     child: Child,
-    /// Reads the child's standard error, until the child closes it.
+    /// Reads the child's standard error until it is closed.
     stderr: Option<JoinHandle<Vec<u8>>>,
     config: ConnectConfig,
 }
@@ -54,7 +54,7 @@ impl EngineProcess {
         command.args(first).args(["serve", &child, "--config", "-"]);
         let mut engine = Self::spawn(command, ConnectConfig::new(&service))?;
         if let Some(stdin) = &mut engine.child.stdin {
-            // An error means that the engine has ended, which `connect` reports with its message.
+            // On an error the engine has ended, which `connect` reports with the engine's message.
             let _ = serde_json::to_writer(stdin, &EngineConfig { service, ..config });
         }
         Ok(engine)
@@ -65,10 +65,10 @@ impl EngineProcess {
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
-            // In a process group of its own, the engine does not receive Ctrl-C. This process does, and then stops the engine.
+            // A separate process group, so that Ctrl-C reaches only this process, which then stops the engine.
             .process_group(0)
             .spawn()?;
-        // In a thread, because a child that has filled the pipe would wait for a reader.
+        // In a thread, because a child blocks when the pipe is full.
         let stderr = child.stderr.take().map(|stderr| std::thread::spawn(|| read_message(stderr)));
         let config = ConnectConfig { timeout: POLL_INTERVAL, ..config };
         Ok(EngineProcess { child, stderr, config })
@@ -126,7 +126,7 @@ impl EngineProcess {
 impl Drop for EngineProcess {
     fn drop(&mut self) {
         if let Some(mut stdin) = self.child.stdin.take() {
-            // Closing it is not enough if another process has inherited it. An error means that the engine has ended.
+            // Closing it is not enough if another process has inherited it. On an error the engine has ended.
             let _ = stdin.write_all(b"\n");
         }
         let start = Instant::now();
@@ -156,7 +156,7 @@ mod tests {
 
     use super::*;
 
-    /// The error of connecting to a shell script in place of an engine.
+    /// The error of connecting to a shell script instead of an engine.
     fn error(name: &str, script: &str, timeout: Duration, stop: bool) -> String {
         let root = format!("/tmp/endless-child-{name}-{}", std::process::id());
         let config = ConnectConfig { namespace: Namespace::at(&root), ..ConnectConfig::new("gym") };

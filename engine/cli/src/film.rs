@@ -8,7 +8,7 @@ use endless_gym_core::raster::PixelFormat;
 use super::failure::Failure;
 use super::play::{Policy, RandomPolicy};
 
-/// Who plays.
+/// The policy that plays.
 enum Player {
     Expert(Experts),
     Random(RandomPolicy),
@@ -23,12 +23,12 @@ pub struct Film {
 }
 
 impl Film {
-    /// Starts the first episode of the environment that `config` describes, which its scripted expert plays.
+    /// Starts the first episode of the environment that `config` describes, played by its scripted expert.
     pub fn new(registry: &Registry, config: &PoolConfig) -> Result<Self, Failure> {
         Film::played_by(registry, config, Policy::Expert, 0)
     }
 
-    /// As [`new`](Film::new), with another policy. `action_seed` is the seed of the random actions.
+    /// Like [`new`](Film::new), with another policy. `action_seed` seeds the random actions.
     pub fn played_by(
         registry: &Registry,
         config: &PoolConfig,
@@ -59,8 +59,8 @@ impl Film {
         self.batch().observation()
     }
 
-    /// The ground-truth view, uint8 (336, 336, 3), indexed \[row\]\[column\]\[channel\]. Each call shows the next picture of a
-    /// clue, as the original's does; call it once a step.
+    /// The ground-truth view, uint8 (336, 336, 3), indexed \[row\]\[column\]\[channel\]. Each call shows the next
+    /// picture of a clue, as in the original; call it once per step.
     pub fn ground_truth_view(&mut self) -> Result<Vec<u8>, Failure> {
         let mut view = vec![0; VIEW_BYTES];
         self.pool.ground_truth_view(0, &mut view)?;

@@ -1,4 +1,4 @@
-//! The files of films: GIF, animated WebP, animated PNG, and MP4 by ffmpeg.
+//! Film files: GIF, animated WebP, animated PNG, and MP4 through ffmpeg.
 
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Read, Write};
@@ -9,24 +9,24 @@ use super::failure::Failure;
 use super::film_picture::{Picture, magnified};
 use super::film_webp::WebpFilm;
 
-/// The variable that names the program ffmpeg; that of the Python package imageio-ffmpeg.
+/// The environment variable that names the program ffmpeg, the same as for the Python package imageio-ffmpeg.
 const FFMPEG: &str = "IMAGEIO_FFMPEG_EXE";
 
-/// The kind of a film's file.
+/// The format of a film file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// With a palette of 256 colours for each picture.
     Gif,
-    /// Animated WebP, without loss.
+    /// Animated WebP, lossless.
     Webp,
-    /// Animated PNG, without loss.
+    /// Animated PNG, lossless.
     Png,
-    /// H.264 or what else ffmpeg chooses, with loss.
+    /// H.264 or whatever ffmpeg chooses, lossy.
     Mp4,
 }
 
 impl Format {
-    /// The format that the suffix of a file's name stands for.
+    /// The format for a file name's suffix.
     pub fn of(file: &Path) -> Result<Self, Failure> {
         let suffix = file.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match suffix.as_str() {
@@ -39,7 +39,7 @@ impl Format {
     }
 }
 
-/// What is fixed for all pictures of a film.
+/// Properties that all pictures of a film share.
 #[derive(Clone, Copy, Debug)]
 pub struct Shape {
     /// Size of a picture before it is magnified.
@@ -59,7 +59,7 @@ enum Encoder {
     Mp4(Child),
 }
 
-/// A film that is being written. Without [`finish`](FilmFile::finish) nothing remains.
+/// A film that is being written. If it is dropped without [`finish`](FilmFile::finish), no file remains.
 pub struct FilmFile {
     encoder: Option<Encoder>,
     shape: Shape,
@@ -76,7 +76,7 @@ impl FilmFile {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let suffix = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         let partial = path.with_file_name(format!(".{name}.{}.partial.{suffix}", std::process::id()));
-        // Also for ffmpeg, so that a folder that cannot be written is reported alike.
+        // Also for ffmpeg, so that an unwritable folder gives the same error for all formats.
         let created = File::create(&partial).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
         let mut film = FilmFile { encoder: None, shape, duration: 0, partial, path: path.to_owned() };
         film.encoder = Some(film.encoder(format, BufWriter::new(created))?);
@@ -120,12 +120,12 @@ impl FilmFile {
         })
     }
 
-    /// Adds a picture that is shown for the time of that number of pictures, 1 or more.
+    /// Adds a picture that is shown for `count` picture durations, 1 or more.
     pub fn add(&mut self, picture: &Picture, count: u16) -> Result<(), Failure> {
         let Shape { scale, fps, .. } = self.shape;
         let (start, end) = (self.duration, self.duration + u64::from(count));
         self.duration = end;
-        // Rounded so that the film as a whole has the right duration.
+        // Rounding errors do not add up: the whole film has the right duration.
         let time = |pictures: u64, unit: u64| (pictures * unit + u64::from(fps) / 2) / u64::from(fps);
         let duration = |unit: u64| time(end, unit) - time(start, unit);
         let pixels = || magnified(&picture.pixels, picture.width, scale).into_flattened();
@@ -148,7 +148,7 @@ impl FilmFile {
                 let pixels = pixels();
                 let written = child.stdin.as_mut().map(|stdin| (0..count).try_for_each(|_| stdin.write_all(&pixels)));
                 match written {
-                    // It has ended; `finish` reports its error.
+                    // ffmpeg has ended; `end` reports its error.
                     Some(Err(error)) if error.kind() == ErrorKind::BrokenPipe => return self.end(),
                     Some(written) => written.map_err(|error| format!("cannot write to ffmpeg: {error}"))?,
                     None => {}
@@ -159,7 +159,7 @@ impl FilmFile {
         Ok(())
     }
 
-    /// Ends the encoder, so that all of the file is written.
+    /// Ends the encoder, which writes the rest of the file.
     fn end(&mut self) -> Result<(), Failure> {
         match self.encoder.take() {
             Some(Encoder::Gif(encoder)) => encoder.into_inner()?.flush()?,
@@ -182,7 +182,7 @@ impl FilmFile {
         Ok(())
     }
 
-    /// Completes the file. It appears under its name at once.
+    /// Completes the file and renames it to its final name.
     pub fn finish(mut self) -> Result<(), Failure> {
         self.end()
             .and_then(|()| Ok(std::fs::rename(&self.partial, &self.path)?))
@@ -196,7 +196,7 @@ impl Drop for FilmFile {
             let _ = child.kill();
             let _ = child.wait();
         }
-        // A finished film has another name.
+        // Fails for a finished film, which was renamed.
         let _ = std::fs::remove_file(&self.partial);
     }
 }

@@ -35,12 +35,12 @@ impl View {
         (if self == View::Both { 2 * SCREEN + GAP } else { SCREEN }, SCREEN)
     }
 
-    /// The picture of the film's current step. Call it once a step.
+    /// The picture of the film's current step. Call it once per step.
     pub fn picture(self, film: &mut Film) -> Result<Picture, Failure> {
         let view = film.ground_truth_view()?;
         let view = view.as_chunks::<3>().0;
         let agent = film.observation().as_chunks::<3>().0;
-        // The view is the frame with every pixel magnified.
+        // The view is the frame, magnified: reduce it to the frame's size.
         let magnified = VIEW / SCREEN;
         let mut pixels = Vec::new();
         for row in 0..SCREEN {
@@ -57,7 +57,7 @@ impl View {
     }
 }
 
-/// Magnifies a picture in rows of `width` pixels: each becomes a square with that side.
+/// Magnifies a picture with rows of `width` pixels: each pixel becomes a square with side `scale`.
 pub fn magnified<T: Copy>(pixels: &[T], width: usize, scale: usize) -> Vec<T> {
     let wide = |row: &[T]| row.iter().flat_map(|pixel| std::iter::repeat_n(*pixel, scale)).collect::<Vec<T>>();
     pixels.chunks_exact(width).flat_map(|row| wide(row).repeat(scale)).collect()

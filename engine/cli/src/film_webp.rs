@@ -15,13 +15,13 @@ const CHUNK_HEADER: usize = 8;
 /// The flag of a file with an animation.
 const ANIMATION: u32 = 1 << 1;
 
-/// The flag of a picture that replaces the one before, without blending.
+/// The flag of a picture that replaces the previous one without blending.
 const REPLACES: u8 = 1 << 1;
 
 /// Durations have 24 bits.
 const MAX_MILLISECONDS: u32 = (1 << 24) - 1;
 
-/// An animated WebP file that is being written. It repeats without end.
+/// An animated WebP file that is being written. It loops forever.
 pub struct WebpFilm<W> {
     file: W,
     size: (u32, u32),
@@ -35,7 +35,7 @@ impl<W: Write + Seek> WebpFilm<W> {
         film.file.write_all(b"RIFF\0\0\0\0WEBP")?;
         let extended = [&ANIMATION.to_le_bytes()[..], &three(size.0 - 1), &three(size.1 - 1)].concat();
         film.chunk(b"VP8X", &[&extended])?;
-        // The background, transparent; and repetitions, 0 for no end.
+        // A transparent background, and the number of repetitions, 0 for endless.
         film.chunk(b"ANIM", &[&[0; 4], &[0; 2]])?;
         Ok(film)
     }
@@ -45,7 +45,7 @@ impl<W: Write + Seek> WebpFilm<W> {
         let (width, height) = self.size;
         let mut still = Vec::new();
         WebPEncoder::new(&mut still).encode(pixels, width, height, ColorType::Rgb8)?;
-        // A still without metadata is one chunk, which a picture of an animation contains as it is.
+        // A still picture without metadata is a single chunk, which an animation contains unchanged.
         let picture = still.get(HEADER..).unwrap_or_default();
         let duration = three(milliseconds.min(MAX_MILLISECONDS));
         let place = [&three(0)[..], &three(0), &three(width - 1), &three(height - 1), &duration, &[REPLACES]].concat();
@@ -62,7 +62,7 @@ impl<W: Write + Seek> WebpFilm<W> {
         Ok(self.file.flush()?)
     }
 
-    /// Writes a chunk. Chunks begin at even places.
+    /// Writes a chunk, padded so that the next one starts at an even offset.
     fn chunk(&mut self, name: &[u8; 4], parts: &[&[u8]]) -> Result<(), Failure> {
         let length = u32::try_from(parts.iter().map(|part| part.len()).sum::<usize>())?;
         self.file.write_all(name)?;

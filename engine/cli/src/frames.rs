@@ -1,4 +1,4 @@
-//! `endless frames`: the raw frames of an expert's episode, for programs that make pictures of them.
+//! `endless frames`: the raw frames of an expert's episode, for programs that turn them into pictures.
 
 use endless_gym_core::pool::Registry;
 use std::io::{self, ErrorKind, Write};

@@ -1,7 +1,7 @@
 //! How much memory of a process is in transparent huge pages.
 
-/// Kinds of memory, by their names in `smaps_rollup`: private memory, such as batches in process, and shared memory, such as an
-/// engine's batches.
+/// Kinds of memory, by their names in `smaps_rollup`: private memory, such as in-process batches, and shared memory,
+/// such as an engine's batches.
 pub const PRIVATE: &str = "AnonHugePages:";
 pub const SHARED: &str = "ShmemPmdMapped:";
 

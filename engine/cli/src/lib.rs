@@ -54,25 +54,27 @@ struct Cli {
 enum Command {
     /// List the environments, or describe one: spaces, reset parameters, info and features.
     List(list::Args),
-    /// Play through shared memory, with an engine in a child process, and report speed and returns.
+    /// Play through shared memory with an engine in a child process, and report speed and returns.
     Demo(demo::Args),
     /// Serve environments in shared memory until Ctrl-C.
     Serve(serve::Args),
     /// Show what the running engines are doing, without disturbing them.
     Status(status::Args),
-    /// Watch a training: steps per second, episodes, returns and lengths, without slowing it, until Ctrl-C or the engine's end.
+    /// Watch a training run without slowing it: steps per second, episodes, returns and lengths, until Ctrl-C or the
+    /// engine's end.
     Watch(watch::Args),
-    /// Show the environments of a running engine, in a browser on this machine or in the terminal, without slowing the training.
+    /// Show the environments of a running engine in a browser on this machine or in the terminal, without slowing the
+    /// training.
     View(view::Args),
-    /// Play an environment, in a browser on this machine or in the terminal.
+    /// Play an environment in a browser on this machine or in the terminal.
     Play(play_command::Args),
-    /// Record episodes of scripted experts or of random actions: a film, or a Minari data set (Python package).
+    /// Record episodes of scripted experts or random actions as a film or, with the Python package, a Minari data set.
     #[command(disable_help_flag = true)]
     Record(record::Args),
-    /// Measure steps per second, in process and through shared memory.
+    /// Measure steps per second in process and through shared memory.
     ///
-    /// Actions are random, and resets are included. Each round measures every method once. The median over the rounds is reported,
-    /// since other programs on the machine disturb single measurements.
+    /// Actions are random, and resets are included. Each round measures every method once. The result is the median
+    /// over the rounds, since other programs on the machine disturb single measurements.
     Bench(bench::Args),
     /// Replay recorded traces of the original, and compare every observation, reward, flag and info.
     Verify(verify::Args),
@@ -81,22 +83,24 @@ enum Command {
     Frames(frames::Args),
 }
 
-/// Exit status of a command that failed, or that found differences.
+/// Exit status of a command that failed or found differences.
 const FAILURE: u8 = 1;
 
 /// Runs the program `endless` with the environments of `registry` and returns its exit status.
 ///
-/// `arguments` are the arguments without the program's name. `executable` is the command, with its first arguments, that starts the
-/// program in a new process; `demo` and `bench` start an engine with it. Only the first call of a process sets it.
+/// `arguments` are the arguments without the program's name. `executable` is the command, with its first arguments,
+/// with which `demo` and `bench` start the program in a new process as an engine. Only the first call in a process sets
+/// it.
 ///
-/// The status is 0 after success; 1 after an error, which is printed to standard error as one line, and if `verify` finds a
-/// difference; 2 if the arguments do not follow the usage. Output that cannot be written is an error, but a closed pipe is not.
+/// The status is 0 on success; 1 after an error, which is printed to standard error as one line, or if `verify` finds a
+/// difference; 2 if the arguments are invalid. Output that cannot be written is an error, but a closed pipe is not.
 ///
-/// The first call of a process that has no subscriber of `tracing` yet installs one that logs to standard error.
+/// If the process has no `tracing` subscriber yet, the first call installs one that logs to standard error.
 ///
-/// `demo`, `serve`, `watch`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP, which stay installed. The first signal
-/// stops the command, and a second one ends the process at once. Do not run two of them at the
-/// same time in one process: a signal, and the start of one of them, affects both.
+/// `demo`, `serve`, `watch`, `play`, `view`, `record` and `bench` install handlers for SIGINT, SIGTERM and SIGHUP,
+/// which stay installed. The first signal stops the command, and a second one ends the process at once. Do not run two
+/// of these commands at the same time in one process: they share one stop flag, which a signal sets and a starting
+/// command clears.
 pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
     let arguments = std::iter::once("endless".into()).chain(arguments);

@@ -16,7 +16,7 @@ pub struct Args {
     /// Print JSON [default: text].
     #[arg(long, conflicts_with = "picture")]
     json: bool,
-    /// When to show a picture of the environment, made of coloured characters.
+    /// When to show a picture of the environment made of coloured characters.
     #[arg(long, value_enum, value_name = "WHEN", default_value = "auto", requires = "id")]
     picture: When,
 }
@@ -60,7 +60,7 @@ fn as_json(spec: &EnvSpec) -> serde_json::Value {
     value
 }
 
-/// What the numbers of a branch mean: `0 nothing, 1 left, 2 right`.
+/// What the numbers of a branch mean, such as `0 nothing, 1 left, 2 right`.
 fn choices(branch: &ActionBranch) -> String {
     let named: Vec<_> = branch.choices.iter().enumerate().map(|(n, choice)| format!("{n} {}", choice.name)).collect();
     named.join(", ")

@@ -8,13 +8,14 @@ use tracing_subscriber::util::SubscriberInitExt;
 
 use super::failure::Failure;
 
-/// The environment variable that says what to log.
+/// The environment variable that sets what to log.
 const VARIABLE: &str = "ENDLESS_GYM_LOG";
 
-/// What is logged by default: also an engine in the background reports what a person should know.
+/// Warnings by default, so that even a background engine reports what a person should know.
 const DEFAULT: &str = "warn";
 
-/// Starts logging what `given` says, or else the environment variable. A subscriber that the process already has is kept.
+/// Starts logging as set by `given`, or else by the environment variable. Keeps a subscriber that the process already
+/// has.
 pub fn start(given: Option<&str>) -> Result<(), Failure> {
     let variable = std::env::var(VARIABLE).ok().filter(|text| !text.is_empty());
     let (name, text) = match (given, &variable) {
@@ -29,7 +30,7 @@ pub fn start(given: Option<&str>) -> Result<(), Failure> {
         )
     })?;
     let lines = tracing_subscriber::fmt::layer().with_writer(io::stderr).with_ansi(false);
-    // An error means that the process has a subscriber, such as that of the Python package.
+    // Fails if the process already has a subscriber, such as that of the Python package.
     let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
     Ok(())
 }

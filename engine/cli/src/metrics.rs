@@ -12,13 +12,13 @@ use super::failure::Failure;
 /// Prometheus' text format.
 const CONTENT_TYPE: &str = "text/plain; version=0.0.4; charset=utf-8";
 
-/// A server of metrics that has its address.
+/// A metrics server that is bound to its address.
 pub struct Metrics {
     server: Server,
 }
 
 impl Metrics {
-    /// Takes the address.
+    /// Binds the address.
     pub fn bind(address: SocketAddr) -> Result<Self, Failure> {
         let server = Server::http(address).map_err(|error| format!("--metrics {address}: {error}"))?;
         Ok(Metrics { server })
@@ -29,15 +29,15 @@ impl Metrics {
         format!("http://{}/metrics", self.server.server_addr())
     }
 
-    /// Answers requests in a thread, from the status that the engine publishes: a slow client affects neither the engine nor the
-    /// end of the process.
+    /// Answers requests in a thread, from the engine's published status, so that a slow client delays neither the
+    /// engine nor the end of the process.
     pub fn start(self, namespace: Namespace, service: &str) -> Result<(), Failure> {
         let service = service.to_owned();
         thread::Builder::new().name("metrics".to_owned()).spawn(move || {
             for request in self.server.incoming_requests() {
                 let (namespace, service) = (namespace.clone(), service.clone());
-                // Writing to a client that does not read blocks, so each request has a thread. tiny_http has one for each
-                // connection too.
+                // Each request has its own thread, since writing to a client that does not read blocks. tiny_http also
+                // has one for each connection.
                 let answer = thread::Builder::new().spawn(move || answer(request, &namespace, &service));
                 if let Err(error) = answer {
                     tracing::warn!(%error, "cannot answer a request for metrics");
@@ -71,7 +71,7 @@ fn answer(request: Request, namespace: &Namespace, service: &str) {
 type GroupMetric = (&'static str, &'static str, &'static str, fn(&GroupStatus) -> f64);
 
 const GROUP_METRICS: [GroupMetric; 12] = [
-    ("step", "gauge", "Batches returned, counted on from the checkpoint that the engine resumed from.", |g| {
+    ("step", "gauge", "Batches returned, including those before the checkpoint that the engine resumed from.", |g| {
         g.step as f64
     }),
     ("batches_total", "counter", "Batches sent, including those of resets.", |g| g.batches as f64),

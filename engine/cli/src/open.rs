@@ -1,4 +1,4 @@
-//! A page in the user's browser.
+//! Opens a page in the user's browser.
 
 use std::ffi::OsString;
 use std::io;
@@ -7,13 +7,13 @@ use std::thread;
 
 use super::output::print_error;
 
-/// The variable that names the browser: commands with `:` between them, in each of which `%s` stands for the address.
+/// The environment variable that names the browser: commands separated by `:`, in which `%s` stands for the address.
 const BROWSER: &str = "BROWSER";
 
-/// The program that opens an address in the browser that the desktop has chosen.
+/// The program that opens an address in the desktop's default browser.
 const DESKTOP: &str = "xdg-open";
 
-/// Opens an address in a browser, without waiting for it. If that fails, says so: the page is served nevertheless.
+/// Opens an address in a browser without waiting for it. A failure is only printed, since the page is served anyway.
 pub fn in_browser(url: &str) {
     let commands = std::env::var(BROWSER).unwrap_or_default();
     let commands = commands.split(':').filter(|command| !command.trim().is_empty()).chain([DESKTOP]);
@@ -43,7 +43,7 @@ fn words(command: &str, url: &str) -> (OsString, Vec<OsString>) {
     (program, arguments)
 }
 
-/// Reaps the process, and says if it has failed: `xdg-open` does where there is no desktop.
+/// Reaps the process and reports its failure: `xdg-open` fails where there is no desktop.
 fn report_end(command: String, mut child: Child) {
     let wait = move || match child.wait() {
         Ok(status) if !status.success() => {
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_address_is_where_the_command_wants_it() {
+    fn the_address_replaces_its_placeholder_or_comes_last() {
         let text = |command| {
             let (program, arguments) = words(command, "http://127.0.0.1:1/?a=b&c");
             std::iter::once(program)

@@ -15,7 +15,7 @@ pub fn autoreset_value(mode: Autoreset) -> String {
     mode.name().replace('_', "-")
 }
 
-/// The parser of `--autoreset`, with the help of each mode. The mode's own name, with an underscore, is accepted too.
+/// The parser of `--autoreset`, with the help of each mode. Also accepts the mode's name with an underscore.
 pub fn autoreset_parser() -> impl TypedValueParser<Value = Autoreset> {
     let value = |mode: Autoreset| PossibleValue::new(autoreset_value(mode)).alias(mode.name()).help(mode.summary());
     PossibleValuesParser::new(Autoreset::ALL.map(value)).try_map(|text| text.replace('-', "_").parse::<Autoreset>())
@@ -24,7 +24,7 @@ pub fn autoreset_parser() -> impl TypedValueParser<Value = Autoreset> {
 /// The format of frames.
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub struct FrameArgs {
-    /// Write no frames, and draw nothing [default: RGB frames, uint8 (84, 84, 3), indexed `[x][y][channel]`].
+    /// Draw and write no frames [default: RGB frames, uint8 (84, 84, 3), indexed `[x][y][channel]`].
     #[arg(long, conflicts_with_all = ["grayscale", "channels_first", "row_major", "frame_stack"])]
     no_frames: bool,
     /// Grayscale frames without a channel axis [default: RGB].
@@ -64,21 +64,21 @@ pub struct EnvironmentArgs {
     /// Seed: environment i, counted over all groups, is seeded with SEED + i [default: entropy of the operating system].
     #[arg(long)]
     seed: Option<u64>,
-    /// Draw the seed of each episode from START to END - 1, every STEP-th [default: every one], as the training in the paper does
-    /// from 0..100000; `--seed` seeds the draws [default: episodes continue the generator of their environment].
+    /// Draw the seed of each episode from START to END - 1 in steps of STEP [default: 1]; the paper trains with
+    /// 0..100000. `--seed` seeds the draws [default: episodes continue the generator of their environment].
     #[arg(long, value_name = "START..END[:STEP]", value_parser = seed_range)]
     seed_range: Option<(u64, u64, u64)>,
-    /// Seeds of the episodes, in turn, repeated from the start [default: as for `--seed-range`].
+    /// Seeds of successive episodes, starting over at the end of the list [default: as for `--seed-range`].
     #[arg(long, value_name = "SEED,..", value_delimiter = ',', conflicts_with_all = ["seed", "seed_range"])]
     seed_list: Vec<u64>,
-    /// Episodes depend on their seed and reset parameters alone [default: as in the original, some show what an earlier one left, and
-    /// continue its generator].
+    /// Make episodes depend only on their seed and reset parameters [default: as in the original, some show leftovers
+    /// of an earlier episode and continue its generator].
     #[arg(long)]
     independent_episodes: bool,
-    /// Number of the first environment, for seeds, if several engines share the environments of one trainer.
+    /// Number of the first environment, for seeds, if one trainer uses several engines.
     #[arg(long, value_name = "N", default_value_t = 0)]
     first_env: usize,
-    /// Environments of all engines together [default: --first-env and those of this engine].
+    /// Environments of all engines together [default: --first-env plus those of this engine].
     #[arg(long, value_name = "N")]
     total_envs: Option<usize>,
 }
@@ -120,7 +120,7 @@ pub fn parameters(given: &[String]) -> Result<OptionMap, Failure> {
         let (name, value) = option
             .split_once('=')
             .ok_or_else(|| format!("--option {option}: expected NAME=VALUE, such as arena_size=6"))?;
-        // Text that is not JSON is passed on as a string; the parameter's own check then reports the allowed values.
+        // Text that is not JSON is passed on as a string; the check of the parameter then reports the allowed values.
         let value = serde_json::from_str(value).unwrap_or_else(|_| Json::from(value));
         options.insert(name.to_owned(), value);
     }
@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn autoreset_modes_are_given_by_their_names() {
+    fn autoreset_modes_are_parsed_from_both_spellings() {
         let parse = |given: &str| {
             let command = Command::new("endless").arg(Arg::new("mode").value_parser(autoreset_parser()));
             command.try_get_matches_from(["endless", given]).map(|found| found.get_one::<Autoreset>("mode").copied())

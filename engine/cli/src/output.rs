@@ -9,7 +9,7 @@ use terminal_size::{Width, terminal_size_of};
 
 use super::failure::Failure;
 
-/// Width if standard output is no terminal, in characters.
+/// Width in characters if standard output is not a terminal.
 const PIPE_WIDTH: u16 = 120;
 
 /// An empty table with these headings, at most as wide as standard output.
@@ -38,7 +38,7 @@ pub fn clear() -> Result<(), Failure> {
     if stdout.is_terminal() { check(write!(stdout, "\x1b[H\x1b[2J")) } else { Ok(()) }
 }
 
-/// Replaces the last line of the terminal on standard output by `text`, cut to its width.
+/// Replaces the last line of the terminal on standard output with `text`, cut to the terminal's width.
 pub fn replace_line(text: &str) -> Result<(), Failure> {
     let fitting: String = text.chars().take(usize::from(width()).saturating_sub(1)).collect();
     let mut stdout = io::stdout().lock();
@@ -65,8 +65,8 @@ pub fn print_error(error: impl std::fmt::Display) {
     let _ = writeln!(io::stderr(), "endless: {error}");
 }
 
-/// Turns an error of standard output into a failure. A closed pipe is none: with `endless list | head -1`, the reader closed
-/// the pipe deliberately, and the command ends with the status that it would have had.
+/// Turns an error of standard output into a failure. A closed pipe is not an error: in `endless list | head -1`, the
+/// reader closes it deliberately, and the command's exit status stays the same.
 fn check(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
@@ -76,7 +76,7 @@ fn check(written: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// A number rounded to an integer, with commas between its thousands.
+/// A number rounded to an integer, with thousands separators.
 pub fn grouped(number: f64) -> String {
     let digits = format!("{number:.0}");
     let mut text = String::new();
@@ -89,7 +89,7 @@ pub fn grouped(number: f64) -> String {
     text
 }
 
-/// A progress bar of `length` steps on standard error, hidden if that is no terminal.
+/// A progress bar of `length` steps on standard error, hidden if that is not a terminal.
 pub fn progress(length: u64, template: &str) -> ProgressBar {
     let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
     ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr()).with_style(style)

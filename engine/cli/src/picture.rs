@@ -49,14 +49,14 @@ const SIDE: usize = SCREEN / SCALE;
 /// Spaces between two pictures.
 const GAP: usize = 2;
 
-/// The seed of the episode that is shown: long enough in every environment.
+/// The seed of the episode shown, which is long enough in every environment.
 const SEED: u64 = 15;
 
 /// A step that shows what the environment is about: a command, the path, the spotlights.
 const TYPICAL_STEP: usize = 12;
 
-/// The ground-truth view at a typical step of an episode, in 42 columns and 22 lines; if 86 columns are available, beside the
-/// observation. The expert plays the episode, or random actions where there is none.
+/// The ground-truth view at a typical step of an episode, in 42 columns and 22 lines; next to the observation if 86
+/// columns are available. The expert plays the episode, or random actions if there is no expert.
 pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<String, Failure> {
     let config = PoolConfig { seeding: Seeding::Continue { seed: Some(SEED) }, ..PoolConfig::new(spec.id, 1) };
     let policy = if registry.expert(spec.id).is_ok() { Policy::Expert } else { Policy::Random };
@@ -104,13 +104,13 @@ mod tests {
     use endless_gym_core::memory_gym;
 
     #[test]
-    fn colours_need_a_terminal_that_has_them_and_a_user_who_wants_them() {
+    fn colours_need_a_capable_terminal_and_no_no_color() {
         assert!(true_colour("truecolor", "") && true_colour("24bit", ""));
         assert!(!true_colour("", "") && !true_colour("256color", "") && !true_colour("truecolor", "1"));
     }
 
     #[test]
-    fn a_line_has_both_rows_and_names_a_colour_once() {
+    fn a_line_shows_two_rows_and_sets_each_colour_once() {
         let mut rows = [[0; 3]; 2 * SIDE];
         rows[SIDE + 1] = [1, 2, 3];
         let line = half_block_line(&rows);

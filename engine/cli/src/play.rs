@@ -47,12 +47,12 @@ pub struct EpisodeStatistics {
     returns: f64,
     lengths: f64,
     info: Vec<f64>,
-    /// Mean return so far of the episodes in the batch that was added last.
+    /// Mean return so far of the episodes in the last added batch.
     pub running_return: f64,
 }
 
 impl EpisodeStatistics {
-    /// Statistics of no episode.
+    /// Statistics without episodes.
     pub fn new(spec: &EnvSpec) -> Self {
         EpisodeStatistics {
             steps: 0,

@@ -11,20 +11,20 @@ use super::{open, stop, terminal};
 
 /// Arguments of `endless play`.
 ///
-/// In the terminal, arrows or W A S D move, Q E Z C move diagonally. Space or P pauses; then N plays one step without a movement, and
-/// a movement one step. R restarts the episode, page up and page down start the one of the next and the previous seed, Esc or Ctrl-C
-/// quits.
+/// In the terminal, arrows or W A S D move, Q E Z C move diagonally. Space or P pauses; while paused, N plays one step
+/// without moving, and a movement key plays one step with it. R restarts the episode, page up and page down start the
+/// episode of the next and the previous seed, Esc or Ctrl-C quits.
 ///
-/// Most terminals do not report when a key is released. A key acts in at least one step, and on until HOLD seconds after the terminal
-/// last reported it; while it is down it is reported again and again, after a delay that the system's settings choose. Another direction
-/// replaces it at once; two that are pressed within one step move diagonally. Terminals with the kitty keyboard protocol report
-/// releases, and there a key acts while it is down.
+/// Most terminals do not report when a key is released, but report a key that is down repeatedly, after a delay that
+/// the system sets. A key acts in at least one step, until HOLD seconds after its last report. Another direction
+/// replaces it at once; two keys pressed within one step move diagonally. In terminals with the kitty keyboard
+/// protocol, which reports releases, a key acts while it is down.
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id; `endless list` lists them.
     #[arg(value_name = "ID", default_value = "MortarMayhem-v0")]
     id: String,
-    /// Seed of the first episode [default: on the page random, 0 to 99,999; in the terminal 0].
+    /// Seed of the first episode [default: random, 0 to 99,999, on the page; 0 in the terminal].
     #[arg(long)]
     seed: Option<u64>,
     /// Reset parameter, such as `arena_size=6`; may be repeated [default: the environment's own, which `endless list ID` shows].

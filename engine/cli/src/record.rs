@@ -1,4 +1,4 @@
-//! `endless record`: films. The Python package's program records data sets itself, since Python's libraries write them.
+//! `endless record`: films. The Python package's program records data sets itself, with Python libraries.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -16,27 +16,28 @@ use super::output::print;
 use super::play::Policy;
 use super::stop;
 
-/// Arguments of `endless record`: those of a film, or those of a data set, which Python reads.
+/// Arguments of `endless record`: those of a film, or those of a data set, which the Python package parses.
 #[derive(clap::Args)]
 pub struct Args {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
     arguments: Vec<OsString>,
 }
 
-/// Record a film of scripted experts or of random actions.
+/// Record a film of scripted experts or random actions.
 ///
-/// Each episode is played in an environment of its own, so that it follows from its seed and its reset parameters. Without --film,
-/// the Python package's program `endless record` writes a Minari data set.
+/// Each episode is played in a new environment, so that it depends only on its seed and reset parameters. Without
+/// --film, the Python package's program `endless record` writes a Minari data set.
 #[derive(Parser)]
 #[command(name = "endless record", max_term_width = 110)]
 struct FilmArgs {
     /// Environment id; `endless list` lists them.
     #[arg(value_name = "ID")]
     id: String,
-    /// File of the film: .gif (256 colours for each picture), .webp or .png (animated, without loss) or .mp4 (needs ffmpeg).
+    /// File of the film: .gif (256 colours for each picture), .webp or .png (animated, lossless) or .mp4 (needs
+    /// ffmpeg).
     #[arg(long, value_name = "FILE")]
     film: PathBuf,
-    /// Number of episodes, which are shown in order.
+    /// Number of episodes, shown in order.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     episodes: u64,
     /// Number of steps after which an episode is cut off.
@@ -94,7 +95,7 @@ impl FilmArgs {
         Film::played_by(registry, &config, self.policy, self.action_seed.wrapping_add(episode))
     }
 
-    /// Pictures of all episodes.
+    /// Number of pictures of all episodes.
     fn count(&self, registry: &Registry) -> Result<u32, Failure> {
         let mut count: u32 = 0;
         for episode in 0..self.episodes {
@@ -112,12 +113,12 @@ impl FilmArgs {
 /// Records the film, and prints the return and the length of each episode.
 fn film(registry: &Registry, args: &FilmArgs) -> Result<(), Failure> {
     let spec = registry.spec(&args.id)?;
-    // Played twice: the header of the file has the number of pictures.
+    // A PNG's header holds the number of pictures, so the episodes are played twice.
     let pictures = if Format::of(&args.film)? == Format::Png { args.count(registry)? } else { 0 };
     let fps = args.fps.unwrap_or(u16::try_from(spec.render_fps)?);
     let shape = Shape { size: args.view.size(), scale: usize::from(args.scale), fps, pictures };
     let stop = stop::on_signal()?;
-    // The environment first: what is wrong with its options is to be said before a file exists.
+    // Create the environment first, so that invalid options are reported before a file exists.
     let mut next = Some(args.start(registry, 0)?);
     let mut file = FilmFile::create(&args.film, shape)?;
     let mut played = Vec::new();
@@ -129,7 +130,7 @@ fn film(registry: &Registry, args: &FilmArgs) -> Result<(), Failure> {
             }
             let picture = args.view.picture(&mut film)?;
             let is_last = step == args.max_steps || !film.step()?;
-            // An episode's last picture is shown for one second longer.
+            // Show an episode's last picture for one second longer.
             file.add(&picture, if is_last { 1 + fps } else { 1 })?;
             if is_last {
                 break;

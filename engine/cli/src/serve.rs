@@ -15,7 +15,7 @@ use super::options::{EnvironmentArgs, FrameArgs, autoreset_parser, autoreset_val
 use super::output::{grouped, print, print_error};
 use super::stop;
 
-/// The arguments that give a configuration, or their groups.
+/// The arguments, or groups of arguments, that make up a configuration.
 const CONFIGURATION: [&str; 12] = [
     "EnvironmentArgs",
     "FrameArgs",
@@ -42,8 +42,8 @@ pub struct Args {
     /// Serve metrics for Prometheus at http://ADDRESS/metrics, such as 127.0.0.1:9100; port 0 takes any free port.
     #[arg(long, value_name = "ADDRESS")]
     metrics: Option<SocketAddr>,
-    /// Print nothing, and stop when standard input closes or gives a byte: for an engine that is a child process. With the id of the
-    /// parent process, also stop when that process ends.
+    /// For an engine that is a child process: print nothing, and stop when standard input closes or delivers a byte.
+    /// With the id of the parent process, also stop when that process ends.
     #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
     #[expect(clippy::option_option, reason = "clap's form of an option with an optional value")]
     child: Option<Option<u32>>,
@@ -61,10 +61,11 @@ struct EngineArgs {
     /// Threads that step environments; 0 for one per core.
     #[arg(long, default_value_t = 0)]
     threads: usize,
-    /// Groups of environments. Groups are stepped independently, so that the trainer can process one while the engine steps another.
+    /// Groups of environments. They are stepped independently, so that the trainer can process one while the engine
+    /// steps another.
     #[arg(long, default_value_t = 1)]
     groups: usize,
-    /// Name of the engine, to which the trainer connects: 1 to 64 letters, digits, `.`, `_` or `-`.
+    /// Name of the engine, by which trainers find it: 1 to 64 letters, digits, `.`, `_` or `-`.
     #[arg(long, value_name = "NAME", default_value = "endless")]
     service: String,
     #[command(flatten)]
@@ -83,13 +84,13 @@ struct EngineArgs {
     /// Batches of each group that the trainer may hold at a time, 1 to 16.
     #[arg(long, default_value_t = 3)]
     batches_held: usize,
-    /// Save all environments to FILE when the engine stops, and when its trainer asks for it.
+    /// Save all environments to FILE when the engine stops and when its trainer requests it.
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
     /// Also save while the engine runs, at this interval, such as `30s`, `5m` or `1h 30m`.
     #[arg(long, value_name = "DURATION", requires = "checkpoint", value_parser = humantime::parse_duration)]
     every: Option<Duration>,
-    /// Continue from FILE, identically, if it exists. Without this, a FILE that exists is an error.
+    /// Resume from FILE if it exists; the episodes continue identically. Without this, an existing FILE is an error.
     #[arg(long, requires = "checkpoint")]
     resume: bool,
 }
@@ -110,8 +111,8 @@ impl EngineArgs {
     }
 }
 
-/// Reads a configuration from a file, or from standard input for `-`. There, it ends with its last bracket: what follows is for
-/// `--child`.
+/// Reads a configuration from a file, or from standard input for `-`. There, it ends with its last bracket; the rest is
+/// for `--child`.
 fn read(path: &Path) -> Result<EngineConfig, Failure> {
     let config = if path == Path::new("-") {
         EngineConfig::deserialize(&mut serde_json::Deserializer::from_reader(std::io::stdin()))
@@ -124,7 +125,7 @@ fn read(path: &Path) -> Result<EngineConfig, Failure> {
 
 /// Runs `endless serve`, until a signal stops it.
 pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
-    // Before `on_signal`: a signal ends the process while it waits for standard input.
+    // Before `on_signal`, so that a signal still ends a process that waits for standard input.
     let mut config = args.config.as_deref().map_or_else(|| args.engine.configure(), read)?;
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {
@@ -156,7 +157,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     }
     let summary = loop {
         match engine.run(stop) {
-            // The episodes are lost with the connection, but a trainer can reconnect without help.
+            // The episodes are lost, but a trainer can reconnect without user action.
             Err(error @ ServiceError::RootRemoved { .. }) => {
                 print_error(&error);
                 drop(engine);

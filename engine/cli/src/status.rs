@@ -12,13 +12,13 @@ use super::options::seconds;
 use super::output::{clear, grouped, print, print_json, table};
 use super::stop;
 
-/// Time between the two readings from which steps per second are computed, unless `--watch` gives another.
+/// Time between the two readings from which steps per second are computed, unless `--watch` sets it.
 const INTERVAL: Duration = Duration::from_millis(250);
 
 /// Arguments of `endless status`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Name of the engine [default: all that are running].
+    /// Name of the engine [default: all running engines].
     service: Option<String>,
     /// Print JSON [default: text]. With `--watch`, one document for each reading.
     #[arg(long)]
@@ -28,7 +28,7 @@ pub struct Args {
     watch: Option<f64>,
 }
 
-/// The status of an engine at one time, and its steps per second since the reading before.
+/// The status of an engine at one time, and its steps per second since the previous reading.
 struct Reading {
     status: EngineStatus,
     processes: EngineProcesses,
@@ -59,7 +59,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// The status of the engines that were asked for.
+/// The status of the requested engines.
 fn read(args: &Args, namespace: &Namespace) -> Result<Vec<EngineStatus>, Failure> {
     let mut found = EngineStatus::all(namespace);
     let Some(service) = &args.service else { return Ok(found) };
@@ -73,7 +73,7 @@ fn read(args: &Args, namespace: &Namespace) -> Result<Vec<EngineStatus>, Failure
     Ok(found)
 }
 
-/// Reads again, and compares with what was read before.
+/// Reads again, and compares with the previous reading.
 fn readings(
     args: &Args,
     namespace: &Namespace,
@@ -113,7 +113,7 @@ fn show(args: &Args, readings: &[Reading]) -> Result<(), Failure> {
 
 fn as_json(reading: &Reading) -> Result<Json, Failure> {
     let mut value = serde_json::to_value(&reading.status)?;
-    // Not every reader of JSON keeps 64 bits.
+    // As text, since not every JSON reader keeps 64 bits.
     value["incarnation"] = json!(format!("{:016x}", reading.status.incarnation));
     value["env_steps"] = json!(env_steps(&reading.status));
     value["episodes"] = json!(reading.status.total(|group| group.episodes));

@@ -8,29 +8,29 @@ use std::time::{Duration, Instant};
 
 use super::failure::Failure;
 
-/// How often a child process looks whether its parent is running.
+/// How often a child process checks whether its parent is running.
 const PARENT_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The flag of the running command. A process has one set of signal handlers, so all commands of a process share it.
 static STOP: AtomicBool = AtomicBool::new(false);
 
-/// When the first signal came since the flag was cleared.
+/// When the first signal since the flag was cleared came.
 static FIRST_SIGNAL: Mutex<Option<Instant>> = Mutex::new(None);
 
-/// What the process does before a second signal ends it.
+/// Called before a second signal ends the process.
 static BEFORE_EXIT: Mutex<Option<fn()>> = Mutex::new(None);
 
-/// Signals within this time of the first count as one: a terminal that closes sends several.
+/// Signals within this time of the first count as one, since a closing terminal sends several.
 const SAME_SIGNAL: Duration = Duration::from_millis(200);
 
-/// How often a command that waits looks at its flag.
+/// How often a waiting command checks its flag.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Exit status of a process that a second signal ended, as of one that SIGINT killed.
+/// Exit status of a process ended by a second signal, the same as for one killed by SIGINT.
 const INTERRUPTED: i32 = 130;
 
-/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets. Each call clears it. A second signal ends the process at once: what
-/// runs does not look at the flag, or takes too long for the user.
+/// A flag that SIGINT (Ctrl-C), SIGTERM or SIGHUP sets. Each call clears it. A second signal ends the process at once,
+/// in case the command does not check the flag or takes too long.
 pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     // A second call of `set_handler` is an error.
     static HANDLER: OnceLock<Result<(), String>> = OnceLock::new();
@@ -51,7 +51,7 @@ pub fn on_signal() -> Result<&'static AtomicBool, Failure> {
     Ok(&STOP)
 }
 
-/// Has `action` run before a second signal ends the process.
+/// Sets what to do before a second signal ends the process.
 pub fn before_exit(action: fn()) {
     *BEFORE_EXIT.lock().unwrap_or_else(PoisonError::into_inner) = Some(action);
 }
@@ -65,8 +65,9 @@ pub fn wait(stop: &AtomicBool, time: Duration) -> bool {
     stop.load(Ordering::Relaxed)
 }
 
-/// Sets the flag when the parent process asks for it or ends: with a byte on standard input, at its end, or when `parent` is no
-/// longer this process's parent. The end of standard input alone would not do: children that the parent has forked keep it open.
+/// Sets the flag when the parent process requests it or ends: on a byte on standard input, when it closes, or when
+/// `parent` is no longer this process's parent. Standard input alone would not do, since other children that the parent
+/// has forked keep it open.
 pub fn with_parent(stop: &'static AtomicBool, parent: Option<u32>) {
     std::thread::spawn(move || {
         let _ = std::io::stdin().read(&mut [0]);
@@ -87,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_command_of_a_process_starts_with_a_cleared_flag() {
+    fn each_command_starts_with_a_cleared_flag() {
         on_signal().unwrap().store(true, Ordering::Relaxed);
         assert!(!on_signal().unwrap().load(Ordering::Relaxed));
     }

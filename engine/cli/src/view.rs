@@ -1,4 +1,4 @@
-//! `endless view`: a page that shows a running engine, served on this machine; or the same in the terminal.
+//! `endless view`: shows a running engine, on a page served on this machine or in the terminal.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,27 +17,27 @@ const DEFAULT_SERVICE: &str = "endless";
 
 /// Arguments of `endless view`.
 ///
-/// The view is an observer: it does not slow the training. Ctrl-C ends it; in the terminal, Q and Esc do, too.
+/// The view is an observer, so it does not slow the training. Ctrl-C ends it; in the terminal, so do Q and Esc.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Name of the engine, which need not run yet for the page [default: the page lists those that are running; in the terminal
-    /// `endless`].
+    /// Name of the engine; the page can be opened before it starts [default: the page lists the running engines; in the
+    /// terminal, `endless`].
     service: Option<String>,
     #[command(flatten)]
     page: PageArgs,
     #[command(flatten)]
     terminal: terminal::view::TerminalArgs,
-    /// Stop when standard input closes or gives a byte: for a server that is a child process. With the id of the parent process,
-    /// also stop when that process ends.
+    /// For a server that is a child process: stop when standard input closes or delivers a byte. With the id of the
+    /// parent process, also stop when that process ends.
     #[arg(long, value_name = "PARENT", num_args = 0..=1, require_equals = true, hide = true)]
     #[expect(clippy::option_option, reason = "clap's form of an option with an optional value")]
     child: Option<Option<u32>>,
 }
 
-/// Where a page is.
+/// Where to serve a page.
 #[derive(clap::Args)]
 pub struct PageArgs {
-    /// Port on 127.0.0.1; 0 takes any that is free.
+    /// Port on 127.0.0.1; 0 takes any free port.
     #[arg(long, default_value_t = 0, conflicts_with = "terminal")]
     pub port: u16,
     /// Open the page in the browser that the variable BROWSER names, or the desktop [default: print the address].
@@ -61,7 +61,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(server.run(stop)?)
 }
 
-/// Takes the port and prints the address.
+/// Binds the port and prints the address.
 fn announce(service: Option<&str>, port: u16, open: bool) -> Result<ViewServer, Failure> {
     let server = ViewServer::bind(port, Namespace::default(), service)?;
     let url = server.url();
@@ -72,7 +72,7 @@ fn announce(service: Option<&str>, port: u16, open: bool) -> Result<ViewServer, 
     Ok(server)
 }
 
-/// A page that is served in a thread, beside something else. It ends when this is dropped.
+/// A page served in a background thread, until this is dropped.
 pub struct Beside {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -97,7 +97,7 @@ impl Beside {
 impl Drop for Beside {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        // A panic of the thread has been printed.
+        // A panic of the thread has already been printed.
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }

@@ -1,4 +1,4 @@
-//! `endless watch`: what an observer sees of a training, as one line.
+//! `endless watch`: statistics of a training run, from an observer, in one line.
 
 use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,11 +13,11 @@ use super::options::seconds;
 use super::output::{end_line, grouped, print, replace_line};
 use super::stop;
 
-/// Time between two updates of the line in a terminal, and between two lines elsewhere, unless `--interval` gives another.
+/// Seconds between updates of the line in a terminal, and between lines elsewhere, unless `--interval` sets them.
 const LIVE_INTERVAL: f64 = 0.25;
 const LINE_INTERVAL: f64 = 1.0;
 
-/// Longest wait between two looks at the stop flag.
+/// Longest wait between checks of the stop flag.
 const SLICE: Duration = Duration::from_millis(50);
 
 /// Arguments of `endless watch`.
@@ -29,7 +29,7 @@ pub struct Args {
     /// Watch this group only [default: all].
     #[arg(long)]
     group: Option<usize>,
-    /// Seconds between two lines [default: 1; 0.25 for the line that is updated in a terminal].
+    /// Seconds between lines [default: 1; 0.25 between updates of the line in a terminal].
     #[arg(long, value_name = "SECONDS")]
     interval: Option<f64>,
     /// How long to wait for the engine to start, in seconds.
@@ -40,10 +40,10 @@ pub struct Args {
     json: bool,
 }
 
-/// What was observed so far.
+/// Statistics of the batches observed so far.
 pub struct Statistics {
     num_envs: u64,
-    /// Batches of all groups, those that were missed included, without the first of each group.
+    /// Batches of all groups, including missed ones.
     batches: u64,
     missed: u64,
     pub episodes: RecentEpisodes,
@@ -54,7 +54,7 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// Nothing observed yet, of groups with that number of environments.
+    /// Empty statistics, for groups with that number of environments.
     pub fn new(num_envs: usize) -> Self {
         let now = Instant::now();
         Statistics {
@@ -117,7 +117,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// The observers, or `None` if a signal came while the engine was waited for.
+/// The observers, or `None` if a signal came while waiting for the engine.
 pub fn connect(
     service: &str,
     group: Option<usize>,

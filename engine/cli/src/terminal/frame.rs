@@ -1,11 +1,11 @@
-//! The newest frame of an observation, in colours and rows, whatever its format.
+//! Converts the newest frame of an observation from any format to RGB rows.
 
 use endless_gym_core::batch::Frames;
 use endless_gym_core::envs::SCREEN;
 
 use super::picture::Pixels;
 
-/// The newest frame of one environment's observation in that format. Bytes that are missing are black.
+/// The newest frame of one environment's observation in that format. Missing bytes are black.
 pub fn newest(observation: &[u8], frames: Frames) -> Pixels {
     let bytes: usize = frames.format.shape(SCREEN, SCREEN).iter().product();
     let frame = observation.get((frames.stack - 1) * bytes..).unwrap_or_default();

@@ -10,7 +10,7 @@ use super::super::failure::Failure;
 use super::frame::newest;
 use super::picture::Pixels;
 
-/// An episode, of an environment of its own, so that it follows from its seed and the actions.
+/// An episode of a new environment, so that it depends only on its options, its seed and the actions.
 pub struct Game {
     registry: Registry,
     pool: Pool,
@@ -34,7 +34,7 @@ impl Game {
         Ok(Game { registry: registry.clone(), pool, blocks, options, seed })
     }
 
-    /// Starts another episode, with another seed or the same.
+    /// Starts another episode with the same or another seed.
     pub fn restart(&mut self, seed: u64) -> Result<(), Failure> {
         *self = Game::start(&self.registry, self.spec().id, self.options.clone(), seed)?;
         Ok(())
@@ -73,7 +73,7 @@ impl Game {
         format!("{}  seed {}  step {length}  reward {reward:.3}  return {total:.3}", self.spec().id, self.seed)
     }
 
-    /// How far the episode is, and at its end its final infos.
+    /// The progress of the episode, and at its end its final infos.
     pub fn progress(&self) -> Result<String, Failure> {
         let counted = self.pool.progress(0)?.into_iter().map(|progress| match progress.of {
             Some(of) => format!("{} {} of {of}", progress.name, progress.value),
@@ -86,7 +86,7 @@ impl Game {
         Ok(parts.join("  "))
     }
 
-    /// The commands that the agent reads in its vector observation, in the order of its one-hot places; empty if there is none.
+    /// The commands in the vector observation, decoded from its one-hot codes; empty if there are none.
     pub fn commands(&self) -> String {
         const ARROWS: [&str; 9] = ["⊗", "→", "←", "↑", "↓", "↘", "↗", "↙", "↖"];
         let places = self.batch().vector_observation().chunks_exact(ARROWS.len());

@@ -1,8 +1,8 @@
-//! From keys to actions.
+//! Turns keys into actions.
 //!
-//! Most terminals report that a key was pressed, and while it is down that it was pressed again, but not that it was released. A key
-//! acts in at least one step, and on until a short time after it was last reported. Terminals with the kitty keyboard protocol
-//! report releases; there a key acts while it is down.
+//! Most terminals report that a key was pressed, repeatedly while it is down, but not that it was released. A key acts
+//! in at least one step, until a short time after its last report. In terminals with the kitty keyboard protocol, which
+//! reports releases, a key acts while it is down.
 
 use std::time::{Duration, Instant};
 
@@ -20,10 +20,10 @@ pub enum Direction {
 
 use Direction::{Down, Left, Right, Up};
 
-/// What a key stands for.
+/// What a key does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// A movement; several are a diagonal one.
+    /// A movement; two directions make a diagonal.
     Move(&'static [Direction]),
     /// The end of a movement.
     Stop(&'static [Direction]),
@@ -35,7 +35,7 @@ pub enum Command {
     Quit,
 }
 
-/// The help on the keys.
+/// The help for the keys.
 pub const HELP: &str =
     "arrows or W A S D move, Q E Z C diagonally, Space pauses, N one step, R restarts, PgUp/PgDn seed, Esc quits";
 
@@ -82,7 +82,7 @@ pub fn command(event: KeyEvent) -> Option<Command> {
 struct Held {
     direction: Direction,
     pressed: Instant,
-    /// It has acted in a step since it was last reported.
+    /// Whether it has acted in a step since it was last reported.
     has_acted: bool,
     is_released: bool,
 }
@@ -92,17 +92,17 @@ struct Held {
 pub struct Keys {
     hold: Duration,
     held: Vec<Held>,
-    /// The terminal reports releases.
+    /// Whether the terminal reports releases.
     has_releases: bool,
 }
 
 impl Keys {
-    /// `hold` is the time for which a key acts after it was last reported.
+    /// `hold` is how long a key acts after it was last reported.
     pub fn new(hold: Duration) -> Self {
         Keys { hold, held: Vec::new(), has_releases: false }
     }
 
-    /// Directions were pressed at that time. They replace those of earlier steps, unless the terminal says that these are held too.
+    /// Directions were pressed at that time. They replace those of earlier steps, unless the terminal reports releases.
     pub fn press(&mut self, directions: &[Direction], now: Instant) {
         let opposite = |direction| match direction {
             Left => Right,
@@ -120,7 +120,7 @@ impl Keys {
         self.held.extend(directions.iter().map(new));
     }
 
-    /// Directions were released. A key that has not acted yet acts in the next step.
+    /// Directions were released. A key that has not acted yet still acts in the next step.
     pub fn release(&mut self, directions: &[Direction]) {
         self.has_releases = true;
         for held in self.held.iter_mut().filter(|held| directions.contains(&held.direction)) {
@@ -129,7 +129,7 @@ impl Keys {
         self.held.retain(|held| !(held.is_released && held.has_acted));
     }
 
-    /// No key is held.
+    /// Releases all keys.
     pub fn clear(&mut self) {
         self.held.clear();
     }
@@ -147,7 +147,7 @@ impl Keys {
     }
 }
 
-/// The action that moves in these directions. Where only one is possible, the last one counts.
+/// The action that moves in these directions. If only one is possible, the last one counts.
 fn action(spec: &EnvSpec, directions: &[Direction]) -> Vec<i32> {
     let choice = |branch: &endless_gym_core::envs::ActionBranch, direction: &Direction| {
         let names: &[&str] = match direction {
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_acts_once_and_until_it_is_no_longer_reported() {
+    fn a_key_acts_at_least_once_and_while_it_is_reported() {
         let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_direction_replaces_the_old_one_unless_both_come_at_once() {
+    fn a_new_direction_replaces_the_old_one_unless_pressed_in_the_same_step() {
         let (spec, start) = (memory_gym().spec("MortarMayhem-v0").unwrap(), Instant::now());
         let mut keys = Keys::new(HOLD);
         keys.press(&[Left], start);

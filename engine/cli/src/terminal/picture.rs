@@ -14,7 +14,7 @@ pub struct Pixels {
 }
 
 impl Pixels {
-    /// The same picture with another side: magnified, or with averages of the pixels.
+    /// The same picture with another side: magnified, or reduced by averaging pixels.
     pub fn resized(&self, side: usize) -> Pixels {
         let range = |place: usize| place * self.side / side..((place + 1) * self.side).div_ceil(side);
         let average = |place: usize| {
@@ -44,8 +44,8 @@ impl Widget for &Pixels {
     }
 }
 
-/// The largest side of a frame's picture that fits `columns` and `lines`: a multiple of the frame's own, or less. Even, so that
-/// it ends with a whole character; 0 without room.
+/// The largest side of a frame's picture that fits into `columns` and `lines`: a multiple of the frame's side, or less
+/// if that does not fit. It is even, so that the picture ends with a whole character; 0 if there is no room.
 pub fn fitting(columns: u16, lines: u16) -> usize {
     let room = usize::from(columns).min(2 * usize::from(lines));
     if room >= SCREEN { room / SCREEN * SCREEN } else { room & !1 }
@@ -62,7 +62,7 @@ mod tests {
     use super::super::frame::newest;
     use super::*;
 
-    /// A frame of an environment, and its pixels as the original's array has them, indexed \[x\]\[y\].
+    /// A frame of an environment, and its pixels in the original's order, indexed \[x\]\[y\].
     fn frame() -> (Pixels, Vec<[u8; 3]>) {
         let mut pool =
             Pool::new(memory_gym(), &PoolConfig::new("MortarMayhem-v0", 1), &Threads::new(1).unwrap()).unwrap();

@@ -16,10 +16,10 @@ use super::picture::fitting;
 use super::screen::{Screen, check};
 use super::status;
 
-/// Longest wait for a key between two looks at the stop flag.
+/// Longest wait for a key between checks of the stop flag.
 const SLICE: Duration = Duration::from_millis(50);
 
-/// How long a key acts after it was last reported, and the pace up to which a key is one step instead.
+/// How long a key acts after it was last reported, in seconds, and the pace up to which a key is one step instead.
 const HOLD: f64 = 0.15;
 const SLOW_FPS: u32 = 10;
 
@@ -41,7 +41,7 @@ pub struct TerminalArgs {
     hold: Option<f64>,
 }
 
-/// A game and what the keys do with it.
+/// A game that keys control.
 struct Player {
     game: Game,
     keys: Keys,
@@ -93,7 +93,7 @@ impl Player {
     fn step(&mut self, now: Instant) -> Result<(), Failure> {
         let action = self.keys.action(self.game.spec(), now);
         self.game.step(&action)?;
-        // After a pause of the process, the game goes on at its pace.
+        // After a pause of the process, the game does not catch up.
         self.due = (self.due + self.period).max(now);
         Ok(())
     }
@@ -151,7 +151,7 @@ impl Player {
     }
 }
 
-/// Draws the picture in the middle, and the lines below.
+/// Draws the picture in the middle and the lines below it.
 fn draw(frame: &mut Frame<'_>, game: &Game, lines: &[String]) {
     let (above, below) = status::divide(frame.area(), LINES);
     let side = fitting(above.width, above.height);
@@ -217,7 +217,7 @@ mod tests {
         let line = |row: u16| (0..90).map(|column| buffer[(column, row)].symbol()).collect::<String>();
         assert!(line(42).starts_with("MortarMayhemB-Grid-v0  seed 3  step 0  reward 0.000  return 0.000"));
         assert!(line(45).starts_with("arrows or W A S D move"));
-        // Nothing fits, and nothing fails.
+        // Drawing where nothing fits does not fail.
         for (columns, rows) in [(1, 1), (3, 5), (200, 4)] {
             let mut small = Terminal::new(TestBackend::new(columns, rows)).unwrap();
             small.draw(|frame| draw(frame, &player.game, &lines)).unwrap();

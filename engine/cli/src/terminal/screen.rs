@@ -1,4 +1,4 @@
-//! The terminal while a command draws in it. It is left again however the command ends.
+//! The terminal while a command draws in it, restored however the command ends.
 
 use std::io::{IsTerminal, stdin, stdout};
 use std::time::Duration;
@@ -17,7 +17,7 @@ use super::super::stop;
 /// The alternate screen, in raw mode. Dropping it leaves both, and so do a panic and a second signal.
 pub struct Screen(DefaultTerminal);
 
-/// Fails if standard input or standard output is no terminal.
+/// Fails if standard input or standard output is not a terminal.
 pub fn check() -> Result<(), Failure> {
     match (stdin().is_terminal(), stdout().is_terminal()) {
         (true, true) => Ok(()),
@@ -38,13 +38,12 @@ impl Screen {
             leave();
             format!("cannot draw in the terminal: {error}")
         })?;
-        // Terminals that do not know it ignore it; the others report when a key is released.
+        // Asks the terminal to report key releases; terminals without this protocol ignore it.
         let flags = KeyboardEnhancementFlags::DISAMBIGUATE_ESCAPE_CODES | KeyboardEnhancementFlags::REPORT_EVENT_TYPES;
         execute!(stdout(), PushKeyboardEnhancementFlags(flags))?;
         Ok(screen)
     }
 
-    /// Draws.
     pub fn draw(&mut self, draw: impl FnOnce(&mut Frame<'_>)) -> Result<(), Failure> {
         self.0.draw(draw).map(drop).map_err(|error| format!("cannot draw in the terminal: {error}").into())
     }
@@ -62,7 +61,7 @@ impl Drop for Screen {
     }
 }
 
-/// Leaves what [`Screen::enter`] entered. A terminal that no longer exists needs nothing.
+/// Undoes [`Screen::enter`]. Errors mean that the terminal no longer exists.
 fn leave() {
     let _ = execute!(stdout(), PopKeyboardEnhancementFlags);
     let _ = ratatui::try_restore();

@@ -27,7 +27,7 @@ const INTERVAL: Duration = Duration::from_millis(100);
 /// Time over which steps per second are measured.
 const RATE_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Longest wait for a batch before the keys are looked at.
+/// Longest wait for a batch between checks of the keys.
 const SLICE: Duration = Duration::from_millis(20);
 
 /// The smallest side of an environment's picture, unless the terminal is smaller.
@@ -55,14 +55,14 @@ struct Wall {
     frames: Option<Frames>,
     num_envs: usize,
     groups: usize,
-    /// For each group that has been seen its first environments, and when it was last seen.
+    /// By group, when it was last seen and its first environments.
     seen: BTreeMap<usize, (Instant, Vec<Pixels>)>,
-    /// Environments that fit the screen.
+    /// Number of environments that fit on the screen.
     places: usize,
 }
 
 impl Wall {
-    /// Remembers the frames of a batch, not more often than the screen is drawn.
+    /// Stores the frames of a batch, at most as often as the screen is drawn.
     fn add(&mut self, observed: &Observed) {
         let group = observed.lease.group();
         let is_recent = self.seen.get(&group).is_some_and(|(time, _)| time.elapsed() < INTERVAL);
@@ -101,7 +101,8 @@ struct Grid {
 }
 
 impl Grid {
-    /// The largest squares of which that number fits; if there are too many, as many as fit of a size that still shows something.
+    /// The largest squares of which `count` fit; if there are too many, as many squares of the smallest useful size as
+    /// fit.
     fn new(area: Rect, count: usize) -> Self {
         let largest = fitting(area.width, area.height).min(SCREEN);
         let grid = |side: usize| {
@@ -158,7 +159,7 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     if has_ended { print("the engine has ended") } else { Ok(()) }
 }
 
-/// Looks at the keys. Waits for them if nothing else is waited for.
+/// Checks for keys that quit. Waits for them if there is nothing else to wait for.
 fn is_quit(screen: &Screen, is_waiting: bool) -> Result<bool, Failure> {
     let mut timeout = if is_waiting { INTERVAL } else { Duration::ZERO };
     while let Some(event) = screen.event(timeout)? {
@@ -231,12 +232,12 @@ mod tests {
     }
 
     #[test]
-    fn environments_lie_in_rows_by_group_and_number() {
+    fn environments_are_drawn_in_rows_by_group_and_number() {
         let mut wall = wall(2, 3);
         let mut terminal = Terminal::new(TestBackend::new(86, 32)).unwrap();
         terminal.draw(|frame| draw(frame, &mut wall, ["first".to_owned(), "last".to_owned()])).unwrap();
         let buffer = terminal.backend().buffer();
-        // Three columns of 28 with one character between them, and two rows of 14 lines.
+        // Three columns of 28 characters, one apart, and two rows of 14 lines.
         for (number, (group, env)) in [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)].into_iter().enumerate() {
             let (x, y) = (number % 3 * 29, number / 3 * 15);
             for (column, row) in [(x, y), (x + 27, y + 13)] {
