@@ -6,11 +6,11 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Action space of an environment, with the names of Gymnasium's spaces. In JSON it is `{"Discrete": 4}` or
-/// `{"MultiDiscrete": [3, 3]}`.
+/// Action space of an environment, named after Gymnasium's spaces. In JSON it is `{"Discrete": 4}` or `{"MultiDiscrete": [3,
+/// 3]}`.
 ///
-/// An action is one `i32` for each branch, from 0 to below the branch's number of choices. Deserialising refuses spaces without a
-/// branch or with a branch without choices.
+/// An action is one `i32` for each branch, from 0 to less than the branch's number of choices. Deserialising rejects a space
+/// without branches, and a branch without choices.
 ///
 /// ```
 /// use endless_gym_core::envs::ActionSpace;
@@ -45,7 +45,7 @@ impl ActionSpace {
         }
     }
 
-    /// Checks the actions of `num_envs` environments, one row of one number for each branch after the other.
+    /// Checks the actions of `num_envs` environments: for each, a row with one number for each branch.
     ///
     /// # Errors
     ///
@@ -72,7 +72,7 @@ impl fmt::Display for ActionSpace {
     }
 }
 
-/// An action space as it is in JSON.
+/// An action space as in JSON.
 #[derive(Deserialize)]
 #[serde(rename = "ActionSpace")]
 enum ActionSpaceFields {
@@ -96,7 +96,7 @@ impl TryFrom<ActionSpaceFields> for ActionSpace {
     }
 }
 
-/// A description of an action space without a branch, or with a branch without choices.
+/// An action space has no branch, or a branch without choices.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("an action space must have at least one branch, and each at least one choice, got {given}")]
 pub struct InvalidActionSpace {
@@ -104,7 +104,7 @@ pub struct InvalidActionSpace {
     pub given: String,
 }
 
-/// Actions of a wrong number or out of range.
+/// There are too few or too many actions, or one is out of range.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum ActionError {
     /// Too few or too many numbers.
@@ -113,7 +113,7 @@ pub enum ActionError {
         num_envs.saturating_mul(*branches)
     )]
     Count {
-        /// The number of numbers that was given.
+        /// The length that was given.
         given: usize,
         /// Number of environments.
         num_envs: usize,
@@ -123,7 +123,7 @@ pub enum ActionError {
     /// A number is out of its branch's range.
     #[error("the action of environment {env} must be in {space}, got {given:?}")]
     Range {
-        /// Number of the environment, the first one with such an action.
+        /// Number of the first environment with such an action.
         env: usize,
         /// Its action.
         given: Vec<i32>,

@@ -6,7 +6,7 @@ use std::f64::consts::SQRT_2;
 
 use serde::{Deserialize, Serialize};
 
-/// Pixels by which a picture is wider than body and hands.
+/// Pixels by which a picture is wider than the body's diameter plus a hand's radius.
 pub(super) const MARGIN: i32 = 14;
 
 /// Dimensions of the character at one scale, in pixels.
@@ -63,11 +63,11 @@ impl Character {
         (0..360).contains(&self.rotation) && self.rotation % 45 == 0 && near(self.position.0) && near(self.position.1)
     }
 
-    /// Turns in the direction of the action, and returns it as a unit vector; (0, 0) for no movement, which turns
-    /// nothing. Without a branch, since random actions could not be predicted.
+    /// Turns in the direction of the action and returns it as a unit vector; no movement returns (0, 0) and turns nothing.
+    /// Without a branch, since random actions are unpredictable.
     fn turn(&mut self, action: &[i32]) -> [f64; 2] {
         const TOWARDS: [f64; 3] = [0.0, -1.0, 1.0];
-        // By the branches of the action. The first is not used.
+        // Indexed by the branches of the action. The first is not used.
         const ROTATIONS: [[i32; 3]; 3] = [[0, 0, 180], [90, 45, 135], [270, 315, 225]];
         let (x, y) = (action[0] as usize, action[1] as usize);
         let rotation = ROTATIONS[x][y];
@@ -83,8 +83,8 @@ impl Character {
         (x, y)
     }
 
-    /// Moves by `speed` pixels, truncated to whole pixels on each axis, and keeps `radius` pixels away from the edges
-    /// of `bounds`. Where `bounds` is too small for that, the left and top edges take precedence.
+    /// Moves by `speed` pixels, truncated to whole pixels on each axis, and keeps `radius` pixels away from the edges of
+    /// `bounds`. If `bounds` is too small for that, the left and top edges take precedence.
     pub fn step_within(&mut self, action: &[i32], speed: f64, radius: i32, bounds: Bounds) {
         self.step(action, speed);
         let (left, top, right, bottom) = bounds;
@@ -101,7 +101,7 @@ impl Character {
         let half = f64::from(radius) * 0.5;
         let wrap = |at: f64, low: i32, high: i32| {
             let (low, high) = (f64::from(low) - half, f64::from(high) + half);
-            // The second check applies to the result of the first. Rounds half away from zero, as a pygame Rect does.
+            // The second check applies to the result of the first. Rounds half away from zero, like a pygame Rect.
             let at = at.round();
             let at = if at > high { low } else { at };
             if at < low { high } else { at }.round() as i32

@@ -47,12 +47,12 @@ impl CharacterSprites {
         CharacterSprites { size, sprites }
     }
 
-    /// The pictures as they look under a black surface of some `alpha`.
+    /// The pictures as seen through a black surface with the given `alpha`.
     pub fn shaded(&self, alpha: u8) -> Self {
         CharacterSprites { sprites: self.sprites.each_ref().map(|sprite| sprite.shaded(alpha)), ..*self }
     }
 
-    /// The picture of the character, and the position of its top left corner on the screen.
+    /// The picture of the character, and the position of the picture's top left corner on the screen.
     pub fn picture(&self, character: &Character) -> (&Sprite, (i32, i32)) {
         let (x, y) = character.position;
         let corner = self.size.centre();

@@ -1,4 +1,4 @@
-//! What actions mean, for the ids that share it.
+//! The meaning of actions that several ids share.
 
 use super::spec::{ActionBranch, Choice};
 
@@ -6,7 +6,7 @@ const fn choice(name: &'static str, description: &'static str) -> Choice {
     Choice { name, description }
 }
 
-/// Free movement: a branch for each axis. Both together move diagonally, by the same distance.
+/// Free movement, with a branch for each axis. Both together move diagonally, by the same distance.
 pub(super) const MOVE: &[ActionBranch] = &[
     ActionBranch {
         name: "horizontal",

@@ -13,23 +13,23 @@ use super::screen::SCREEN;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
-/// Rules and pictures of one family of environments.
+/// The rules and pictures of one family of environments.
 ///
-/// [`step`](Environment::step) changes the state, [`scene`](Environment::scene) describes what the state looks like,
-/// and [`paint`](Environment::paint) and [`repaint`](Environment::repaint) paint scenes. One object plays many
-/// episodes. As in the original, some of the state is kept from one episode to the next.
+/// [`step`](Environment::step) changes the state, [`scene`](Environment::scene) describes what the state looks like, and
+/// [`paint`](Environment::paint) and [`repaint`](Environment::repaint) draw scenes. One object plays many episodes. As in the
+/// original, some state carries over from one episode to the next.
 pub trait Environment: Send + Sync {
-    /// What distinguishes the ids of the family.
+    /// Distinguishes the ids of the family.
     type Variant: Copy + Send + Sync + 'static;
 
-    /// What all environments with the same reset parameters share: the parameters, and the pictures made from them.
+    /// Shared by all environments with the same reset parameters: the parameters, and the pictures made from them.
     type Assets: Send + Sync;
 
-    /// Everything that changes during play; the part of an environment that a snapshot stores.
+    /// Everything that changes during play, and that a snapshot stores.
     type State: Serialize + DeserializeOwned;
 
-    /// What a frame shows, as a small value. Together with the assets it determines every pixel, so that a comparison
-    /// of two scenes finds what has changed.
+    /// What a frame shows, as a small value. A scene and its assets determine every pixel, so comparing two scenes finds what
+    /// has changed.
     type Scene: Clone + PartialEq + Debug + Send + Sync;
 
     /// Creates the shared assets for one set of reset parameters.
@@ -47,10 +47,10 @@ pub trait Environment: Send + Sync {
     /// The assets of the current episode.
     fn shared(&self) -> &Arc<Self::Assets>;
 
-    /// What the observation shows.
+    /// The scene that the observation shows.
     fn scene(&self) -> Self::Scene;
 
-    /// Paints every pixel of a scene within the canvas' clip, independent of what the canvas showed before.
+    /// Paints every pixel of a scene within the canvas' clip, whatever the canvas showed before.
     fn paint(assets: &Self::Assets, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
     /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ.
@@ -66,17 +66,18 @@ pub trait Environment: Send + Sync {
         Self::paint(self.shared(), &self.scene(), &mut Canvas::new(frame, SCREEN, SCREEN));
     }
 
-    /// Draws the original's ground-truth view on a canvas of the observation's size, before the original scales it up.
-    /// The state changes where the original advances an animation with every view.
+    /// Draws the original's ground-truth view at the observation's size, before the original scales it up. Advances the
+    /// animations that the original advances with every view.
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>);
 
-    /// Sets these animations as if the view had been drawn once after the reset and after each step before this one.
+    /// Sets these animations as if the view had been drawn once after the reset and after each earlier step.
     fn align_ground_truth(&mut self) {}
 
     /// Writes the vector observation; an environment without one writes nothing.
     fn vector_observation(&self, _out: &mut [f32]) {}
 
-    /// Writes what the current frame shows as numbers, in the order of [`EnvSpec::features`](super::EnvSpec::features).
+    /// Writes the feature observation, which describes the current frame, in the order of
+    /// [`EnvSpec::features`](super::EnvSpec::features).
     fn features(&self, out: &mut [f32]);
 
     /// Writes the ground truth; an environment without one writes nothing.
@@ -85,18 +86,18 @@ pub trait Environment: Send + Sync {
     /// The state, for a snapshot.
     fn state(&self) -> &Self::State;
 
-    /// Continues from a state that an environment with these assets was in.
+    /// Restores a state of an environment with these assets.
     ///
     /// # Errors
     ///
-    /// [`InvalidState`] if a number of the state is out of its range. The environment is then unchanged.
+    /// [`InvalidState`] if a number in the state is out of range. The environment is then unchanged.
     fn restore(&mut self, assets: &Arc<Self::Assets>, state: Self::State) -> Result<(), InvalidState>;
 
-    /// Progress of the episode, at any time, for a human viewer.
+    /// Progress of the episode, for a human viewer. Valid at any time.
     fn progress(&self) -> Vec<Progress>;
 
-    /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended
-    /// the episode.
+    /// Writes the final info in the order of [`EnvSpec::info`](super::EnvSpec::info). Valid after the step that ended the
+    /// episode.
     fn info(&self, out: &mut [f64]);
 
     /// A scripted expert, if the family has one.
@@ -108,15 +109,15 @@ pub trait Environment: Send + Sync {
 /// What one step returns in addition to the observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Transition {
-    /// The reward, in the precision of a Python float.
+    /// The reward, with the precision of a Python float.
     pub reward: f64,
-    /// Whether the task ended the episode. Memory Gym reports every end so, also that by the step limit.
+    /// Whether the task ended the episode. Memory Gym reports every end this way, even one by the step limit.
     pub terminated: bool,
-    /// Whether something outside of the task ended the episode, such as a limit of steps.
+    /// Whether something outside the task ended the episode, such as a step limit.
     pub truncated: bool,
 }
 
-/// A state with a number that is out of its range.
+/// The state has a number that is out of range.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
 #[error("the state has a number that is out of its range")]
 pub struct InvalidState;

@@ -1,14 +1,14 @@
-//! The interface of the scripted experts, and what they share.
+//! The interface of the scripted experts, and their shared helpers.
 
 /// Plays an environment from its feature and vector observations, and remembers what an agent would need to remember.
 pub trait Expert: Send {
     /// Resets the expert's memory.
     fn reset(&mut self);
 
-    /// Chooses an action. The caller must call it once for each observation, including the first of an episode.
+    /// Chooses an action. Must be called once for each observation, including the first of an episode.
     ///
-    /// `features` and `vector_observation` are as the environment writes them; `action` has one number for each branch
-    /// of the action space.
+    /// `features` and `vector_observation` are those that the environment writes; `action` has one number for each branch of
+    /// the action space.
     fn act(&mut self, features: &[f32], vector_observation: &[f32], action: &mut [i32]);
 }
 
@@ -18,7 +18,7 @@ const LEFT: i32 = 1;
 const RIGHT: i32 = 2;
 const AHEAD: i32 = 3;
 
-/// The grid action for a movement by `(x, y)` cells of an agent with that heading, a unit vector: horizontally first.
+/// The grid action that moves an agent with that heading, a unit vector, by `(x, y)` cells, horizontally first.
 pub fn turn_or_walk([heading_x, heading_y]: [f32; 2], (x, y): (i32, i32)) -> i32 {
     let (wanted_x, wanted_y) = match (x, y) {
         (0, 0) => return NOTHING,

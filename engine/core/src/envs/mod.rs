@@ -1,4 +1,4 @@
-//! The environments: the trait that each family implements, their specifications, and the reset parameters.
+//! The environments: the trait that every family implements, specifications, and reset parameters.
 
 mod action_space;
 mod character;

@@ -1,10 +1,10 @@
-//! Reset parameters: the original's names and defaults, and the validation of given values.
+//! Reset parameters: their names and defaults, which are the original's, and the validation of given values.
 
 use serde::Serialize;
 use serde_json::{Map, Value as Json};
 use thiserror::Error;
 
-/// Largest number of values in a list.
+/// Maximum number of values in a list.
 const MAX_LIST: usize = 4096;
 
 /// Type, default and limits of a reset parameter.
@@ -113,7 +113,7 @@ impl Parameter {
         }
     }
 
-    /// What a valid value is, for error messages: [`allowed`](Self::allowed) with an article.
+    /// A description of valid values for error messages: [`allowed`](Self::allowed) with an article.
     fn requirement(&self) -> String {
         let article = match self.kind {
             ParameterKind::Bool { .. } => "",
@@ -170,7 +170,7 @@ enum Value {
     IntList(Vec<i64>),
 }
 
-/// A complete and valid set of reset parameters: the given values, and the defaults of all others.
+/// A complete and valid set of reset parameters: the given values, and defaults for all others.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResetParameters {
     values: Vec<(&'static str, Value)>,
@@ -181,7 +181,7 @@ impl ResetParameters {
     ///
     /// # Errors
     ///
-    /// If a name is unknown, or a value has another type or is out of range.
+    /// If a name is unknown, or a value has the wrong type or is out of range.
     pub fn new(
         id: &'static str,
         parameters: &'static [Parameter],
@@ -226,7 +226,7 @@ impl ResetParameters {
 /// An invalid reset parameter.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum ParameterError {
-    /// The environment has no reset parameter of that name.
+    /// The environment has no reset parameter with this name.
     #[error("{id} has no reset parameter `{name}`; it has {allowed}")]
     Unknown {
         /// The environment's id.
@@ -236,7 +236,7 @@ pub enum ParameterError {
         /// The environment's reset parameters, separated by commas.
         allowed: String,
     },
-    /// The value has another type than the parameter.
+    /// The value has the wrong type.
     #[error("reset parameter `{name}` must be {allowed}, got {value}")]
     WrongType {
         /// The parameter's name.
@@ -246,7 +246,7 @@ pub enum ParameterError {
         /// Allowed type and range as text.
         allowed: String,
     },
-    /// The value has the parameter's type and is out of its range.
+    /// The value has the right type but is out of range.
     #[error("reset parameter `{name}` must be {allowed}, got {value}")]
     OutOfRange {
         /// The parameter's name.

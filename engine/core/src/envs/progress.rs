@@ -5,7 +5,7 @@ use serde::Serialize;
 /// One number that changes during an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Progress {
-    /// What is counted, in the plural.
+    /// Name of what is counted, in the plural.
     pub name: &'static str,
     /// The current number.
     pub value: f64,

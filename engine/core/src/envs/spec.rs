@@ -1,4 +1,4 @@
-//! What is fixed about an environment id: spaces, reset parameters, info columns.
+//! The specification of an environment id: spaces, reset parameters, info columns.
 
 use serde::Serialize;
 use thiserror::Error;
@@ -11,7 +11,7 @@ use super::parameters::Parameter;
 pub struct ActionBranch {
     /// Name, unique within the environment.
     pub name: &'static str,
-    /// What each number means, from 0 on.
+    /// The meaning of each number, from 0 on.
     pub choices: &'static [Choice],
 }
 
@@ -38,7 +38,7 @@ pub struct Column {
 pub struct InfoColumn {
     /// The original's key in the final info.
     pub name: &'static str,
-    /// Whether the original's number is a Python int; otherwise it is a float.
+    /// Whether the original's value is a Python int; otherwise it is a float.
     pub is_integer: bool,
     /// Meaning and unit.
     pub description: &'static str,
@@ -53,11 +53,11 @@ pub struct EnvSpec {
     pub summary: &'static str,
     /// The original's action space.
     pub action_space: ActionSpace,
-    /// What the numbers of an action mean, in the order of its branches.
+    /// The meaning of an action's numbers, in the order of its branches.
     pub actions: &'static [ActionBranch],
-    /// Numbers in the vector observation (float32 in 0..=1), 0 if there is none.
+    /// Length of the vector observation (float32 in 0..=1); 0 if there is none.
     pub vector_observation: usize,
-    /// Columns of the ground truth (float64 in 0..=1), none if there is none.
+    /// Columns of the ground truth (float64 in 0..=1); empty if there is none.
     pub ground_truth: &'static [Column],
     /// Whether the ground truth of a single environment has an integer dtype in the original.
     pub ground_truth_is_integer: bool,
@@ -72,7 +72,7 @@ pub struct EnvSpec {
 }
 
 impl EnvSpec {
-    /// An id without reset parameters, infos and features, at 25 frames per second. The agent's task, `summary`, takes one line.
+    /// An id without reset parameters, infos and features, at 25 frames per second. `summary` is the agent's task in one line.
     pub const fn new(id: &'static str, summary: &'static str, action_space: ActionSpace) -> Self {
         EnvSpec {
             id,
@@ -90,7 +90,7 @@ impl EnvSpec {
     }
 }
 
-/// An id that a registry does not have.
+/// The registry does not have this id.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("no environment `{id}`; there are {known}")]
 pub struct UnknownEnvironment {

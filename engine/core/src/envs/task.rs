@@ -1,4 +1,4 @@
-//! The small trait for an environment of one's own.
+//! The small trait for custom environments.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -12,13 +12,13 @@ use super::spec::EnvSpec;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
-/// The rules of one id, and what they show: all that an environment needs in order to run in a pool or an engine.
+/// The rules and the look of one id: all that an environment needs in order to run in a pool or an engine.
 ///
-/// A value is the state of one environment: what a snapshot stores, and what [`paint`](Task::paint) shows. One value plays many
-/// episodes; [`Default`] makes it, and [`reset`](Task::reset) comes before every other call. Everything random comes from the given
-/// generator, so that an episode follows from its seed, its reset parameters and the actions.
+/// A value is the state of one environment, which a snapshot stores and [`paint`](Task::paint) draws. One value plays many
+/// episodes: [`Default`] creates it, and [`reset`](Task::reset) comes before every other call. Draw all random numbers from the
+/// given generator, so that seed, reset parameters and actions determine an episode.
 ///
-/// A family that shares rules among ids, keeps pictures, or repaints only what changed implements [`Environment`] instead.
+/// Implement [`Environment`] instead to share rules among several ids, to keep pictures, or to repaint only what changed.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
@@ -73,10 +73,10 @@ use crate::raster::Canvas;
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwned + Send + Sync + 'static {
-    /// Reset parameters as typed values, which the environments that were given the same ones share.
+    /// Reset parameters as typed values, shared by the environments that were given the same ones.
     type Parameters: Send + Sync;
 
-    /// Id, spaces, tables of reset parameters, features and infos.
+    /// Id, spaces, reset parameters, features and infos.
     fn spec() -> EnvSpec;
 
     /// The typed reset parameters. `given` is complete, and every value is within its limits.
@@ -105,13 +105,13 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
         Vec::new()
     }
 
-    /// Whether a restored state is one that the rules can reach, so that no later call panics. A snapshot may be forged.
+    /// Whether the rules can reach a restored state, so that no later call panics. A snapshot may be forged.
     fn is_valid(&self, _parameters: &Self::Parameters) -> bool {
         true
     }
 }
 
-/// A [`Task`] as an [`Environment`]: its scene is its state, and a frame is painted anew when the state has changed.
+/// A [`Task`] as an [`Environment`]: its scene is its state, and a frame is painted in full whenever the state has changed.
 #[derive(Clone, Debug)]
 pub struct TaskEnv<T: Task> {
     parameters: Arc<T::Parameters>,

@@ -2,10 +2,10 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// Largest difference in radians between an angle and a quarter turn that counts as one.
+/// Maximum difference in radians from a quarter turn for an angle to count as one.
 const EPSILON: f64 = 1e-6;
 
-/// `vector.rotate(degrees)`: exact for quarter turns, by sine and cosine for all other angles.
+/// `vector.rotate(degrees)`: exact for quarter turns, with sine and cosine for all other angles.
 pub fn rotate([x, y]: [f64; 2], degrees: f64) -> [f64; 2] {
     let angle = (degrees * PI / 180.0).rem_euclid(TAU);
     if (angle + EPSILON) % FRAC_PI_2 < 2.0 * EPSILON {
@@ -42,7 +42,7 @@ mod tests {
         assert_eq!(distance([1.0, 2.0], [4.0, -2.0]), 5.0);
     }
 
-    /// Values that pygame 2.4 printed.
+    /// Values printed by pygame 2.4.
     #[test]
     fn rotations_equal_pygames() {
         for (degrees, expected) in [

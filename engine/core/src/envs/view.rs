@@ -1,6 +1,6 @@
 //! The pictures that the original's `render` returns.
 //!
-//! They are indexed \[row\]\[column\]\[channel\], as in image libraries, while observations are indexed
+//! They are indexed \[row\]\[column\]\[channel\], as in image libraries, whereas observations are indexed
 //! \[x\]\[y\]\[channel\].
 
 use super::environment::Environment;

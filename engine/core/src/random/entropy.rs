@@ -2,10 +2,10 @@
 
 use thiserror::Error;
 
-/// 128 bits of the operating system's entropy, what numpy draws for `SeedSequence()`.
+/// 128 bits of the operating system's entropy, as numpy draws for `SeedSequence()`.
 ///
-/// The bits are read from the system on every call: a process-wide generator would repeat its output in the child of a fork,
-/// which is how Python starts parallel environments.
+/// Every call reads from the system: a process-wide generator would repeat its output in the child of a fork, which is how
+/// Python starts parallel environments.
 ///
 /// # Errors
 ///
@@ -22,7 +22,7 @@ pub fn entropy() -> Result<u128, EntropyError> {
     Err(EntropyError("this build has no source of entropy (feature `entropy`)".to_owned()))
 }
 
-/// An unseeded generator needs entropy, and there is none.
+/// An unseeded generator needs entropy, and none is available.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("cannot draw a seed: {0}; pass a seed")]
 pub struct EntropyError(String);

@@ -1,4 +1,4 @@
-//! numpy's `Generator`: the methods that the environments use.
+//! The methods of numpy's `Generator` that the environments use.
 
 use std::fmt;
 
@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 use super::entropy::{EntropyError, entropy};
 use super::seed_sequence::SeedSequence;
 
-/// Maximum number of draws that rejection sampling repeats, after which it takes a biased one. numpy has no such limit. Less than
-/// half of the draws are rejected, so that no seed reaches it; a state from outside could.
+/// Maximum number of redraws in rejection sampling, after which it takes a biased draw. numpy has no such limit. Fewer than
+/// half of the draws are rejected, so no seed reaches it, but a deserialised state could.
 const MAX_REDRAWS: u32 = 1024;
 
 /// `numpy.random.Generator(PCG64(seed))`: the same draws from the same seed.
@@ -31,10 +31,10 @@ const MAX_REDRAWS: u32 = 1024;
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "UncheckedGenerator")]
 pub struct Generator {
-    /// The bit generator, 64 bits a step.
+    /// The bit generator, with 64 bits per step.
     bits: Pcg64,
-    /// The high half of a step whose low half was used by a 32-bit draw. The next 32-bit draw uses
-    /// it, regardless of 64-bit draws in between. numpy's `has_uint32` and `uinteger`.
+    /// The high half of a step whose low half was used by a 32-bit draw. The next 32-bit draw uses it, regardless of 64-bit
+    /// draws in between. numpy's `has_uint32` and `uinteger`.
     kept: Option<u32>,
 }
 
@@ -51,46 +51,46 @@ impl Generator {
         Self { bits: Pcg64::new(join(state_high, state_low), join(stream_high, stream_low)), kept: None }
     }
 
-    /// An unseeded generator, `Generator(PCG64())`: from 128 bits of the operating system's
-    /// [`entropy`], as Gymnasium takes for a reset without a seed.
+    /// An unseeded generator, `Generator(PCG64())`, from 128 bits of the operating system's [`entropy`], as in Gymnasium for a
+    /// reset without a seed.
     ///
     /// # Errors
     ///
-    /// If there is no entropy; see [`entropy`].
+    /// If no entropy is available; see [`entropy`].
     pub fn from_entropy() -> Result<Self, EntropyError> {
         Ok(Self::from_seed_sequence(&SeedSequence::from_u128(entropy()?)))
     }
 
-    /// `integers(low, high)`: a uniform whole number of `low..high`, by numpy's `int64` path.
-    /// numpy truncates float arguments towards zero.
+    /// `integers(low, high)`: a uniform integer in `low..high`, by numpy's `int64` path. numpy truncates float arguments
+    /// towards zero.
     ///
-    /// A range of one number returns that number and draws nothing. An empty range, for which numpy
-    /// raises an error, returns `low` and draws nothing.
+    /// A range of one number returns that number and draws nothing. An empty range, for which numpy raises an error, returns
+    /// `low` and draws nothing.
     #[inline]
     pub fn integers(&mut self, low: i64, high: i64) -> i64 {
         if low.saturating_add(1) >= high {
             return low;
         }
-        // How many numbers there are: 2 to 2⁶⁴ - 1, exact in spite of the wrapping.
+        // The size of the range: 2 to 2⁶⁴ - 1, exact despite the wrapping.
         let count = high.wrapping_sub(low) as u64;
         low.wrapping_add_unsigned(self.below(count))
     }
 
-    /// `integers(low, high, size)`: fills `values`. The draws are those of as many calls of
-    /// [`integers`](Self::integers), as in numpy.
+    /// `integers(low, high, size)`: fills `values`, with the same draws as that many calls of [`integers`](Self::integers), as
+    /// in numpy.
     #[inline]
     pub fn fill_integers(&mut self, low: i64, high: i64, values: &mut [i64]) {
         values.fill_with(|| self.integers(low, high));
     }
 
-    /// `choice(items)`: one of the items, with equal probabilities. A single item draws nothing.
+    /// `choice(items)`: one of the items, with equal probabilities. Draws nothing for a single item.
     ///
     /// # Panics
     ///
     /// If `items` is empty, for which numpy raises an error.
     #[inline]
     pub fn choice<'a, T>(&mut self, items: &'a [T]) -> &'a T {
-        // A slice of items that have a size holds at most i64::MAX of them.
+        // A slice of sized items holds at most i64::MAX of them.
         &items[self.integers(0, items.len() as i64) as usize]
     }
 
@@ -101,15 +101,14 @@ impl Generator {
         (self.bits.next_u64() >> 11) as f64 * STEP
     }
 
-    /// `uniform(low, high)`: `low + (high - low) * random()`, rounded after each operation as in
-    /// numpy, so in `[low, high)` up to rounding. `high - low` must be finite and not negative, or
-    /// the result is meaningless; numpy raises an error.
+    /// `uniform(low, high)`: `low + (high - low) * random()`, rounded after each operation as in numpy, so in `[low, high)` up
+    /// to rounding. `high - low` must be finite and not negative, or the result is meaningless; numpy raises an error.
     #[inline]
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.random()
     }
 
-    /// A uniform number of `0..count`, for a count of 2 or more, from as many bits as numpy uses.
+    /// A uniform number in `0..count`, for a count of 2 or more, from as many bits as numpy uses.
     #[inline]
     fn below(&mut self, count: u64) -> u64 {
         const WORDS: u64 = 1 << 32;
@@ -122,8 +121,8 @@ impl Generator {
         }
     }
 
-    /// Lemire's method on 32-bit draws: the high half of `count * draw` is the result, and the low
-    /// half identifies the few draws that would bias the result and are repeated.
+    /// Lemire's method on 32-bit draws: the high half of `count * draw` is the result, and the low half identifies the few
+    /// draws that would bias it and are repeated.
     ///
     /// Daniel Lemire, "Fast Random Integer Generation in an Interval",
     /// ACM Transactions on Modeling and Computer Simulation 29 (1), 2019.
@@ -170,7 +169,7 @@ impl Generator {
     }
 }
 
-/// A deserialised generator before the check of its increment.
+/// A deserialised generator whose increment has not been checked.
 #[derive(Deserialize)]
 struct UncheckedGenerator {
     bits: Pcg64,
@@ -180,8 +179,8 @@ struct UncheckedGenerator {
 impl TryFrom<UncheckedGenerator> for Generator {
     type Error = &'static str;
 
-    /// Refuses an even increment. It shortens the period, down to a generator that only returns zeros, on which the rejection
-    /// sampling of [`Generator::integers`] does not end.
+    /// Rejects an even increment. It shortens the period; at worst the generator only returns zeros, and the rejection sampling
+    /// of [`Generator::integers`] would not end.
     fn try_from(unchecked: UncheckedGenerator) -> Result<Self, Self::Error> {
         let UncheckedGenerator { bits, kept } = unchecked;
         // `from_state` makes the increment odd.
@@ -192,7 +191,7 @@ impl TryFrom<UncheckedGenerator> for Generator {
     }
 }
 
-/// Shows the whole state, which `rand_pcg` keeps out of its own `Debug`.
+/// Shows the whole state, which the `Debug` of `rand_pcg` omits.
 impl fmt::Debug for Generator {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter
@@ -210,7 +209,7 @@ mod tests {
 
     #[test]
     fn rejection_sampling_ends_on_any_state() {
-        // With an even increment, which `from_state` and deserialising do not let through, all draws are 0 and rejected.
+        // With an even increment, which `from_state` and deserialising prevent, all draws are 0 and rejected.
         let stuck: Pcg64 = serde_json::from_str(r#"{"state":0,"increment":0}"#).unwrap();
         for high in [49, 1 << 33, i64::MAX - 1] {
             let mut generator = Generator { bits: stuck.clone(), kept: None };

@@ -1,12 +1,12 @@
-//! numpy's random numbers, bit for bit: [`SeedSequence`] and [`Generator`] over PCG64.
+//! numpy's random numbers, bit-exact: [`SeedSequence`] and [`Generator`] over PCG64.
 //!
-//! The original environments use `numpy.random.Generator(PCG64(SeedSequence(seed)))`, the generator
-//! of Gymnasium's `np_random(seed)`. The same seed must give the same episodes here, so the draws
-//! equal those of numpy 1.26 and 2.x, which agree, including the number of bits that each consumes.
+//! The original environments use `numpy.random.Generator(PCG64(SeedSequence(seed)))`, the generator of Gymnasium's
+//! `np_random(seed)`. The same seed must give the same episodes here, so the draws, and the number of bits that each consumes,
+//! equal those of numpy 1.26 and 2.x, which agree.
 //!
 //! # Stability
 //!
-//! [`Generator`] and [`EntropyError`] are part of the crate's interface. All else is public for the benchmarks and for
+//! [`Generator`] and [`EntropyError`] are part of the crate's interface. Everything else is public for the benchmarks and for
 //! [`Environment`](crate::envs::Environment), and may change in any version.
 
 mod entropy;
@@ -46,7 +46,7 @@ mod tests {
         draws: Vec<Draw>,
     }
 
-    /// Arguments, then what was drawn; floats as their bits.
+    /// Arguments, then the drawn values; floats as their bits.
     #[derive(Deserialize)]
     #[serde(rename_all = "lowercase")]
     enum Draw {

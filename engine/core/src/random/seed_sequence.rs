@@ -1,13 +1,13 @@
-//! numpy's seeding: entropy of any size is mixed into a small pool, from which initial states are derived.
+//! numpy's seeding: mixes entropy of any size into a small pool, and derives initial states from it.
 
 use std::array;
 
 /// Number of 32-bit words in the pool, numpy's default.
 const POOL_SIZE: usize = 4;
 
-/// The hash of words that are mixed into the pool.
+/// The hash for words that are mixed into the pool.
 const ABSORB: Hash = Hash { constant: 0x43b0_d7e5, step: 0x931e_8875 };
-/// The hash of words that are generated from the pool.
+/// The hash for words that are generated from the pool.
 const GENERATE: Hash = Hash { constant: 0x8b51_f9dd, step: 0x58f3_8ded };
 /// Weights of the two words that are mixed into one.
 const MIX_LEFT: u32 = 0xca01_f9dd;
@@ -41,16 +41,14 @@ impl SeedSequence {
         Self::from_u128(entropy.into())
     }
 
-    /// `SeedSequence(entropy)` for up to 128 bits, the size that numpy draws from the operating
-    /// system when no seed is given.
+    /// `SeedSequence(entropy)` for up to 128 bits, the size that numpy draws from the operating system when no seed is given.
     pub fn from_u128(entropy: u128) -> Self {
         // Leading zero words make no difference: numpy pads with zeros up to the pool's size.
         Self::from_words(&array::from_fn::<_, POOL_SIZE, _>(|index| (entropy >> (32 * index)) as u32))
     }
 
-    /// `SeedSequence(entropy)` for entropy of any size, given as its 32-bit words, least
-    /// significant first. It equals numpy's for a list of such words as well, and an empty slice
-    /// is equivalent to 0.
+    /// `SeedSequence(entropy)` for entropy of any size, given as its 32-bit words, least significant first. Equals numpy's for
+    /// a list of such words as well. An empty slice is equivalent to 0.
     pub fn from_words(entropy: &[u32]) -> Self {
         let mut hash = ABSORB;
         let mut pool: [u32; POOL_SIZE] = array::from_fn(|index| hash.next(entropy.get(index).copied().unwrap_or(0)));
@@ -63,18 +61,18 @@ impl SeedSequence {
         Self { pool, hash }.absorb(rest)
     }
 
-    /// `SeedSequence(entropy, spawn_key=key)`: an independent sequence for each key of the same
-    /// entropy. On a sequence that has a key already the new one is appended, as numpy's `spawn`
-    /// does. numpy splits a key above 2³² - 1 into two words, least significant first.
+    /// `SeedSequence(entropy, spawn_key=key)`: an independent sequence for each key of the same entropy. If the sequence
+    /// already has a key, the new one is appended, as in numpy's `spawn`. numpy splits a key above 2³² - 1 into two words,
+    /// least significant first.
     #[must_use]
     pub fn with_spawn_key(self, key: &[u32]) -> Self {
-        // numpy pads short entropy to the pool's size before it appends the key, so a key is always
-        // absorbed after the pool was filled.
+        // numpy pads short entropy to the pool's size before it appends the key, so a key is always absorbed after the pool has
+        // been filled.
         self.absorb(key)
     }
 
-    /// `generate_state(N, numpy.uint32)`. The sequence does not change: every call returns the same
-    /// words, and those of a smaller `N` are a prefix of those of a larger.
+    /// `generate_state(N, numpy.uint32)`. The sequence does not change: every call returns the same words, and the words of a
+    /// smaller `N` are a prefix of those of a larger one.
     pub fn generate_state_u32<const N: usize>(&self) -> [u32; N] {
         let mut hash = GENERATE;
         array::from_fn(|index| hash.next(self.pool[index % POOL_SIZE]))

@@ -1,11 +1,11 @@
-//! Painting one surface onto another: copied, with a colour key, and translucent.
+//! Painting one surface onto another: opaque, with a colour key, or translucent.
 
 use super::canvas::Canvas;
 use super::runs::{Rgb, clip};
 use super::surface::Surface;
 
-/// Blends a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26
-/// does: the change is `1/255` of the difference per unit of `alpha`, truncated towards zero.
+/// Blends a channel of a colour-keyed translucent surface into the channel below it, as SDL 2.26 does: the change is `1/255` of
+/// the difference per unit of `alpha`, truncated towards zero.
 #[inline]
 pub const fn blend_keyed(source: u8, below: u8, alpha: u8) -> u8 {
     let weighted = source.abs_diff(below) as u16 * alpha as u16;
@@ -14,9 +14,8 @@ pub const fn blend_keyed(source: u8, below: u8, alpha: u8) -> u8 {
     if source >= below { below + change } else { below - change }
 }
 
-/// Blends a channel of a translucent surface without a colour key into the channel below it, as SDL
-/// 2.26 does: the change is `1/256` of the difference per unit of `alpha`, rounded down, but an
-/// `alpha` of 255 is opaque.
+/// Blends a channel of a translucent surface without a colour key into the channel below it, as SDL 2.26 does: the change is
+/// `1/256` of the difference per unit of `alpha`, rounded down, but an `alpha` of 255 is opaque.
 #[inline]
 const fn blend_plain(source: u8, below: u8, alpha: u8) -> u8 {
     if alpha == 255 {
@@ -63,8 +62,8 @@ impl Blending {
 }
 
 impl Canvas<'_> {
-    /// Paints `source` with its top left corner at `(x, y)`, as `pygame.Surface.blit` does: without
-    /// the pixels of its colour key, and blended by its alpha.
+    /// Paints `source` with its top left corner at `(x, y)`, as `pygame.Surface.blit` does: without the pixels of its colour
+    /// key, and blended by its alpha.
     pub fn blit(&mut self, source: &Surface, x: i32, y: i32) {
         let (x, y) = (i64::from(x), i64::from(y));
         let columns = clip(x, x + source.width() as i64 - 1, &self.columns());
@@ -88,7 +87,7 @@ impl Canvas<'_> {
 /// The parts of a run between the pixels of the colour key, each with the index of its first pixel.
 pub(super) fn opaque_runs(run: &[Rgb], key: Option<Rgb>) -> impl Iterator<Item = (usize, &[Rgb])> {
     let mut next = 0;
-    // Without a key, nothing has to be compared.
+    // Without a key, nothing needs to be compared.
     let is_same = move |a: &Rgb, b: &Rgb| key.is_none_or(|key| (*a == key) == (*b == key));
     run.chunk_by(is_same).filter_map(move |part| {
         let first = next;

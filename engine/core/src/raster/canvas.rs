@@ -1,4 +1,4 @@
-//! Borrowed pixels to draw on, and the blocks and rows that all shapes are made of.
+//! Borrowed pixels to draw on, and the blocks and rows that make up all shapes.
 
 use std::ops::Range;
 
@@ -7,8 +7,8 @@ use super::runs::{Rgb, clip, copy_run, fill_run};
 
 /// Borrowed pixels with a width and a height: the target of all drawing.
 ///
-/// Drawing is clipped to the canvas, so any coordinate is allowed. On a [`clipped`](Canvas::clipped) canvas only the pixels of a
-/// rectangle change, which repaints a part of a picture.
+/// Drawing is clipped to the canvas, so any coordinate is allowed. On a [`clipped`](Canvas::clipped) canvas only the pixels of
+/// a rectangle change, so that part of a picture can be repainted.
 #[derive(Debug)]
 pub struct Canvas<'a> {
     pixels: &'a mut [u8],
@@ -17,12 +17,12 @@ pub struct Canvas<'a> {
     /// The pixels that may change.
     columns: Range<usize>,
     rows: Range<usize>,
-    /// For each column a bit for each row, set where a pixel was painted. `None` without dirty tracking.
+    /// For each column, a mask with a bit for each row, set when the pixel is painted. `None` without dirty tracking.
     dirty: Option<&'a mut [u128]>,
 }
 
 impl<'a> Canvas<'a> {
-    /// A canvas of `width` by `height` pixels over `pixels`, column by column, 3 bytes a pixel.
+    /// A canvas of `width` by `height` pixels over `pixels`, column by column, 3 bytes per pixel.
     ///
     /// # Panics
     ///
@@ -34,7 +34,8 @@ impl<'a> Canvas<'a> {
         Self { pixels, width, height, columns: 0..width, rows: 0..height, dirty: None }
     }
 
-    /// The same canvas with dirty tracking: painted pixels are marked in `dirty`, which has for each column a bit for each row.
+    /// The same canvas with dirty tracking: painted pixels are marked in `dirty`, which has a mask for each column with a bit
+    /// for each row.
     ///
     /// # Panics
     ///
@@ -50,11 +51,11 @@ impl<'a> Canvas<'a> {
         self.dirty.is_some()
     }
 
-    /// Marks some rows of some columns as dirty. Nothing happens without dirty tracking.
+    /// Marks some rows of some columns as dirty. Does nothing without dirty tracking.
     ///
     /// # Panics
     ///
-    /// With dirty tracking, if a column or row lies beyond the canvas.
+    /// With dirty tracking, if a column or row is out of range.
     #[inline]
     pub fn mark_dirty(&mut self, columns: Range<usize>, rows: &Range<usize>) {
         if let Some(dirty) = &mut self.dirty {
@@ -62,7 +63,7 @@ impl<'a> Canvas<'a> {
         }
     }
 
-    /// The same canvas, of which only the pixels in `rect` may change.
+    /// The same canvas, with changes restricted to `rect`.
     #[inline]
     pub fn clipped(&mut self, rect: Rect) -> Canvas<'_> {
         let columns = clip(rect.x.into(), i64::from(rect.x) + i64::from(rect.width) - 1, &self.columns);
@@ -95,20 +96,20 @@ impl<'a> Canvas<'a> {
         self.height
     }
 
-    /// All bytes, column by column, 3 a pixel.
+    /// All bytes, column by column, 3 per pixel.
     #[inline]
     pub fn pixels(&self) -> &[u8] {
         self.pixels
     }
 
-    /// All bytes, for painting. The caller must stay within [`columns`](Canvas::columns) and [`rows`](Canvas::rows), and
+    /// All bytes, mutably. The caller must stay within [`columns`](Canvas::columns) and [`rows`](Canvas::rows), and
     /// [mark](Canvas::mark_dirty) the pixels that it paints.
     #[inline]
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         self.pixels
     }
 
-    /// Some rows of a column, which are marked as dirty. The caller must stay within [`columns`](Canvas::columns) and
+    /// Some rows of a column, marked as dirty. The caller must stay within [`columns`](Canvas::columns) and
     /// [`rows`](Canvas::rows).
     #[inline]
     pub fn run_mut(&mut self, x: usize, rows: Range<usize>) -> &mut [u8] {
@@ -117,15 +118,14 @@ impl<'a> Canvas<'a> {
         &mut self.pixels[(column + rows.start) * 3..(column + rows.end) * 3]
     }
 
-    /// One pixel, which is marked as dirty. The caller must stay within [`columns`](Canvas::columns) and
-    /// [`rows`](Canvas::rows).
+    /// One pixel, marked as dirty. The caller must stay within [`columns`](Canvas::columns) and [`rows`](Canvas::rows).
     #[inline]
     pub fn pixel_mut(&mut self, x: usize, y: usize) -> &mut Rgb {
         self.mark_dirty(x..x + 1, &(y..y + 1));
         &mut self.pixels.as_chunks_mut::<3>().0[x * self.height + y]
     }
 
-    /// The part of each column that may change, with the column's number. All of them are marked as dirty.
+    /// The part of each column that may change, with the column's index. Marks all of them as dirty.
     #[inline]
     pub fn runs_mut(&mut self) -> impl Iterator<Item = (usize, &mut [u8])> {
         self.mark_dirty(self.columns.clone(), &self.rows.clone());
@@ -145,7 +145,7 @@ impl<'a> Canvas<'a> {
         }
     }
 
-    /// Copies every pixel from a picture of the canvas' size.
+    /// Copies every pixel from a picture with the size of the canvas.
     #[inline]
     pub fn paste(&mut self, picture: &[u8]) {
         self.mark_dirty(self.columns.clone(), &self.rows.clone());
@@ -171,14 +171,12 @@ impl<'a> Canvas<'a> {
         self.fill_block(x, y, x, y, color);
     }
 
-    /// Paints the row `y` from `x0` to `x1`, both included. As pygame's horizontal runs, the ends
-    /// may come in either order.
+    /// Paints the row `y` from `x0` to `x1`, both included. As in pygame's horizontal runs, the ends may come in either order.
     pub(super) fn fill_row(&mut self, x0: i64, x1: i64, y: i64, color: Rgb) {
         self.fill_block(x0.min(x1), y, x0.max(x1), y, color);
     }
 
-    /// Paints the columns `x0` to `x1` of the rows `y0` to `y1`, all included; nothing when an end
-    /// lies before its start.
+    /// Paints the columns `x0` to `x1` of the rows `y0` to `y1`, all included; nothing if an end lies before its start.
     pub(super) fn fill_block(&mut self, x0: i64, y0: i64, x1: i64, y1: i64, color: Rgb) {
         let columns = clip(x0, x1, &self.columns);
         let rows = clip(y0, y1, &self.rows);
@@ -191,7 +189,7 @@ impl<'a> Canvas<'a> {
     }
 }
 
-/// Sets the bits of some rows in the masks of columns.
+/// Sets the bits of some rows in the masks of several columns.
 fn mark_rows(masks: &mut [u128], rows: &Range<usize>) {
     if rows.start < rows.end {
         let bits = u128::MAX >> (u128::BITS as usize - rows.len()) << rows.start;

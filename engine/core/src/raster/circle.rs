@@ -1,24 +1,23 @@
-//! Circles: filled, thin and with a border of some width.
+//! Circles: filled, thin, or with a wide border.
 //!
-//! pygame's circles have an even diameter: about the centre `(x, y)`, the distance 1 is the column
-//! `x` to the right and the column `x - 1` to the left, and likewise for the rows.
+//! pygame's circles have an even diameter: about the centre `(x, y)`, the distance 1 is the column `x` to the right and the
+//! column `x - 1` to the left, and likewise for the rows.
 
 use std::ops::Range;
 
 use super::canvas::Canvas;
 use super::runs::{Rgb, clip, fill_run};
 
-/// Maximum radius; larger ones are drawn with it, to bound the time.
+/// Maximum radius; larger ones are clamped, to bound the time.
 const MAX_RADIUS: i64 = 1 << 16;
 
-/// Whether the midpoint that follows the point `(x, y)` of an outline lies outside of the circle,
-/// in which case the outline moves one pixel towards the centre.
+/// Whether the midpoint that follows the point `(x, y)` of an outline lies outside the circle, so that the outline moves one
+/// pixel towards the centre.
 pub(super) fn midpoint_is_outside(radius: i64, x: i64, y: i64) -> bool {
     (x + 1) * (x + 1) + y * (y - 1) >= radius * radius
 }
 
-/// The points of an eighth of a circle by the midpoint rule: distances `(x, y)` from the centre, by
-/// growing `x`.
+/// The points of an eighth of a circle by the midpoint rule: distances `(x, y)` from the centre, in the order of `x`.
 #[derive(Clone, Debug)]
 pub(super) struct Octant {
     radius: i64,
@@ -45,10 +44,10 @@ impl Iterator for Octant {
     }
 }
 
-/// A filled circle, compiled to one run per column, for painting at any place.
+/// A filled circle, compiled to one run per column, for painting anywhere.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Disc {
-    /// For each distance of a column from the centre, from 1, the half height of its run.
+    /// Half the height of each column's run, by the column's distance from the centre, from 1.
     half_heights: Vec<i32>,
 }
 
@@ -67,9 +66,9 @@ impl Disc {
         let radius = i64::from(radius).clamp(0, MAX_RADIUS);
         let mut half_heights = vec![0; radius as usize];
         for (x, y) in Octant::new(radius) {
-            // pygame swaps the ends of a run that end before they start: none is empty.
+            // pygame swaps the ends of a run that ends before it starts, so no run is empty.
             half_heights[x as usize - 1] = y.max(1) as i32;
-            // Of the points with the same `y`, the last is the farthest out.
+            // Of all points with the same `y`, the last is the farthest out.
             if y > 0 && midpoint_is_outside(radius, x, y) {
                 let half_height = &mut half_heights[y as usize - 1];
                 *half_height = (*half_height).max(x as i32);
@@ -83,8 +82,7 @@ impl Disc {
         self.half_heights.len() as i32
     }
 
-    /// The runs of the disc about `center` that lie in some columns and rows, from left to right,
-    /// without the empty ones.
+    /// The nonempty runs of the disc about `center` that lie in some columns and rows, from left to right.
     #[inline]
     pub fn columns(
         &self,
@@ -107,7 +105,7 @@ impl Disc {
         self.half_heights.get((x ^ (x >> 63)) as usize).copied().unwrap_or(0)
     }
 
-    /// Whether the disc covers the pixel at `(x, y)` from its centre.
+    /// Whether the disc covers the pixel at the offset `(x, y)` from its centre.
     #[inline]
     pub fn contains(&self, (x, y): (i32, i32)) -> bool {
         // The disc is symmetric: the column -1 is as far from the centre as the column 0.
@@ -128,8 +126,8 @@ impl Disc {
     }
 }
 
-/// The pixels of a circle whose border is one pixel wide, from its centre, each of them once; empty for radii below 1. All of
-/// them lie on the [`Disc`] of the same radius.
+/// The pixels of a circle with a border of one pixel, relative to its centre, without duplicates; empty for radii below 1. All
+/// of them lie on the [`Disc`] of the same radius.
 pub fn circle_outline(radius: i32) -> Vec<(i32, i32)> {
     let mut pixels: Vec<(i32, i32)> = Octant::new(i64::from(radius).clamp(0, MAX_RADIUS))
         .map(|(near, far)| (near as i32, far as i32))
@@ -141,8 +139,8 @@ pub fn circle_outline(radius: i32) -> Vec<(i32, i32)> {
     pixels
 }
 
-/// The outline of a circle as the wide border follows it: one point per row, downwards from the
-/// top, by two midpoint rules that meet on the diagonal.
+/// The outline of a circle with a wide border: one point per row, downwards from the top, by two midpoint rules that meet on
+/// the diagonal.
 struct Contour {
     radius: i64,
     x: i64,
@@ -154,7 +152,7 @@ impl Contour {
         Self { radius, x: 0, y: radius }
     }
 
-    /// Whether the contour is still in the part where a row is wider than one point.
+    /// Whether the contour is still in the flat part, where a row is wider than one point.
     fn is_flat(&self) -> bool {
         self.x < self.y
     }
@@ -167,13 +165,13 @@ impl Contour {
         }
     }
 
-    /// Goes diagonally to the next row; only for the flat part.
+    /// Moves diagonally to the next row; only for the flat part.
     fn descend_flat(&mut self) {
         self.x += 1;
         self.y -= 1;
     }
 
-    /// Goes to the next row in the steep part.
+    /// Moves to the next row in the steep part.
     fn descend_steep(&mut self) {
         let outside = 4 * self.radius * self.radius;
         if (2 * self.x + 1).pow(2) + 4 * (self.y - 1).pow(2) <= outside {
@@ -186,9 +184,9 @@ impl Contour {
 impl Canvas<'_> {
     /// Draws a circle as `pygame.draw.circle` does. Lengths are in pixels.
     ///
-    /// With a `width` of 0, or one of the radius or more, the circle is filled; else `width` is
-    /// that of its border, which grows inwards. Nothing is drawn for a `radius` below 1 or a
-    /// negative `width`. Exact for radii up to 46340, beyond which pygame's own numbers overflow.
+    /// A `width` of 0, or of at least the radius, fills the circle; otherwise `width` is the thickness of its border, which
+    /// grows inwards. Nothing is drawn for a `radius` below 1 or a negative `width`. Exact for radii up to 46340, beyond which
+    /// pygame's own numbers overflow.
     pub fn draw_circle(&mut self, color: Rgb, center: (i32, i32), radius: i32, width: i32) {
         if radius < 1 || width < 0 {
             return;
@@ -208,7 +206,7 @@ impl Canvas<'_> {
         }
     }
 
-    /// Fills a circle with a compiled [`Disc`]: the same pixels as those of [`Canvas::draw_circle`].
+    /// Fills a circle with a compiled [`Disc`]: the same pixels as [`Canvas::draw_circle`].
     pub fn fill_disc(&mut self, color: Rgb, center: (i32, i32), disc: &Disc) {
         for DiscColumn { x, rows } in disc.columns(center, &self.columns(), self.rows()) {
             fill_run(self.run_mut(x, rows), color);
@@ -232,7 +230,7 @@ impl Canvas<'_> {
         let mut inner = Contour::new(inner_radius);
         let mut is_hollow = false;
         while outer.y >= 0 {
-            // Decided before the row is widened, which may end the flat part.
+            // Decided before widening the row, which may end the flat part.
             let is_flat = outer.is_flat();
             if is_flat {
                 outer.widen();

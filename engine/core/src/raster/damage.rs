@@ -3,10 +3,10 @@
 use super::canvas::Canvas;
 use super::rect::Rect;
 
-/// Maximum number of rectangles; beyond it they are merged.
+/// Maximum number of rectangles; more are merged.
 const MAX_RECTS: usize = 8;
 
-/// Dirty rectangles of a canvas, which do not overlap: the old and the new places of what has changed.
+/// Non-overlapping dirty rectangles of a canvas: the old and new places of what has changed.
 #[derive(Clone, Copy, Debug)]
 pub struct Damage {
     canvas: Rect,
@@ -15,13 +15,13 @@ pub struct Damage {
 }
 
 impl Damage {
-    /// No damage to a canvas of that size.
+    /// No damage, for a canvas of this size.
     pub fn new(width: usize, height: usize) -> Self {
         let canvas = Rect::new(0, 0, width as i32, height as i32);
         Damage { canvas, rects: [Rect::default(); MAX_RECTS], count: 0 }
     }
 
-    /// Adds a rectangle, clipped to the canvas. Rectangles that overlap are merged into their bounding rectangle.
+    /// Adds a rectangle, clipped to the canvas. Overlapping rectangles are merged into their bounding rectangle.
     #[inline]
     pub fn add(&mut self, rect: Rect) {
         let mut rect = self.canvas.intersection(&rect);
@@ -30,7 +30,7 @@ impl Damage {
         }
         let mut at = 0;
         while at < self.count {
-            // A rectangle that has grown may overlap those that it was compared with before.
+            // A rectangle that has grown may overlap those that it was already compared with.
             if overlap(&self.rects[at], &rect) || self.count == MAX_RECTS {
                 rect = bounding(&self.rects[at], &rect);
                 self.count -= 1;
@@ -62,7 +62,7 @@ impl Damage {
     }
 }
 
-/// [`Rect::overlaps`] for rectangles on the canvas that have pixels, whose sums cannot overflow.
+/// [`Rect::overlaps`] for nonempty rectangles on the canvas, whose sums cannot overflow.
 #[inline]
 fn overlap(one: &Rect, other: &Rect) -> bool {
     one.x < other.x + other.width
@@ -71,7 +71,7 @@ fn overlap(one: &Rect, other: &Rect) -> bool {
         && other.y < one.y + one.height
 }
 
-/// [`Rect::union`] for the same.
+/// [`Rect::union`] for nonempty rectangles on the canvas.
 #[inline]
 fn bounding(one: &Rect, other: &Rect) -> Rect {
     let (x, y) = (one.x.min(other.x), one.y.min(other.y));

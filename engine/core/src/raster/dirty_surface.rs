@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::canvas::Canvas;
 use super::runs::Rgb;
 
-/// Pixels with a dirty mask, of which only the painted ones are copied elsewhere.
+/// Pixels with a dirty mask, so that only painted pixels need to be copied.
 ///
 /// The colours of pixels that were not painted since the last call of [`canvas`](DirtySurface::canvas) are unspecified.
 #[derive(Clone, Debug)]
@@ -13,12 +13,12 @@ pub struct DirtySurface {
     pixels: Vec<u8>,
     width: usize,
     height: usize,
-    /// For each column a bit for each row.
+    /// For each column, a mask with a bit for each row.
     dirty: Vec<u128>,
 }
 
 impl DirtySurface {
-    /// A surface of at most 128 rows without a dirty pixel.
+    /// A surface of at most 128 rows, with no dirty pixel.
     ///
     /// # Panics
     ///
@@ -38,7 +38,7 @@ impl DirtySurface {
         self.height
     }
 
-    /// Clears the dirty mask, and returns a canvas that marks the pixels painted on it.
+    /// Clears the dirty mask and returns a canvas that marks painted pixels.
     pub fn canvas(&mut self) -> Canvas<'_> {
         self.dirty.fill(0);
         Canvas::new(&mut self.pixels, self.width, self.height).tracking_dirty(&mut self.dirty)
@@ -64,7 +64,7 @@ mod tests {
     use super::*;
     use crate::raster::{Rect, Sprite, Surface};
 
-    /// The pixels that were painted.
+    /// All painted pixels.
     fn painted(surface: &DirtySurface) -> Vec<(usize, usize)> {
         let mut painted = Vec::new();
         surface.for_each_run(|x, rows, _| painted.extend(rows.map(|y| (x, y))));
@@ -88,7 +88,6 @@ mod tests {
         assert_eq!(painted(&surface), []);
     }
 
-    /// Every drawing operation marks each pixel that it changes.
     #[test]
     fn every_drawing_operation_marks_its_pixels() {
         let mut source = Surface::new(7, 9);

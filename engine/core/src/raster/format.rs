@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::dirty_surface::DirtySurface;
 use super::runs::Rgb;
 
-/// Order and kind of the numbers in a frame. The default is the order of a [`Canvas`](super::Canvas) and of the original's
+/// Order and kind of the numbers in a frame. The default is that of a [`Canvas`](super::Canvas) and of the original's
 /// observations: \[x\]\[y\]\[channel\].
 ///
 /// ```
@@ -17,9 +17,9 @@ use super::runs::Rgb;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PixelFormat {
-    /// One number for each pixel, without an index for the channel: its luma, as Gymnasium's `GrayscaleObservation` computes it.
+    /// One number for each pixel, without a channel index: its luma, as Gymnasium's `GrayscaleObservation` computes it.
     pub grayscale: bool,
-    /// The channel is the first index, as PyTorch's convolutions expect. Without effect in grayscale.
+    /// The channel is the first index, as PyTorch's convolutions expect. No effect in grayscale.
     pub channels_first: bool,
     /// Indexed \[row\]\[column\] instead of \[x\]\[y\].
     pub row_major: bool,
@@ -36,7 +36,7 @@ impl PixelFormat {
         }
     }
 
-    /// Whether a [`Canvas`](super::Canvas) can be laid over a frame in this format.
+    /// Whether a [`Canvas`](super::Canvas) can paint a frame in this format directly.
     pub(crate) fn is_canvas(self) -> bool {
         !self.row_major && !self.grayscale && !self.channels_first
     }

@@ -6,7 +6,7 @@ use super::runs::Rgb;
 /// A point in whole pixels.
 type Point = (i64, i64);
 
-/// Bresenham's walk along a line, as pygame counts its error.
+/// Bresenham's algorithm, with pygame's error term.
 struct Walk {
     span: Point,
     step: Point,
@@ -42,8 +42,8 @@ impl Walk {
     }
 }
 
-/// Clips a line to `0..=width` and `0..=height`, by Liang and Barsky's method; `None` when nothing
-/// is left. As in pygame, the far edges are one pixel too far out, and the ends are rounded.
+/// Clips a line to `0..=width` and `0..=height` by Liang and Barsky's method; `None` if nothing is left. As in pygame, the far
+/// edges are one pixel too far out, and the ends are rounded.
 fn clip_line(start: Point, end: Point, width: i64, height: i64) -> Option<(Point, Point)> {
     let delta = (end.0 - start.0, end.1 - start.1);
     let mut enter = 0.0f64;
@@ -74,9 +74,8 @@ fn clip_line(start: Point, end: Point, width: i64, height: i64) -> Option<(Point
 }
 
 impl Canvas<'_> {
-    /// Draws a line of `width` pixels between two points, both included, as `pygame.draw.line`
-    /// does: the ends of a wide line are flat, and its width is measured along the axis to which the
-    /// line is steeper. Nothing is drawn for a `width` below 1.
+    /// Draws a line of `width` pixels between two points, both included, as `pygame.draw.line` does: the ends of a wide line
+    /// are flat, and its width is measured along the axis in which the line is shorter. Nothing is drawn for a `width` below 1.
     ///
     /// pygame truncates the points towards zero first.
     pub fn draw_line(&mut self, color: Rgb, start: (i32, i32), end: (i32, i32), width: i32) {
@@ -87,7 +86,7 @@ impl Canvas<'_> {
         }
     }
 
-    /// Draws a line of a `width` of at least 1.
+    /// Draws a line with a `width` of at least 1.
     pub(super) fn stroke(&mut self, color: Rgb, start: Point, end: Point, width: i64) {
         let size = (self.width() as i64, self.height() as i64);
         let Some(clipped) = clip_line(start, end, size.0, size.1) else {
@@ -111,10 +110,10 @@ impl Canvas<'_> {
         self.put(end.0, end.1, color);
     }
 
-    /// Walks from the first to the second of the `clipped` points, and on towards the `end` proper
-    /// while an edge of the line is visible.
+    /// Walks from the first `clipped` point to the second, and on towards the unclipped `end` while an edge of the line is
+    /// visible.
     fn stroke_wide(&mut self, color: Rgb, start: Point, end: Point, clipped: (Point, Point), width: i64) {
-        // From here on, the first coordinate is the one along the line, the second the one across.
+        // From here on, the first coordinate runs along the line, the second across it.
         let is_steep = (end.0 - start.0).abs() <= (end.1 - start.1).abs();
         let turned = |(x, y): Point| if is_steep { (y, x) } else { (x, y) };
         let size = turned((self.width() as i64, self.height() as i64));

@@ -1,4 +1,4 @@
-//! Rectangles as values: position, size and corners.
+//! Rectangles and their corners.
 
 /// A rectangle in pixels: its top left corner and its size.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -19,13 +19,13 @@ impl Rect {
         Self { x, y, width, height }
     }
 
-    /// The column right of the rectangle and the row below it.
+    /// The column to the right of the rectangle, and the row below it.
     #[inline]
     fn end(&self) -> (i32, i32) {
         (self.x.saturating_add(self.width), self.y.saturating_add(self.height))
     }
 
-    /// Whether a pixel lies in both rectangles.
+    /// Whether the rectangles have a pixel in common.
     #[inline]
     pub fn overlaps(&self, other: &Rect) -> bool {
         self.x < other.x.saturating_add(other.width)
@@ -35,7 +35,7 @@ impl Rect {
             && [self.width, self.height, other.width, other.height].iter().all(|length| *length > 0)
     }
 
-    /// The pixels that lie in both; with a width or height of 0 or less if there is none.
+    /// The pixels that lie in both; its width or height is 0 or less if there are none.
     #[inline]
     pub fn intersection(&self, other: &Rect) -> Rect {
         let (x, y) = (self.x.max(other.x), self.y.max(other.y));

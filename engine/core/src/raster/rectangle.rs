@@ -5,7 +5,7 @@ use super::circle::{Octant, midpoint_is_outside};
 use super::rect::{CornerRadii, Rect};
 use super::runs::Rgb;
 
-/// Maximum coordinate of a rounded rectangle; larger ones are drawn as this, to bound the time.
+/// Maximum coordinate of a rounded rectangle; larger ones are clamped, to bound the time.
 const MAX_COORDINATE: i64 = 1 << 16;
 
 /// The outermost columns and rows of a rectangle, all within it.
@@ -32,7 +32,7 @@ impl Edges {
     }
 }
 
-/// The four radii as lengths on the canvas.
+/// The four radii as signed lengths.
 #[derive(Clone, Copy)]
 struct Corners {
     top_left: i64,
@@ -42,7 +42,7 @@ struct Corners {
 }
 
 impl Corners {
-    /// The radii, all scaled down by one factor where two of them do not fit on their edge.
+    /// The radii, all scaled down by one factor if two of them do not fit on their edge.
     fn fitting(radii: CornerRadii, edges: &Edges) -> Self {
         let corners = Self {
             top_left: radii.top_left.into(),
@@ -83,9 +83,9 @@ enum Quadrant {
 impl Canvas<'_> {
     /// Draws a rectangle as `pygame.draw.rect` does.
     ///
-    /// With a `width` of 0 it is filled; else `width` is that of its border in pixels, which grows
-    /// inwards. A border that would leave no hole in the visible part fills that part. Nothing is
-    /// drawn for a negative `width` or a `rect` whose width or height is below 1.
+    /// A `width` of 0 fills it; otherwise `width` is the thickness of its border in pixels, which grows inwards. A border that
+    /// would leave no hole in the visible part fills that part. Nothing is drawn for a negative `width` or a `rect` whose width
+    /// or height is below 1.
     pub fn draw_rect(&mut self, color: Rgb, rect: Rect, width: i32) {
         let Edges { left, top, right, bottom } = Edges::of(rect);
         let visible_width = right.min(self.width() as i64 - 1) - left.max(0) + 1;
@@ -104,13 +104,11 @@ impl Canvas<'_> {
         self.fill_block(right - width + 1, top + width, right, bottom - width, color);
     }
 
-    /// Draws a rectangle with rounded corners as `pygame.draw.rect` does when it is given radii for
-    /// the corners.
+    /// Draws a rectangle with rounded corners as `pygame.draw.rect` does when it is given corner radii.
     ///
-    /// `width` is as in [`Canvas::draw_rect`], which also draws the rectangles whose radii are all
-    /// 0 and those that are less than 2 pixels wide or high. Radii that do not fit are scaled down.
-    /// A negative width or height of `rect` counts to the left or upwards. Exact for coordinates of
-    /// up to 2^16 pixels.
+    /// `width` is as in [`Canvas::draw_rect`], which also draws rectangles whose radii are all 0, and those less than 2 pixels
+    /// wide or high. Radii that do not fit are scaled down. A negative width or height of `rect` extends to the left or
+    /// upwards. Exact for coordinates of up to 2^16 pixels.
     pub fn draw_rounded_rect(&mut self, color: Rgb, rect: Rect, width: i32, radii: CornerRadii) {
         if width < 0 {
             return;
@@ -158,7 +156,7 @@ impl Canvas<'_> {
         }
     }
 
-    /// Fills a rectangle whose corners are cut off straight; the round corners are added to it.
+    /// Fills a rectangle whose corners are cut off straight; the round corners are added later.
     fn fill_octagon(&mut self, color: Rgb, edges: &Edges, corners: &Corners) {
         let &Edges { left, top, right, bottom } = edges;
         let points = [
@@ -172,13 +170,12 @@ impl Canvas<'_> {
             (left, bottom - corners.bottom_left),
         ];
         let sides = || points.iter().zip(points.iter().cycle().skip(1));
-        // A corner as high as the rectangle reaches one pixel beyond it.
+        // A corner as high as the rectangle extends one pixel beyond it.
         let first = points.iter().fold(top, |first, point| first.min(point.1));
         let last = points.iter().fold(bottom, |last, point| last.max(point.1));
 
         for y in first.max(0)..=last.min(self.height() as i64 - 1) {
-            // Where the slanted and upright sides cross the row; their lower ends do not count,
-            // except on the last row.
+            // Where the slanted and upright sides cross the row; their lower ends do not count, except on the last row.
             let mut crossings: Vec<i64> = sides()
                 .filter_map(|(&a, &b)| {
                     let (upper, lower) = if a.1 < b.1 { (a, b) } else { (b, a) };
@@ -192,7 +189,7 @@ impl Canvas<'_> {
                 self.fill_row(pair[0], pair[1], y, color);
             }
         }
-        // A level side below which the shape narrows is not covered by the crossings.
+        // The crossings do not cover a level side below which the shape narrows.
         for (a, b) in sides().filter(|(a, b)| a.1 == b.1 && first < a.1 && a.1 < last) {
             self.fill_row(a.0, b.0, a.1, color);
         }
@@ -201,11 +198,11 @@ impl Canvas<'_> {
     /// Draws the straight parts of a border between its round corners.
     fn draw_sides(&mut self, color: Rgb, edges: &Edges, corners: &Corners, width: i64) {
         let &Edges { left, top, right, bottom } = edges;
-        // The middle of a side, such that its wide line covers the `width` outermost pixels.
+        // Offsets to the middle of a side, so that its wide line covers the `width` outermost pixels.
         let near = width / 2 - 1 + width % 2;
         let far = width / 2;
 
-        // Where two corners meet in a point, pygame only fills the gap between them.
+        // If two corners meet in a point, pygame only fills the gap between them.
         let (start, end) = (left + corners.top_left, right - corners.top_right);
         if start == end {
             self.fill_block(start, top, start, top + width - 1, color);
@@ -232,9 +229,9 @@ impl Canvas<'_> {
         }
     }
 
-    /// Draws a quarter of a circle: filled for a `width` of 0, else its border.
+    /// Draws a quarter of a circle: filled for a `width` of 0, otherwise its border.
     fn draw_quadrant(&mut self, color: Rgb, quadrant: Quadrant, center: (i64, i64), radius: i64, width: i64) {
-        // The pixel at a distance from the centre: distances start at 1 in all directions.
+        // The pixel at a distance from the centre; distances start at 1 in all directions.
         let at = |x: i64, y: i64| match quadrant {
             Quadrant::TopLeft => (center.0 - x, center.1 - y),
             Quadrant::TopRight => (center.0 + x - 1, center.1 - y),
@@ -250,7 +247,7 @@ impl Canvas<'_> {
         }
         if width == 0 {
             let is_top = matches!(quadrant, Quadrant::TopLeft | Quadrant::TopRight);
-            // Above the centre, the columns reach one pixel beyond the centre's line.
+            // Above the centre, the columns extend one pixel beyond the centre line.
             let first = if is_top { 0 } else { 1 };
             for (near, far) in Octant::new(radius) {
                 fill(at(far, first), at(far, near));

@@ -1,4 +1,4 @@
-//! Pixels, and runs of them: consecutive pixels of a column, which are contiguous in memory.
+//! Pixels, and runs: consecutive pixels of a column, which are contiguous in memory.
 
 use std::ops::Range;
 
@@ -10,7 +10,7 @@ pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
     if color == [color[0]; 3] {
         return fill_bytes(run, color[0]);
     }
-    // Up to this length, pixels are written one by one; the rest is copied in chunks that double.
+    // Writes pixels one by one up to this length; copies the rest in chunks that double.
     let mut painted = run.len().min(96 * 3);
     run[..painted].as_chunks_mut().0.fill(color);
     while painted < run.len() {
@@ -20,7 +20,7 @@ pub(super) fn fill_run(run: &mut [u8], color: Rgb) {
     }
 }
 
-/// Fills bytes: up to 64 of them from registers, without a call to `memset`.
+/// Fills bytes: 16 to 63 of them from registers, without a call to `memset`.
 #[inline]
 fn fill_bytes(bytes: &mut [u8], byte: u8) {
     match bytes.len() {
@@ -30,7 +30,7 @@ fn fill_bytes(bytes: &mut [u8], byte: u8) {
     }
 }
 
-/// Fills the first `N` bytes and the last.
+/// Fills the first and the last `N` bytes.
 #[inline]
 fn fill_ends<const N: usize>(bytes: &mut [u8], byte: u8) {
     if let Some(first) = bytes.first_chunk_mut::<N>() {
@@ -52,11 +52,11 @@ pub(super) fn clip(first: i64, last: i64, within: &Range<usize>) -> Range<usize>
 
 /// Copies a run between slices of the same length.
 ///
-/// Up to 128 bytes are copied as two blocks of a fixed size that may overlap, in registers, without a call to `memcpy`.
+/// Copies of 3 to 127 bytes are two blocks of a fixed size that may overlap, in registers, without a call to `memcpy`.
 ///
 /// # Panics
 ///
-/// If the lengths differ and `source` has 3 bytes at most or 128 at least.
+/// If the lengths differ and `source` has fewer than 3 bytes or at least 128.
 #[inline]
 pub fn copy_run(source: &[u8], target: &mut [u8]) {
     match source.len() {
@@ -70,7 +70,7 @@ pub fn copy_run(source: &[u8], target: &mut [u8]) {
     }
 }
 
-/// Copies the first `N` bytes and the last.
+/// Copies the first and the last `N` bytes.
 #[inline]
 fn copy_ends<const N: usize>(source: &[u8], target: &mut [u8]) {
     if let (Some(source), Some(target)) = (source.first_chunk::<N>(), target.first_chunk_mut()) {

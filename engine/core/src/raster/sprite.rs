@@ -9,14 +9,14 @@ use super::rect::Rect;
 use super::runs::{clip, copy_run};
 use super::surface::Surface;
 
-/// A picture whose opaque pixels are stored as vertical runs, which are contiguous on a canvas.
+/// A picture stored as vertical runs of opaque pixels, which are contiguous on a canvas.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sprite {
     runs: Vec<Run>,
     /// The pixels of all runs, one run after the other.
     pixels: Vec<u8>,
     bounds: Rect,
-    /// The same pixels in blocks of fixed sizes, for a sprite that is painted as a whole.
+    /// The same pixels in blocks of fixed sizes, for painting the whole sprite.
     blocks: Blocks,
 }
 
@@ -33,8 +33,7 @@ struct Run {
 }
 
 impl Sprite {
-    /// Compiles a surface: all pixels but those of its colour key. The surface's alpha has no
-    /// effect; a sprite is opaque.
+    /// Compiles all pixels of a surface except those of its colour key. The surface's alpha has no effect; a sprite is opaque.
     pub fn new(surface: &Surface) -> Self {
         let mut runs = Vec::new();
         let mut pixels = Vec::new();
@@ -55,14 +54,14 @@ impl Sprite {
         Self { runs, pixels, bounds, blocks }
     }
 
-    /// The bounding rectangle of the opaque pixels, from the sprite's top left corner: what
-    /// [`Sprite::blit`] at `(0, 0)` can change. Without opaque pixels its size is 0.
+    /// The bounding rectangle of the opaque pixels, relative to the sprite's top left corner: what [`Sprite::blit`] at `(0, 0)`
+    /// can change. Without opaque pixels its size is 0.
     pub fn bounds(&self) -> Rect {
         self.bounds
     }
 
-    /// Paints the sprite with its top left corner at `(x, y)`: the same pixels as the surface's
-    /// [`Canvas::blit`] at full alpha.
+    /// Paints the sprite with its top left corner at `(x, y)`: the same pixels as [`Canvas::blit`] of the surface at full
+    /// alpha.
     #[inline]
     pub fn blit(&self, canvas: &mut Canvas<'_>, x: i32, y: i32) {
         let left = i64::from(x) + i64::from(self.bounds.x);
@@ -73,7 +72,7 @@ impl Sprite {
         let (first, end) = (columns.start as i64, columns.end as i64);
         let (highest, lowest) = (rows.start as i64, rows.end as i64);
         if left >= first && top >= highest && right <= end && bottom <= lowest && !canvas.tracks_dirty() {
-            // Negative where the sprite's empty margin reaches beyond the canvas; the blocks do not.
+            // Negative if the sprite's empty margin extends beyond the canvas; the blocks do not.
             let corner = i64::from(x) * canvas.height() as i64 + i64::from(y);
             self.blocks.copy(corner, canvas);
         } else if right > first && bottom > highest && left < end && top < lowest {
@@ -81,7 +80,7 @@ impl Sprite {
         }
     }
 
-    /// The bounding rectangle of the opaque pixels of the sprite with its top left corner at `(x, y)`.
+    /// The bounding rectangle of the opaque pixels when the sprite's top left corner is at `(x, y)`.
     #[inline]
     pub fn bounds_at(&self, (x, y): (i32, i32)) -> Rect {
         Rect { x: x.saturating_add(self.bounds.x), y: y.saturating_add(self.bounds.y), ..self.bounds }
@@ -94,7 +93,7 @@ impl Sprite {
         }
     }
 
-    /// Paints the part of the sprite that lies on the canvas within the disc about `center`.
+    /// Paints the part of the sprite that lies on the canvas and within the disc about `center`.
     pub fn blit_within(&self, canvas: &mut Canvas<'_>, x: i32, y: i32, disc: &Disc, center: (i32, i32)) {
         let overlaps = |at: i32, length: i32, center: i32| {
             let (start, center, radius) = (i64::from(at), i64::from(center), i64::from(disc.radius()));
@@ -121,7 +120,7 @@ impl Sprite {
         }
     }
 
-    /// The sprite as it looks under a black surface of some `alpha` that has a colour key: 0 as it is, 255 black.
+    /// The sprite as seen through a black surface with a colour key and the given `alpha`: 0 changes nothing, 255 is black.
     pub fn shaded(&self, alpha: u8) -> Sprite {
         let pixels = self.pixels.iter().map(|channel| blend_keyed(0, *channel, alpha)).collect();
         Self::from_runs(self.runs.clone(), pixels)
@@ -150,8 +149,8 @@ impl Sprite {
     }
 }
 
-/// Runs by their lengths, each as two blocks of a fixed size that may overlap. Copies of fixed sizes are a few moves each,
-/// without a loop or a call.
+/// Runs grouped by length, each as two blocks of a fixed size that may overlap. A copy of fixed size is a few moves, without a
+/// loop or a call.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Blocks {
     one: BlocksOf<3>,
@@ -165,7 +164,7 @@ impl Blocks {
     fn new(runs: &[Run], pixels: &[u8]) -> Self {
         let mut blocks = Self::default();
         for run in runs {
-            // Two of the largest blocks at a time.
+            // At most two of the largest blocks at a time.
             for above in (0..run.length).step_by(32) {
                 let (y, length) = (run.y + above, (run.length - above).min(32));
                 let pixels = &pixels[(run.start + above * 3) as usize..][..length as usize * 3];
@@ -202,7 +201,7 @@ struct Pair<const N: usize> {
     /// Position of the first pixel from the sprite's top left corner.
     x: u32,
     y: u32,
-    /// Bytes from the first block to the last.
+    /// Bytes from the start of the first block to the start of the last.
     step: u32,
     first: [u8; N],
     last: [u8; N],

@@ -4,7 +4,7 @@ use super::canvas::Canvas;
 use super::rect::{CornerRadii, Rect};
 use super::runs::Rgb;
 
-/// An RGB picture, as a `pygame.Surface` of the display's format: 32 bits, no alpha per pixel.
+/// An RGB picture, like a `pygame.Surface` in the display's format: 32 bits, no per-pixel alpha.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Surface {
     width: usize,
@@ -12,7 +12,7 @@ pub struct Surface {
     pixels: Vec<u8>,
     color_key: Option<Rgb>,
     alpha: u8,
-    /// Whether SDL would hold the picture run-length encoded, which changes how it is blended.
+    /// Whether SDL would store the picture run-length encoded, which changes how it is blended.
     pub(super) run_length_encoded: bool,
 }
 
@@ -34,8 +34,8 @@ impl Surface {
         }
     }
 
-    /// A black surface of another size that pygame's transformations make out of this one: with
-    /// its colour key and alpha, and run-length encoded where there is a colour key.
+    /// A black surface of another size, with the attributes of pygame's transformations of this one: the same colour key and
+    /// alpha, and run-length encoded if there is a colour key.
     pub(super) fn transformed(&self, width: usize, height: usize) -> Self {
         Self {
             color_key: self.color_key,
@@ -55,12 +55,12 @@ impl Surface {
         self.height
     }
 
-    /// The bytes, column by column, 3 a pixel.
+    /// The bytes, column by column, 3 per pixel.
     pub fn pixels(&self) -> &[u8] {
         &self.pixels
     }
 
-    /// The bytes, for changing them.
+    /// The bytes, mutably.
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         &mut self.pixels
     }
@@ -70,7 +70,7 @@ impl Surface {
         self.pixels
     }
 
-    /// The colour of a pixel, or `None` outside of the surface.
+    /// The colour of a pixel, or `None` outside the surface.
     pub fn pixel(&self, x: usize, y: usize) -> Option<Rgb> {
         if x >= self.width || y >= self.height {
             return None;
@@ -78,7 +78,7 @@ impl Surface {
         self.pixels.as_chunks().0.get(x * self.height + y).copied()
     }
 
-    /// The colour that is left out when the surface is blitted.
+    /// The colour that a blit of the surface leaves out.
     pub fn color_key(&self) -> Option<Rgb> {
         self.color_key
     }
@@ -90,7 +90,7 @@ impl Surface {
         self.run_length_encoded &= color_key.is_none();
     }
 
-    /// The opacity when the surface is blitted, from 0 (transparent) to 255 (opaque).
+    /// The opacity in a blit of the surface, from 0 (transparent) to 255 (opaque).
     pub fn alpha(&self) -> u8 {
         self.alpha
     }

@@ -1,4 +1,4 @@
-//! The drawings that pygame made, replayed; and drawing with arguments that pygame never sees.
+//! Replays drawings recorded from pygame, and draws with arguments that pygame never sees.
 
 use proptest::prelude::*;
 use serde::Deserialize;
@@ -12,8 +12,7 @@ struct Cases {
     alpha_sweeps: Vec<AlphaSweep>,
 }
 
-/// An operation on the surface whose number comes first; new surfaces get the next number. Colours
-/// are 0xRRGGBB.
+/// An operation on the surface whose number comes first; new surfaces get the next number. Colours are 0xRRGGBB.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Operation {
@@ -27,17 +26,17 @@ enum Operation {
     Line(usize, u32, i32, i32, i32, i32, i32),
     Rect(usize, u32, i32, i32, i32, i32, i32),
     RoundedRect(usize, u32, i32, i32, i32, i32, i32, u32, u32, u32, u32),
-    /// What the new surface is made of, and the degrees.
+    /// The source of the new surface, and the degrees.
     Rotate(usize, i32),
-    /// What the new surface is made of, and its size.
+    /// The source of the new surface, and its size.
     Scale(usize, usize, usize),
     /// The target, the source and the position.
     Blit(usize, usize, i32, i32),
-    /// The expected size and check sum.
+    /// The expected size and checksum.
     Check(usize, usize, usize, u32),
 }
 
-/// Check sums of the mixtures of every level (columns) into every level (rows), by the alpha.
+/// Checksums of blending every level (columns) over every level (rows), by alpha.
 #[derive(Deserialize)]
 struct AlphaSweep {
     mode: String,
@@ -53,7 +52,7 @@ fn rgb(color: u32) -> Rgb {
     [r, g, b]
 }
 
-/// Colours of all kinds; about an eighth of the pixels is 0x010203.
+/// Pseudorandom colours; about an eighth of the pixels are 0x010203.
 fn noise(surface: &mut Surface, seed: u32) {
     for (index, pixel) in (0u32..).zip(surface.pixels_mut().as_chunks_mut().0) {
         let mut value = index.wrapping_mul(2_654_435_761) ^ seed.wrapping_mul(2_246_822_519);
@@ -158,7 +157,7 @@ fn any_position() -> impl Strategy<Value = (i32, i32)> {
     (any_number(), any_number())
 }
 
-/// A small picture with a colour key, and with holes.
+/// A small picture with a colour key and holes.
 fn any_picture() -> impl Strategy<Value = Surface> {
     (0..20usize, 0..20usize, any::<u32>()).prop_map(|(width, height, seed)| {
         let mut surface = Surface::new(width, height);
@@ -226,7 +225,7 @@ proptest! {
             blitted.blit(&picture, x, y);
             sprite.blit(&mut Canvas::new(painted.pixels_mut(), 40, 30), x, y);
             prop_assert_eq!(&blitted, &painted);
-            // Outside of the bounds nothing may change.
+            // Nothing may change outside the bounds.
             let left = i64::from(x) + i64::from(bounds.x);
             let top = i64::from(y) + i64::from(bounds.y);
             for (index, pixel) in painted.pixels().as_chunks::<3>().0.iter().enumerate() {

@@ -3,9 +3,8 @@
 use super::surface::Surface;
 
 impl Surface {
-    /// The surface scaled to `width` by `height` pixels, each of which takes the nearest pixel
-    /// before it, as `pygame.transform.scale` does. The colour key and the alpha carry over. A
-    /// surface without pixels gives a black one.
+    /// The surface scaled to `width` by `height` pixels, each of which takes the nearest pixel before it, as in
+    /// `pygame.transform.scale`. The colour key and the alpha carry over. A surface without pixels gives a black one.
     pub fn scale_nearest(&self, width: usize, height: usize) -> Surface {
         if self.width() == 0 || self.height() == 0 {
             return self.transformed(width, height);
@@ -14,7 +13,7 @@ impl Surface {
         self.resampled(width, height, |x, y| (nearest(x, self.width(), width), nearest(y, self.height(), height)))
     }
 
-    /// A surface of another size, each of whose pixels is the one that `position` gives for it.
+    /// A surface of another size. `position` returns the source position of each pixel.
     fn resampled(&self, width: usize, height: usize, position: impl Fn(usize, usize) -> (usize, usize)) -> Surface {
         let mut target = self.transformed(width, height);
         let source = self.pixels().as_chunks::<3>().0;
@@ -25,12 +24,11 @@ impl Surface {
         target
     }
 
-    /// The surface rotated counterclockwise by `degrees`, as `pygame.transform.rotate` does.
+    /// The surface rotated counterclockwise by `degrees`, as in `pygame.transform.rotate`.
     ///
-    /// Multiples of 90 degrees move the pixels exactly. Other angles give a surface that is large
-    /// enough for the rotated picture, sample the nearest pixel in 16.16 fixed point, and fill the
-    /// rest with the colour key or, without one, with the colour of the top left pixel. The colour
-    /// key and the alpha carry over.
+    /// Multiples of 90 degrees move the pixels exactly. Other angles give a surface that is large enough for the rotated
+    /// picture, sample the nearest pixel in 16.16 fixed point, and fill the rest with the colour key or, without one, with the
+    /// colour of the top left pixel. The colour key and the alpha carry over.
     pub fn rotate(&self, degrees: i32) -> Surface {
         if self.width() == 0 || self.height() == 0 {
             self.clone()
