@@ -8,7 +8,7 @@ pub const BLOCK_BYTES: usize = 64;
 /// 64 bytes, aligned to 64 bytes.
 ///
 /// A batch is a slice of blocks, so every section that starts at a block is aligned for any number type and for vector
-/// instructions, in process memory and as the payload type of an iceoryx2 sample.
+/// instructions, both in process memory and as the payload of an iceoryx2 sample.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 #[repr(align(64))]

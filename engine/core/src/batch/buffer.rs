@@ -1,4 +1,4 @@
-//! Process memory for a batch, on huge pages where the system has them.
+//! Process memory for a batch, on huge pages if the system has them.
 
 use std::ops::{Deref, DerefMut};
 
@@ -6,10 +6,9 @@ use super::block::{Block, zeroed};
 
 /// The memory of one batch in this process, zeroed. It dereferences to `[Block]`.
 ///
-/// With the feature `huge-pages`, on Linux, a buffer of at least 4 MiB is a mapping of its own for which transparent huge pages are
-/// requested: a step writes a few cache lines of each environment's frame, so that with pages of 4 KiB nearly every environment
-/// costs misses of the TLB. A smaller buffer, or one that the kernel refuses, is a `Vec<Block>`, as that of
-/// [`zeroed`].
+/// With the feature `huge-pages`, on Linux, a buffer of at least 4 MiB is a separate mapping that requests transparent huge
+/// pages. A step writes a few cache lines of each environment's frame, so with pages of 4 KiB nearly every environment costs
+/// TLB misses. A smaller buffer, or one that the kernel refuses, is a `Vec<Block>` as from [`zeroed`].
 ///
 /// ```
 /// use endless_gym_core::batch::BatchBuffer;
@@ -32,7 +31,7 @@ enum Memory {
 }
 
 impl BatchBuffer {
-    /// A zeroed buffer of `blocks` blocks. Its pages are allocated when they are written for the first time.
+    /// A zeroed buffer of `blocks` blocks. Its pages are allocated on their first write.
     pub fn new(blocks: usize) -> Self {
         #[cfg(all(feature = "huge-pages", target_os = "linux"))]
         if let Some(mapped) = mapped::Mapped::new(blocks) {
@@ -73,14 +72,14 @@ mod mapped {
     /// Size of a huge page on x86-64, and on ARM with pages of 4 KiB.
     const HUGE_PAGE: usize = 2 << 20;
 
-    /// Buffers below this size stay on the heap: they need few entries of the TLB.
+    /// Buffers below this size stay on the heap: they need few TLB entries.
     pub const LEAST_BYTES: usize = 4 << 20;
 
     /// An anonymous mapping that is advised to use huge pages.
     #[derive(Debug)]
     pub struct Mapped {
         map: MmapMut,
-        /// Bytes of the blocks; the mapping is longer.
+        /// Bytes of the blocks; the mapping may be longer.
         bytes: usize,
     }
 
@@ -91,7 +90,7 @@ mod mapped {
             if bytes < LEAST_BYTES {
                 return None;
             }
-            // Linux aligns a mapping to huge pages if its length is a multiple of them (6.7 and later).
+            // Linux (6.7 and later) aligns a mapping to huge pages if its length is a multiple of them.
             let map = MmapMut::map_anon(bytes.checked_next_multiple_of(HUGE_PAGE)?).ok()?;
             // Only whole huge pages, so that the rest of the last one takes no memory.
             map.advise_range(Advice::HugePage, 0, bytes - bytes % HUGE_PAGE).ok()?;
@@ -120,7 +119,7 @@ mod tests {
     const SIZES: [usize; 8] = [0, 64, 4096, (4 << 20) - 64, 4 << 20, (4 << 20) + 64, (6 << 20) - 64, 21_700_000];
 
     #[test]
-    fn a_buffer_is_zeroed_aligned_and_of_the_length_asked_for() {
+    fn buffers_are_zeroed_and_aligned_and_have_the_requested_length() {
         for bytes in SIZES {
             let blocks = blocks_for(bytes);
             let mut buffer = BatchBuffer::new(blocks);
@@ -148,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pool_writes_the_same_into_a_small_and_a_large_buffer_as_into_a_vec() {
+    fn a_pool_writes_the_same_batch_into_buffers_and_vecs() {
         for num_envs in [2, 256] {
             let config = PoolConfig::new("MortarMayhem-Grid-v0", num_envs);
             let mut pools = [(); 2].map(|()| Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap());

@@ -5,7 +5,7 @@ use std::fmt;
 use bytemuck::Pod;
 use serde::{Deserialize, Serialize};
 
-/// Number type of a section. In JSON it is written as [`name`](Dtype::name).
+/// Number type of a section. In JSON it is its [`name`](Dtype::name).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Dtype {
@@ -31,7 +31,7 @@ impl Dtype {
         }
     }
 
-    /// numpy's name of the type.
+    /// numpy's name for the type.
     pub const fn name(self) -> &'static str {
         match self {
             Dtype::Uint8 => "uint8",
@@ -50,7 +50,7 @@ impl fmt::Display for Dtype {
 }
 
 /// A supertrait that other crates cannot name, so that they cannot implement [`Element`] or
-/// [`SectionTable`](super::SectionTable). A number type with the [`Dtype`] of another type would make the views of a batch panic:
+/// [`SectionTable`](super::SectionTable). A number type with the [`Dtype`] of another type would make batch views panic:
 ///
 /// ```compile_fail,E0277
 /// use endless_gym_core::batch::{Dtype, Element};
@@ -71,7 +71,7 @@ pub trait Sealed {}
 ///
 /// The trait is sealed: other crates cannot implement it.
 pub trait Element: Sealed + Pod + Send + Sync {
-    /// The number type's description in a layout.
+    /// The corresponding number type of a layout.
     const DTYPE: Dtype;
 }
 

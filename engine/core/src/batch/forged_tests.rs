@@ -1,4 +1,4 @@
-//! Layouts in forged JSON are refused, or can be used like any other.
+//! Forged layouts are rejected, or can be used like any other.
 
 use proptest::prelude::*;
 use serde_json::{Value as Json, json};
@@ -11,7 +11,7 @@ fn layout(num_envs: usize) -> Layout {
     batch_layout(memory_gym().spec("Endless-MortarMayhem-v0").unwrap(), num_envs, contents).unwrap()
 }
 
-/// What deserialising says of a layout of which a part is replaced.
+/// The error from deserialising a layout with one part replaced.
 fn refused(pointer: &str, value: Json) -> String {
     let mut json = serde_json::to_value(layout(4)).unwrap();
     *json.pointer_mut(pointer).expect(pointer) = value;
@@ -96,7 +96,7 @@ fn messages_that_are_too_short_for_their_bytes_are_refused() {
     assert_eq!(error.to_string(), "section `options` must have at least 16384 bytes, got 4000");
 }
 
-/// A number that a forger would try.
+/// A number that a forger might try.
 fn numbers() -> impl Strategy<Value = Json> {
     prop_oneof![
         (0..9_u64).prop_map(Json::from),
@@ -131,7 +131,7 @@ fn pointers(json: &Json, at: String, to: &mut Vec<String>) {
     }
 }
 
-/// Replaces, removes, doubles and swaps parts.
+/// Replaces, removes, duplicates and swaps parts.
 fn forge(mut json: Json, changes: &[(prop::sample::Index, u8, Json)]) -> Json {
     for (index, kind, value) in changes {
         let mut places = Vec::new();
@@ -163,7 +163,7 @@ fn forge(mut json: Json, changes: &[(prop::sample::Index, u8, Json)]) -> Json {
     json
 }
 
-/// Reads, writes and divides a batch of that layout, and one that is too short.
+/// Reads, writes and splits a batch of that layout, and one that is too short.
 fn use_all(layout: &Layout) -> Result<(), TestCaseError> {
     prop_assert!(BatchMut::new(layout, &mut zeroed(layout.blocks().min(1 << 16) - 1)).is_none());
     if layout.blocks() > 1 << 16 {
@@ -195,7 +195,7 @@ fn use_all(layout: &Layout) -> Result<(), TestCaseError> {
 proptest! {
     #![proptest_config(crate::property_cases::property_cases(2_000))]
 
-    /// Whatever deserialises can be read, written and divided.
+    /// Any layout that deserialises can be read, written and split.
     #[test]
     fn forged_layouts_are_refused_or_usable(
         id in 0..9_usize,

@@ -16,7 +16,7 @@ pub struct Frames {
     /// Order of the numbers within a frame.
     pub format: PixelFormat,
     /// Number of frames in an observation, 1 to [`MAX_STACK`]: the last frames of the episode, oldest first. At the start of an
-    /// episode its first frame is repeated. With more than 1 the frame is the first index, as in Gymnasium's
+    /// episode its first frame is repeated. With more than 1, the frame is the first index, as in Gymnasium's
     /// `FrameStackObservation`.
     pub stack: usize,
 }

@@ -9,7 +9,7 @@ use super::limits::MAX_ENVS;
 use super::sections::{ActionSection, BatchSection, Contents, RowShape, SectionTable};
 use crate::envs::{ActionSpace, EnvSpec};
 
-/// Maximum number of dimensions of a section's array, the environment's index included.
+/// Maximum number of dimensions of a section's array, including the environment's index.
 pub const MAX_DIMENSIONS: usize = 8;
 
 /// One array of a batch: `num_envs` rows of [`shape`](Section::shape) numbers in C order.
@@ -48,7 +48,7 @@ impl<S: SectionTable> Section<S> {
         self.width
     }
 
-    /// Bytes of all rows, without the padding behind them.
+    /// Bytes of all rows, without the padding after them.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
@@ -56,9 +56,9 @@ impl<S: SectionTable> Section<S> {
 
 /// Where the sections of a batch of `num_envs` environments lie in memory.
 ///
-/// A layout that exists is valid: its sections are those of the table `S` with their number types and numbers of dimensions, each
-/// starts at a multiple of [`BLOCK_BYTES`], they do not overlap, and all of them lie within the declared size. Deserialising
-/// refuses anything else with a [`LayoutError`].
+/// Every layout is valid: its sections are those of the table `S` with their number types and numbers of dimensions, each
+/// starts at a multiple of [`BLOCK_BYTES`], they do not overlap, and all lie within the declared size. Deserialising rejects
+/// anything else with a [`LayoutError`].
 ///
 /// ```
 /// use endless_gym_core::batch::{BatchSection, Contents, Frames, Layout, batch_layout, zeroed};
@@ -84,7 +84,7 @@ impl<S: SectionTable> Section<S> {
 #[serde(try_from = "LayoutFields", into = "LayoutFields", bound = "S: SectionTable")]
 pub struct Layout<S: SectionTable = BatchSection> {
     num_envs: usize,
-    /// By their offsets.
+    /// In the order of their offsets.
     sections: Vec<Section<S>>,
     blocks: usize,
 }
@@ -113,7 +113,7 @@ pub fn action_layout(space: &ActionSpace, num_envs: usize) -> Result<ActionLayou
 }
 
 impl<S: SectionTable> Layout<S> {
-    /// Lays sections of these row shapes out one after the other.
+    /// Places sections with these row shapes one after the other.
     fn new(num_envs: usize, sections: impl IntoIterator<Item = (S, Vec<usize>)>) -> Result<Self, LayoutError> {
         let mut builder = Builder::new(num_envs)?;
         for (name, shape) in sections {
@@ -148,8 +148,8 @@ impl<S: SectionTable> Layout<S> {
         self.blocks - S::STAMP_BLOCKS
     }
 
-    /// The section's numbers in `batch`: `num_envs` rows after each other. Empty if the layout lacks the section, if `T` is not
-    /// its type, or if `batch` is too short.
+    /// The section's numbers in `batch`: `num_envs` consecutive rows. Empty if the layout lacks the section, if `T` is not its
+    /// type, or if `batch` is too short.
     pub fn read<'a, T: Element>(&self, batch: &'a [Block], name: S) -> &'a [T] {
         self.section(name)
             .filter(|_| name.dtype() == T::DTYPE)
@@ -160,7 +160,7 @@ impl<S: SectionTable> Layout<S> {
             .map_or(&[], bytemuck::cast_slice)
     }
 
-    /// As [`Layout::read`], for writing.
+    /// Like [`Layout::read`], for writing.
     pub fn write<'a, T: Element>(&self, batch: &'a mut [Block], name: S) -> &'a mut [T] {
         self.section(name)
             .filter(|_| name.dtype() == T::DTYPE)
@@ -208,11 +208,11 @@ impl<S: SectionTable> Builder<S> {
             return Err(LayoutError::Overlap { section: text, given: offset, end: self.end });
         }
         let too_large = || LayoutError::TooLarge { section: text };
-        // As if no dimension were 0, so that each of them alone fits too.
+        // Treats dimensions of 0 as 1, so that each dimension alone fits too.
         let count = shape.iter().try_fold(self.num_envs, |count, length| count.checked_mul((*length).max(1)));
         let largest =
             count.and_then(|count| count.checked_mul(name.dtype().size())).and_then(|n| n.checked_add(offset));
-        // A slice has at most isize::MAX bytes; the last block and the stamp must fit too.
+        // A slice has at most isize::MAX bytes, and the last block and the stamp must fit too.
         largest.filter(|end| *end <= isize::MAX as usize - 2 * BLOCK_BYTES).ok_or_else(too_large)?;
         let width: usize = shape.iter().product();
         let bytes = self.num_envs * width * name.dtype().size();
@@ -236,7 +236,7 @@ impl<S: SectionTable> Builder<S> {
     }
 }
 
-/// A layout as it is in JSON.
+/// A layout as in JSON.
 #[derive(Clone, Serialize, Deserialize)]
 struct LayoutFields {
     num_envs: usize,
@@ -289,34 +289,34 @@ impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
     }
 }
 
-/// A description of a layout that is not valid.
+/// A description of a layout is invalid.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum LayoutError {
-    /// No environment, or too many.
+    /// There are no environments, or too many.
     #[error("num_envs must be 1 to {MAX_ENVS}, got {given}")]
     NumEnvs {
         /// The number that was given.
         given: usize,
     },
-    /// A section that the table lacks.
+    /// The table has no such section.
     #[error("unknown section `{given}`")]
     UnknownSection {
         /// The name that was given.
         given: String,
     },
-    /// A section that is given twice.
+    /// A section is given twice.
     #[error("section `{section}` is given twice")]
     Duplicate {
         /// The section's name.
         section: &'static str,
     },
-    /// A section is missing that every layout has.
+    /// A required section is missing.
     #[error("section `{section}` is missing")]
     Missing {
         /// The section's name.
         section: &'static str,
     },
-    /// A section has another number type than the table says.
+    /// A section's number type differs from the table's.
     #[error("section `{section}` must have dtype {expected}, got {given}")]
     Dtype {
         /// The section's name.
@@ -326,7 +326,7 @@ pub enum LayoutError {
         /// The table's number type.
         expected: Dtype,
     },
-    /// A section's row has another number of dimensions than the table says.
+    /// A section's row has the wrong number of dimensions.
     #[error("the row shape of section `{section}` must be {expected}, got {given:?}")]
     Shape {
         /// The section's name.
@@ -352,7 +352,7 @@ pub enum LayoutError {
         /// The offset that was given, in bytes.
         given: usize,
     },
-    /// A section starts before the end of the one before it.
+    /// A section starts before the previous one ends.
     #[error("section `{section}` overlaps the one before it: it must start at byte {end} or later, got {given}")]
     Overlap {
         /// The section's name.
@@ -362,23 +362,23 @@ pub enum LayoutError {
         /// End of the section before it, in bytes.
         end: usize,
     },
-    /// A section's end does not fit the address space.
+    /// A section's end does not fit into the address space.
     #[error("section `{section}` is too large for the address space")]
     TooLarge {
         /// The section's name.
         section: &'static str,
     },
-    /// A section of bytes is too short for the longest message.
+    /// A section of bytes is too short for the longest content.
     #[error("section `{section}` must have at least {needed} bytes, got {given}")]
     TooShort {
         /// The section's name.
         section: &'static str,
         /// Bytes of all rows.
         given: usize,
-        /// Bytes of the longest message.
+        /// Bytes of the longest content.
         needed: usize,
     },
-    /// A section reaches beyond the declared size.
+    /// A section extends beyond the declared size.
     #[error("section `{section}` ends at byte {end}, beyond the declared {blocks} blocks of {BLOCK_BYTES} bytes")]
     PastEnd {
         /// The section's name.
@@ -388,7 +388,7 @@ pub enum LayoutError {
         /// The declared size in blocks.
         blocks: usize,
     },
-    /// The declared size is not that of the sections.
+    /// The declared size differs from the size of the sections.
     #[error("blocks must be {expected}, the size of all sections, got {given}")]
     Blocks {
         /// The declared size.

@@ -1,4 +1,4 @@
-//! The size of a batch, and of the pool that writes it.
+//! Limits of a batch, and of the pool that writes it.
 
 /// Maximum number of threads that step a pool's environments.
 pub const MAX_THREADS: usize = 1024;

@@ -1,15 +1,15 @@
 //! The layout of a batch in memory.
 //!
-//! A **batch** is the result of one step of a group of environments: one contiguous piece of memory, in this process or in shared
-//! memory, with an array for each quantity, a *section*. [`BatchSection`] is the table of the sections, [`Layout`] describes where
-//! they are, and [`Batch`] reads them. The message with which a trainer steps or resets a group has a layout of the same kind:
-//! [`ActionSection`], [`ActionLayout`].
+//! A **batch** is the result of one step of a group of environments: one contiguous block of memory, in this process or in
+//! shared memory, with an array, a *section*, for each quantity. [`BatchSection`] lists the sections, [`Layout`] describes
+//! where they are, and [`Batch`] reads them. The message with which a trainer steps or resets a group has a layout of the same
+//! kind: [`ActionSection`], [`ActionLayout`].
 //!
 //! Every section starts at a multiple of 64 bytes and has `num_envs` rows in C order.
 //!
-//! The sections of a batch are followed by one [`Block`] for the pool's generation stamp. A pool that finds the stamp of its own
-//! last write into that memory repaints only what has changed since; with any other stamp it draws every frame in full. After a
-//! change to the frames of a batch that a pool will write into again, call [`Layout::forget_frames`].
+//! The sections of a batch are followed by one [`Block`] for the pool's generation stamp. A pool that finds the stamp of its
+//! own last write into that memory repaints only what has changed since; with any other stamp it draws every frame in full.
+//! After changing the frames of a batch that a pool will write into again, call [`Layout::forget_frames`].
 
 mod block;
 mod buffer;
@@ -33,12 +33,12 @@ pub(crate) use stamp::Stamp;
 pub use view::Batch;
 pub(crate) use view::BatchMut;
 
-/// Version of the sections' meaning and of the messages that carry batches. A trainer refuses an engine of another version.
+/// Version of the sections' meaning and of the messages that carry batches. A trainer rejects an engine of another version.
 ///
 /// Version 4: the specification's key `epoch` became `incarnation`, the message headers have new type names, and a reset with a
 /// seed counts the environments of all groups.
 ///
-/// Version 6: requests that set the options of next episodes, and that ask for seed and options of the running ones.
+/// Version 6: requests that set the options of next episodes, and that return the seeds and options of running ones.
 ///
-/// Version 8: batches no longer say which rows of frames have changed, as those of version 7 did.
+/// Version 8: batches no longer say which rows of frames have changed, unlike those of version 7.
 pub const LAYOUT_VERSION: u32 = 8;

@@ -1,4 +1,4 @@
-//! The tables of sections: the single source of layouts, their checks, the views of a batch and this documentation.
+//! The tables of sections: the single source for layouts, their checks, the views of a batch, and this documentation.
 
 use std::fmt;
 
@@ -9,18 +9,18 @@ use crate::envs::{ActionSpace, EnvSpec};
 /// Maximum length of a message's reset parameters, in bytes of JSON text.
 pub const OPTIONS_BYTES: usize = 16 * 1024;
 
-/// Maximum length of a snapshot in a message, in bytes. Most snapshots have less than a kilobyte in addition to their reset
-/// parameters; one with 1,000 spotlights has about 80 kilobytes, and reset parameters allow twice as many.
+/// Maximum length of a snapshot in a message, in bytes. Most snapshots take less than a kilobyte more than their reset
+/// parameters; one with 1,000 spotlights takes about 80 kilobytes, and reset parameters allow twice as many.
 pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 
-/// The sections that a kind of memory may have: [`BatchSection`] or [`ActionSection`].
+/// The sections that a batch or a message may have: [`BatchSection`] or [`ActionSection`].
 ///
 /// A [`Layout`](super::Layout) describes where each of them is. The trait is sealed: other crates cannot implement it.
 pub trait SectionTable: Sealed + Copy + Eq + fmt::Debug + fmt::Display + 'static {
-    /// All sections, in the order in which they lie in memory.
+    /// All sections, in the order of their memory.
     const ALL: &'static [Self];
 
-    /// Blocks behind the last section that belong to the writer.
+    /// Blocks after the last section that belong to the writer.
     const STAMP_BLOCKS: usize;
 
     /// The section's name in JSON and in Python.
@@ -35,7 +35,7 @@ pub trait SectionTable: Sealed + Copy + Eq + fmt::Debug + fmt::Display + 'static
     /// Whether every layout has the section.
     fn is_required(self) -> bool;
 
-    /// The section of that name, if there is one.
+    /// The section with this name, if there is one.
     fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|section| section.name() == name)
     }
@@ -57,7 +57,7 @@ pub enum RowShape {
 }
 
 impl RowShape {
-    /// Whether a row may have that shape. How many bytes a section of [`RowShape::Bytes`] has in all is not checked here.
+    /// Whether a row may have that shape. The total size of a [`RowShape::Bytes`] section is not checked here.
     pub(super) fn admits(self, shape: &[usize]) -> bool {
         match self {
             RowShape::Scalar | RowShape::Flag => shape.is_empty(),
@@ -77,7 +77,7 @@ impl fmt::Display for RowShape {
     }
 }
 
-/// numpy's name of a Rust number type, for the documentation.
+/// numpy's name for a Rust number type, for the documentation.
 macro_rules! dtype_name {
     (u8) => {
         "uint8"
@@ -124,7 +124,7 @@ macro_rules! presence {
     };
 }
 
-/// Makes the enum of a table, with the table as its documentation.
+/// Defines the enum of a table, with the table as its documentation.
 macro_rules! section_table {
     (
         $(#[$meta:meta])*
@@ -183,7 +183,7 @@ macro_rules! section_table {
     };
 }
 
-/// Calls another macro with the tokens that are given, followed by the table of a batch's sections.
+/// Calls another macro with the given tokens, followed by the table of a batch's sections.
 macro_rules! batch_sections {
     ($macro:ident! $($before:tt)*) => {
         $macro! {
@@ -191,23 +191,23 @@ macro_rules! batch_sections {
             Observation observation: u8, Frames, optional,
                 "the frames; absent if frames are turned off";
             VectorObservation vector_observation: f32, Vector, optional,
-                "the commands, one-hot; ids with `MortarMayhemB` only";
+                "the commands, one-hot; only for ids with `MortarMayhemB`";
             Features features: f32, Vector, optional,
-                "the content of the frame in numbers, in the order of the environment's specification; on request";
+                "the content of the frame as numbers, in the order of the environment's specification; on request";
             GroundTruth ground_truth: f64, Vector, optional,
-                "the original's info `ground_truth`; ids that have it only";
+                "the original's info `ground_truth`; only for ids that have it";
             Reward reward: f64, Scalar, required,
                 "reward of this step";
             Terminated terminated: u8, Flag, required,
-                "1 where this step ended the episode";
+                "1 if the task ended the episode in this step; Memory Gym reports its step limit this way too";
             Truncated truncated: u8, Flag, required,
-                "always 0: the original reports its step limit as `terminated`";
+                "1 if something outside the task ended the episode in this step; always 0 in Memory Gym";
             EpisodeReturn episode_return: f64, Scalar, required,
-                "sum of the running episode's rewards, this step included";
+                "sum of the running episode's rewards, including this step";
             EpisodeLength episode_length: i32, Scalar, required,
-                "number of steps of the running episode, this step included";
+                "number of steps of the running episode, including this step";
             Info info: f64, Vector, required,
-                "the original's further final infos, in the order of the environment's specification; 0 in steps that end no episode";
+                "the original's other final infos, in the order of the environment's specification; 0 in steps that end no episode";
             FinalObservation final_observation: u8, Frames, optional,
                 "`observation` of an episode that same-step autoreset ended in this step, on request; other rows are unspecified";
             FinalVectorObservation final_vector_observation: f32, Vector, optional,
@@ -230,12 +230,12 @@ batch_sections! { section_table!
 }
 
 section_table! {
-    /// A section of the message that a trainer sends to an engine. All are present; a message's header says which are in use.
+    /// A section of the message that a trainer sends to an engine. All are present; the message's header says which are used.
     ActionSection, 0;
     Action action: i32, Vector, required,
         "for a step, one number for each branch of the action space";
     Reset reset: u8, Scalar, required,
-        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`; for a question about running episodes: 0 omits the environment";
+        "for a reset of some environments: 0 does not reset the environment, 1 starts its next episode, 2 starts an episode with `seed`; for a query of running episodes: 0 omits the environment";
     Seed seed: u64, Scalar, required,
         "for a reset of some environments: the seed where `reset` is 2";
     Options options: u8, Bytes(OPTIONS_BYTES), required,
@@ -247,16 +247,16 @@ section_table! {
 /// Which optional sections a batch has. The default has none.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Contents {
-    /// Format of the frames; `None` leaves them out, and nothing is drawn.
+    /// Format of the frames; `None` omits them, and nothing is drawn.
     pub frames: Option<Frames>,
-    /// Whether there is the feature observation.
+    /// Whether to include the feature observation.
     pub features: bool,
-    /// Whether there are the `final_*` sections, for same-step autoreset.
+    /// Whether to include the `final_*` sections, for same-step autoreset.
     pub final_observation: bool,
 }
 
 impl BatchSection {
-    /// Shape of the section's row in a batch of that environment; `None` where the batch lacks the section.
+    /// Shape of the section's row in a batch of that environment; `None` if the batch lacks the section.
     pub(super) fn row_shape(self, spec: &EnvSpec, contents: Contents) -> Option<Vec<usize>> {
         let columns = |count: usize| (count > 0).then(|| vec![count]);
         let final_of = |section: BatchSection| section.row_shape(spec, contents).filter(|_| contents.final_observation);
@@ -308,7 +308,7 @@ mod tests {
         check::<ActionSection>();
     }
 
-    /// Each `final_*` section has the number type and the shape of the section that it is named after.
+    /// Each `final_*` section has the number type and the shape of its original.
     #[test]
     fn final_sections_equal_their_originals() {
         for spec in memory_gym().specs() {

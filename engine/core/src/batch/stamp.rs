@@ -1,4 +1,4 @@
-//! The generation stamp of a batch: by which write of which pool its frames were drawn.
+//! The generation stamp of a batch: which write of which pool drew its frames.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -8,8 +8,8 @@ use super::layout::Layout;
 /// Identifies the last write into a batch.
 ///
 /// A pool that finds the stamp of its own last write into a buffer knows the scene that each frame shows, and repaints only the
-/// differences. With any other stamp, such as that of a batch that was copied or overwritten, it draws every frame in full. Zeros
-/// are no stamp.
+/// differences. With any other stamp, such as that of a batch that was copied or overwritten, it draws every frame in full. An
+/// all-zero stamp means no stamp.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct Stamp {
@@ -17,12 +17,12 @@ pub(crate) struct Stamp {
     pub pool: u64,
     /// Index of the pool's record of the buffer.
     pub buffer: u64,
-    /// Generation counter: number of the write among all of the pool's, from 1.
+    /// Generation counter: number of the write among all writes of the pool, from 1.
     pub generation: u64,
 }
 
 impl Stamp {
-    /// The stamp of a batch; none where the batch is too short to have one.
+    /// The stamp of a batch; zeros if the batch is too short to have one.
     pub fn read(layout: &Layout, batch: &[Block]) -> Stamp {
         batch.get(layout.section_blocks()).map_or_else(Stamp::default, |block| {
             *bytemuck::from_bytes(&bytemuck::bytes_of(block)[..size_of::<Stamp>()])
@@ -38,7 +38,7 @@ impl Stamp {
 }
 
 impl Layout {
-    /// Removes the stamp of `batch`, such that the pool that next writes into it draws every frame in full. Required between a
+    /// Removes the stamp of `batch`, so that the next pool that writes into it draws every frame in full. Call it between a
     /// change to the frames and the pool's next write into the same memory.
     pub fn forget_frames(&self, batch: &mut [Block]) {
         Stamp::default().write(self, batch);

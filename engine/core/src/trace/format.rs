@@ -23,8 +23,8 @@ pub struct Trace {
     pub options: Map<String, Json>,
     /// The episodes in the order in which they were played.
     pub episodes: Vec<Episode>,
-    /// Number of steps after which the recording of an episode stops if it has not ended; by default 700, and 200 in a trace with
-    /// ground-truth views, as the reference traces were recorded.
+    /// Number of steps after which the recording of an unfinished episode stops. The default is that of the reference traces:
+    /// 700, or 200 in a trace with ground-truth views.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_steps: Option<usize>,
 }
@@ -32,13 +32,13 @@ pub struct Trace {
 /// One recorded episode.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct Episode {
-    /// Seed of the reset; `None` continues the generator of the episode before.
+    /// Seed of the reset; `None` continues the previous episode's generator.
     pub seed: Option<u64>,
     /// CRC-32 of the first observation.
     pub reset_crc: u32,
     /// The reset's info.
     pub reset_info: Map<String, Json>,
-    /// The first vector observation; empty where there is none.
+    /// The first vector observation; empty if there is none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub reset_vector: Vec<f32>,
     /// The steps from the first to the last.
@@ -59,7 +59,7 @@ pub struct Step {
     pub crc: u32,
     /// The step's info.
     pub info: Map<String, Json>,
-    /// CRC-32 of the ground-truth view, where it was recorded.
+    /// CRC-32 of the ground-truth view, if it was recorded.
     pub render_crc: Option<u32>,
 }
 
@@ -95,7 +95,7 @@ impl From<StepFields> for Step {
     }
 }
 
-/// In the form of the file: a list, with the action as a number where it is one.
+/// As in the file: a list, with a single-number action as a number.
 impl Serialize for Step {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut list = serializer.serialize_tuple(if self.render_crc.is_some() { 6 } else { 5 })?;
@@ -124,7 +124,7 @@ impl Trace {
         Self::read(File::open(path).map_err(TraceError::Open)?)
     }
 
-    /// As [`open`](Self::open), from any source of the file's bytes.
+    /// Like [`open`](Self::open), from any source of the file's bytes.
     ///
     /// # Errors
     ///
@@ -146,7 +146,7 @@ impl Trace {
         encoder.finish()?.flush()
     }
 
-    /// Checks that no episode lacks its last steps: each has ended, or has as many steps as are recorded of an episode at most.
+    /// Checks that no episode lacks its last steps: each has ended, or has the maximum number of recorded steps.
     ///
     /// # Errors
     ///
@@ -168,7 +168,7 @@ impl Trace {
     }
 }
 
-/// A trace that cannot be read or replayed.
+/// A trace cannot be read or replayed.
 #[derive(Debug, Error)]
 pub enum TraceError {
     /// The file cannot be opened.
@@ -193,7 +193,7 @@ pub enum TraceError {
         /// Number of steps after which a recording stops.
         max_steps: usize,
     },
-    /// The environment does not exist, or the recorded reset parameters or actions are not valid.
+    /// The environment does not exist, or the recorded reset parameters or actions are invalid.
     #[error(transparent)]
     Pool(#[from] PoolError),
 }

@@ -1,6 +1,7 @@
-//! Recorded episodes of the original: their format, their replay in this engine, and recordings of this engine in that format.
+//! Recorded episodes: the format of the original's recordings, their replay in this engine, and recordings of this engine in
+//! that format.
 //!
-//! A trace file is gzipped JSON: one environment object of the original that plays several episodes in a row.
+//! A trace file is gzipped JSON: one environment object of the original, which plays several episodes in a row.
 //!
 //! ```text
 //! {"env": id, "options": {reset parameter: value},
@@ -8,8 +9,8 @@
 //!                "steps": [[action, reward, done, crc, info], ..]}]}
 //! ```
 //!
-//! `crc` is the CRC-32 of the observation's bytes; a seed of `null` continues the object's generator; `reset_vector` is the
-//! vector observation where there is one. A step may end with a sixth element, the CRC-32 of the ground-truth view.
+//! `crc` is the CRC-32 of the observation's bytes; a `seed` of `null` continues the object's generator; `reset_vector` is the
+//! vector observation, if there is one. A step may end with a sixth element, the CRC-32 of the ground-truth view.
 
 mod format;
 mod record;

@@ -40,13 +40,13 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// A recording without an episode.
+    /// A recording without episodes.
     pub fn new(env: &str, options: &OptionMap) -> Self {
         let trace = Trace { env: env.to_owned(), options: options.clone(), episodes: Vec::new(), max_steps: None };
         Recorder { trace }
     }
 
-    /// Starts an episode, of which `blocks` have the first observation.
+    /// Starts an episode whose first observation is in `blocks`.
     pub fn reset(&mut self, seed: Option<u64>, pool: &Pool, blocks: &[Block]) {
         let batch = Batch::new(pool.layout(), blocks);
         self.trace.episodes.push(Episode {
@@ -58,7 +58,7 @@ impl Recorder {
         });
     }
 
-    /// Adds the step in `blocks` to the last episode. Without an episode nothing is recorded.
+    /// Adds the step in `blocks` to the last episode. Does nothing if there is no episode.
     pub fn step(&mut self, action: &[i32], pool: &Pool, blocks: &[Block]) {
         let Some(episode) = self.trace.episodes.last_mut() else { return };
         let batch = Batch::new(pool.layout(), blocks);
@@ -73,7 +73,7 @@ impl Recorder {
         });
     }
 
-    /// Writes the file, gzipped JSON. If the last episode has not ended, the file says that the recording stopped there.
+    /// Writes the trace as gzipped JSON. If the last episode has not ended, the file says that the recording stopped there.
     ///
     /// # Errors
     ///

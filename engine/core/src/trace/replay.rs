@@ -1,4 +1,4 @@
-//! The replay of a trace, with a comparison of everything that the original returned.
+//! Replays a trace and compares everything that the original returned.
 
 use std::fmt;
 
@@ -66,7 +66,7 @@ impl Replay {
 ///
 /// # Errors
 ///
-/// [`TraceError::Pool`] if the trace's environment, reset parameters or actions are not valid.
+/// [`TraceError::Pool`] if the trace's environment, reset parameters or actions are invalid.
 ///
 /// ```
 /// use endless_gym_core::memory_gym;
@@ -87,7 +87,7 @@ pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> 
         options: ResetOptions::Shared(trace.options.clone()),
         autoreset: Autoreset::Disabled,
         check_drawing: true,
-        // Used only by a first episode without a seed, since not every platform has a source of entropy.
+        // Only used by a first episode without a seed, since not every platform has a source of entropy.
         seeding: Seeding::Continue { seed: Some(0) },
         ..PoolConfig::new(&trace.env, 1)
     };

@@ -3,8 +3,8 @@
     python record_random.py > cases.json
     python record_random.py --streams 2000 --draws 400 > wide.json    # a wider run, not stored
 
-numpy 1.26 and 2.x write the same cases. The file holds whole numbers only: floats are stored as
-the 64 bits of their IEEE 754 form, so that no decimal conversion stands between the two sides.
+numpy 1.26 and 2.x write the same cases. The file holds only integers: floats are stored as the
+64 bits of their IEEE 754 form, which avoids decimal conversions.
 """
 
 import argparse
@@ -21,7 +21,7 @@ GAME_RANGES = [
     (0, 1), (0, 2), (0, 3), (2, 4), (1, 9), (0, 5), (0, 25), (0, 36), (0, 84), (0, 100),
     (0, 360), (-45, 45), (-135, 135), (-8, 8), (-2, 2), (7, 14), (30, 56),
 ]
-# Ranges around the borders between numpy's methods, and ones that reject often.
+# Ranges around the limits of numpy's methods, and ranges that reject often.
 EDGE_RANGES = [
     (0, 2**31 - 1), (0, 2**31), (0, 2**31 + 1), (-7, 3 * 2**30), (0, 2**32 - 2),
     (0, 2**32 - 1), (-5, 2**32 - 5), (0, 2**32), (-(2**31), 2**31), (0, 2**32 + 1), (-3, 2**32),
@@ -40,7 +40,7 @@ def bits(value):
 
 
 def words(value):
-    """The little-endian 32-bit words of a whole number, as SeedSequence cuts it."""
+    """The little-endian 32-bit words of an integer, as SeedSequence splits it."""
     result = [value & 0xFFFFFFFF]
     while value := value >> 32:
         result.append(value & 0xFFFFFFFF)
@@ -72,7 +72,7 @@ def integers(rng, picker):
         (picker.choice(GAME_RANGES), picker.choice(EDGE_RANGES), random_range(picker)), (5, 4, 2)
     )[0]
     size = picker.choices((None, 1, 2, 3, 5), (8, 1, 2, 1, 1))[0]
-    # A float argument counts as the whole number it holds.
+    # numpy truncates float arguments.
     exact = max(abs(low), abs(high)) < 2**31
     as_float = exact and picker.random() < 0.2
     drawn = rng.integers(float(low), float(high), size) if as_float else rng.integers(low, high, size)
@@ -95,7 +95,7 @@ def draw(rng, picker):
 def stream(seed, spawn_key, count, picker):
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=spawn_key)))
     draws = [draw(rng, picker) for _ in range(count)]
-    # One of each at the end tells whether state and kept half agree after the last draw.
+    # One draw of each kind at the end checks the state and the kept half after the last draw.
     draws.append({"integers": [0, 2**32, [int(rng.integers(0, 2**32))]]})
     draws.append({"random": bits(rng.random())})
     return {"seed": seed, "spawn_key": list(spawn_key), "draws": draws}

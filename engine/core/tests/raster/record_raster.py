@@ -6,8 +6,8 @@
 
 Needs pygame 2.4.0 and memory_gym 1.0.2. A scene is a list of operations on numbered surfaces, with
 checks among them: the size of a surface and the CRC-32 of its pixels as [x][y][channel]. Colours
-are 0xRRGGBB, floats are already cut off as pygame cuts them. Some scenes are random; the others
-are what the environments' own pictures and episodes did, caught on the way to pygame.
+are 0xRRGGBB; floats are already truncated as pygame truncates them. Some scenes are random; the others
+are the calls that the environments' pictures and episodes made, intercepted on the way to pygame.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def check(surface):
 
 
 class Surface(BaseSurface):
-    """A pygame surface that notes what is done to it."""
+    """A pygame surface that records the operations on it."""
 
     def __init__(self, size, *arguments):
         super().__init__(size, *arguments)
@@ -131,7 +131,7 @@ pygame.transform.rotate, pygame.transform.scale = rotate, scale
 
 
 def noise(surface, seed):
-    """Colours of all kinds; about an eighth of the pixels is 0x010203."""
+    """Pseudorandom colours; about an eighth of the pixels are 0x010203."""
     note("noise", number(surface), seed)
     width, height = surface.get_size()
     with np.errstate(over="ignore"):
@@ -148,7 +148,7 @@ def noise(surface, seed):
 
 
 def random_scene(rng, draws):
-    """A surface on which shapes are drawn one over the other."""
+    """A surface with random shapes drawn over each other."""
     size = (rng.choice([84, 84, rng.randint(1, 100)]), rng.choice([84, 84, rng.randint(1, 100)]))
     surface = Surface(size)
     span = rng.choice([0, 5, 60, 400])
@@ -191,7 +191,7 @@ def random_scene(rng, draws):
 
 
 def edge_scene():
-    """Shapes that random ones seldom hit: corners as high as their rectangle, lines that end just
+    """Shapes that random scenes seldom have: corners as high as their rectangle, lines that end just
     off the surface, circles beyond an edge, borders about as wide as what is visible."""
     surface = Surface((60, 50))
     for height in (2, 3, 11, 41):
@@ -216,7 +216,7 @@ def edge_scene():
 
 
 def random_transformation(rng):
-    """Surfaces with colour keys and alphas, turned, scaled and blitted."""
+    """Surfaces with colour keys and alphas, rotated, scaled and blitted."""
     most = rng.choice([3, 12, 40, 90])
     source = Surface((rng.randint(0, most), rng.randint(0, most)))
     noise(source, rng.getrandbits(31))
@@ -236,7 +236,7 @@ def random_transformation(rng):
         source = scale(rotate(source, angle), (rng.randint(0, 90), rng.randint(0, 90)))
     check(source)
     if kind != 3 and rng.random() < 0.3:
-        # What was transformed is no surface that notes what is done to it.
+        # A transformed surface does not record the operations on it.
         if rng.random() < 0.5:
             alpha = rng.randint(0, 255)
             note("alpha", number(source), alpha)
@@ -253,7 +253,7 @@ def random_transformation(rng):
 
 
 def alpha_sweep(mode, levels):
-    """The check sums of every colour mixed into every other one, per alpha."""
+    """The checksums of blending every level over every other level, per alpha."""
     sums = []
     values = np.arange(256, dtype=np.uint8)
     over = np.repeat(np.broadcast_to(values[:, None, None], (256, 256, 1)), 3, axis=2)
@@ -321,7 +321,7 @@ def spotlight_pictures(item_scale):
 
 
 def episode(name, options, seed, steps, debug_views):
-    """The reset and some steps of an environment, with the observation checked at each."""
+    """The reset and some steps of an environment, each followed by a check of the observation."""
     import gymnasium
 
     screen = None
@@ -356,7 +356,7 @@ def episode(name, options, seed, steps, debug_views):
 
 
 def option_sets(rng):
-    """Options that change what is drawn, per environment; those it does not know are left out."""
+    """Options that change what is drawn, per environment; those that it does not know are omitted."""
     agent_scale = rng.choice([0.1, 0.25, 0.3, 0.5, 1.0])
     quick = {
         "command_count": [2], "command_show_duration": [1], "command_show_delay": [1],

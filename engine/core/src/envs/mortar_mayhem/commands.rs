@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// Number of different commands.
 pub const COMMANDS: usize = 9;
 
-/// Largest number of commands of an id with a vector observation.
+/// Maximum number of commands of an id with a vector observation.
 pub const MAX_VECTOR_COMMANDS: usize = 20;
 
 /// A command, by its number in the original's order; `allowed_commands` counts from the start.
@@ -18,7 +18,7 @@ struct Properties {
     offset: (i32, i32),
     /// Counterclockwise turn of the arrow, in degrees from right; `None` is shown as a crossed circle.
     angle: Option<i32>,
-    /// Place in a one-hot vector observation.
+    /// Index in a one-hot vector observation.
     one_hot: usize,
 }
 
@@ -45,7 +45,7 @@ impl Command {
         (0..count.min(COMMANDS) as u8).map(Command)
     }
 
-    /// The command of that number, modulo [`COMMANDS`].
+    /// The command with this number, modulo [`COMMANDS`].
     pub fn from_index(index: usize) -> Command {
         Command((index % COMMANDS) as u8)
     }
@@ -55,7 +55,7 @@ impl Command {
         self.index() < COMMANDS
     }
 
-    /// Its number in the original's order, from 0.
+    /// The command's number in the original's order, from 0.
     pub fn index(self) -> usize {
         usize::from(self.0)
     }
@@ -66,12 +66,12 @@ impl Command {
         PROPERTIES[self.index()].angle
     }
 
-    /// Its place in a one-hot vector observation.
+    /// The command's index in a one-hot vector observation.
     pub fn one_hot(self) -> usize {
         PROPERTIES[self.index()].one_hot
     }
 
-    /// The command at that place of a one-hot vector observation.
+    /// The command at an index of a one-hot vector observation.
     pub fn from_one_hot(place: usize) -> Option<Command> {
         PROPERTIES.iter().position(|command| command.one_hot == place).map(Command::from_index)
     }

@@ -1,4 +1,4 @@
-//! Reset parameters and the geometry that follows from them.
+//! Reset parameters and the geometry derived from them.
 
 use super::parameters::{Parameters, Variant};
 use crate::envs::character::{Bounds, CharacterSize};

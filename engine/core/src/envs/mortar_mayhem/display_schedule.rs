@@ -1,4 +1,4 @@
-//! The schedule by which commands are shown.
+//! The schedule for showing commands.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,7 +20,7 @@ impl DisplaySchedule {
         DisplaySchedule { first, duration, delay, frame: 0, frames: count * (duration + delay) }
     }
 
-    /// Whether every number is in its range. A forged snapshot may hold any numbers.
+    /// Whether every number is in range. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
         const LIMIT: u64 = 1 << 32;
         [self.first, self.duration, self.delay, self.frame, self.frames].iter().all(|number| (*number as u64) < LIMIT)

@@ -1,4 +1,4 @@
-//! What a frame of Mortar Mayhem shows, its pictures, and how they are composed.
+//! The scene of a Mortar Mayhem frame, its pictures, and how they are composed.
 
 use std::sync::Arc;
 
@@ -32,16 +32,16 @@ type TileColours = (Rgb, Rgb);
 const CALM: TileColours = ([21, 43, 77], [29, 60, 107]);
 const BURNING: TileColours = ([81, 18, 26], [112, 24, 36]);
 
-/// What all environments with the same reset parameters share: the configuration and the pictures.
+/// Shared by all environments with the same reset parameters: the configuration and the pictures.
 #[derive(Debug)]
 pub struct Assets {
-    /// What the rules need.
+    /// Configuration of the rules.
     pub config: Config,
     /// The character's pictures.
     pub(super) character: Arc<CharacterSprites>,
-    /// Frame of the empty arena with no tile burning.
+    /// The empty arena with no tile burning.
     calm: Vec<u8>,
-    /// Frame of the empty arena with all tiles burning.
+    /// The empty arena with all tiles burning.
     burning: Vec<u8>,
     commands: [Sprite; COMMANDS],
 }
@@ -69,7 +69,7 @@ impl Assets {
         }
     }
 
-    /// Paints the arena; all tiles but `safe_tile` burn, or none if there is no such tile.
+    /// Paints the arena. All tiles except `safe_tile` burn; without a `safe_tile`, none do.
     fn paint_arena(&self, safe_tile: Option<(i32, i32)>, canvas: &mut Canvas<'_>) {
         match safe_tile {
             None => canvas.paste(&self.calm),
@@ -86,8 +86,8 @@ impl Assets {
         self.commands[command.index()].blit(canvas, x, y);
     }
 
-    /// Draws the original's `_build_debug_surface`, which marks the target and advances the shown commands by one frame
-    /// with every call. `earlier_sprites` are the pictures of an earlier episode's character.
+    /// Draws the original's `_build_debug_surface`, which marks the target and advances the shown commands by one frame per
+    /// call. `earlier_sprites` are the pictures of an earlier episode's character.
     pub(super) fn draw_ground_truth(
         &self,
         state: &mut State,
@@ -127,16 +127,16 @@ fn draw_arena(config: &Config, (fill, border): TileColours) -> Vec<u8> {
 /// What a frame shows.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Scene {
-    /// The one tile that does not burn, while the others do.
+    /// The only tile that does not burn, while the others do.
     pub(super) safe_tile: Option<(i32, i32)>,
     pub(super) character: Character,
-    /// The character's pictures, if they are an earlier episode's and differ from the current ones.
+    /// The character's pictures, if they belong to an earlier episode and differ from the current ones.
     pub(super) earlier_sprites: Option<Arc<CharacterSprites>>,
     pub(super) command: Option<Command>,
 }
 
 impl Scene {
-    /// What a state looks like. `sprites` are the current episode's, `earlier_sprites` those of an earlier episode's
+    /// The scene of a state. `sprites` are the current episode's pictures, `earlier_sprites` those of an earlier episode's
     /// character.
     pub(super) fn new(
         state: &State,
@@ -163,8 +163,8 @@ impl Scene {
         }
     }
 
-    /// The rectangles in which this scene's frame differs from `shown`'s. Unless painted pixels are `tracked`, they may be larger
-    /// where that is faster to paint.
+    /// The rectangles in which this scene's frame differs from `shown`'s. Unless painted pixels are `tracked`, they may be
+    /// larger where larger ones are faster to paint.
     pub(super) fn damage_since(&self, shown: &Scene, assets: &Assets, tracked: bool) -> Damage {
         let mut damage = Damage::new(SCREEN, SCREEN);
         if self.safe_tile != shown.safe_tile {

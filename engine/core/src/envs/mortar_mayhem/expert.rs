@@ -10,9 +10,9 @@ use crate::envs::screen::SCREEN;
 /// Distance in pixels from a tile's centre within which the agent stops.
 const DEAD_ZONE: i32 = 2;
 
-/// Plays Mortar Mayhem from the feature and vector observations. It recognises a new command by the pause before it or
-/// by a difference, and knows that a command is finished when the fire goes out. It therefore needs `visual_feedback`,
-/// and a `command_show_delay` of at least 1.
+/// Plays Mortar Mayhem from the feature and vector observations. It recognises a new command by the pause before it or by a
+/// difference, and knows that a command is finished when the fire goes out. It therefore needs `visual_feedback`, and a
+/// `command_show_delay` of at least 1.
 #[derive(Debug)]
 pub struct MortarExpert {
     variant: Variant,
@@ -49,7 +49,7 @@ impl MortarExpert {
             && let Some(command) = shown
         {
             self.commands.push(command);
-            // A command shown while tiles still burn restarts the sequence when the fire is out.
+            // A command shown while tiles still burn restarts the sequence once the fire is out.
             if features[BURNING] == 1.0 {
                 self.current = None;
             }

@@ -1,4 +1,4 @@
-//! The feature observation of Mortar Mayhem: what a frame shows, as numbers.
+//! The feature observation of Mortar Mayhem: the content of a frame as numbers.
 
 use super::commands::COMMANDS;
 use super::config::Config;

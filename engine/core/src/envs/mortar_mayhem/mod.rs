@@ -1,4 +1,4 @@
-//! Mortar Mayhem: memorise a sequence of commands, then execute it on an arena whose other tiles burn.
+//! Mortar Mayhem: memorise a sequence of commands, then execute it in an arena whose other tiles burn.
 
 mod commands;
 mod config;

@@ -5,7 +5,7 @@
 use super::commands::COMMANDS;
 use crate::envs::parameters::ResetParameters;
 
-/// What distinguishes the ids of Mortar Mayhem.
+/// Distinguishes the ids of Mortar Mayhem.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Variant {
     /// How the agent moves.
@@ -23,17 +23,17 @@ pub struct Variant {
 pub enum Locomotion {
     /// By `agent_speed` in eight directions, limited by the arena's border.
     Free,
-    /// By `agent_speed` in eight directions; leaving the screen on one side leads to the other.
+    /// By `agent_speed` in eight directions, wrapping around the edges of the screen.
     Wrapping,
     /// Turns and walks from tile to tile.
     Grid,
 }
 
-/// Largest scale of the agent: a radius of 100 pixels.
+/// Maximum scale of the agent: a radius of 100 pixels.
 pub const MAX_AGENT_SCALE: f64 = 4.0;
-/// Largest duration and delay in steps.
+/// Maximum duration and delay in steps.
 pub const MAX_DURATION: i64 = 1000;
-/// Largest number of commands of an id that shows them.
+/// Maximum number of commands of an id that shows them.
 pub const MAX_COMMANDS: i64 = 1000;
 
 /// One set of reset parameters.
@@ -49,7 +49,7 @@ pub struct Parameters {
     pub arena_size: i32,
     /// Number of [commands](super::Command) that may occur, counted from the first; 4 to 9.
     pub allowed_commands: usize,
-    /// Number of commands of an episode, to draw from; empty for the endless id.
+    /// Number of commands in an episode, to draw from; empty for the endless id.
     pub command_count: Vec<i64>,
     /// Commands at the start of an episode of the endless id.
     pub initial_command_count: usize,
@@ -67,8 +67,7 @@ pub struct Parameters {
     pub reward_command_failure: f64,
     /// Reward for executing one command.
     pub reward_command_success: f64,
-    /// `reward_episode_success`, or `reward_new_command_success` of the endless id: reward for executing the whole
-    /// sequence.
+    /// `reward_episode_success`, or `reward_new_command_success` of the endless id: reward for executing the whole sequence.
     pub reward_sequence_success: f64,
 }
 

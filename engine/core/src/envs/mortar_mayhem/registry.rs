@@ -1,7 +1,7 @@
 //! The ids of Mortar Mayhem, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks few values. The limits here are wide enough
-//! for every use, and narrow enough that no value breaks the rules or needs much memory.
+//! Source: `default_reset_parameters` of the original. The original checks few values. The limits here are wide enough for
+//! every use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;

@@ -1,7 +1,7 @@
 //! The rules of Mortar Mayhem: one implementation for all five ids.
 //!
-//! Source: `reset` and `step` of the original's `mortar_mayhem*.py` and `endless_mortar_mayhem.py`. The order of the
-//! random draws is part of the rules.
+//! Source: `reset` and `step` of the original's `mortar_mayhem*.py` and `endless_mortar_mayhem.py`. The order of the random
+//! draws is part of the rules.
 
 use super::commands::Command;
 use super::config::Config;
@@ -13,7 +13,7 @@ use crate::envs::environment::Transition;
 use crate::random::Generator;
 
 impl State {
-    /// Starts an episode. `last_scale` is the scale of the agent in the episode before.
+    /// Starts an episode. `last_scale` is the scale of the agent in the previous episode.
     pub(super) fn reset(&mut self, config: &Config, last_scale: f64, random: &mut Generator) {
         let (variant, parameters) = (config.variant, &config.parameters);
         if self.displayed == DisplayedCharacter::Current {
@@ -61,8 +61,7 @@ impl State {
         self.explosion_delay = *random.choice(&parameters.explosion_delay) as u32;
     }
 
-    /// Adds `count` commands that stay within the arena, each drawn from those that are possible where the last one
-    /// leads.
+    /// Adds `count` commands that stay within the arena, each drawn from those that are possible after the last one.
     fn add_valid_commands(&mut self, config: &Config, count: i64, random: &mut Generator) {
         let mut at = self.agent_tile;
         for _ in 0..count {
@@ -70,7 +69,7 @@ impl State {
                 Command::first(config.parameters.allowed_commands).filter(|command| config.contains(command.apply(at)))
             };
             let drawn = random.integers(0, valid().count() as i64) as usize;
-            // At least two of the first four commands lead from any tile to another.
+            // From any tile, at least two of the first four commands lead to another.
             if let Some(command) = valid().nth(drawn) {
                 at = command.apply(at);
                 self.commands.push(command);
@@ -83,7 +82,7 @@ impl State {
         self.commands.push(Command::from_index(drawn as usize));
     }
 
-    /// The tile that the command of this index leads to; the endless arena is a torus.
+    /// The tile that the command at `index` leads to; the endless arena is a torus.
     fn tile_after(&self, config: &Config, tile: (i32, i32), index: usize) -> (i32, i32) {
         let (x, y) = self.commands.get(index).map_or(tile, |command| command.apply(tile));
         if config.variant.endless {
@@ -94,16 +93,16 @@ impl State {
         }
     }
 
-    /// Starts to show the commands from index `first` on.
+    /// Starts showing the commands from index `first` on.
     fn start_display(&mut self, first: usize) {
         let count = self.commands.len() - first;
         self.display = DisplaySchedule::new(first, count, self.show_duration, self.show_delay);
         self.view_display = self.display;
     }
 
-    /// Sets the view's schedule to where it is when every frame of the episode was viewed once.
+    /// Sets the view's schedule as if every frame of the episode had been viewed once.
     pub(super) fn align_view_display(&mut self) {
-        // A schedule that starts with the episode shows its first frame at once, a later one in the step after.
+        // A schedule that starts with the episode shows its first frame at once; a later one, in the next step.
         let starts_with_episode = self.display.first() == 0;
         self.view_display = self.display.before(usize::from(starts_with_episode));
     }
@@ -184,8 +183,7 @@ impl State {
         self.command_steps = 1;
     }
 
-    /// While tiles burn: ends the episode if the agent is on one, and extinguishes them after `explosion_duration`
-    /// steps.
+    /// While tiles burn, ends the episode if the agent is on one, and extinguishes them after `explosion_duration` steps.
     fn burn(&mut self, config: &Config, transition: &mut Transition) {
         if !self.tiles_on {
             self.command_steps += 1;

@@ -9,16 +9,16 @@ use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_DURATION, Parameters};
 use crate::envs::character::Character;
 use crate::envs::progress::Progress;
 
-/// The character that frames show after the first frame of an episode.
+/// The character that frames show after an episode's first frame.
 ///
 /// The original's endless id keeps showing the last episode's character until the agent may move in the new episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) enum DisplayedCharacter {
-    /// No episode has played a step yet, so the current character is shown.
+    /// The current one, since no episode has played a step yet.
     Initial,
     /// The current episode's.
     Current,
-    /// An earlier episode's, with the scale that it was drawn at.
+    /// An earlier episode's, with the scale at which it was drawn.
     Earlier { character: Character, scale: f64 },
 }
 
@@ -27,7 +27,7 @@ pub(super) enum DisplayedCharacter {
 pub struct State {
     pub(super) agent: Character,
     pub(super) displayed: DisplayedCharacter,
-    /// The frame is the first of its episode.
+    /// Whether the frame is the first of its episode.
     pub(super) first_frame: bool,
     /// The command that the frame shows.
     pub(super) shown_command: Option<Command>,
@@ -36,16 +36,16 @@ pub struct State {
     pub(super) agent_tile: (i32, i32),
     /// The tile that the current command leads to.
     pub(super) target: (i32, i32),
-    /// All tiles but the target burn.
+    /// Whether all tiles but the target burn.
     pub(super) tiles_on: bool,
     pub(super) display: DisplaySchedule,
-    /// The same schedule for the ground-truth view, which advances it by one frame with every view.
+    /// The same schedule for the ground-truth view, in which every view advances it by one frame.
     pub(super) view_display: DisplaySchedule,
     pub(super) show_duration: usize,
     pub(super) show_delay: usize,
     pub(super) explosion_duration: u32,
     pub(super) explosion_delay: u32,
-    /// Commands of the sequence that were checked.
+    /// Number of commands of the sequence that have been checked.
     pub(super) current_command: usize,
     /// Steps since the current command became due.
     pub(super) command_steps: u32,
@@ -53,7 +53,7 @@ pub struct State {
     pub(super) verify_steps: u32,
     pub(super) steps: i64,
     pub(super) total_completed: usize,
-    /// The whole sequence was checked in this step, which finite ids count as success.
+    /// Whether the whole sequence was checked in this step, which finite ids count as success.
     pub(super) success: bool,
 }
 
@@ -84,7 +84,7 @@ impl State {
         }
     }
 
-    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
+    /// Whether the rules can continue from every number. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self, config: &Config) -> bool {
         let displayed_is_valid = match &self.displayed {
             DisplayedCharacter::Earlier { character, scale } => {
@@ -129,7 +129,7 @@ impl State {
         }
     }
 
-    /// Commands executed, and of how many.
+    /// The number of commands executed, and the total.
     pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
         let (executed, sequence) = (self.total_completed as f64, self.commands.len() as f64);
         if config.variant.endless {
