@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Steps per second of every environment, beside the original's, all measured in one run. Prints the table and keeps it under
-# target/. Further arguments go to `endless bench`.
+# Steps per second of every environment and of the original, measured in one run. Prints the table and also writes it to
+# target/. Arguments are passed to `endless bench`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$(cargo xtask original)

@@ -1,7 +1,7 @@
 """Compares the time of a step between two builds: `python benches/compare_builds.py OLD NEW [--env ID ...] [--num-envs N ...]`.
 
-OLD and NEW are programs that `cargo bench --bench step_profile --no-run` built, copied away in between. Both keep running and
-take turns of some milliseconds of processor time, so that the load of the machine falls on both alike.
+OLD and NEW are programs built by `cargo bench --bench step_profile --no-run`; copy the first before building the
+second. Both keep running and take turns of a few milliseconds of CPU time, so that other load affects both equally.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Build:
         )
 
     def turn(self) -> float:
-        """Takes steps, and returns the nanoseconds of processor time that one environment's step took."""
+        """Takes steps, and returns the CPU time of one environment's step in nanoseconds."""
         assert self.process.stdin is not None and self.process.stdout is not None
         print(self.steps, file=self.process.stdin, flush=True)
         return float(self.process.stdout.readline())
@@ -39,7 +39,7 @@ def compare(paths: list[str], env: str, num_envs: int, rounds: int) -> str:
     builds = [Build(path, env, num_envs) for path in paths]
     times: list[list[float]] = [[], []]
     for number in range(rounds):
-        # Who begins alternates.
+        # The builds take turns to begin.
         for build in (0, 1) if number % 2 else (1, 0):
             times[build].append(builds[build].turn())
     for each in builds:

@@ -1,13 +1,13 @@
-"""Steps per second compared with the original, from Rust and from Python: complete episodes, random actions, medians of rounds.
+"""Compares steps per second with the original, from Rust and Python: whole episodes, random actions, medians.
 
 cargo xtask bench                      # installs the requirements and runs this script; other arguments are passed to it
 cargo xtask bench --markdown t.md --json t.json
 
-Requires Python 3.11 with this package and `stable-baselines3`, and another Python 3.11 (`--original`) with `memory-gym`. The
-original pins Gymnasium 0.29 and numpy 1. Its environments run in a process of this Python whose PYTHONPATH has the packages of
-the other Python first; Stable-Baselines3 is that of this Python. For scale, the environments of EnvPool and the memory bandwidth
-are measured as well; those of PufferLib are not, since their build downloads sources. Each round measures every contender once,
-in turn, so that the load of other programs affects all contenders.
+Requires Python 3.11 with this package and `stable-baselines3`, and another Python 3.11 (`--original`) with
+`memory-gym`. The original pins Gymnasium 0.29 and numpy 1. Its environments run in a process of this Python whose
+PYTHONPATH lists the packages of the other Python first; Stable-Baselines3 comes from this Python. For scale, EnvPool's
+environments and the memory bandwidth are measured as well; PufferLib's environments are not, since their build
+downloads sources. Each round measures every contender once, so that the load of other programs affects all of them.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ SIZES = [64, 1024]
 #: EnvPool's environment with the most similar observations (four gray frames of 84 x 84), and its fastest environment.
 ENVPOOL = ["Pong-v5", "CartPole-v1"]
 
-#: Targets: multiple of the best vectorised original, multiple of the original's single environment, share of the service's speed
-#: from Rust.
+#: Targets: multiple of the best vectorised original, multiple of the original's single environment, and share of the
+#: speed of the service from Rust.
 VECTORISED, SINGLE, OF_RUST = 300.0, 20.0, 0.9
 
 
@@ -115,7 +115,7 @@ def envpool(python: str, id: str, num_envs: int, seconds: float) -> float:
 
 
 def memory_bandwidth() -> float:
-    """Write bandwidth of a large memory copy in GB/s; it reads as much."""
+    """Write bandwidth of a large memory copy in GB/s; it reads the same amount."""
     source = np.ones(1 << 28, dtype=np.uint8)
     target = np.zeros_like(source)
     start = time.perf_counter()
@@ -214,7 +214,7 @@ def markdown(whole: dict[str, Any]) -> str:
 
 
 def machine() -> dict[str, Any]:
-    """The machine and the versions of the measurement."""
+    """The machine and the versions."""
     models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
         "processor": models[0].split(":")[1].strip() if models else platform.machine(),

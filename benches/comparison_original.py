@@ -16,7 +16,7 @@ from typing import Any
 warnings.filterwarnings("ignore")
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
-# Libraries print to stdout, also in forked processes. Their output goes to stderr.
+# Libraries print to stdout, even in forked processes. Redirect their output to stderr.
 answers = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
 

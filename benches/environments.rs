@@ -1,4 +1,4 @@
-//! Cost of one environment alone, by id: a step without a picture, a reset, a frame drawn in full, and the features.
+//! Cost of a single environment, by id: a step without drawing, a reset, a full frame, and the features.
 
 mod actions;
 

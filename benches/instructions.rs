@@ -1,6 +1,7 @@
 //! Steps of every environment for an instruction counter: `cargo xtask instructions` runs it under callgrind.
 //!
-//! Prints nothing and measures nothing itself. Its argument is an environment id; the counter takes what `steps` does.
+//! It prints and measures nothing itself. Its argument is an environment id; callgrind counts the instructions of
+//! `steps`.
 
 mod actions;
 
@@ -16,7 +17,7 @@ const STEPS: usize = 250;
 
 fn main() {
     let id = std::env::args().nth(1).unwrap_or_default();
-    // Cargo's own runs of all benchmarks give no id.
+    // A plain `cargo bench` passes no id.
     let Ok(spec) = memory_gym().spec(&id) else { return };
     let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, NUM_ENVS) };
     let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
@@ -29,7 +30,7 @@ fn main() {
     steps(&mut pool, &mut actions, &mut batch);
 }
 
-/// What is counted.
+/// The counted function.
 #[inline(never)]
 fn steps(pool: &mut Pool, actions: &mut Actions, batch: &mut [Block]) {
     for _ in 0..STEPS {

@@ -1,4 +1,5 @@
-//! What a step paints, by id: bytes and cache lines, the traffic that bounds many environments. `cargo bench --bench painted`.
+//! Bytes and cache lines that a step paints, by id, since this traffic limits many environments:
+//! `cargo bench --bench painted`.
 
 mod actions;
 

@@ -1,4 +1,4 @@
-//! Cost of a pool's step: one thread and several, and observations of other formats.
+//! Cost of a pool's step: with one and several threads, and with other observation formats.
 
 mod actions;
 
@@ -30,7 +30,7 @@ fn config(spec: &EnvSpec, num_envs: usize) -> PoolConfig {
     PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(spec.id, num_envs) }
 }
 
-/// Every id, in and beyond the processor's caches.
+/// Every id, with batches inside and beyond the CPU's caches.
 fn step(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("pool/step");
     for (spec, num_envs) in memory_gym().specs().flat_map(|spec| [64, 1024, 16384].map(|num_envs| (spec, num_envs))) {
@@ -54,7 +54,7 @@ fn threads(criterion: &mut Criterion) {
     }
 }
 
-/// What the formats cost in addition to the original's.
+/// Cost of other formats compared with the original's.
 fn formats(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("pool/formats");
     let spec = memory_gym().spec("Endless-MysteryPath-v0").unwrap();

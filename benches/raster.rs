@@ -1,4 +1,4 @@
-//! Cost of painting: what a step paints, and what is made once for each set of reset parameters.
+//! Cost of painting in a step, and of what is made once for each set of reset parameters.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use endless_gym::envs::{FRAME_BYTES, SCREEN};

@@ -1,11 +1,11 @@
-"""Weak scaling of training by `torchrun` on this machine: steps per second of 1, 2 and 4 ranks with as many environments each.
+"""Weak scaling of training with `torchrun` on this machine: 1, 2 and 4 ranks with the same number of environments each.
 
     python benches/scale.py                                  # the GRU agent of the preset quick
-    python benches/scale.py --agent trxl -- --ppo.steps 128  # arguments after `--` are those of `endless-train`
+    python benches/scale.py --agent trxl -- --ppo.steps 128  # arguments after `--` go to `endless-train`
 
-Each rank has cores of its own as far as there are enough. Runs that are not connected, as many at once as ranks, are the bound:
-cores share memory bandwidth, and virtual cores perhaps a physical one. What the ranks fall short of it is communication and
-waiting. The first update of a run is not counted. Other load falsifies the figures.
+Each rank has its own cores if there are enough. The upper bound is measured with unconnected runs, as many at once as
+ranks, since cores share memory bandwidth, and virtual cores may share a physical one. The gap between the two is
+communication and waiting. The first update of a run is not counted. Other load distorts the figures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from endless_gym_agents.logs import read_progress
 
 
 def start(ranks: int, folder: Path, cores: list[int], arguments: list[str]) -> subprocess.Popen[bytes]:
-    """Start a run of some ranks on these cores."""
+    """Start a run with `ranks` ranks on these cores."""
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
     program = [*(launch if ranks > 1 else [sys.executable]), "-m", "endless_gym_agents.train"]
     before = os.sched_getaffinity(0)

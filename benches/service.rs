@@ -1,4 +1,5 @@
-//! Cost of a step through shared memory, to an engine in a separate process: from sending actions to holding the batch.
+//! Cost of a step through shared memory with an engine in a separate process, from sending actions to holding the
+//! batch.
 
 mod actions;
 
@@ -16,12 +17,12 @@ use actions::Actions;
 const ID: &str = "Endless-MortarMayhem-v0";
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// An engine that ends with this.
+/// An engine process that ends when this is dropped.
 struct Engine(Child);
 
 impl Drop for Engine {
     fn drop(&mut self) {
-        // It ends when its input does.
+        // The engine ends when its standard input closes.
         drop(self.0.stdin.take());
         let _ = self.0.wait();
     }
@@ -34,7 +35,7 @@ fn service(criterion: &mut Criterion) {
         group.throughput(Throughput::Elements(num_envs as u64));
         let mut actions = Actions::new(spec, num_envs);
 
-        // The work itself, to compare with.
+        // The step alone, for comparison.
         let config = PoolConfig { seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(ID, num_envs) };
         let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
         let mut batch = zeroed(pool.layout().blocks());

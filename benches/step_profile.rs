@@ -1,7 +1,8 @@
-//! Where the time of a step goes, by id and number of environments: `cargo bench --bench step_profile`.
+//! Profiles the phases of a step, by id and number of environments: `cargo bench --bench step_profile`.
 //!
-//! Phases are cumulative variants of a step, each with environments of its own, and a phase's cost is the
-//! difference to the variant before. The variants run in turn for a few milliseconds of processor time each; printed are medians.
+//! Each variant of a step adds one phase to the previous variant, and the cost of a phase is the difference between the
+//! two. The variants have separate environments and take turns of a few milliseconds of CPU time. The results are
+//! medians.
 //!
 //! Arguments: ids (default: all); `--on-request` steps for `benches/compare_builds.py`. `cargo xtask instructions` counts the
 //! instructions of a step.
@@ -30,16 +31,16 @@ const SIZES: [usize; 3] = [64, 1024, 16384];
 const ROUNDS: usize = 9;
 /// Environment steps of a variant in one round, at least four steps of all environments.
 const ROUND_STEPS: usize = 16384;
-/// Steps before the first round: episodes that began together have spread.
+/// Steps before the first round, after which episodes that began together have spread out.
 const WARM_UP: usize = 150;
 
-/// The rules with their random draws, and resets.
+/// Runs the rules with their random draws, and resets.
 const RULES: u8 = 0;
-/// The scene is made.
+/// Also makes the scene.
 const SCENE: u8 = 1;
-/// The scene is compared with the shown one, and stored.
+/// Also compares the scene with the shown one and stores it.
 const COMPARED: u8 = 2;
-/// What differs is painted.
+/// Also paints the differences.
 const PAINTED: u8 = 3;
 
 /// One environment, with what a pool keeps for it.
@@ -74,14 +75,14 @@ impl<E: Environment> Players<E> {
         players
     }
 
-    /// Paints the first pictures, which also touches the memory.
+    /// Paints the first frames, which also touches the memory.
     fn paint(&self, frames: &mut [u8]) {
         for (player, frame) in self.players.iter().zip(frames.chunks_exact_mut(FRAME_BYTES)) {
             E::paint(&self.assets, &player.shown, &mut Canvas::new(frame, SCREEN, SCREEN));
         }
     }
 
-    /// Steps all environments. `frames` has one frame for all, which stays in the cache, or one for each.
+    /// Steps all environments. `frames` holds either one frame for all, which stays in the cache, or one for each.
     fn step<const PHASE: u8>(&mut self, frames: &mut [u8]) {
         let actions = self.actions.next();
         let branches = actions.len() / self.players.len();
@@ -155,7 +156,7 @@ fn player_step<E: Environment + 'static, const PHASE: u8>(
     Box::new(move || players.step::<PHASE>(&mut frames))
 }
 
-/// Processor time of this thread, in nanoseconds.
+/// CPU time of this thread, in nanoseconds.
 fn processor_time() -> f64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     time.tv_sec as f64 * 1e9 + time.tv_nsec as f64
@@ -182,7 +183,7 @@ fn times<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant) 
         let mut times = vec![Vec::new(); steps.len()];
         for _ in 0..ROUNDS {
             for (step, times) in steps.iter_mut().zip(&mut times) {
-                // Its memory returns to the caches.
+                // Warm the caches with this variant's memory.
                 step();
                 let start = processor_time();
                 for _ in 0..repeats {
@@ -205,13 +206,13 @@ fn times<E: Environment + 'static>(spec: &'static EnvSpec, variant: E::Variant) 
     }
 }
 
-/// Reads a number of steps from each line of the standard input, takes them, and prints the processor time of an environment's step in
-/// nanoseconds.
+/// Reads a number of steps from each line of standard input, takes them, and prints the CPU time of an environment's
+/// step in nanoseconds.
 fn on_request(spec: &'static EnvSpec, num_envs: usize) {
     let mut step = pool_step(spec, num_envs, false);
     for line in std::io::stdin().lines() {
         let steps: usize = line.unwrap().parse().unwrap();
-        // Its memory returns to the caches.
+        // Warm the caches with this variant's memory.
         step();
         let start = processor_time();
         for _ in 0..steps {
@@ -221,7 +222,7 @@ fn on_request(spec: &'static EnvSpec, num_envs: usize) {
     }
 }
 
-/// The phases of the ids of a family that are wanted; none stands for all.
+/// Prints the rows of a family's ids: of those in `wanted`, or of all if it is empty.
 fn all_times<E: Environment + 'static>(ids: &'static [(EnvSpec, E::Variant)], wanted: &[&str]) {
     for (spec, variant) in ids.iter().filter(|(spec, _)| wanted.is_empty() || wanted.contains(&spec.id)) {
         times::<E>(spec, *variant);

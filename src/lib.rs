@@ -1,23 +1,25 @@
-//! Endless Gym: the Memory Gym environments, bit for bit, at memory speed, in shared memory, for any trainer on the host.
+//! Endless Gym: the Memory Gym environments, bit-exact and at memory speed, in this process or in shared memory for any
+//! trainer on the host.
 //!
-//! This crate re-exports the public API of the crates that it consists of:
+//! This crate re-exports the public API of its member crates:
 //!
 //! - [`memory_gym`]: the registry of the ten ids; [`envs`]: spaces, reset parameters, scripted experts, and the trait
-//!   [`Task`](envs::Task) for environments of one's own, which draw with [`raster`] and [`random`]; [`pool`]: many environments in
-//!   this process; [`batch`]: what a step returns; [`trace`]: replay of recorded episodes. They are `endless-gym-core`, which does
-//!   not depend on an operating system's services and builds for WebAssembly.
-//! - [`service`]: an engine, its trainer and observers, as processes that share memory. It is `endless-gym-service`.
+//!   [`Task`](envs::Task) for custom environments, which use [`raster`] to draw and [`random`] for random numbers;
+//!   [`pool`]: many environments in this process; [`batch`]: what a step returns; [`trace`]: replay of recorded
+//!   episodes. These are in `endless-gym-core`, which needs no operating system services and builds for WebAssembly.
+//! - [`service`]: an engine, its trainer and observers, as processes that share memory. This is `endless-gym-service`.
 //!
-//! The program `endless` is `endless-gym-cli`; [`program`] runs it. What these crates export beyond this list (sprites and dirty
-//! rectangles, the rules of single environments) serves the project's own tests and benchmarks and may change in any version.
+//! The program `endless` is `endless-gym-cli`; [`program`] runs it. Other exports of these crates (sprites and dirty
+//! rectangles, the rules of single environments) exist for the project's tests and benchmarks and may change in any
+//! version.
 
 use std::io::Write;
 use std::process::ExitCode;
 
 pub use endless_gym_core::{DEFAULT_ENV_ID, memory_gym};
 
-/// Runs the program `endless` with the environments of `registry` and the arguments of this process. It is the whole of `main` in a
-/// program with environments of its own:
+/// Runs the program `endless` with the environments of `registry` and the arguments of this process. In a program with
+/// custom environments, it is all that `main` needs:
 ///
 /// ```no_run
 /// fn main() -> std::process::ExitCode {
@@ -63,12 +65,12 @@ pub mod pool {
     pub use endless_gym_core::random::EntropyError;
 }
 
-/// numpy's random numbers, bit for bit, for environments of one's own.
+/// numpy's random numbers, bit for bit, for custom environments.
 pub mod random {
     pub use endless_gym_core::random::Generator;
 }
 
-/// A rasteriser that paints exactly the pixels that pygame 2.4 paints, for environments of one's own.
+/// A rasteriser that paints exactly the same pixels as pygame 2.4, for custom environments.
 pub mod raster {
     pub use endless_gym_core::raster::{Canvas, CornerRadii, Rect, Rgb, Surface};
 }

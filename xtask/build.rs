@@ -1,4 +1,4 @@
-//! Hands the name of the platform to the chores: cargo tells it to build scripts alone.
+//! Passes the target triple to xtask, since cargo gives it only to build scripts.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

@@ -12,7 +12,7 @@ CRATES = ["bindings/web", "engine/cli", "engine/core", "engine/service", "engine
 
 Module = tuple[str, ...]
 
-#: Comments, texts, visibilities, and modules for tests.
+#: Comments, strings, visibilities, and test modules.
 IGNORED = re.compile(
     r'pub\([^)]*\)|//[^\n]*|"(?:\\.|[^"\\])*"|^#\[cfg\([^\n]*test\b[^\n]*\n(?:pub )?mod \w+ \{.*?^\}',
     re.DOTALL | re.MULTILINE,
@@ -22,7 +22,7 @@ PATH = re.compile(r"\b(?:\w+::)+\w+")
 
 
 def rust_files(folder: Path) -> Iterator[tuple[Module, str]]:
-    """The modules of a crate with their text, without files of tests."""
+    """The modules of a crate with their text, without test files."""
     for path in folder.rglob("*.rs"):
         if not path.stem.endswith("tests"):
             parts = path.relative_to(folder).with_suffix("").parts
@@ -50,9 +50,9 @@ def flat(tree: str) -> list[list[str]]:
 
 
 def rust_imports(folder: Path) -> dict[Module, set[Module]]:
-    """The modules of a crate that each of its modules names, deepest first; a folder's `mod.rs` is a module too."""
+    """For each module of a crate, the modules that it uses; a folder's `mod.rs` is a module, too."""
     files = dict(rust_files(folder))
-    # With folders that have no file of their own, but a module in the root.
+    # Includes folders without a file, whose modules are declared in the root.
     modules = {module[:depth] for module in files for depth in range(len(module) + 1)}
     found: dict[Module, set[Module]] = {}
     for module, text in files.items():
@@ -79,7 +79,7 @@ def rust_imports(folder: Path) -> dict[Module, set[Module]]:
 
 
 def python_imports(folder: Path) -> dict[Module, set[Module]]:
-    """The modules of a package that each of its modules imports, also inside functions and for types alone."""
+    """For each module of a package, the modules that it imports, including imports in functions and for types only."""
     files = {
         path.relative_to(folder.parent).with_suffix("").parts: path
         for path in folder.rglob("*.py*")
@@ -101,7 +101,7 @@ def python_imports(folder: Path) -> dict[Module, set[Module]]:
                     *(parts[: -node.level] if node.level else ()),
                     *(node.module.split(".") if node.module else ()),
                 )
-                # What is no module is a name of the one that it is imported from.
+                # A name that is not a module belongs to the module that it is imported from.
                 targets = {(*origin, alias.name) for alias in node.names}
                 imported |= {target if target in modules else origin for target in targets} & modules
         imported.discard(named(parts))

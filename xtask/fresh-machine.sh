@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Tries what README.md says as a user who has just cloned the repository: HEAD in an empty directory with a space in its path, an
-# empty home, no caches and no virtual environments; for root, as a new user. Only the Rust toolchain is copied. Prints how long
-# each step took and fails when one fails or exceeds its limit. Arguments are passed to `cargo xtask test`.
+# Follows README.md as a user who has just cloned the repository: HEAD in an empty directory with a space in its path, an
+# empty home, no caches and no virtual environments; as a new user if run by root. Only the Rust toolchain is copied.
+# Prints how long each step took, and fails if a step fails or exceeds its limit. Arguments are passed to
+# `cargo xtask test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# Without a space: the compiler that PyTorch starts for files in TMPDIR cannot do with one.
+# No space in TMPDIR: the compiler that PyTorch runs on files in it cannot handle one.
 folder=$(mktemp -d "${TMPDIR:-/tmp}/fresh-machine-XXXXXX")
 checkout="$folder/endless gym"
 user=
@@ -34,7 +35,7 @@ if [[ $(id -u) == 0 ]]; then
     as_user=(setpriv --reuid "$user" --regid "$user" --init-groups)
 fi
 
-# The settings of the network are the machine's, everything else is new.
+# Keep the machine's network settings; everything else is new.
 environment=("HOME=$folder/home" "USER=${user:-$(id -un)}" "LANG=C.UTF-8" "TMPDIR=$folder/tmp")
 environment+=("PATH=$folder/toolchain/bin:/usr/local/bin:/usr/bin:/bin")
 for name in http_proxy https_proxy no_proxy HTTP_PROXY HTTPS_PROXY NO_PROXY PIP_CERT PIP_INDEX_URL SSL_CERT_FILE CI; do

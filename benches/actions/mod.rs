@@ -4,7 +4,7 @@ use endless_gym::envs::EnvSpec;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
-/// Steps after which the same actions come again, in other states.
+/// Steps after which the actions repeat, in other states.
 const STEPS: usize = 251;
 
 /// The actions of all environments, step after step.

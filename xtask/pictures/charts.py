@@ -19,7 +19,7 @@ matplotlib.use("svg")
 
 
 class Theme(NamedTuple):
-    """Colours of a chart: those of the environments, as light or dark as the page requires."""
+    """Colours of a chart, based on the environments' and adapted to a light or dark page."""
 
     text: str
     faint: str
@@ -40,7 +40,7 @@ WIDTH, TITLE, BODY, SMALL = 8.6, 11.5, 9.5, 8.5
 #: Left margin as a share of the width, and the space between two groups as a share of a row.
 LEFT, SPACE = 0.012, 0.4
 
-#: Rows of the comparison by group: the name in `benches/comparison.md` (the number of environments may follow), and what it is.
+#: Rows of the comparison by group: the start of the name in `benches/comparison.md`, and its label.
 GROUPS = {
     "Memory Gym": {
         "original, gymnasium.make": "one environment",
@@ -60,12 +60,12 @@ GROUPS = {
 
 #: Agents of the learning curve.
 AGENTS = {"gru": "GRU", "trxl": "Transformer-XL", "none": "without memory"}
-#: Number of neighbouring updates whose mean is shown.
+#: Window of the moving average, in updates.
 SMOOTH = 24
 
 
 def chart(folder: Path, name: str, height: float, draw: Callable[[Figure, Theme], None]) -> None:
-    """Write both variants of a chart as SVG, without a date, so that the same data give the same files."""
+    """Write both variants of a chart as SVG, without a date, so that the same data gives the same files."""
     for variant, theme in THEMES.items():
         settings = {
             "svg.hashsalt": name,
@@ -102,7 +102,7 @@ def plain(axes: Axes) -> None:
 
 
 def measured(report: str) -> Iterator[tuple[str, float]]:
-    """Contender and number of each row of the tables that `benches/comparison.py` writes as Markdown."""
+    """Contender and number of each row in the Markdown tables of `benches/comparison.py`."""
     for line in report.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         number = cells[1].replace(",", "") if line.startswith("| ") and len(cells) > 1 else ""
@@ -111,7 +111,7 @@ def measured(report: str) -> Iterator[tuple[str, float]]:
 
 
 def short(speed: float) -> tuple[str, str]:
-    """A number of steps per second with two digits or more, and its unit."""
+    """A number of steps per second with at least two digits, and its unit."""
     size, unit = (1e6, "M") if speed >= 1e6 else (1e3, "k")
     return f"{speed / size:.{1 if speed < 10 * size else 0}f}", unit
 
@@ -125,11 +125,11 @@ def spread(low: float, high: float) -> str:
 
 
 def comparison(folder: Path, report: Path) -> None:
-    """Steps per second beside the original's."""
+    """Steps per second compared with the original."""
     found = list(measured(report.read_text()))
 
     def speeds(contender: str) -> list[float]:
-        """One number for each environment; the name may continue with the number of environments, but not with a target's."""
+        """One number for each environment. A name may continue with their number; rows of targets are skipped."""
         return [speed for name, speed in found if name.startswith(contender) and ", times" not in name]
 
     groups = {
@@ -171,7 +171,7 @@ def comparison(folder: Path, report: Path) -> None:
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Means over up to `window` neighbours."""
+    """Moving average over up to `window` values."""
     sums, sizes = (np.convolve(each, np.ones(window), "same") for each in (values, np.ones_like(values)))
     return sums / sizes
 

@@ -40,11 +40,11 @@ class Scene:
     Attributes:
         id: Environment id.
         seed: Seed of the episode in its own animation.
-        step: Milliseconds that a step is shown in its own animation.
+        step: Milliseconds that each step is shown in its own animation.
         steps: Number of steps after which its own animation ends.
         overview_seed: Seed of the episode in the overview.
-        hold: Number of frames that a step is shown in the overview.
-        options: Reset parameters of the episode in the overview: short episodes, and commands that can be read.
+        hold: Number of frames that each step is shown in the overview.
+        options: Reset parameters of the episode in the overview, for short episodes and readable commands.
     """
 
     id: str
@@ -71,10 +71,10 @@ SCENES = [
     Scene("Endless-SearingSpotlights-v0", 1, 40, 500, 3, 1),
 ]
 
-#: The overview: cells in a row, scale, gap and height of a label in pixels, number of frames and milliseconds of a frame.
+#: The overview: cells per row, scale, gap and label height in pixels, number of frames, and milliseconds per frame.
 COLUMNS, SCALE, GAP, LABEL = 5, 4, 24, 48
 LENGTH, FRAME_MS = 196, 80
-#: Brightness of the last frames, so that the film starts again without a jump.
+#: Brightness of the last frames, so that the film loops without a jump.
 _FADE = (0.7, 0.4, 0.15)
 
 
@@ -108,7 +108,7 @@ def write(file: Path, frames: list[Image.Image], milliseconds: int) -> None:
 
 
 def overview(file: Path) -> None:
-    """All environments beside each other."""
+    """All environments in a grid."""
     if {scene.id for scene in SCENES} != set(all_specs()):
         raise ValueError(f"SCENES must have one scene for each of {', '.join(all_specs())}")
     rows = -(-len(SCENES) // COLUMNS)
@@ -133,7 +133,7 @@ def overview(file: Path) -> None:
 
 
 def environment(file: Path, scene: Scene) -> None:
-    """One environment: the observation beside the ground-truth view."""
+    """One environment: the observation next to the ground-truth view."""
     scale, gap, caption = 3, 12, 30
     side = SCREEN * scale
     panel = Image.new("RGB", (2 * side + 3 * gap, side + gap + caption), PANEL)

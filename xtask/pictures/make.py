@@ -1,7 +1,8 @@
 """Makes the pictures of the documentation in `docs/images`: `cargo xtask pictures` installs the package and runs this script.
 
-The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the results of
-`agents/benches/learning.py`; measure or train again first to change them. The same versions make the same bytes.
+The animations are episodes of the scripted experts with fixed seeds. The charts show `benches/comparison.md` and the
+results of `agents/benches/learning.py`; measure or train again to change them. The same versions produce the same
+bytes.
 """
 
 from pathlib import Path

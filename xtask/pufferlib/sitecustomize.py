@@ -1,6 +1,6 @@
-"""On the path while pip builds PufferLib 3.0.0 with NO_OCEAN=1, without the games whose sources it would fetch from GitHub.
+"""On the path while pip builds PufferLib 3.0.0 with NO_OCEAN=1, that is, without the games that it would download.
 
-Its setup.py then reads a name that it only sets where the games are built.
+In this case, its setup.py reads a name that it sets only when it builds the games.
 """
 
 import builtins

@@ -7,8 +7,8 @@ use std::process::Command;
 use crate::shell::{cargo, describe, output, run, target, workspace};
 use crate::{python, web};
 
-/// Checks the generated parts of the pages, or writes them, and builds the site. A warning, a link to a missing page or anchor, and an
-/// error message without help are errors.
+/// Checks the generated parts of the pages, or writes them, and builds the site. Warnings, links to missing pages or
+/// anchors, and error messages without help are errors.
 pub fn build(write: bool) -> Result<(), String> {
     let folder = python::sync("docs", "bindings/python", &["--group", "docs"])?;
     let mut generate = Command::new(folder.join("bin/python"));
@@ -25,7 +25,7 @@ pub fn build(write: bool) -> Result<(), String> {
     }
     let site = target()?.join("site");
     let mut mkdocs = Command::new(folder.join("bin/mkdocs"));
-    // Not `--quiet`: with it, warnings are not errors.
+    // Without `--quiet`, which would keep warnings from being errors.
     mkdocs.args(["build", "--strict", "--site-dir"]).arg(&site).current_dir(workspace());
     // Silences an announcement of Material for MkDocs.
     mkdocs.env("NO_MKDOCS_2_WARNING", "1");

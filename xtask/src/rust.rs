@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use crate::python;
 use crate::shell::{self, describe, output, run, succeeds, target, workspace};
 
-/// A seed of the property tests: a failure in the tests is due to a change.
+/// A fixed seed of the property tests, so that a failure is due to a change.
 const PROPERTY_SEED: &str = "20251122";
 
 fn cargo(arguments: &[&str]) -> Result<(), String> {
@@ -30,7 +30,8 @@ pub fn test() -> Result<(), String> {
     cargo(&["test", "--workspace", "--locked", "--no-fail-fast"])
 }
 
-/// The ignored tests but those that need a browser or the original, or only measure: slow ones, and those that the machine may forbid.
+/// The ignored tests (slow ones, and those that the machine may forbid), except those that need a browser or the
+/// original, or only measure.
 pub fn test_ignored() -> Result<(), String> {
     let mut arguments: Vec<&str> =
         "test --workspace --locked --no-fail-fast --lib --tests --exclude endless-gym-web -- \
@@ -49,26 +50,26 @@ pub fn test_ignored() -> Result<(), String> {
     cargo(&arguments)
 }
 
-/// Says what is not run, and why; an error where the environment variable CI is `true`.
+/// Says what is not run, and why; an error if the environment variable CI is `true`.
 fn not_run(what: &str) -> Result<(), String> {
     println!("not run, {what}");
     if std::env::var("CI").as_deref() == Ok("true") { Err(format!("not run, {what}")) } else { Ok(()) }
 }
 
-/// Compares with the original, from a fixed seed.
+/// Compares with the original, with a fixed seed.
 pub fn test_original() -> Result<(), String> {
     let mut cargo = shell::cargo(&["test", "--locked", "--test", "integration", "--", "--ignored", "live::"]);
     run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("PROPTEST_RNG_SEED", PROPERTY_SEED))
 }
 
-/// Compares `steps` steps of each environment with the original, from new seeds; optimised, since it is long.
+/// Compares `steps` steps of each environment with the original, with new seeds; optimised, since it takes long.
 pub fn live(steps: u64) -> Result<(), String> {
     let tests = ["test", "--release", "--locked", "--test", "integration", "--", "--ignored", "--nocapture", "live::"];
     let mut cargo = shell::cargo(&tests);
     run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("ENDLESS_LIVE_STEPS", steps.to_string()))
 }
 
-/// Runs the fuzz targets, or one of them, from new seeds for at least `minutes`; optimised, since it is long.
+/// Runs one or all fuzz targets with new seeds for at least `minutes`; optimised, since it takes long.
 pub fn fuzz(only: Option<&str>, minutes: u64) -> Result<(), String> {
     let start = Instant::now();
     loop {
@@ -82,7 +83,8 @@ pub fn fuzz(only: Option<&str>, minutes: u64) -> Result<(), String> {
     }
 }
 
-/// Checks the models of the worker threads under loom. The flags apply to all crates, hence a target directory of their own.
+/// Checks the models of the worker threads under loom, in a separate target directory, since the flags apply to all
+/// crates.
 pub fn loom() -> Result<(), String> {
     let mut cargo =
         shell::cargo(&["test", "--locked", "--package", "endless-gym-core", "--lib", "loom_", "--target-dir"]);
@@ -90,12 +92,12 @@ pub fn loom() -> Result<(), String> {
     run(cargo.env("CARGO_PROFILE_TEST_OPT_LEVEL", "2"))
 }
 
-/// The faults of the tests, always the same. A failure prints the command line that repeats it.
+/// Runs the fault injection with a fixed seed. A failure prints the command line that repeats it.
 pub fn test_faults() -> Result<(), String> {
     faults("faults", &["--minutes", "2", "--seed", "1"].map(str::to_owned))
 }
 
-/// Builds the program of `tests/faults` and the engine that it starts, and runs one of its commands.
+/// Builds the program of `tests/faults` and the engine that it starts, and runs one of the program's commands.
 pub fn faults(command: &str, arguments: &[String]) -> Result<(), String> {
     cargo(&["build", "--locked", "--package", "endless-gym", "--package", "endless-gym-faults", "--bins"])?;
     run(Command::new(target()?.join("debug/endless-gym-faults")).arg(command).args(arguments))
@@ -104,11 +106,11 @@ pub fn faults(command: &str, arguments: &[String]) -> Result<(), String> {
 /// Environment steps that `benches/instructions.rs` counts.
 const STEPS: u64 = 250 * 16;
 
-/// Allowed deviation: processors of other kinds copy memory with other instructions.
+/// Allowed deviation, since other CPUs copy memory with other instructions.
 const MARGIN_PERCENT: u64 = 10;
 
-/// Counts the instructions of a step, which unlike times do not depend on the load of the machine, and compares them with the
-/// budgets; with `record`, writes the counts as the new budgets.
+/// Counts the instructions of a step, which do not depend on the machine's load, and compares them with the budgets;
+/// with `record`, writes the counts as the new budgets.
 pub fn instructions(record: bool) -> Result<(), String> {
     let file = workspace().join("benches/instructions.txt");
     let text = std::fs::read_to_string(&file).map_err(describe(&file))?;
@@ -138,7 +140,8 @@ pub fn instructions(record: bool) -> Result<(), String> {
 fn count(id: &str) -> Result<u64, String> {
     const VALGRIND: &str =
         "valgrind --tool=callgrind --callgrind-out-file=/dev/null --log-fd=1 --toggle-collect=instructions::steps";
-    // No `rep movsb` and `rep stosb` in the C library's `memcpy` and `memset`: callgrind counts every byte of them as an instruction.
+    // Keep the C library from using `rep movsb` and `rep stosb`, since callgrind counts each of their bytes as an
+    // instruction.
     const TUNABLES: &str = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_threshold=1000000000";
     let runner = format!("CARGO_TARGET_{}_RUNNER", env!("TARGET").to_uppercase().replace('-', "_"));
     let mut bench =

@@ -1,4 +1,4 @@
-//! Folders of the project and of this machine, and commands.
+//! Paths of the project and this machine, and commands.
 
 use std::ffi::OsString;
 use std::fmt::Display;
@@ -27,10 +27,10 @@ pub fn sysroot() -> Result<PathBuf, String> {
     Ok(PathBuf::from(output(Command::new("rustc").args(["--print", "sysroot"]))?.trim()))
 }
 
-/// Compiler flags that replace the folders of this machine in panic messages.
+/// Compiler flags that replace paths of this machine in panic messages.
 pub fn remap(source: &Path) -> Result<OsString, String> {
     let registry = cargo_home()?.join("registry/src");
-    // Of several that match, the compiler applies the last.
+    // If several match, the compiler applies the last.
     let folders = [(target()?, "target"), (source.into(), "endless-gym"), (registry, "registry"), (sysroot()?, "rust")];
     let flags = folders.map(|(from, to)| {
         let mut flag = OsString::from("--remap-path-prefix=");
@@ -41,14 +41,14 @@ pub fn remap(source: &Path) -> Result<OsString, String> {
     Ok(flags.join("\x1f".as_ref()))
 }
 
-/// The cargo that runs this, so that toolchain and settings are the same, in the root of the workspace.
+/// The cargo that runs this program, for the same toolchain and settings, in the root of the workspace.
 pub fn cargo(arguments: &[&str]) -> Command {
     let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     cargo.args(arguments).current_dir(workspace());
     cargo
 }
 
-/// Prints a command, runs it, and fails if it does.
+/// Prints and runs a command, and fails if the command fails.
 pub fn run(command: &mut Command) -> Result<(), String> {
     let words = std::iter::once(command.get_program()).chain(command.get_args());
     let words: Vec<String> = words.map(|word| word.to_string_lossy().into_owned()).collect();

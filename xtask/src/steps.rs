@@ -12,7 +12,7 @@ pub struct Step {
     /// Whether only `cargo xtask test --all` runs it.
     rest: bool,
     run: fn() -> Result<(), String>,
-    /// What it requires beside Rust, a linker and CPython.
+    /// What it requires besides Rust, a linker and CPython.
     needs: &'static [Need],
 }
 
@@ -71,9 +71,10 @@ pub fn list() -> Result<(), String> {
     Ok(())
 }
 
-/// Runs the steps with these names, or else the first ones, or with `all` the rest, up to the first failure unless `keep_going`.
+/// Runs the steps in `only`; if it is empty, the first ones, or with `all` the rest. Stops at the first failure unless
+/// `keep_going`.
 ///
-/// A step whose needs the machine lacks is not run; where the environment variable CI is `true`, that is a failure.
+/// A step whose needs are not met is skipped; if the environment variable CI is `true`, that is a failure.
 pub fn run(only: &[String], all: bool, keep_going: bool) -> Result<(), String> {
     if let Some(unknown) = only.iter().find(|name| STEPS.iter().all(|step| step.name != *name)) {
         return Err(format!("no step `{unknown}`; `cargo xtask test --list` lists them"));

@@ -1,5 +1,5 @@
-//! The core for WebAssembly, and the page that plays the environments in a browser, in target/web: the core with the files of
-//! `engine/view/page/files`.
+//! Builds the core for WebAssembly, and in target/web the page that plays the environments in a browser, from the core
+//! and the files of `engine/view/page/files`.
 
 use std::fs;
 use std::io::Write;
@@ -13,21 +13,22 @@ use crate::shell::{cargo, describe, output, recreate, remap, run, succeeds, targ
 
 const TARGET: &str = "wasm32-unknown-unknown";
 
-/// What is missing without a toolchain.
+/// What to install if there is no toolchain.
 pub const MISSING: &str = "Rust's standard library for wasm32-unknown-unknown; rustup target add wasm32-unknown-unknown, or on Debian \
     .ci/wasm-toolchain, which unpacks Debian's compiler under target/";
 
-/// Bytes of all files, each compressed: what a browser downloads at most.
+/// Limit of the total bytes of all files, each compressed, which a browser downloads at most.
 const LIMIT: usize = 1_000_000;
 
-/// The file that the build completes: the list of the others, and a number that changes with them.
+/// The file to which the build adds the list of the others and a checksum of them.
 const WORKER: &str = "worker.js";
 
-/// A compiler with the target's standard library, or with the sources to build it from.
+/// A compiler with the target's standard library, or with its sources.
 pub enum Toolchain {
-    /// The one that runs this.
+    /// The compiler on the path.
     Own,
-    /// Debian's compiler in the folder where `.ci/wasm-toolchain` unpacks it; Debian has no compiled standard library of that version.
+    /// Debian's compiler in the folder where `.ci/wasm-toolchain` unpacks it. Debian has no compiled standard library
+    /// for it.
     Debian(PathBuf),
 }
 
@@ -41,16 +42,16 @@ impl Toolchain {
         folder.join("bin/rustc").exists().then_some(Toolchain::Debian(folder))
     }
 
-    /// Builds a crate with `cargo build`, and returns the folder of what it built.
+    /// Builds a crate with `cargo build`, and returns the output folder.
     fn build(&self, arguments: &[&str]) -> Result<PathBuf, String> {
         let mut cargo = cargo(&["build", "--locked", "--release", "--target", TARGET]);
         cargo.args(arguments);
-        // A browser downloads the result, and programs contain it: without names, lines and folders of this machine.
+        // Browsers download the result, and programs embed it, so strip symbols, line numbers and local paths.
         cargo.env("CARGO_ENCODED_RUSTFLAGS", remap(workspace())?);
         cargo.env("CARGO_PROFILE_RELEASE_DEBUG", "false").env("CARGO_PROFILE_RELEASE_STRIP", "true");
         let mut built = target()?;
         if let Toolchain::Debian(folder) = self {
-            // A folder of its own, so that the two compilers do not invalidate each other's builds.
+            // A separate folder, so that the two compilers do not invalidate each other's builds.
             built.push("wasm");
             cargo.args(["-Zbuild-std=std,panic_abort", "--target-dir"]).arg(&built);
             cargo.env("RUSTC", folder.join("bin/rustc")).env("RUSTC_BOOTSTRAP", "1");
@@ -69,7 +70,7 @@ impl Toolchain {
     }
 }
 
-/// Builds the core: without threads and without a system's entropy.
+/// Builds the core without threads and without the system's entropy.
 pub fn build_core() -> Result<(), String> {
     Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-core", "--no-default-features"]).map(drop)
 }
@@ -86,7 +87,7 @@ pub fn folder() -> Result<PathBuf, String> {
     Ok(target()?.join("web"))
 }
 
-/// Builds the page. An error if there is no compiler for WebAssembly, or if the page has become too large.
+/// Builds the page. Fails if there is no compiler for WebAssembly, or if the page is too large.
 pub fn build() -> Result<(), String> {
     let built = Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-web"])?;
     let mut files = vec![("engine.wasm".to_owned(), read(&built.join("endless_gym_web.wasm"))?)];
@@ -99,7 +100,7 @@ pub fn build() -> Result<(), String> {
     files.sort();
     complete_worker(&mut files)?;
     write(&folder()?, &files)?;
-    // From where the program embeds it. Unchanged files are left alone, so that it need not be compiled again.
+    // The program embeds the page from here. Unchanged files are not rewritten, to avoid a rebuild.
     let embedded = workspace().join("engine/view/page/built");
     if files.iter().any(|(name, bytes)| fs::read(embedded.join(name)).ok().as_ref() != Some(bytes)) {
         write(&embedded, &files)?;
@@ -112,16 +113,16 @@ pub fn build() -> Result<(), String> {
     Ok(())
 }
 
-/// Builds the page that plays, and tests it and the page of a running engine in a browser.
+/// Builds the page, and tests it and the page of a running engine in a browser.
 pub fn test() -> Result<(), String> {
     build()?;
-    // Not what only measures or makes pictures.
+    // Skip tests that only measure or make pictures.
     let tests = ["--ignored", "--test-threads", "1", "--skip", "measure"];
     run(cargo(&["test", "--locked", "--package", "endless-gym-web", "--test", "browser", "--"]).args(tests))?;
     run(cargo(&["test", "--locked", "--test", "integration", "--"]).args(tests).arg("browser::"))
 }
 
-/// Writes the list of files, and a checksum of them all, into the service worker, which keeps them for use without a network.
+/// Writes the list of files and a checksum of them into the service worker, which caches them for offline use.
 fn complete_worker(files: &mut [(String, Vec<u8>)]) -> Result<(), String> {
     let mut checksum = flate2::Crc::new();
     files.iter().for_each(|(_, bytes)| checksum.update(bytes));
