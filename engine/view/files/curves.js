@@ -1,4 +1,4 @@
-// Curves over the time of an engine.
+// Curves of an engine's statistics over time.
 
 import { duration, grouped, short } from "./numbers.js";
 
@@ -11,7 +11,7 @@ const CURVES = [
 const WIDTH = 300;
 const HEIGHT = 100;
 
-/** As many points as the page keeps, one a second. */
+/** Number of points that the page keeps, one per second. */
 const MAX_POINTS = 3600;
 
 export class Curves {
@@ -29,7 +29,7 @@ export class Curves {
     });
   }
 
-  /** Forgets the points of another engine. */
+  /** Removes all points, when another engine is shown. */
   clear() {
     this.points = [];
     this.#draw();

@@ -1,15 +1,15 @@
-// The engines that are running.
+// The running engines.
 
 import { grouped, processes } from "./numbers.js";
 
-/** What the server says about them. */
+/** The server's list of running engines. */
 export async function engines() {
   const answer = await fetch("engines");
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();
 }
 
-/** The table of engines, with steps per second between two calls. */
+/** The table of engines, with steps per second since the previous call of `show`. */
 export class Table {
   constructor(body, choose) {
     this.body = body;

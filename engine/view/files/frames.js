@@ -1,6 +1,6 @@
-// Messages of the server, and frames in any order of their numbers.
+// Messages of the server, and frames in any memory layout.
 
-/** The JSON of a binary message, and the bytes behind it. */
+/** The JSON of a binary message, and the bytes after it. */
 export function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const about = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -12,10 +12,10 @@ export function frameBytes(frame) {
   return frame.width * frame.height * frame.channels;
 }
 
-/** The pixels of one frame, used again for the next. */
+/** The pixels of a frame, reused for the next one. */
 let image;
 
-/** Draws the frame that begins at byte `start`. `frame` says how far neighbours are apart. */
+/** Draws the frame that begins at byte `start`. `frame` holds the strides in bytes. */
 export function paint(canvas, frame, pixels, start) {
   if (canvas.width !== frame.width) canvas.width = frame.width;
   if (canvas.height !== frame.height) canvas.height = frame.height;

@@ -1,6 +1,6 @@
-// Numbers as people read them.
+// Formats numbers for people.
 
-/** An integer with its thousands apart. */
+/** An integer with thousands separators. */
 export function grouped(number) {
   return number === null || number === undefined ? "–" : Math.round(number).toLocaleString("en");
 }
@@ -25,7 +25,7 @@ export function megabytes(bytes) {
   return bytes === null || bytes === undefined ? "–" : `${Math.ceil(bytes / 1e6)} MB`;
 }
 
-/** Ids of processes. */
+/** Process ids. */
 export function processes(ids) {
   return ids && ids.length > 0 ? ids.join(" ") : "none";
 }

@@ -1,4 +1,4 @@
-// The page: which engine is shown, and what the server says about it.
+// The page: selects an engine, and shows what the server says about it.
 
 import { Curves } from "./curves.js";
 import { Table, engines } from "./engines.js";
@@ -8,7 +8,7 @@ import { duration, grouped, megabytes, processes, short } from "./numbers.js";
 const $ = (id) => document.getElementById(id);
 const RETRY = 1000;
 
-/** Environments beyond which the grid has no captions. */
+/** Maximum number of environments for which the grid has captions. */
 const CAPTIONS = 36;
 
 class View {
@@ -26,15 +26,15 @@ class View {
     this.#listen();
   }
 
-  /** Shows the engine that the server was started for, or the list. */
+  /** Shows the server's default engine, or the list. */
   async start() {
     const { service } = await this.#list();
     if (service) this.show(service);
-    // Listing costs more than one engine's status, so it is done only while the list is on the screen.
+    // Listing costs more than reading one engine's status, so refresh only while the list is visible.
     setInterval(() => this.service === "" && !document.hidden && this.#list().catch(() => {}), 2000);
   }
 
-  /** Shows an engine; the list for an empty name. */
+  /** Shows an engine, or the list for an empty name. */
   show(service) {
     this.service = service;
     [this.group, this.first, this.large, this.about, this.newest] = [0, 0, null, null, null];
@@ -45,7 +45,7 @@ class View {
     $("live").hidden = service === "";
     $("list").hidden = service !== "";
     $("grid").replaceChildren();
-    // Where it is depends on what is shown above it.
+    // Its position depends on the content above it.
     document.querySelector("footer").hidden = false;
     $("engine").value = service;
     document.title = service === "" ? "Endless Gym: view" : `${service} – Endless Gym`;
@@ -139,7 +139,7 @@ class View {
     $("numbers").replaceChildren(...rows);
   }
 
-  /** The choices, for another engine than before. */
+  /** Updates the controls for another engine. */
   #layout(about) {
     this.group = Math.min(this.group, about.groups - 1);
     this.first = Math.min(this.first, about.num_envs - 1);
@@ -198,12 +198,12 @@ class View {
     return button;
   }
 
-  /** Shows one environment large; none for `null`, or for the one that is large. */
+  /** Enlarges one environment; none for `null` or for the one that is already enlarged. */
   enlarge(env) {
     this.large = env === this.large ? null : env;
     $("large").hidden = this.large === null;
     $("caption").textContent = "";
-    // A trainer that pauses sends nothing new.
+    // While the trainer pauses, no new message arrives.
     if (this.newest) this.#paint(this.newest);
     this.#select();
   }
@@ -240,7 +240,7 @@ class View {
 }
 
 const view = new View();
-// For tests, and for the curious.
+// For tests and for the browser's console.
 globalThis.endless = view;
 try {
   await view.start();

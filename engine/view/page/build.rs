@@ -1,5 +1,5 @@
-//! Lists the files for `include_bytes!`: in a release build those of the built page, otherwise or where it has not been built the
-//! sources. So tests do not depend on what was built before.
+//! Lists the files for `include_bytes!`: those of the built page in a release build if it exists, otherwise the
+//! sources, so that tests do not depend on earlier builds.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! One engine and the browsers that show it: a thread observes the engine as long as there are any, and no longer.
+//! One engine and the browsers that show it. A thread observes the engine as long as there are any.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use crate::message::Selection;
 use crate::statistics::History;
 
-/// Browsers that may show one engine at a time.
+/// Maximum number of browsers that show one engine at a time.
 const MAX_VIEWERS: usize = 16;
 
 /// One engine, found by its name.
@@ -30,13 +30,14 @@ struct Viewers {
     is_observed: bool,
 }
 
-/// One browser's place: the newest message for it, which replaces the one before.
+/// One browser: the newest message for it, which replaces the previous one.
 pub(crate) struct Viewer {
     newest: watch::Sender<Bytes>,
     selection: Mutex<Selection>,
-    /// The browser has received the last message. Until then it gets no other, so that a slow one costs no copies.
+    /// Whether the browser has received the last message. Until then it gets no other, so that a slow one causes no
+    /// copies.
     is_ready: AtomicBool,
-    /// There is something that the last message did not have: news, or another selection.
+    /// Whether there is news or another selection since the last message.
     is_changed: AtomicBool,
 }
 
@@ -62,12 +63,12 @@ impl Viewer {
         self.is_ready.load(Ordering::Acquire)
     }
 
-    /// Whether it shows no environment, as a page in the background.
+    /// Whether it shows no environment, like a page in the background.
     pub fn is_hidden(&self) -> bool {
         lock(&self.selection).envs.is_empty()
     }
 
-    /// Whether it waits for a message: one with news, which it may have missed before, or one of its new selection.
+    /// Whether it waits for a message, with news (perhaps missed earlier) or for a new selection.
     pub fn wants(&self, is_news: bool) -> bool {
         if is_news {
             self.is_changed.store(true, Ordering::Release);
@@ -75,7 +76,7 @@ impl Viewer {
         self.is_ready() && self.is_changed.load(Ordering::Acquire)
     }
 
-    /// Gives it the newest message, made of the selection that it has now.
+    /// Gives it the newest message, made for its current selection.
     pub fn give(&self, message: impl FnOnce(&Selection) -> Vec<u8>) {
         self.is_ready.store(false, Ordering::Release);
         self.is_changed.store(false, Ordering::Release);
@@ -84,7 +85,7 @@ impl Viewer {
     }
 }
 
-/// A browser that is connected. It has left when this is dropped.
+/// A connected browser. Dropping this disconnects it.
 pub(crate) struct Connected {
     channel: Arc<Channel>,
     pub viewer: Arc<Viewer>,
@@ -108,7 +109,8 @@ impl Channel {
         }
     }
 
-    /// Adds a browser, and starts to observe for the first one. `None` if there are too many, or if there is no thread for it.
+    /// Adds a browser, and starts observing for the first one. `None` if there are too many, or if no thread can be
+    /// started.
     pub fn connect(self: &Arc<Self>) -> Option<Connected> {
         let mut viewers = lock(&self.viewers);
         if viewers.shown.len() >= MAX_VIEWERS {
@@ -137,7 +139,7 @@ impl Channel {
         Some(Connected { channel: Arc::clone(self), viewer, messages })
     }
 
-    /// The browsers. Without any, the observing thread must end, and the next browser starts another one.
+    /// The browsers. If there are none, the observing thread must end, and the next browser starts another one.
     pub fn viewers(&self) -> Vec<Arc<Viewer>> {
         let mut viewers = lock(&self.viewers);
         viewers.is_observed = !viewers.shown.is_empty();
@@ -149,7 +151,7 @@ impl Channel {
     }
 }
 
-/// What another thread has left in the middle of a change is shown as it is.
+/// Ignores poisoning: a value that a panic left half changed is only shown.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,4 +1,4 @@
-//! What the page says about engines, from the status that each publishes.
+//! Describes engines for the page, from the status that each publishes.
 
 use endless_gym_service::{EngineProcesses, EngineStatus, GroupStatus, Namespace};
 use serde_json::{Value as Json, json};
@@ -8,7 +8,8 @@ pub(crate) fn list(namespace: &Namespace) -> Vec<Json> {
     EngineStatus::all(namespace).iter().map(|status| describe(status, &Details::of(status, namespace))).collect()
 }
 
-/// What is not in the status: finding it opens files of all engines of the namespace, and reads the engine's memory map.
+/// Details that are not in the status. Reading them opens files of all engines in the namespace and the engine's memory
+/// map.
 #[derive(Debug, Default)]
 pub(crate) struct Details {
     processes: EngineProcesses,
@@ -21,14 +22,14 @@ impl Details {
     }
 }
 
-/// One engine: what it has done, and who uses it.
+/// One engine: its work and its users.
 pub(crate) fn describe(status: &EngineStatus, details: &Details) -> Json {
     let last_request = status.groups.iter().filter_map(|group| group.last_request).min();
     json!({
         "service": status.service,
         "id": status.id,
         "process": status.process,
-        // Not every reader of JSON keeps 64 bits.
+        // As text, since not every JSON reader keeps 64 bits.
         "incarnation": format!("{:016x}", status.incarnation),
         "groups": status.groups.len(),
         "num_envs": status.num_envs,

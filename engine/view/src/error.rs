@@ -1,6 +1,6 @@
 //! Errors of the servers.
 
-/// Why a page is not served.
+/// Why a page cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewError {
     /// The port cannot be used.
@@ -8,10 +8,10 @@ pub enum ViewError {
     Port {
         /// The port that was given.
         port: u16,
-        /// The reason of the operating system.
+        /// The operating system's reason.
         reason: std::io::Error,
     },
-    /// The page on which the environments are played is not part of this program.
+    /// This program does not include the page that plays the environments.
     #[error(
         "this program was built without the page that plays the environments: run `cargo xtask web`, then build with --release"
     )]
@@ -19,7 +19,7 @@ pub enum ViewError {
     /// The server cannot run.
     #[error("the web server cannot run: {reason}")]
     Server {
-        /// The reason of the operating system.
+        /// The operating system's reason.
         reason: std::io::Error,
     },
 }

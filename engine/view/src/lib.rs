@@ -1,8 +1,8 @@
-//! Web pages on this machine alone: [`PlayServer`] serves the page on which the environments are played, and [`ViewServer`]
-//! a page that shows the environments of a running engine while a trainer steps them.
+//! Local web pages: [`PlayServer`] serves the page that plays the environments, and [`ViewServer`] a page that shows
+//! the environments of a running engine while a trainer steps them.
 //!
-//! Both listen on 127.0.0.1 only, and refuse requests that name another host or that come from the page of another site.
-//! The address of a [`ViewServer`] contains a random token, without which nothing is answered.
+//! Both listen only on 127.0.0.1, and refuse requests that name another host or come from another site's page. The
+//! address of a [`ViewServer`] contains a random token, which every request needs.
 
 #![deny(unsafe_code)]
 

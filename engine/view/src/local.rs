@@ -1,4 +1,4 @@
-//! What all servers of this crate share: a port on 127.0.0.1, the check of who asks, files.
+//! Common parts of this crate's servers: a port on 127.0.0.1, the check of a request's origin, and files.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,7 +14,7 @@ use axum::response::{IntoResponse, Response};
 
 use crate::error::ViewError;
 
-/// How often a server looks at its stop flag.
+/// How often a server checks its stop flag.
 const STOP_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A port on 127.0.0.1.
@@ -25,7 +25,7 @@ pub(crate) struct LocalPort {
 }
 
 impl LocalPort {
-    /// Takes the port; 0 for any that is free.
+    /// Binds the port; 0 for any free one.
     pub fn bind(port: u16) -> Result<Self, ViewError> {
         let bound = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).and_then(|listener| {
             listener.set_nonblocking(true)?;
@@ -39,7 +39,7 @@ impl LocalPort {
         format!("http://{}/", self.address)
     }
 
-    /// Serves until the flag is set. Connections that are open then are closed.
+    /// Serves until the flag is set, and then closes open connections.
     pub fn serve(self, router: Router, stop: &AtomicBool) -> Result<(), ViewError> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let runtime = runtime.map_err(|reason| ViewError::Server { reason })?;
@@ -55,7 +55,7 @@ impl LocalPort {
                 () = stopped(stop) => Ok(()),
             }
         });
-        // What still runs in other threads has no effect that anyone would see.
+        // Blocking tasks that still run have no visible effect.
         runtime.shutdown_background();
         served.map_err(|reason| ViewError::Server { reason })
     }
@@ -67,8 +67,7 @@ async fn stopped(stop: &AtomicBool) {
     }
 }
 
-/// Why a request is refused: it was meant for another host, as after a change of a name's
-/// address, or another site's page sends it.
+/// Why a request is refused: it names another host (as in DNS rebinding), or another site's page sent it.
 fn refusal(headers: &HeaderMap, hosts: &[String]) -> Option<&'static str> {
     let text = |name: HeaderName| headers.get(name).map(|value| value.to_str().unwrap_or_default());
     let host = text(HOST).unwrap_or_default();
@@ -91,7 +90,7 @@ pub(crate) fn not_found() -> Response {
     (StatusCode::NOT_FOUND, "there is no such file\n").into_response()
 }
 
-/// Adds what keeps a browser from guessing types, from telling the address to others, and from answering out of an old copy.
+/// Adds headers that keep a browser from guessing types, from revealing the address to other sites, and from caching.
 fn protected(mut response: Response) -> Response {
     let headers = [(X_CONTENT_TYPE_OPTIONS, "nosniff"), (REFERRER_POLICY, "no-referrer"), (CACHE_CONTROL, "no-store")];
     for (name, value) in headers {
@@ -123,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_this_server_and_its_own_pages_are_answered() {
+    fn requests_for_other_hosts_or_from_other_sites_are_refused() {
         let hosts = ["127.0.0.1:80".to_owned(), "localhost:80".to_owned()];
         let refused = |host: Option<&'static str>, origin: Option<&'static str>| {
             let mut headers = HeaderMap::new();

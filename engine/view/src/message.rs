@@ -1,7 +1,7 @@
-//! A message to a browser: what is known of an engine as JSON, and the pixels of the environments that it shows.
+//! A message to a browser: an engine's state as JSON, and the pixels of the environments that the browser shows.
 //!
-//! The length of the JSON text as a little-endian `u32`, the text, and the newest frame of each environment as it is in
-//! the batch.
+//! It consists of the length of the JSON text as a little-endian `u32`, the text, and the newest frame of each
+//! environment as stored in the batch.
 
 use endless_gym_core::batch::{Batch, BatchSection, Frames, Section};
 use endless_gym_core::envs::SCREEN;
@@ -9,7 +9,7 @@ use endless_gym_service::{BatchLease, ServiceSpecification};
 use serde::Deserialize;
 use serde_json::{Value as Json, json};
 
-/// Environments that one browser may show at a time.
+/// Maximum number of environments that a browser shows at a time.
 pub(crate) const MAX_SHOWN: usize = 144;
 
 /// Which environments a browser shows.
@@ -18,7 +18,7 @@ pub(crate) const MAX_SHOWN: usize = 144;
 pub(crate) struct Selection {
     /// Their group.
     pub group: usize,
-    /// Their numbers in the group. Those that do not exist are left out, and so are those after the first [`MAX_SHOWN`].
+    /// Their numbers in the group. Numbers that do not exist, and those after the first [`MAX_SHOWN`], are ignored.
     pub envs: Vec<usize>,
 }
 
@@ -35,7 +35,7 @@ impl Selection {
     }
 }
 
-/// Where a frame's numbers lie: bytes between neighbours. A grayscale frame has one channel.
+/// The memory layout of a frame: its strides in bytes. A grayscale frame has one channel.
 fn describe(frames: Frames) -> Json {
     let (format, side) = (frames.format, SCREEN);
     let channels = if format.grayscale { 1 } else { 3 };
@@ -44,7 +44,7 @@ fn describe(frames: Frames) -> Json {
     json!({"width": side, "height": side, "channels": channels, "x": x, "y": y, "channel": channel, "stack": frames.stack})
 }
 
-/// The message, with `about` as the JSON and with what a batch says about the selected environments.
+/// The message with `about` as its JSON, and the selected environments' data from a batch.
 pub(crate) fn encode(
     mut about: Json,
     specification: Option<&ServiceSpecification>,
@@ -78,7 +78,7 @@ fn newest_frames<'a>(
     envs: &[usize],
 ) -> Vec<&'a [u8]> {
     let width = specification.batch.section(BatchSection::Observation).map_or(0, Section::width);
-    // The stack is the first index, oldest first.
+    // The stack is the first axis, oldest first.
     let length = width / frames.stack.max(1);
     let rows = envs.iter().filter_map(|env| batch.observation().get(env * width..(env + 1) * width));
     rows.map(|row| &row[width - length..]).collect()

@@ -1,4 +1,4 @@
-//! The server of the page on which the environments are played.
+//! The server of the page that plays the environments.
 
 use std::sync::atomic::AtomicBool;
 
@@ -11,12 +11,12 @@ use serde_json::{Map, Value as Json};
 use crate::error::ViewError;
 use crate::local::{self, LocalPort};
 
-/// A service worker without effect, which replaces one that was installed at this address. The page's own keeps a copy of the
-/// page for use without a network, which this server makes needless, and which would outlive the program.
+/// A service worker that replaces and unregisters one installed earlier at this address. The page's own worker caches
+/// the page for offline use, which is useless with a local server and would outlive the program.
 const WORKER: &str = "addEventListener('install', () => skipWaiting());\n\
                       addEventListener('activate', () => registration.unregister());\n";
 
-/// Serves the page on which the environments are played, on 127.0.0.1.
+/// Serves the page that plays the environments on 127.0.0.1.
 ///
 /// ```no_run
 /// use std::sync::atomic::AtomicBool;
@@ -34,7 +34,7 @@ pub struct PlayServer {
 }
 
 impl PlayServer {
-    /// Takes the port; 0 for any that is free.
+    /// Binds the port; 0 for any free one.
     ///
     /// # Errors
     ///
@@ -76,8 +76,8 @@ fn found(name: &str) -> Response {
     endless_gym_page::file(name).map_or_else(local::not_found, |bytes| local::file(name, bytes))
 }
 
-/// What stands behind `#` in the address of an episode, as `link.js` of the page reads it. Reset parameters are JSON; text that
-/// would not be read as anything else stands for itself.
+/// The part after `#` in the address of an episode, as the page's `link.js` reads it. Reset parameters are JSON, but
+/// text that is not valid JSON is written without quotes.
 fn link(id: &str, options: &Map<String, Json>, seed: Option<u64>) -> String {
     let mut fields = Serializer::new(String::new());
     fields.append_pair("env", id);
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_is_what_the_page_reads() {
+    fn links_have_the_format_that_the_page_reads() {
         let Json::Object(options) = json!({"num_coins": [3], "agent_visible": true, "name": "a b", "digits": "7"})
         else {
             panic!("an object")

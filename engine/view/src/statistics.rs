@@ -7,27 +7,27 @@ use endless_gym_core::batch::Batch;
 use endless_gym_service::EngineStatus;
 use serde::Serialize;
 
-/// The mean return and length are those of this number of episodes.
+/// Number of episodes over which the return and the length are averaged.
 const WINDOW: usize = 1000;
 
-/// Points that are kept, one a second.
+/// Maximum number of points kept, one per second.
 const MAX_POINTS: usize = 3600;
 
-/// What an engine did up to a moment.
+/// The statistics of an engine at one time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(crate) struct Point {
     /// Seconds since the engine started.
     pub seconds: f64,
-    /// Environment steps per second since the point before.
+    /// Environment steps per second since the previous point.
     pub steps_per_second: f64,
     /// Episodes that have ended since the engine started.
     pub episodes: u64,
-    /// Means of the last episodes that were seen; `None` before the first.
+    /// Means over the last observed episodes; `None` before the first.
     pub mean_return: Option<f64>,
     pub mean_length: Option<f64>,
 }
 
-/// The returns and lengths of the last episodes that ended in batches.
+/// The returns and lengths of the last episodes that ended in the given batches.
 #[derive(Debug, Default)]
 pub struct RecentEpisodes {
     results: VecDeque<(f64, i32)>,
@@ -49,7 +49,7 @@ impl RecentEpisodes {
         }
     }
 
-    /// The mean return and the mean length of the last 1,000 episodes, or of all if there were fewer; `None` before the first.
+    /// Mean return and mean length of the last 1,000 episodes, or of all if there are fewer; `None` before the first.
     pub fn means(&self) -> Option<(f64, f64)> {
         let count = self.results.len() as f64;
         let sum = |value: fn(&(f64, i32)) -> f64| self.results.iter().map(value).sum::<f64>();
@@ -60,7 +60,7 @@ impl RecentEpisodes {
 /// The points of one run of an engine.
 #[derive(Debug, Default)]
 pub(crate) struct History {
-    /// The run of the engine.
+    /// Identifies the run of the engine.
     pub incarnation: u64,
     /// Points that were dropped from the front.
     dropped: u64,
@@ -71,16 +71,16 @@ pub(crate) struct History {
 }
 
 impl History {
-    /// Starts anew if it is another run of the engine.
+    /// Starts a new history if it is another run of the engine.
     pub fn begin(&mut self, incarnation: u64) {
         if self.incarnation != incarnation {
             *self = History { incarnation, ..History::default() };
         }
-        // A time without observation is not part of a rate.
+        // Rates must not include the time without observation.
         self.counted = None;
     }
 
-    /// Adds a point, from the second status on.
+    /// Adds a point. The first status gives none, since a rate needs two.
     pub fn point(&mut self, status: &EngineStatus) {
         let (now, steps) = (Instant::now(), status.total(|group| group.env_steps));
         let Some((moment, before)) = self.counted.replace((now, steps)) else { return };

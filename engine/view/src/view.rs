@@ -24,7 +24,7 @@ use crate::error::ViewError;
 use crate::local::{self, LocalPort};
 use crate::watcher;
 
-/// The page's own files. Style and icon are those of the page on which the environments are played.
+/// The page's own files. It shares style and icon with the page that plays the environments.
 const FILES: [(&str, &[u8]); 6] = [
     ("view.css", include_bytes!("../files/view.css")),
     ("view.js", include_bytes!("../files/view.js")),
@@ -39,15 +39,15 @@ const INDEX: &str = include_str!("../files/index.html");
 /// Longest message that a browser may send, in bytes.
 const MAX_REQUEST: usize = 16 * 1024;
 
-/// How long the end of the observers is waited for.
+/// How long to wait until the observers end.
 const END_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Names of engines that are remembered with their curves.
+/// Maximum number of engines whose curves are kept.
 const MAX_CHANNELS: usize = 64;
 
-/// Serves a page that shows the environments of running engines, on 127.0.0.1.
+/// Serves a page that shows the environments of running engines on 127.0.0.1.
 ///
-/// While a browser shows an engine, a thread observes it. Without a browser nothing is observed.
+/// A thread observes an engine as long as a browser shows it.
 ///
 /// ```no_run
 /// use std::sync::atomic::AtomicBool;
@@ -75,8 +75,8 @@ struct Shared {
 }
 
 impl ViewServer {
-    /// Takes the port, 0 for any that is free. The page shows the engine `service`, or a list of the namespace's engines for
-    /// `None`. The engine need not run yet.
+    /// Binds the port; 0 for any free one. The page shows the engine `service`, which need not be running yet, or a
+    /// list of the namespace's engines for `None`.
     ///
     /// # Errors
     ///
@@ -115,11 +115,11 @@ impl ViewServer {
 }
 
 impl Shared {
-    /// Waits until no engine is observed, so that this process leaves nothing behind that others would have to remove.
+    /// Waits until no engine is observed, so that this process leaves nothing behind for others to remove.
     fn wait_for_observers(&self) {
         let channels = self.channels.lock().unwrap_or_else(PoisonError::into_inner);
         let begin = Instant::now();
-        // An observing thread has its channel until it ends.
+        // An observing thread holds its channel until it ends.
         while channels.values().any(|channel| Arc::strong_count(channel) > 1) && begin.elapsed() < END_TIMEOUT {
             thread::sleep(Duration::from_millis(5));
         }
@@ -131,8 +131,8 @@ struct Token {
     token: Option<String>,
 }
 
-/// Every address has the token: the page's own in its query, all others as their first folder, so that the page's files find each
-/// other by their names.
+/// Every address contains the token: the page's in its query, all others as their first folder, so that the page's
+/// files can refer to each other by name.
 async fn check_token(State(shared): State<Arc<Shared>>, request: Request, next: Next) -> Response {
     let address = request.uri();
     let given = match address.path() {
@@ -146,7 +146,7 @@ async fn check_token(State(shared): State<Arc<Shared>>, request: Request, next: 
     }
 }
 
-/// Compares in a time that does not tell where they differ.
+/// Compares in constant time.
 fn same(given: &[u8], expected: &[u8]) -> bool {
     given.len() == expected.len() && given.iter().zip(expected).fold(0, |all, (a, b)| all | (a ^ b)) == 0
 }
@@ -170,7 +170,7 @@ async fn file(address: Uri) -> Response {
 /// The running engines, and the one to show first.
 async fn list(State(shared): State<Arc<Shared>>) -> Response {
     let namespace = shared.namespace.clone();
-    // Reads files.
+    // It blocks, since it reads files.
     let engines = tokio::task::spawn_blocking(move || engines::list(&namespace)).await.unwrap_or_default();
     let answer = json!({"service": shared.service, "root": shared.namespace.root(), "engines": engines});
     ([(CONTENT_TYPE, "application/json")], answer.to_string()).into_response()
@@ -201,9 +201,9 @@ async fn socket(
     upgrade.max_message_size(MAX_REQUEST).on_upgrade(move |socket| show(socket, connected, channel))
 }
 
-/// Sends the newest message whenever the last one has been taken, and the points of the curves that the browser lacks.
+/// Sends the newest message after the previous one was sent, and the points that the browser's curves lack.
 async fn show(mut socket: WebSocket, mut connected: Connected, channel: Arc<Channel>) {
-    // Which run's points it has, and how many.
+    // The run whose points the browser has, and how many.
     let mut known = (0, 0);
     loop {
         tokio::select! {

@@ -12,25 +12,25 @@ use crate::engines::{self, Details};
 use crate::message;
 use crate::watched_group::WatchedGroup;
 
-/// Time between two looks at what the browsers want.
+/// Time between two checks of what the browsers want.
 const INTERVAL: Duration = Duration::from_millis(33);
 
-/// The same while the newest batch keeps a busy engine from writing to its memory.
+/// The same while the newest batch keeps a busy engine from reusing its memory.
 const URGENT_INTERVAL: Duration = Duration::from_millis(2);
 
 /// Time between two readings of the engine's status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Time between two readings of what costs more than the status: the engine's processes and its memory.
+/// Time between two readings of the engine's processes and memory, which cost more than the status.
 const DETAILS_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Without a batch for this time, the thread looks whether the engine lives.
+/// How long after the last batch the thread checks whether the engine is alive.
 const LIVENESS_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Time between two attempts to connect.
 const RETRY_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Observes until the last browser has left, and connects again whenever the engine is lost.
+/// Observes until the last browser has left, and reconnects whenever the engine is lost.
 pub(crate) fn run(channel: &Channel) {
     let mut state = State { name: "waiting", reason: String::new() };
     loop {
@@ -61,7 +61,7 @@ pub(crate) fn run(channel: &Channel) {
     }
 }
 
-/// What is said while there is no engine.
+/// What the browsers are told while there is no engine.
 struct State {
     name: &'static str,
     reason: String,
@@ -74,7 +74,7 @@ impl State {
             ServiceError::EngineLost { .. }
             | ServiceError::RootRemoved { .. }
             | ServiceError::EngineRestarted { .. } => "lost",
-            // An engine that was there before is not waited for, it is lost.
+            // Keeps `lost` for an engine that was running before.
             ServiceError::UnknownEngine { .. } | ServiceError::EngineUnreachable { .. } => self.name,
             _ => "refused",
         };
@@ -111,7 +111,7 @@ impl Observation {
         Ok(Observation { specification, groups, status: Json::Null, details: Details::default() })
     }
 
-    /// Until the last browser has left, or the engine is lost.
+    /// Observes until the last browser has left or the engine is lost.
     fn observe(&mut self, channel: &Channel) -> Result<(), ServiceError> {
         let (mut read, mut detailed, mut heard) = (None::<Instant>, None::<Instant>, Instant::now());
         let is_due = |last: Option<Instant>, interval| last.is_none_or(|last| last.elapsed() >= interval);
@@ -133,7 +133,7 @@ impl Observation {
             // A page in the background gets one batch per status, for its curves.
             let shown = |viewer: &&Arc<Viewer>| is_news || !viewer.is_hidden();
             let shown: Vec<_> = viewers.iter().filter(shown).collect();
-            // A batch is taken only for a browser that can receive it, and one that no browser shows only for the curves.
+            // Take a batch only if a browser can receive it; if no browser shows its group, only for the curves.
             let ready: Vec<_> =
                 shown.iter().filter(|viewer| viewer.is_ready()).map(|viewer| viewer.selection()).collect();
             for (number, group) in self.groups.iter_mut().enumerate() {
@@ -156,7 +156,7 @@ impl Observation {
         }
     }
 
-    /// Takes the newest batch of each group from which one is wanted, in place of the one before. Returns whether there was any.
+    /// Takes the newest batch of each group from which one is wanted. Returns whether there was any.
     fn take(&mut self, channel: &Channel) -> Result<bool, ServiceError> {
         let mut is_new = false;
         for group in &mut self.groups {

@@ -1,6 +1,6 @@
-// The trained agents, and how they do on the page.
+// The trained agents, and their results on the page.
 
-/** The file of each environment's agent; docs/train/agents.md says how it is made. */
+/** The file of each environment's agent; docs/train/agents.md describes how to make one. */
 const FILES = { "MortarMayhem-Grid-v0": "MortarMayhem-Grid-v0.agent.bin" };
 
 export class Agents {
@@ -15,12 +15,12 @@ export class Agents {
     return id in FILES;
   }
 
-  /** Why there is no agent to play, or an empty text. */
+  /** Why there is no agent, or an empty string. */
   reason(id) {
     return this.has(id) ? "" : `No agent was trained in ${id}; there is one for ${Object.keys(FILES).join(", ")}.`;
   }
 
-  /** What the file says about an agent that was loaded. */
+  /** The description in a loaded agent's file. */
   description(id) {
     return this.#loaded.get(id);
   }
@@ -36,12 +36,12 @@ export class Agents {
     return this.#loaded.get(id);
   }
 
-  /** The reset parameters that an agent was trained with, as the form has them. */
+  /** The reset parameters that an agent was trained with, as texts of the form. */
   options(id) {
     return Object.fromEntries(Object.entries(this.description(id).options).map(([name, value]) => [name, JSON.stringify(value)]));
   }
 
-  /** Counts an episode that the agent has ended; those of the same environment and reset parameters together. */
+  /** Counts a finished episode of the agent, by environment and reset parameters. */
   count({ id, options }, succeeded) {
     const count = this.counted({ id, options });
     this.#counts.set(key(id, options), { episodes: count.episodes + 1, successes: count.successes + Number(succeeded) });
@@ -51,7 +51,7 @@ export class Agents {
     return this.#counts.get(key(id, options)) ?? { episodes: 0, successes: 0 };
   }
 
-  /** One sentence on the training. */
+  /** One sentence about the training. */
   trained(id) {
     const { steps, evaluation } = this.description(id);
     const share = ({ options, success }) =>

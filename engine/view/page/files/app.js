@@ -1,4 +1,4 @@
-// The page: the engine, the episode, the wall, and the address that names them.
+// The page: connects the engine, the episode, the wall, and the address.
 
 import { Engine } from "./engine.js";
 import { ParameterForm } from "./form.js";
@@ -17,7 +17,7 @@ function say(text, isNote = false) {
 
 const report = (error) => say(error.message);
 
-/** One of the seeds that the paper trains on. */
+/** One of the paper's training seeds. */
 const randomSeed = () => String(crypto.getRandomValues(new Uint32Array(1))[0] % 100_000);
 
 class App {
@@ -35,7 +35,7 @@ class App {
     this.#listen();
   }
 
-  /** Starts what the address names. */
+  /** Starts the episode or wall in the address. */
   follow() {
     const link = readLink(location.hash);
     if (link.wall !== undefined) return this.showWall(link);
@@ -47,7 +47,7 @@ class App {
     else if (link.by) say(`by must be agent or expert, got \`${link.by}\``);
   }
 
-  /** Starts an episode, or says why not. */
+  /** Starts an episode, or reports why it cannot. */
   start(episode) {
     this.#view("play");
     say("");
@@ -120,7 +120,7 @@ class App {
       const id = $("environment").value;
       if (this.play.active) this.start({ id, options: {}, seed: $("seed").value || randomSeed() });
       else this.wall.start({ wall: id, count: $("wall-count").value, by: $("wall-by").value });
-      // The arrow keys are for playing.
+      // Frees the arrow keys for playing.
       $("environment").blur();
     });
     $("seed").addEventListener("change", () => this.#restart());
@@ -151,7 +151,7 @@ class App {
   #restart() {
     const seed = $("seed").value;
     this.start({ id: $("environment").value, options: this.form.options(), seed });
-    // What was typed stays, also where the engine refuses it.
+    // Keep what was typed, even if the engine rejects it.
     if (!$("message").hidden) $("seed").value = seed;
   }
 
@@ -195,7 +195,7 @@ function setTheme(theme) {
   try {
     localStorage.setItem("theme", theme);
   } catch {
-    // A browser may refuse to store; the choice then lasts until the page is left.
+    // The browser may refuse storage; the choice then lasts until the page is closed.
   }
 }
 
@@ -208,10 +208,10 @@ try {
 
 try {
   const app = new App(await Engine.load());
-  // For tests, and for the curious.
+  // For tests and for the browser's console.
   globalThis.endless = app;
   app.follow();
-  // For measurements: milliseconds from the navigation to the frame after the first picture.
+  // For measurements: milliseconds from the start of navigation to the frame after the first picture.
   requestAnimationFrame((now) => (app.firstFrame = now));
 } catch (error) {
   report(error);

@@ -1,4 +1,4 @@
-// The engine: WebAssembly behind a few functions. bindings/web/src/lib.rs describes its side.
+// The WebAssembly engine behind a few functions. bindings/web/src/lib.rs describes its side.
 
 const JSON_REPLY = 0;
 const ERROR_REPLY = 1;
@@ -9,7 +9,7 @@ export class EngineError extends Error {}
 export class Engine {
   #wasm;
 
-  /** Loads the engine from beside the page. */
+  /** Loads the engine from the page's folder. */
   static async load(url = new URL("engine.wasm", import.meta.url)) {
     const response = await fetch(url);
     if (!response.ok) throw new EngineError(`${url} cannot be loaded: ${response.status} ${response.statusText}`);
@@ -21,19 +21,19 @@ export class Engine {
     this.#wasm = wasm;
   }
 
-  /** Carries out a request of src/request.rs. Returns its answer: JSON, or bytes. */
+  /** Executes a request of bindings/web/src/request.rs. Returns its answer: JSON or bytes. */
   request(request) {
     this.#put(new TextEncoder().encode(JSON.stringify(request)));
     return this.#reply(() => this.#wasm.call());
   }
 
-  /** Opens the file of a trace, replays it and makes it the game. */
+  /** Opens a trace file, replays it and makes it the current game. */
   open(bytes) {
     this.#put(bytes);
     return this.#reply(() => this.#wasm.open());
   }
 
-  /** Reads an agent's file. Returns what it says about the agent, which then plays the environment that it was trained in. */
+  /** Reads an agent's file. Returns its description; the agent can then play the environment that it was trained in. */
   loadAgent(bytes) {
     this.#put(bytes);
     return this.#reply(() => this.#wasm.load_agent());
@@ -54,7 +54,7 @@ export class Engine {
     return this.#picture(this.#wasm.view(), 84, 84);
   }
 
-  /** The wall, as a picture of the size that the answer to its request states. */
+  /** The wall, as a picture of the size in the answer to the wall's request. */
   wall(width, height) {
     return this.#picture(this.#wasm.draw_wall(), width, height);
   }

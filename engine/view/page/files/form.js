@@ -1,6 +1,6 @@
 // The reset parameters as a form, made from the engine's table.
 
-/** Makes the fields of an environment in `place`. `check(options)` throws the engine's error. */
+/** Creates the fields of an environment in `place`. `check(options)` throws the engine's error. */
 export class ParameterForm {
   #fields = new Map();
 
@@ -9,7 +9,7 @@ export class ParameterForm {
     this.check = check;
   }
 
-  /** Shows the parameters of `spec` with the given texts, and the defaults of the rest. */
+  /** Shows the parameters of `spec` with the given texts, and defaults for the rest. */
   show(spec, options) {
     this.#fields.clear();
     this.place.replaceChildren(...spec.parameters.map((parameter) => this.#field(parameter, options[parameter.name])));
@@ -26,7 +26,7 @@ export class ParameterForm {
     return options;
   }
 
-  /** Shows at each field what the engine says about it. Returns whether all are valid. */
+  /** Shows the engine's error at each field. Returns whether all fields are valid. */
   validate() {
     let valid = true;
     const options = this.options();

@@ -5,12 +5,12 @@ const KEYS = {
   KeyA: "left", KeyD: "right", KeyW: "up", KeyS: "down",
 };
 
-/** Whether the keyboard belongs to a control of the page. */
+/** Whether a control of the page receives the keys. */
 export function isTyping(target) {
   return target instanceof Element && target.matches("input, select, textarea");
 }
 
-/** The directions that are held, and those that were pressed since the last step: none is lost at a slow pace. */
+/** The held directions, and those pressed since the last step, so that none is lost at a slow pace. */
 export class Directions {
   #held = new Map();
   #pressed = new Set();
@@ -50,7 +50,7 @@ export class Directions {
     this.#pressed.clear();
   }
 
-  /** A pad of buttons, each with its directions in `data-directions`. A finger may slide from one to another. */
+  /** Attaches a pad of buttons with directions in `data-directions`. A finger may slide from one to another. */
   attach(pad) {
     const at = (event) => {
       const button = document.elementFromPoint(event.clientX, event.clientY)?.closest("[data-directions]");

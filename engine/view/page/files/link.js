@@ -1,6 +1,6 @@
-// The address: environment, seed, who plays and reset parameters, or a wall.
+// The address: environment, seed, player and reset parameters, or a wall.
 
-/** What an address asks for. */
+/** Parses an address. */
 export function readLink(hash) {
   const fields = new URLSearchParams(hash.replace(/^#/, ""));
   const take = (name) => {
@@ -16,7 +16,7 @@ export function readLink(hash) {
   return { id, seed, by, options: Object.fromEntries(fields) };
 }
 
-/** The address of an episode; `by` is who plays it, if not a person. */
+/** The address of an episode; `by` is the player, if not a person. */
 export function episodeLink({ id, seed, options, by }) {
   return "#" + new URLSearchParams({ env: id, seed, ...(by ? { by } : {}), ...options });
 }

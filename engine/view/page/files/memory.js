@@ -1,10 +1,10 @@
-// What a player that remembers should know at this step, and how often it succeeds.
+// Shows what a player should remember at this step, and how often the agent succeeds.
 
 import { arrowOf, outcomeOf } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 
-/** Shows the commands that an episode has shown, those that are done, and the next one. */
+/** Lists the commands that an episode has shown, and marks the finished ones and the next one. */
 export function showMemory(state, agents) {
   const { clues } = state;
   const done = state.progress.find(({ name }) => name === "commands")?.value ?? 0;

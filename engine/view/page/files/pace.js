@@ -1,6 +1,6 @@
-// A clock that calls for steps at a pace, once for each frame of the screen.
+// A clock that requests steps at a pace, once per animation frame.
 
-/** Most steps between two frames of the screen; what the machine cannot keep up with is dropped. */
+/** Maximum number of steps per animation frame; steps beyond it are dropped. */
 const MOST = 200;
 
 export class Pace {

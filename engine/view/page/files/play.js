@@ -1,4 +1,4 @@
-// The episode on the screen: who plays it, at which pace, and what is shown of it.
+// The episode on the screen: its player, its pace, and its display.
 
 import { Agents } from "./agents.js";
 import { flash } from "./flash.js";
@@ -20,7 +20,7 @@ const DIRECTION_SIGNS = { left: "←", right: "→", up: "↑", down: "↓" };
 
 const STEP_REQUESTS = { expert: "step_of_expert", agent: "step_of_agent", trace: "step_of_trace" };
 
-/** Milliseconds from the end of an agent's episode to its next one. */
+/** Milliseconds between two episodes of an agent. */
 const BREAK = 2500;
 
 // A phone has no keys.
@@ -29,7 +29,7 @@ const GO = TOUCH ? "A tap" : "Space";
 const AGAIN = TOUCH ? "" : "Enter: next seed. R: again.";
 
 export class Play {
-  /** `changed(episode)` is called when an episode starts, `report(error)` with what the engine refuses. */
+  /** Calls `changed(episode)` when an episode starts, and `report(error)` with the engine's errors. */
   constructor(engine, specs, { changed, report }) {
     this.engine = engine;
     this.specs = specs;
@@ -49,7 +49,7 @@ export class Play {
     return this.specs.find((spec) => spec.id === this.state?.id);
   }
 
-  /** Starts an episode of the given environment. Throws what the engine refuses. */
+  /** Starts an episode of the given environment. Throws the engine's error. */
   start({ id, options, seed }, player = "person") {
     const state = this.engine.request({ start: { id, options, seed } });
     this.player = player;
@@ -57,7 +57,7 @@ export class Play {
     if (player === "expert" || player === "agent") this.play();
   }
 
-  /** Loads the agent of an environment and lets it play, with the reset parameters of its training where none are given. */
+  /** Loads the agent of an environment and lets it play. Reset parameters default to those of its training. */
   async playAgent({ id, options, seed }) {
     const before = this.state;
     try {
@@ -65,12 +65,12 @@ export class Play {
     } catch (error) {
       return this.report(error);
     }
-    // Meanwhile a person may have started another episode.
+    // The user may have started another episode meanwhile.
     if (this.state !== before) return;
     this.#attempt(() => this.start({ id, options: { ...this.agents.options(id), ...options }, seed }, "agent"));
   }
 
-  /** Lets the trained agent play, or ends that. */
+  /** Starts or stops the trained agent. */
   toggleAgent() {
     if (!this.state || !this.agents.has(this.state.id)) return;
     if (this.player === "agent") {
@@ -90,7 +90,7 @@ export class Play {
     return outcome;
   }
 
-  /** Continues where it stands. */
+  /** Continues the episode. */
   play() {
     if (!this.state || this.#over()) return;
     this.pace.start();
@@ -103,21 +103,21 @@ export class Play {
     this.#show();
   }
 
-  /** The same episode again. */
+  /** Restarts the episode. */
   restart() {
     if (!this.state) return;
     if (this.player === "trace") this.#attempt(() => this.open(this.file));
     else this.#attempt(() => this.start(this.state, this.player));
   }
 
-  /** The episode of a seed that is `by` larger. */
+  /** Starts the episode whose seed is larger by `by`. */
   otherSeed(by) {
     if (!this.state) return;
     const seed = BigInt.asUintN(64, BigInt(this.state.seed ?? 0) + BigInt(by)).toString();
     this.#attempt(() => this.start({ ...this.state, seed }, this.player === "trace" ? "person" : this.player));
   }
 
-  /** Lets the expert play, which remembers an episode from its start, or ends that. */
+  /** Starts or stops the expert, which must see an episode from its start. */
   toggleExpert() {
     if (!this.state) return;
     if (this.player === "expert") {
@@ -125,7 +125,7 @@ export class Play {
       this.changed(this.state);
       return this.stop();
     }
-    // A recording may start without a seed.
+    // A recording may have no seed.
     this.#attempt(() => this.start({ ...this.state, seed: this.state.seed ?? "0" }, "expert"));
   }
 
@@ -136,7 +136,7 @@ export class Play {
     this.#steps(1, true);
   }
 
-  /** The recording as the file of a trace, and its name. */
+  /** The recording as a trace file, and its name. */
   recording() {
     const { id, seed, length } = this.state;
     return { bytes: this.engine.request("save"), name: `${id}.seed-${seed ?? "none"}.${length}-steps.json.gz` };
@@ -194,7 +194,7 @@ export class Play {
     });
     if (this.#over()) {
       this.pace.stop();
-      // An agent that was started plays one episode after the other.
+      // A running agent plays one episode after the other.
       if (this.player === "agent" && this.state.done && !single) this.following = setTimeout(() => this.otherSeed(1), BREAK);
     }
     this.#show();
@@ -248,7 +248,7 @@ export class Play {
   #agent() {
     const { player, state } = this;
     const reason = this.agents.reason(state.id);
-    // A disabled button would not be reached by the keyboard, and its reason not be read.
+    // Not `disabled`, so that the keyboard still reaches the button and a screen reader reads the reason.
     $("agent").setAttribute("aria-pressed", String(player === "agent"));
     $("agent").setAttribute("aria-disabled", String(reason !== ""));
     $("agent").title = reason;
@@ -356,7 +356,7 @@ export class Play {
   }
 }
 
-/** A number as people read it. */
+/** A number with at most three decimals. */
 function round(value) {
   return value === null ? "–" : String(Math.round(value * 1000) / 1000);
 }

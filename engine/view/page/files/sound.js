@@ -2,7 +2,7 @@
 
 let context = null;
 
-/** Must be called from a click: browsers are silent before one. */
+/** Must be called from a click: browsers play no sound before one. */
 export function enable() {
   context ??= new AudioContext();
   context.resume();

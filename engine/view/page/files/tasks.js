@@ -1,4 +1,4 @@
-// What an episode asks for, and how each environment is steered.
+// The tasks of the environments, and how each is steered.
 
 const MORTAR = "Remember the commands that are shown one after another: arrows name a neighbouring tile, a crossed circle means stay.";
 const GRID = "Left and right turn the agent, up walks to the tile ahead.";
@@ -33,13 +33,13 @@ const FREE = { left: [0, 1], right: [0, 2], up: [1, 1], down: [1, 2] };
 const TURN = { left: [0, 1], right: [0, 2], up: [0, 3] };
 const AHEAD = { right: [0, 1], up: [0, 2], down: [0, 3] };
 
-/** For each direction that means something: the branch of the action and its number. */
+/** For each direction that the environment has: the branch of the action and its number. */
 export function steering(spec) {
   if (spec.id === "Endless-MysteryPath-v0") return AHEAD;
   return spec.action_branches.length === 2 ? FREE : TURN;
 }
 
-/** The action for directions; a later direction of the same branch counts. */
+/** The action for directions; the last direction of a branch counts. */
 export function actionFor(spec, directions) {
   const action = spec.action_branches.map(() => 0);
   const meaning = steering(spec);
@@ -55,7 +55,7 @@ export function directionsOf(spec, action) {
   return meaning.filter(([, [branch, number]]) => action[branch] === number).map(([direction]) => direction);
 }
 
-// The order of the vector observation's places.
+// In the order of the vector observation.
 const COMMANDS = ["stay", "right", "left", "up", "down", "right down", "right up", "left down", "left up"];
 const ARROWS = { stay: "⊗", right: "→", left: "←", up: "↑", down: "↓", "right down": "↘", "right up": "↗", "left down": "↙", "left up": "↖" };
 
@@ -64,7 +64,7 @@ export function arrowOf(command) {
   return ARROWS[command];
 }
 
-/** How an episode has ended: `success`, `failure`, `end` where none is defined, or null before its end. */
+/** How an episode ended: `success`, `failure`, `end` if the environment defines no success, or null before its end. */
 export function outcomeOf(state) {
   if (!state.done) return null;
   if (!("success" in (state.info ?? {}))) return "end";

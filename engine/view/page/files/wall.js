@@ -1,14 +1,14 @@
-// Many environments on one canvas, which play by themselves.
+// Many self-playing environments on one canvas.
 
 import { Pace } from "./pace.js";
 
 const $ = (id) => document.getElementById(id);
 
-/** Milliseconds of a frame of the screen that steps may take, so that the page stays at 60 frames a second. */
+/** Milliseconds per animation frame that steps may take, so that the page keeps 60 frames per second. */
 const BUDGET = 10;
 
 export class Wall {
-  /** `changed(wall)` is called when a wall starts, `play(id)` when a person chooses one of its environments. */
+  /** Calls `changed(wall)` when a wall starts, and `play(id)` when the user clicks one of its environments. */
   constructor(engine, specs, { changed, play, report }) {
     this.engine = engine;
     this.specs = specs;

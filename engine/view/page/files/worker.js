@@ -1,11 +1,11 @@
-// The service worker: the page works without a network once it was loaded. The build puts VERSION and FILES above this line.
+// The service worker: once loaded, the page works offline. The build inserts VERSION and FILES above this line.
 
 const CACHE = `endless-gym-${VERSION}`;
 
 self.addEventListener("install", (event) => {
   const fill = async () => {
     const cache = await caches.open(CACHE);
-    // Not from the browser's own cache, which may hold files of another version.
+    // Bypass the browser's HTTP cache, which may hold files of another version.
     await cache.addAll(["./", ...FILES].map((file) => new Request(file, { cache: "reload" })));
     await self.skipWaiting();
   };

@@ -1,7 +1,8 @@
-//! The files of the page on which the environments are played in a browser, for a program that serves them.
+//! The files of the web page that plays the environments, for programs that serve it.
 //!
-//! `cargo xtask web` builds the page into this package's folder `built`, with the engine as WebAssembly. Release builds of this crate
-//! after that contain it. Others contain the sources of the page alone, which other pages share: style, icon, modules.
+//! `cargo xtask web` builds the page, with the engine as WebAssembly, into this package's folder `built`. Later release
+//! builds of this crate contain it. Other builds contain only the page's sources, from which other pages take style and
+//! icon.
 
 /// Names and contents of the files.
 pub const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
@@ -16,7 +17,7 @@ pub fn file(name: &str) -> Option<&'static [u8]> {
     FILES.iter().find_map(|(other, bytes)| (*other == name).then_some(*bytes))
 }
 
-/// Whether the page can be played: whether it was built before this crate.
+/// Whether the page was built before this crate and so can be played.
 pub fn is_built() -> bool {
     file("engine.wasm").is_some()
 }
