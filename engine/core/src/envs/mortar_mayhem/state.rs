@@ -84,7 +84,7 @@ impl State {
         }
     }
 
-    /// Whether the rules can continue from every number. A forged snapshot may hold any numbers.
+    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self, config: &Config) -> bool {
         let displayed_is_valid = match &self.displayed {
             DisplayedCharacter::Earlier { character, scale } => {

@@ -1,7 +1,6 @@
-//! The expert's belief about a hidden path: the probability that a tile is on it, given what was observed.
+//! The expert's belief about a hidden path: the probability that a tile is on it, given the observations.
 //!
-//! The belief is a set of sample paths from the generator of the rules. Samples that contradict an observation are
-//! removed.
+//! The belief is a set of sample paths, generated as in the rules. Samples that contradict an observation are removed.
 
 use std::sync::OnceLock;
 
@@ -12,7 +11,7 @@ use crate::random::Generator;
 /// Number of sample paths for each tile that a path can start on.
 const SAMPLES: usize = 16_384;
 
-/// Weight of the prior, in samples. It decides when no sample is left.
+/// Weight of the prior, in samples. The prior decides if no sample is left.
 const PRIOR_WEIGHT: f64 = 4.0;
 
 /// The sample paths that agree with all observations.
@@ -22,8 +21,7 @@ pub struct Belief {
 }
 
 impl Belief {
-    /// All samples that start at `start`: on one grid, and for the endless id with the tile that leads to the next
-    /// grid.
+    /// All samples that start at `start`: on one grid, and for the endless id including the tile that leads to the next grid.
     pub fn new(variant: Variant, start: Tile) -> Self {
         static FINITE: [OnceLock<Vec<TileSet>>; 64] = [const { OnceLock::new() }; 64];
         static ENDLESS: [OnceLock<Vec<TileSet>>; 8] = [const { OnceLock::new() }; 8];
@@ -35,12 +33,12 @@ impl Belief {
         Belief { samples: samples.get_or_init(|| sample_paths(variant, (x, y))).clone() }
     }
 
-    /// Takes into account whether a tile is on the path.
+    /// Removes the samples that contradict whether a tile is on the path.
     pub fn observe(&mut self, tile: Tile, on_path: bool) {
         self.samples.retain(|path| path.contains(tile) == on_path);
     }
 
-    /// The probability that a tile is on the path. `prior` is the probability without any sample, and has the weight of
+    /// The probability that a tile is on the path. `prior` is the probability without any samples, and has the weight of
     /// [`PRIOR_WEIGHT`] samples.
     pub fn probability(&self, tile: Tile, prior: f64) -> f64 {
         let on_path = self.samples.iter().filter(|path| path.contains(tile)).count();
@@ -51,7 +49,7 @@ impl Belief {
 fn sample_paths(variant: Variant, start: Tile) -> Vec<TileSet> {
     let mut random = Generator::from_seed(1);
     let last = GRID - 1;
-    // The sides that the path can start on; a corner lies on two.
+    // The sides on which the path can start; a corner lies on two.
     let on_side = [start.0 == 0, start.0 == last, start.1 == 0, start.1 == last];
     let sides: Vec<i64> = match variant {
         Variant::Free | Variant::Grid => (0..).zip(on_side).filter_map(|(side, on)| on.then_some(side)).collect(),

@@ -1,4 +1,4 @@
-//! Reset parameters and the geometry that follows from them.
+//! Reset parameters and the geometry derived from them.
 
 use super::parameters::{Parameters, Variant};
 use super::path::{GRID, Tile};
@@ -8,7 +8,7 @@ use crate::envs::screen::SCREEN;
 /// Side of a tile in pixels.
 pub const TILE: i32 = SCREEN as i32 / GRID;
 
-/// Largest number of tiles to the left of the endless agent that are on the screen.
+/// Maximum number of tiles on the screen to the left of the endless agent.
 const MAX_CAMERA_OFFSET: f64 = 5.5;
 
 /// Everything that the rules need in addition to the state.
@@ -22,7 +22,7 @@ pub struct Config {
     pub agent: CharacterSize,
     /// Left edge of the screen at the start of an episode, in pixels of the path's coordinates.
     pub camera: f64,
-    /// Columns of the past path that are shown beside the agent's neighbour column.
+    /// Number of columns of the past path that are shown, besides the column next to the agent.
     pub past_depth: i32,
     /// Horizontal centre of the endless agent on the screen, which scrolls with it, in pixels.
     pub agent_x: i32,

@@ -25,16 +25,16 @@ const STAMINA_BAR: i32 = 4;
 /// Opacity of the path in the endless id's ground-truth view, 0 to 255.
 const PATH_ALPHA: i32 = 200;
 
-/// What all environments with the same reset parameters share: the configuration and the pictures.
+/// Shared by all environments with the same reset parameters: the configuration and the pictures.
 #[derive(Debug)]
 pub struct Assets {
-    /// What the rules need.
+    /// Configuration of the rules.
     pub config: Config,
     character: CharacterSprites,
     cross: Sprite,
     /// A tile of the past path.
     past_tile: Sprite,
-    /// A tile of the ground truth.
+    /// A path tile in the ground-truth view.
     path_tile: Surface,
     /// The screen and one more column of tiles; empty if there is no background.
     background: Vec<u8>,
@@ -88,7 +88,7 @@ fn background() -> Vec<u8> {
     surface.into_pixels()
 }
 
-/// The square of a tile with that top left corner.
+/// The square of a tile with its top left corner at that position.
 fn tile_rect(left: i32, top: i32) -> Rect {
     Rect { x: left, y: top, width: TILE, height: TILE }
 }
@@ -156,7 +156,7 @@ impl Scene {
     }
 }
 
-/// Part of the stamina bar.
+/// The rectangle of `height` rows of the stamina bar, from row `y` on.
 fn stamina_bar(y: i32, height: i32) -> Rect {
     Rect { x: SCREEN as i32 - STAMINA_BAR, y, width: STAMINA_BAR, height }
 }
@@ -171,12 +171,13 @@ fn cross_corner((x, y): (i32, i32)) -> (i32, i32) {
 }
 
 impl Assets {
-    /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and
-    /// walls, or the endless id's whole path and stamina.
+    /// Draws the original's ground-truth view, with what the observation hides: the finite ids' path, goal, origin and walls,
+    /// or the endless id's whole path and stamina.
     pub(super) fn draw_ground_truth(&self, state: &State, canvas: &mut Canvas<'_>) {
         self.paint_background(state.endless.background(), canvas);
         if self.config.variant == Variant::Endless {
-            // The picture of the whole path is truncated to whole pixels once, unlike the past path's tiles.
+            // The position of the whole path's picture is truncated to whole pixels once, unlike the positions of the past
+            // path's tiles.
             let shift = -state.endless.camera() as i32;
             for (x, y) in state.route.tiles() {
                 canvas.blit(&self.path_tile, x * TILE + shift, y * TILE);
@@ -213,8 +214,7 @@ impl Assets {
         if (0..=SCREEN as i32 - TILE).contains(&left) {
             self.past_tile.blit(canvas, left, top);
         } else {
-            // A border covers the last two pixels of a tile that leaves the screen, so that a clipped picture would
-            // differ.
+            // The border covers the last two pixels of a tile that leaves the screen, so a clipped picture would differ.
             canvas.draw_rect(WHITE, tile_rect(left, top), 0);
             canvas.draw_rect(TILE_BORDER, tile_rect(left, top), 1);
         }

@@ -1,4 +1,4 @@
-//! State and rules of the endless id only: the growing path, the scrolling screen, stamina, and the ends of an episode.
+//! State and rules of the endless id only: the growing path, the scrolling screen, stamina, and the end of an episode.
 //!
 //! Source: the original's `endless_mystery_path.py`.
 
@@ -10,11 +10,10 @@ use super::path::Tile;
 use super::route::{Route, SEGMENT};
 use crate::random::Generator;
 
-/// Number of paths at the start of an episode.
+/// Number of joined paths at the start of an episode.
 const FIRST_SEGMENTS: usize = 3;
 
-/// Direction of the next tile of the path. Where the path leads left, where the agent cannot go, the last direction
-/// remains.
+/// Direction of the next tile of the path. If the path leads left, where the agent cannot go, the last direction remains.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Direction {
     /// To the next column.
@@ -26,21 +25,20 @@ pub enum Direction {
     Down,
 }
 
-/// State of the endless id in addition to what it shares with the finite ids. In the finite ids it keeps its default, a screen
-/// that does not scroll.
+/// State of the endless id in addition to that of the finite ids. In the finite ids it keeps its default: a screen that does
+/// not scroll.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EndlessState {
-    /// Left edge of the screen in pixels of the path's coordinates. Summed step by step, which decides how it is
-    /// rounded.
+    /// Left edge of the screen in pixels of the path's coordinates. Summed step by step, which determines its rounding.
     camera: f64,
     /// Pixels that the background has scrolled to the left, less than a tile.
     background: i32,
     stamina: i64,
     /// The farthest column of the path that the agent was on.
     farthest: i32,
-    /// Tiles in that column or beyond where the agent fell off. A second fall at one of them ends the episode.
+    /// Tiles in the farthest column or beyond where the agent fell off. A second fall at one of them ends the episode.
     falls: Vec<Tile>,
-    /// Index along the route of the last tile that the agent was on.
+    /// Index in the route of the last tile that the agent was on.
     at: usize,
     direction: Direction,
 }
@@ -58,12 +56,12 @@ impl EndlessState {
         self.update_direction(route);
     }
 
-    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
+    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self, route: &Route) -> bool {
         const FAR: i32 = 1 << 28;
         self.camera.abs() < f64::from(FAR)
             && (0..TILE).contains(&self.background)
-            // Negative while an episode is played on after its end.
+            // Negative while an episode continues after its end.
             && (-MAX_STAMINA..=MAX_STAMINA).contains(&self.stamina)
             && (0..FAR).contains(&self.farthest)
             && self.at < route.tiles().len()
@@ -73,7 +71,7 @@ impl EndlessState {
     pub(super) fn scroll(&mut self, x: i32) {
         self.camera += f64::from(x);
         self.background += x;
-        // The original keeps the remainder modulo the agent's speed, which is always 0 as all steps are equally long.
+        // The original keeps the remainder modulo the agent's speed, which is always 0 since all steps have the same length.
         if self.background >= TILE {
             self.background = 0;
         }
@@ -85,14 +83,14 @@ impl EndlessState {
         self.background = 0;
     }
 
-    /// Adds a path when the agent is on the last but one.
+    /// Adds a path once the agent is on the last path but one.
     pub(super) fn extend(&self, (x, _): Tile, route: &mut Route, random: &mut Generator) {
         if i64::from(x / SEGMENT) > route.segments() as i64 - 2 {
             route.extend(random);
         }
     }
 
-    /// Records a fall at `tile`, and restores the stamina. Returns whether the fall ends the episode.
+    /// Records a fall at `tile` and restores the stamina. Returns whether the fall ends the episode.
     pub(super) fn fall(&mut self, tile: Tile, stamina: i64) -> bool {
         self.stamina = stamina;
         if tile.0 < self.farthest || self.falls.contains(&tile) {
@@ -128,7 +126,7 @@ impl EndlessState {
         };
     }
 
-    /// Steps that are left to make progress.
+    /// Number of steps left to make progress.
     pub(super) fn stamina_left(&self) -> i64 {
         self.stamina
     }
@@ -144,7 +142,7 @@ impl EndlessState {
         self.stamina == 0
     }
 
-    /// Position on the screen of a position in the path's coordinates, rounded as pygame rounds a rectangle's centre.
+    /// Converts a position in the path's coordinates to one on the screen, rounded as pygame rounds a rectangle's centre.
     pub(super) fn on_screen(&self, (x, y): (i32, i32)) -> (i32, i32) {
         ((f64::from(x) - self.camera).round() as i32, y)
     }
@@ -159,7 +157,7 @@ impl EndlessState {
         self.background
     }
 
-    /// The share of the stamina that is left, at most 1. Negative if the episode is played on after its end.
+    /// The share of the stamina that is left, at most 1. Negative if the episode continues after its end.
     pub(super) fn stamina_share(&self, full: i64) -> f64 {
         self.stamina.min(full) as f64 / full as f64
     }
@@ -174,11 +172,11 @@ impl EndlessState {
         self.direction
     }
 
-    /// The tiles before the last one that the agent was on, backwards until one in the column `depth` columns before
-    /// the agent's neighbour column.
+    /// The tiles before the last one that the agent was on, backwards to the column that is `depth` columns before the one next
+    /// to the agent.
     ///
-    /// As in the original, a path that turns back can be cut short, and if the agent is off the path, the columns count
-    /// from where it fell.
+    /// As in the original, a path that turns back can be cut short, and if the agent is off the path, the columns count from
+    /// where it fell.
     pub(super) fn past_path<'a>(
         &self,
         (x, _): Tile,

@@ -11,13 +11,13 @@ use super::route::SEGMENT;
 use crate::envs::expert::{Expert, turn_or_walk};
 use crate::envs::screen::SCREEN;
 
-/// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so that the frames do not show it.
+/// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so the frames do not show it.
 const ENDLESS_SPEED: i32 = 3;
 
 /// Penalty for each tile of distance, as a probability.
 const WALK: f64 = 0.01;
 
-/// Prior probability that an unknown tile is on the path: beside the last tile found, and beside others.
+/// Prior probability that an unknown tile is on the path: next to the last tile found, and elsewhere.
 const TIP: f64 = 0.5;
 const ELSEWHERE: f64 = 0.03;
 
@@ -28,20 +28,20 @@ enum Known {
     OffPath,
 }
 
-/// Plays all ids of Mystery Path from the feature observation. It walks to the tile that is most likely on the path.
-/// When it falls off, it remembers the tile, walks back and tries the next best. In the endless id it avoids tiles
-/// before the farthest column, since a fall there ends the episode.
+/// Plays all ids of Mystery Path from the feature observation. It walks to the tile that is most likely on the path. When it
+/// falls off, it remembers the tile, walks back and tries the next best. In the endless id it avoids tiles before the farthest
+/// column, since a fall there ends the episode.
 ///
-/// It needs `visual_feedback`, the default `agent_scale`, and an `agent_speed` of less than a tile; in the endless id
-/// the default speed, since it counts its steps to know its position. It needs no ground truth: only a fall before the
-/// farthest column ends an endless episode, so that every tile at the end of the known path can be tried once. It
-/// cannot pass the rare paths that lead back to the left.
+/// It needs `visual_feedback`, the default `agent_scale`, and an `agent_speed` of less than a tile; in the endless id it needs
+/// the default speed, since it counts its steps to know its position. It needs no ground truth: only a fall before the farthest
+/// column ends an endless episode, so it can try every tile at the end of the known path once. It cannot pass the rare paths
+/// that lead back to the left.
 #[derive(Debug)]
 pub struct PathExpert {
     variant: Variant,
-    /// What is known of each column, by row.
+    /// What is known about each column, by row.
     columns: Vec<[Option<Known>; GRID as usize]>,
-    /// The belief about each segment that was entered.
+    /// The belief about each segment that the agent has entered.
     beliefs: Vec<Belief>,
     /// Horizontal centre of the endless agent in pixels of the path's coordinates.
     endless_x: i32,
@@ -101,23 +101,22 @@ impl PathExpert {
         })
     }
 
-    /// The probability that an unknown tile beside `tile` is on the path.
+    /// The probability that an unknown tile `(x, y)` next to `tile` is on the path.
     fn probability(&self, (x, y): Tile, tile: Tile) -> f64 {
         // The tile after the last tile of a segment is always on the path.
         let Some(belief) = self.beliefs.get((x / SEGMENT) as usize) else { return 1.0 };
         let (tip_x, tip_y) = self.tip;
         let prior = match () {
-            // The path most likely continues beside the last tile found.
+            // The path most likely continues next to the last tile found.
             _ if tile == self.tip => TIP,
-            // If the path has no other continuation, it leads left, where the endless agent cannot go. There may be a
-            // detour.
+            // If the path has no other continuation, it leads left, where the endless agent cannot go. There may be a detour.
             _ if (x, y) == (tip_x - 1, tip_y) && self.reachable(self.tip).all(|next| self.known(next).is_some()) => 1.0,
             _ => ELSEWHERE,
         };
         belief.probability((x % SEGMENT, y), prior)
     }
 
-    /// Plans the unknown tile to try next, and the shortest walk there along known tiles.
+    /// Chooses the unknown tile to try next, and plans the shortest walk there along known tiles.
     fn make_plan(&mut self, from: Tile) {
         let mut queue = VecDeque::from([(from, 0, usize::MAX)]);
         let mut visited: Vec<(Tile, usize)> = Vec::new();

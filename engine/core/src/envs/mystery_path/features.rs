@@ -1,5 +1,5 @@
-//! The feature observation of Mystery Path: what a frame shows, as numbers. It does not contain the path, which the
-//! agent must remember.
+//! The feature observation of Mystery Path: the content of a frame as numbers. It does not contain the path, which the agent
+//! must remember.
 
 use super::config::{Config, TILE};
 use super::parameters::Variant;
@@ -26,7 +26,7 @@ pub(super) const PAST_PATH: usize = PAST_SHIFT + 1;
 const SCREEN_COLUMNS: usize = GRID as usize + 1;
 const SCREEN_TILES: usize = SCREEN_COLUMNS * GRID as usize;
 
-/// Divisor of the numbers of a tile.
+/// Divisor of a tile's column and row.
 const LAST_TILE: f32 = GRID as f32 - 1.0;
 
 const fn column(name: &'static str, description: &'static str) -> Column {
@@ -56,7 +56,7 @@ const FINITE: [Column; GOAL + 3] = with_shared([
     column("goal_y", "row of the goal, divided by 6; 0 if it is not seen"),
 ]);
 
-/// The shared columns, then an id's own columns, then empty columns for the rest.
+/// The shared columns, followed by an id's own columns and empty ones.
 const fn with_shared<const OWN: usize, const ALL: usize>(own: [Column; OWN]) -> [Column; ALL] {
     let mut all = [column("", ""); ALL];
     let mut place = 0;
@@ -97,7 +97,7 @@ macro_rules! past_names {
     };
 }
 
-/// Names of the past path's columns by column and row on the screen.
+/// Names of the past path's feature columns, by column and row on the screen.
 const PAST_NAMES: [[&str; GRID as usize]; SCREEN_COLUMNS] = past_names!(0 1 2 3 4 5 6 7);
 
 impl State {

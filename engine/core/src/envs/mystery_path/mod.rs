@@ -1,15 +1,15 @@
 //! Mystery Path: find an invisible path, and remember it after each fall.
 //!
-//! In the finite ids the agent crosses the screen from one side to the goal on the other. An agent that steps off the
-//! path starts over. In the endless id paths are joined to the right without end. An episode ends when the agent falls
-//! off before the farthest column that it was on, falls twice at one tile, or runs out of stamina.
+//! In the finite ids the agent crosses the screen from one side to the goal on the other. An agent that steps off the path
+//! starts over. The endless id joins path after path to the right. Its episode ends when the agent falls off in a column before
+//! the farthest one that it was on, falls twice at the same tile, or runs out of stamina.
 //!
-//! Where the original raises an error or an option has no effect:
+//! Options with which the original raises an error, or that have no effect:
 //!
 //! - `stamina_level` below 1 makes the original divide by zero, or the stamina never runs out; here it is at least 1.
-//! - `agent_speed` above the screen's width moves the original's agent beyond the generated path; here it is at most
-//!   that width.
-//! - `show_origin` of the endless id and `agent_scale` of the grid id have no effect in the original, nor here.
+//! - `agent_speed` above the screen's width moves the original's agent beyond the generated path; here it is at most that
+//!   width.
+//! - `show_origin` of the endless id and `agent_scale` of the grid id have no effect, as in the original.
 
 mod belief;
 mod config;

@@ -4,7 +4,7 @@
 
 use crate::envs::parameters::ResetParameters;
 
-/// What distinguishes the ids of Mystery Path.
+/// Distinguishes the ids of Mystery Path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Variant {
     /// One screen with a goal; the agent moves by `agent_speed` in eight directions, limited by the screen's border.
@@ -17,9 +17,9 @@ pub enum Variant {
 
 /// The original's default scale of the agent: a radius of 6 pixels.
 pub const DEFAULT_AGENT_SCALE: f64 = 0.25;
-/// Largest scale of the agent: a radius of 100 pixels.
+/// Maximum scale of the agent: a radius of 100 pixels.
 pub const MAX_AGENT_SCALE: f64 = 4.0;
-/// Largest `stamina_level`.
+/// Maximum `stamina_level`.
 pub const MAX_STAMINA: i64 = 1_000_000_000;
 
 /// One set of reset parameters.
@@ -45,8 +45,8 @@ pub struct Parameters {
     pub show_stamina: bool,
     /// Whether a red cross shows that the agent fell off the path.
     pub visual_feedback: bool,
-    /// Tiles to the left of the endless agent that are on the screen, limited to 0 to 5.5; truncated, the number of
-    /// past columns that are shown.
+    /// Number of tiles on the screen to the left of the endless agent, limited to 0 to 5.5; truncated, the number of past
+    /// columns that are shown.
     pub camera_offset_scale: f64,
     /// Steps within which the endless agent must reach the next tile, at least 1.
     pub stamina_level: i64,

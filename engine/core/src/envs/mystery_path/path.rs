@@ -1,22 +1,22 @@
-//! Generation of paths: random walls, then a search for a path around them.
+//! Path generation: random walls, then a search for a path around them.
 //!
-//! Source: `Node` and `MysteryPath` of the original's `pygame_assets.py`. The original's A* search deviates from the
-//! textbook, and this one reproduces that together with the order of the random draws: the search expands the first
-//! tile of the open list with a lower score than the list's first tile, the cost of each step is a random number, and a
-//! cheaper path to an open tile changes the tile's parent but not its cost.
+//! Source: `Node` and `MysteryPath` of the original's `pygame_assets.py`. The original's A* search deviates from the textbook,
+//! and this one reproduces its deviations and the order of its random draws: the search expands the first tile of the open list
+//! with a lower score than the list's first tile, the cost of each step is a random number, and a cheaper path to an open tile
+//! changes the tile's parent but not its cost.
 
 use serde::{Deserialize, Serialize};
 
 use crate::random::Generator;
 
-/// Columns and rows of the grid that a path is generated on.
+/// Number of columns and rows of the grid that a path is generated on.
 pub const GRID: i32 = 7;
 
 /// Chance in percent that an inner tile is a wall.
 const WALL_PERCENT: i64 = 33;
-/// Numbers of walls that are added on the grid's border, if there is room; one of them is drawn.
+/// Choices for the number of walls that are added on the grid's border, if there is room.
 const BORDER_WALLS: [u32; 2] = [4, 8];
-/// A step of the search costs `LOWEST_COST..COST_END`.
+/// Range of the random cost of a search step, `LOWEST_COST..COST_END`.
 const LOWEST_COST: i64 = 1;
 const COST_END: i64 = 9;
 
@@ -25,8 +25,8 @@ pub type Tile = (i32, i32);
 
 /// A set of tiles, column by column: the tile `(x, y)` is the bit `8 x + y`.
 ///
-/// A grid has seven rows. The eighth row is always empty, so that no step leads from one column's end to the next
-/// column's start. The eighth column holds the tile that joins two grids.
+/// A grid has seven rows. The eighth row is always empty, so that no step leads from the end of one column to the start of the
+/// next. The eighth column holds the tile that joins two grids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TileSet(u64);
 
@@ -34,7 +34,7 @@ impl TileSet {
     const GRID: TileSet = TileSet(0x007f_7f7f_7f7f_7f7f);
     const BORDER: TileSet = TileSet(0x007f_4141_4141_417f);
 
-    /// The set of one tile; empty if it does not lie within eight columns and seven rows.
+    /// The set of one tile; empty if the tile is outside the eight columns and seven rows.
     pub fn of((x, y): Tile) -> Self {
         let inside = (0..=GRID).contains(&x) && (0..GRID).contains(&y);
         if inside { TileSet(1 << index((x, y))) } else { TileSet(0) }
@@ -69,13 +69,13 @@ impl TileSet {
         TileSet((self.0 << 8 | self.0 >> 8 | self.0 << 1 | self.0 >> 1) & TileSet::GRID.0)
     }
 
-    /// The eight tiles around each.
+    /// The tiles themselves and the eight tiles around each.
     fn around(self) -> TileSet {
         let columns = self.0 | self.0 << 8 | self.0 >> 8;
         TileSet((columns | columns << 1 | columns >> 1) & TileSet::GRID.0)
     }
 
-    /// Removes and returns the tile with that index, counted column by column.
+    /// Removes and returns the tile number `number`, counted column by column.
     fn take(&mut self, number: u32) -> TileSet {
         let mut rest = self.0;
         for _ in 0..number {
@@ -87,7 +87,7 @@ impl TileSet {
     }
 }
 
-/// Largest number of tiles of a path.
+/// Maximum number of tiles in a path.
 const MAX_LENGTH: usize = (GRID * GRID) as usize;
 
 fn index((x, y): Tile) -> u8 {
@@ -98,7 +98,7 @@ fn tile(index: u8) -> Tile {
     (i32::from(index / 8), i32::from(index % 8))
 }
 
-/// A generated path and the walls that it goes around.
+/// A generated path, and the walls that it avoids.
 #[derive(Clone, Debug)]
 pub struct Path {
     /// The walls, which the finite ids' ground-truth view shows.
@@ -137,8 +137,8 @@ impl Path {
     }
 }
 
-/// Draws the first and the last tile of a path: on the given side of the grid (0 left, 1 right, 2 top, others bottom),
-/// and on the opposite side.
+/// Draws the first and the last tile of a path: on the given side of the grid (0 left, 1 right, 2 top, others bottom), and on
+/// the opposite side.
 pub fn draw_ends(side: i64, random: &mut Generator) -> (Tile, Tile) {
     let first = random.integers(0, i64::from(GRID)) as i32;
     let second = random.integers(0, i64::from(GRID)) as i32;
@@ -151,8 +151,8 @@ pub fn draw_ends(side: i64, random: &mut Generator) -> (Tile, Tile) {
     }
 }
 
-/// Searches for a path around the walls. There always is one: a wall on the border has no inner wall next to it, so
-/// that a path along the border can go around each.
+/// Searches for a path around the walls. One always exists: a wall on the border has no inner wall next to it, so a path along
+/// the border can go around it.
 fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Path {
     const NOWHERE: u8 = u8::MAX;
     let (start, end, goal) = (index(start), index(end), end);
@@ -162,12 +162,12 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
     };
     let mut costs = [0_i64; 64];
     let mut parent = [NOWHERE; 64];
-    // Score and tile side by side, since every search of the list reads all scores.
+    // Score and tile are stored together, since every search of the list reads all scores.
     let mut open_list = [(0.0_f64, 0_u8); MAX_LENGTH];
     open_list[0] = (0.0, start);
     let mut open_count = 1;
     let mut open = TileSet(1 << start);
-    // Walls and tiles outside of the grid count as closed, so that they are never entered.
+    // Walls and tiles outside the grid count as closed, so they are never entered.
     let mut closed = TileSet(walls.0 | !TileSet::GRID.0);
     while open_count > 0 {
         let list = &open_list[..open_count];
@@ -181,7 +181,7 @@ fn search(start: Tile, end: Tile, walls: TileSet, random: &mut Generator) -> Pat
         open_count -= 1;
         open.0 &= !(1 << current);
         closed.0 |= 1 << current;
-        // A step off the grid gives an index outside of 0..64 or in the empty row.
+        // A step off the grid gives an index outside 0..64 or in the empty row.
         for next in [current + 8, current.wrapping_sub(8), current + 1, current.wrapping_sub(1)] {
             if next >= 64 || closed.holds(next) {
                 continue;

@@ -1,7 +1,7 @@
 //! The ids of Mystery Path, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough
-//! for every use, and narrow enough that no value breaks the rules or needs much memory.
+//! Source: `default_reset_parameters` of the original. The original checks no values. The limits here are wide enough for every
+//! use, and narrow enough that no value breaks the rules or needs much memory.
 
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};

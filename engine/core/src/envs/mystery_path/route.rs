@@ -1,6 +1,6 @@
 //! The route of an episode: one generated path, or a growing row of joined paths.
 //!
-//! Source: `EndlessMysteryPath` of the original's `pygame_assets.py`, and the visits that its nodes remember.
+//! Source: `EndlessMysteryPath` of the original's `pygame_assets.py`, and the visits that its nodes record.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,11 +15,11 @@ pub const SEGMENT: i32 = GRID + 1;
 struct Segment {
     tiles: TileSet,
     walls: TileSet,
-    /// Index of the first tile along the whole route.
+    /// Index of the first tile in the whole route.
     first: usize,
     /// Tiles that the agent has visited in the episode. The route's first tile always counts as visited.
     seen: TileSet,
-    /// Tiles that the agent has visited since its last fall; before the first fall, the route's first tile too.
+    /// Tiles that the agent has visited since its last fall. The route's first tile always counts as visited.
     seen_since_fall: TileSet,
 }
 
@@ -34,14 +34,14 @@ pub struct Route {
 /// The result of a visit to a tile of the route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Visit {
-    /// It is the first visit in the episode.
+    /// Whether it is the first visit in the episode.
     pub first: bool,
-    /// It is the first visit since the last fall.
+    /// Whether it is the first visit since the last fall.
     pub first_since_fall: bool,
 }
 
 impl Route {
-    /// Whether every index and every tile is in its range. A forged snapshot may hold any numbers.
+    /// Whether every index and every tile is in range. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
         let columns = self.segments.len() as i64 * i64::from(SEGMENT);
         self.segments.len() < 1 << 24
@@ -50,20 +50,19 @@ impl Route {
             && self.segments.iter().all(|segment| segment.first < self.tiles.len())
     }
 
-    /// Removes all paths, and keeps the allocated memory.
+    /// Removes all paths but keeps the allocated memory.
     pub fn clear(&mut self) {
         self.segments.clear();
         self.tiles.clear();
     }
 
-    /// Replaces the route by one path from `start` to `end`.
+    /// Replaces the route with one path from `start` to `end`.
     pub fn set_path(&mut self, start: Tile, end: Tile, random: &mut Generator) {
         self.clear();
         self.add(Path::generate(start, end, random), None);
     }
 
-    /// Adds a path from left to right that starts in the row where the last one ended; the first one starts in a random
-    /// row.
+    /// Adds a path from left to right that starts in the row where the last one ended; the first one starts in a random row.
     pub fn extend(&mut self, random: &mut Generator) {
         let mut row = || random.integers(0, i64::from(GRID)) as i32;
         let start = self.tiles.last().map_or_else(&mut row, |(_, y)| *y);
@@ -136,13 +135,13 @@ impl Route {
         Some(visit)
     }
 
-    /// Records a fall: no tile but the first has been visited since.
+    /// Records a fall: no tile except the first has been visited since.
     pub fn fall(&mut self) {
         self.segments.iter_mut().for_each(|segment| segment.seen_since_fall = TileSet::default());
         self.mark_start();
     }
 
-    /// The index along the route of a tile; `None` if it is not on the route.
+    /// The index of a tile in the route; `None` if it is not on the route.
     pub fn index(&self, tile: Tile) -> Option<usize> {
         let first = self.segments.get(usize::try_from(tile.0 / SEGMENT).ok()?)?.first;
         self.tiles[first..].iter().position(|other| *other == tile).map(|place| first + place)

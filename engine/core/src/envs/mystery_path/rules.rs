@@ -1,8 +1,7 @@
-//! The rules of Mystery Path: those that all three ids share, and the goal of the finite ids.
+//! The rules of Mystery Path: those of all three ids, and the goal of the finite ids.
 //!
-//! Source: `reset` and `step` of the original's `mystery_path.py`, `mystery_path_grid.py` and
-//! `endless_mystery_path.py`. The order of the random draws is part of the rules, and so is the order in which rewards
-//! are summed.
+//! Source: `reset` and `step` of the original's `mystery_path.py`, `mystery_path_grid.py` and `endless_mystery_path.py`. The
+//! order of the random draws and the order in which rewards are summed are part of the rules.
 
 use super::config::{Config, TILE, tile_at};
 use super::parameters::Variant;
@@ -37,7 +36,7 @@ impl State {
     fn origin(&self, config: &Config) -> (i32, i32) {
         let inset = match config.variant {
             Variant::Grid => TILE / 2,
-            // The middle of the tile at the default scale only.
+            // The middle of the tile only at the default scale.
             Variant::Free | Variant::Endless => config.agent.radius(),
         };
         let (x, y) = self.route.start();

@@ -1,4 +1,4 @@
-//! What a frame of Mystery Path shows.
+//! The scene of a Mystery Path frame.
 
 use super::config::{Config, TILE};
 use super::parameters::Variant;
@@ -14,7 +14,7 @@ pub struct Scene {
     pub(super) origin: Option<Tile>,
     pub(super) past: PastPath,
     pub(super) agent: Character,
-    /// Rows of the stamina bar that are red, if it is shown.
+    /// Number of red rows in the stamina bar, if it is shown.
     pub(super) spent: Option<i32>,
     /// Centre of the red cross.
     pub(super) cross: Option<(i32, i32)>,
@@ -29,7 +29,7 @@ pub(super) struct PastPath {
     camera: f64,
     /// The tiles' first column.
     first: i32,
-    /// By their columns relative to the first.
+    /// With columns relative to `first`.
     tiles: TileSet,
 }
 
@@ -41,7 +41,7 @@ impl PastPath {
 }
 
 impl State {
-    /// What the state looks like.
+    /// The scene of the state.
     pub(super) fn scene(&self, config: &Config) -> Scene {
         let parameters = &config.parameters;
         Scene {
@@ -63,7 +63,7 @@ impl State {
         past
     }
 
-    /// The past path's tiles that are on the screen, each with its left edge in pixels, truncated as it is drawn.
+    /// The past path's tiles on the screen, each with its left edge in pixels, truncated as it is drawn.
     pub(super) fn past_tiles(&self, config: &Config) -> impl Iterator<Item = (i32, Tile)> {
         let camera = self.endless.camera();
         self.endless
@@ -80,7 +80,7 @@ impl State {
         }
     }
 
-    /// Rows of the stamina bar that are red.
+    /// Number of red rows in the stamina bar.
     pub(super) fn spent_stamina(&self, config: &Config) -> i32 {
         let left = self.endless.stamina_share(config.parameters.stamina_level);
         (SCREEN as f64 * (1.0 - left)) as i32

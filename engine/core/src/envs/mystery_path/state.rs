@@ -18,21 +18,21 @@ pub struct State {
     /// The tile of the agent's centre.
     pub(super) tile: Tile,
     pub(super) route: Route,
-    /// The agent fell off; the next step returns it to the start.
+    /// Whether the agent fell off; the next step returns it to the start.
     pub(super) off_path: bool,
     /// Centre of the red cross on the screen, while it is shown.
     pub(super) cross: Option<(i32, i32)>,
     pub(super) fails: u32,
     pub(super) tiles_visited: u32,
     pub(super) steps: i64,
-    /// The goal was reached in this step.
+    /// Whether the goal was reached in this step.
     pub(super) success: bool,
     /// State of the endless id only.
     pub(super) endless: EndlessState,
 }
 
 impl State {
-    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
+    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self) -> bool {
         const NEAR: i32 = 1 << 28;
         self.agent.is_valid()
@@ -44,7 +44,7 @@ impl State {
             && (0..i64::MAX / 2).contains(&self.steps)
     }
 
-    /// Tiles of the path that the agent was on, without the first one, and falls.
+    /// Number of falls, and of tiles of the path that the agent was on, except the first one; and the endless id's stamina.
     pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
         let falls = Progress::count("falls", self.fails);
         if config.variant == Variant::Endless {

@@ -52,13 +52,13 @@ impl Game {
     }
 
     fn frame(&self) -> Vec<u8> {
-        // The content before must not matter.
+        // The previous content must not matter.
         let mut frame = vec![77; FRAME_BYTES];
         self.env.draw(&mut frame);
         frame
     }
 
-    /// Moves to a neighbouring tile of the path or off it, and sums up the rewards.
+    /// Moves to a neighbouring tile, on the path or off it, and sums the rewards.
     fn walk_to(&mut self, (x, y): Tile) -> Transition {
         let mut sum = Transition::default();
         while self.state().tile != (x, y) && !self.state().off_path && !sum.terminated {
@@ -76,7 +76,7 @@ impl Game {
         sum
     }
 
-    /// A tile above or below the path's tile with that index that is not on the path.
+    /// A tile above or below the path's tile `number` that is not on the path.
     fn beside(&self, number: usize) -> Option<Tile> {
         let (x, y) = self.state().route.tiles()[number];
         let free = |tile: &Tile| (0..GRID).contains(&tile.1) && self.state().route.index(*tile).is_none();
@@ -84,7 +84,7 @@ impl Game {
     }
 }
 
-/// A game with a path that never leads left, and with free tiles beside the tiles with these indices.
+/// A game whose path never leads left, with free tiles next to the tiles of these numbers.
 fn endless_with_room(options: &Json, numbers: &[usize]) -> Game {
     let fits = |game: &Game| {
         let tiles = game.state().route.tiles();
@@ -130,7 +130,7 @@ fn a_fall_shows_a_cross_and_leads_back() {
 }
 
 #[test]
-fn the_endless_episode_ends_by_a_fall_before_the_farthest_column() {
+fn an_endless_episode_ends_with_a_fall_before_the_farthest_column() {
     let mut game = endless_with_room(&json!({ "stamina_level": 1000 }), &[0]);
     let tiles = game.state().route.tiles().to_vec();
     let first = game.beside(0).unwrap();
@@ -152,7 +152,7 @@ fn the_endless_episode_ends_by_a_fall_before_the_farthest_column() {
 }
 
 #[test]
-fn the_endless_episode_ends_by_a_second_fall_at_one_place() {
+fn an_endless_episode_ends_with_a_second_fall_at_the_same_tile() {
     let mut game = endless_with_room(&json!({ "stamina_level": 1000 }), &[0]);
     let off = game.beside(0).unwrap();
     assert!(!game.walk_to(off).terminated);
@@ -196,9 +196,9 @@ fn the_route_is_extended_and_kept() {
 }
 
 #[test]
-fn features_show_the_past_path_where_the_picture_shows_it() {
+fn features_and_frame_show_the_same_past_path() {
     for offset in [5.0, 5.3, 2.5, 0.4] {
-        // An agent without a size covers nothing.
+        // An agent of size 0 covers nothing.
         let options = json!({ "camera_offset_scale": offset, "show_background": true, "agent_scale": 0 });
         let mut game = endless_with_room(&options, &[]);
         for number in 1..12 {
@@ -255,7 +255,7 @@ fn column_names_are_unique() {
 }
 
 proptest! {
-    /// No allowed reset parameters panic, and the episodes stay small.
+    /// No allowed reset parameters cause a panic, and the episodes stay small.
     #[test]
     fn all_allowed_options_are_playable(
         number in 0..3_usize,

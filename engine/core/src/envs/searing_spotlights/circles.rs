@@ -1,7 +1,7 @@
 //! The circles that spotlights light.
 //!
-//! A frame's circles are stored side by side, so that vector instructions test all of them at once: most tests of a frame are about
-//! circles that are far away, and no branch predictor knows which are near.
+//! A frame's circles are stored as a structure of arrays, so that vector instructions test all of them at once: most tests are
+//! about circles that are far away, and no branch predictor knows which are near.
 
 use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
@@ -10,13 +10,13 @@ use super::config::BAR_HEIGHT;
 use crate::envs::screen::SCREEN;
 use crate::raster::Rect;
 
-/// Longest move along each axis of which a circle's crescents are precomputed, in pixels.
+/// Longest move along each axis, in pixels, for which a circle's crescents are precomputed.
 pub(super) const REACH: i16 = 3;
 
-/// Largest radius of which crescents are precomputed. Larger circles are repainted in full.
+/// Maximum radius for which crescents are precomputed. Larger circles are repainted in full.
 pub(super) const MAX_MOVED_RADIUS: i16 = 24;
 
-/// Whether the crescents of a move are precomputed. Without a branch, for vector instructions.
+/// Whether the crescents of a move are precomputed. Branchless, for vector instructions.
 #[inline]
 pub(super) fn is_short_move(radius: i16, (x, y): (i16, i16)) -> bool {
     let is_near = |distance: i16| (distance.wrapping_add(REACH)) as u16 <= 2 * REACH as u16;
@@ -34,7 +34,7 @@ pub(super) struct Circle {
     pub radius: i16,
 }
 
-/// The edges of a rectangle, in pixels of the screen, limited to what circles are compared with.
+/// The edges of a rectangle in pixels of the screen, limited to `i16`, the type of a circle's numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Edges {
     pub left: i16,
@@ -69,7 +69,7 @@ impl Circle {
         Rect::new(x - radius, y - radius, 2 * radius, 2 * radius)
     }
 
-    /// Whether a part of it may be visible: on the screen, and not only behind the bar at the top.
+    /// Whether any part of it may be visible: on the screen, and not only behind the bar at the top.
     #[inline]
     pub fn is_on_screen(&self) -> bool {
         let (low, high) = (-self.radius, SCREEN as i16 + self.radius);
@@ -77,12 +77,12 @@ impl Circle {
         is_within(self.x, low) && is_within(self.y, BAR_HEIGHT as i16 + low) && self.radius > 0
     }
 
-    /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius. Without a branch, since none
-    /// could be predicted.
+    /// Whether it may light a pixel of a rectangle: the rectangle's nearest point is within its radius. Branchless, since the
+    /// branches would be unpredictable.
     #[inline]
     pub fn reaches(&self, rect: &Rect) -> bool {
         let radius = i32::from(self.radius);
-        // The distance outside of the rectangle along one axis; one of `radius` is too far already.
+        // The distance from the rectangle along one axis, limited to `radius`, which is already too far.
         let gap = |at: i16, low: i32, length: i32| {
             let at = i32::from(at);
             (low - at).max(at - low - length).min(radius).max(0)
@@ -98,10 +98,10 @@ impl Circle {
     }
 }
 
-/// Circles of a block.
+/// Circles in a block.
 const LANES: usize = 8;
 
-/// Up to [`LANES`] circles. The lanes behind the last circle are 0.
+/// Up to [`LANES`] circles. The lanes after the last circle are 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Block {
     x: [i16; LANES],
@@ -119,11 +119,12 @@ impl Block {
         self.square[lane] = (radius * radius).min(u16::MAX.into()) as u16;
     }
 
-    /// A bit for each circle that may light a pixel from `left` and `top` to `right` and `bottom`.
+    /// A bit for each circle that may light a pixel of the rectangle.
     #[inline]
     fn reaching(&self, Edges { left, top, right, bottom }: Edges) -> u16 {
-        // The distance outside of the rectangle along one axis, at most 255, so that squares fit into 16 bits. That and the saturated
-        // sum of squares change nothing for radii below 256. With 256, the largest, a circle just out of reach may be reported.
+        // The distance from the rectangle along one axis, limited to 255 so that squares fit into 16 bits. This limit and the
+        // saturating sum of squares change nothing for radii below 256. With the maximum of 256, a circle just out of reach may
+        // be reported.
         let gap =
             |at: i16, low: i16, high: i16| low.saturating_sub(at).max(at.saturating_sub(high)).clamp(0, 255) as u16;
         let mut bits = [0; LANES];
@@ -135,7 +136,7 @@ impl Block {
         bits.iter().fold(0, |all, bit| all | bit)
     }
 
-    /// A bit for each circle that is not where `former` has it, and whether all have made no move but a precomputed one.
+    /// A bit for each circle that has moved since `former`, and whether all moves are precomputed.
     #[inline]
     fn moved_since(&self, former: &Block) -> (u16, bool) {
         let (mut bits, mut all_near) = ([0; LANES], true);
@@ -151,7 +152,7 @@ impl Block {
     }
 }
 
-/// Any number of circles side by side, in order.
+/// Any number of circles, in order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Circles {
     len: usize,
@@ -159,7 +160,7 @@ pub(super) struct Circles {
 }
 
 impl Circles {
-    /// The most circles of which [`Numbers`] can be made.
+    /// Maximum number of circles for which [`Numbers`] can be made.
     pub const MAX_NUMBERED: usize = u32::BITS as usize;
 
     #[inline]
@@ -167,7 +168,7 @@ impl Circles {
         self.len
     }
 
-    /// Adds a circle behind the last.
+    /// Appends a circle.
     #[inline]
     pub fn push(&mut self, circle: &Circle) {
         let (block, lane) = (self.len / LANES, self.len % LANES);
@@ -178,11 +179,11 @@ impl Circles {
         self.len += 1;
     }
 
-    /// A circle.
+    /// The circle of that number.
     ///
     /// # Panics
     ///
-    /// If there is none of that number.
+    /// If there is no such circle.
     #[inline]
     pub fn get(&self, number: usize) -> Circle {
         let (block, lane) = (&self.blocks[number / LANES], number % LANES);
@@ -193,8 +194,8 @@ impl Circles {
         (0..self.len).map(|number| self.get(number))
     }
 
-    /// The circles that may light a pixel of a rectangle: those that [reach](Circle::reaches) it, and some of the largest radius
-    /// that do not. Only for at most [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
+    /// The circles that may light a pixel of a rectangle: those that [reach](Circle::reaches) it, and some of the maximum
+    /// radius that do not. Only for at most [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
     #[inline]
     pub fn reaching(&self, rect: impl Into<Edges>) -> Numbers {
         let edges = rect.into();
@@ -202,7 +203,7 @@ impl Circles {
         Numbers(self.blocks.iter().enumerate().map(bits).fold(0, |all, bits| all | bits))
     }
 
-    /// The circles that are not where `former` has them. `None` unless all have made no move but a precomputed one. Only for at most
+    /// The circles that have moved since `former`; `None` unless all moves are precomputed. Only for at most
     /// [`MAX_NUMBERED`](Self::MAX_NUMBERED) circles.
     #[inline]
     pub fn moved_since(&self, former: &Circles) -> Option<Numbers> {
@@ -219,7 +220,7 @@ impl Circles {
     }
 }
 
-/// The numbers of some of at most [`MAX_NUMBERED`](Circles::MAX_NUMBERED) circles, in order.
+/// A subset of at most [`MAX_NUMBERED`](Circles::MAX_NUMBERED) circles, as their numbers in order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Numbers(u32);
 
@@ -231,7 +232,7 @@ impl Numbers {
         self.0 == 0
     }
 
-    /// Those that are in both.
+    /// The numbers in both sets.
     #[inline]
     pub fn and(self, other: Numbers) -> Numbers {
         Numbers(self.0 & other.0)
@@ -243,7 +244,7 @@ impl Numbers {
         self.0 |= u32::from(present) << number;
     }
 
-    /// All but one.
+    /// All numbers except one.
     #[inline]
     pub fn without(self, number: usize) -> Numbers {
         Numbers(self.0 & !(1 << number))
@@ -256,7 +257,7 @@ impl Iterator for Numbers {
     #[inline]
     fn next(&mut self) -> Option<usize> {
         let number = self.0.trailing_zeros() as usize;
-        // Without the lowest bit.
+        // Clears the lowest bit.
         (self.0 != 0).then(|| self.0 &= self.0 - 1).map(|()| number)
     }
 }
@@ -299,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn circles_side_by_side_reach_what_each_reaches() {
+    fn blocks_of_circles_reach_what_each_circle_reaches() {
         // More than fit into one block, of all sizes, some far off the screen.
         let radii = [1, 2, 5, 11, 24, 100, 254, 255];
         let all = circles(
@@ -330,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn moves_are_found_where_all_are_precomputed() {
+    fn moves_are_found_if_all_are_precomputed() {
         let former = circles((0..20).map(|i| (i * 4, 50, 10)));
         let moved_by = |number: i16, by: (i16, i16), radius: i16| {
             circles((0..20).map(|i| if i == number { (i * 4 + by.0, 50 + by.1, radius) } else { (i * 4, 50, 10) }))

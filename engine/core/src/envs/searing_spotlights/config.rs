@@ -1,4 +1,4 @@
-//! Reset parameters and the geometry that follows from them.
+//! Reset parameters and the geometry derived from them.
 
 use super::parameters::{MAX_SPOTLIGHTS, Parameters, Variant};
 use crate::envs::character::CharacterSize;
@@ -10,7 +10,7 @@ pub const BAR_HEIGHT: usize = 4;
 /// Width in pixels of the health bar, the left half of the bar at the top.
 pub const HEALTH_WIDTH: usize = SCREEN / 2;
 
-/// Bound of all coordinates in pixels.
+/// Limit of all coordinates in pixels.
 pub const MAX_COORDINATE: u32 = 1 << 13;
 
 /// Everything that the rules need in addition to the state.
@@ -28,7 +28,7 @@ pub struct Config {
     pub exit_radius: f64,
     /// Side of the exit's picture in pixels.
     pub exit_side: i32,
-    /// Typical number of spotlights at a time, with a reserve: the capacity to allocate.
+    /// Typical number of spotlights at a time, plus a reserve: the capacity to allocate.
     pub typical_spotlights: usize,
 }
 
@@ -47,7 +47,7 @@ impl Config {
     }
 }
 
-/// The number of spotlights in the steady state, in which as many leave as appear, with a reserve.
+/// The number of spotlights in the steady state, in which as many leave as appear, plus a reserve.
 fn typical_spotlights(parameters: &Parameters) -> usize {
     let lifetime = 1.0 / parameters.spot_min_speed.max(1e-9);
     let at_once = (lifetime / parameters.spawn_interval.max(1) as f64).min(parameters.num_spawns as f64);

@@ -1,8 +1,7 @@
-//! How the pictures of Searing Spotlights are composed into a frame.
+//! Composes the pictures of Searing Spotlights into a frame.
 //!
-//! The original paints a black surface with transparent circles over the scene. Here the frame is filled with the
-//! darkened background, and each circle repaints the lit scene within it, so that nothing that stays dark is painted
-//! twice.
+//! The original paints a black surface with transparent circles over the scene. Here the frame is filled with the darkened
+//! background, and each circle repaints the lit scene within it, so that nothing dark is painted twice.
 
 use super::circles::{Circle, Circles};
 use super::config::BAR_HEIGHT;
@@ -13,7 +12,7 @@ use super::state::State;
 use crate::envs::screen::SCREEN;
 use crate::raster::{Canvas, Damage, DiscColumn, Rect, Sprite, blend_keyed, copy_run};
 
-/// Where light and objects that are hidden in the dark are visible.
+/// The area in which light and objects that are hidden in the dark are visible.
 const BELOW_BAR: Rect = Rect { x: 0, y: BAR_HEIGHT as i32, width: SCREEN as i32, height: (SCREEN - BAR_HEIGHT) as i32 };
 
 /// A selection of the objects on the background.
@@ -34,7 +33,7 @@ impl Objects {
 }
 
 impl Assets {
-    /// Draws the original's ground-truth view: the light, and above it every object.
+    /// Draws the original's ground-truth view: the light, with all objects above it.
     pub(super) fn draw_ground_truth(&self, state: &State, canvas: &mut Canvas<'_>) {
         let scene = Scene::ground_truth(state, &self.config);
         scene.paint_light(self, Objects::NONE, canvas);
@@ -53,7 +52,7 @@ impl Scene {
     pub(super) fn paint(&self, assets: &Assets, canvas: &mut Canvas<'_>) {
         let visible = self.visible_in_dark(assets);
         let hidden = Objects { coins: !visible.coins, exit: !visible.exit, agent: !visible.agent };
-        // Within the bar's rows nothing else is visible.
+        // Nothing else is visible within the bar's rows.
         if canvas.rows().end > BAR_HEIGHT {
             if self.blacked_out {
                 canvas.fill([0; 3]);
@@ -61,8 +60,8 @@ impl Scene {
                 self.paint_light(assets, hidden, canvas);
             }
         }
-        // Objects that are visible in the dark are above the light. Some are even above the bar, depending on which
-        // others are visible.
+        // Objects that are visible in the dark are above the light. Some are even above the bar, depending on which other
+        // objects are visible.
         let below_bar = Objects {
             coins: visible.coins,
             exit: visible.exit && visible.coins,
@@ -79,7 +78,7 @@ impl Scene {
     pub(super) fn repaint(&self, shown: &Scene, assets: &Assets, canvas: &mut Canvas<'_>) {
         let same_light = self.darkness == shown.darkness && self.blacked_out == shown.blacked_out;
         let same_background = self.background == shown.background;
-        // In full darkness every background is black.
+        // Every background is black in full darkness.
         let same_dark = same_background || self.darkness == 255;
         let many = self.circles.len().max(shown.circles.len()) > Circles::MAX_NUMBERED;
         let same_coins = self.coins_visible == shown.coins_visible;
@@ -113,7 +112,7 @@ impl Scene {
         damage.repair(canvas, |canvas| self.paint(assets, canvas));
     }
 
-    /// Adds the bounds of visible objects that have changed or whose light has changed.
+    /// Adds the bounds of visible objects that have changed, or whose light has changed.
     fn add_objects(&self, shown: &Scene, assets: &Assets, change: &LightChange<'_>, damage: &mut Damage) {
         let visible = self.visible_in_dark(assets);
         for (objects, changed) in self.objects_since(shown) {
@@ -141,8 +140,8 @@ impl Scene {
         }
     }
 
-    /// Repaints the objects after [`LightChange::paint`] has painted the background. Only for full darkness with all objects hidden in
-    /// it: what is not lit of them is black already.
+    /// Repaints the objects after [`LightChange::paint`] has painted the background. Only for full darkness in which all
+    /// objects are hidden: their unlit parts are black already.
     fn repaint_hidden_objects(
         &self,
         shown: &Scene,
@@ -187,7 +186,7 @@ impl Scene {
         !self.circles.reaching(rect).is_empty()
     }
 
-    /// Each kind of objects, and whether objects of that kind have changed.
+    /// Each kind of object, and whether objects of that kind have changed.
     fn objects_since(&self, shown: &Scene) -> [(Objects, bool); 3] {
         let nothing = Objects::NONE;
         [
@@ -232,7 +231,7 @@ impl Scene {
     fn paint_light(&self, assets: &Assets, hidden: Objects, canvas: &mut Canvas<'_>) {
         let dark = assets.dark(self.darkness);
         canvas.paste(dark.background(self.background).as_flattened().as_flattened());
-        // In full darkness nothing is visible.
+        // Nothing is visible in full darkness.
         if self.darkness < 255 {
             self.for_each_object(assets, dark, hidden, |sprite, (x, y)| sprite.blit(canvas, x, y));
         }

@@ -1,11 +1,11 @@
-//! The feature observation of Searing Spotlights: what a frame shows, as numbers.
+//! The feature observation of Searing Spotlights: the content of a frame as numbers.
 
 use super::config::{Config, HEALTH_WIDTH};
 use super::state::{Background, Exit, State};
 use crate::envs::screen::SCREEN;
 use crate::envs::spec::Column;
 
-/// Largest number of coins and spotlights in the features. A frame may show more.
+/// Maximum number of coins and spotlights in the features. A frame may show more.
 pub(super) const COINS: usize = 8;
 pub(super) const SPOTLIGHTS: usize = 16;
 
@@ -100,8 +100,7 @@ const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = [
 
 const COUNT: usize = SPOTLIGHT + 3 * SPOTLIGHTS;
 
-/// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit
-/// circle.
+/// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit circle.
 pub const FEATURES: &[Column] = &{
     let mut columns = [FIRST[0]; COUNT];
     let mut at = 0;
@@ -124,7 +123,7 @@ impl State {
         out.fill(0.0);
         let parameters = &config.parameters;
         let coins_visible = self.coins_visible(parameters);
-        // In the endless id without a coin, the surface of the coin hides everything that is not visible in the dark.
+        // In the endless id without a coin, the coin's surface hides everything that is not visible in the dark.
         let blacked_out = config.variant.endless && self.coins.is_empty() && coins_visible;
         let share = |(x, y): (i32, i32)| [x as f32 / SCREEN as f32, y as f32 / SCREEN as f32];
 

@@ -1,6 +1,6 @@
-//! How the light on the background changes from one frame to another.
+//! Changes of the light on the background from one frame to another.
 //!
-//! A spotlight moves by about a pixel per step, so that only the crescents that it leaves and enters differ. The crescents of short
+//! A spotlight moves by about a pixel per step, so only the crescents that it leaves and enters differ. The crescents of short
 //! moves are precomputed.
 
 use std::ops::Range;
@@ -18,10 +18,10 @@ use crate::raster::{Canvas, Disc, DiscColumn, Rect, Rgb, circle_outline, copy_ru
 /// The pixels of a background, column by column.
 pub(super) type Pixels = [[Rgb; SCREEN]; SCREEN];
 
-/// Number of circles that are searched for one that has moved.
+/// Number of circles among which to search for one that has moved.
 const WINDOW: usize = 3;
 
-/// A circle that is not the same in two frames, and has not moved by a precomputed move.
+/// A circle that differs between two frames, other than by a precomputed move.
 #[derive(Clone, Copy, Debug)]
 enum Replaced {
     Appeared(Circle),
@@ -41,19 +41,18 @@ impl Replaced {
 pub(super) struct LightChange<'a> {
     scene: &'a Scene,
     shown: &'a Scene,
-    /// The circles of the scene that have moved, and the crescents of the move are precomputed.
+    /// The circles of the scene that have moved, by precomputed moves.
     moved: Numbers,
-    /// For each of them, its number in the scene that was shown.
+    /// For each moved circle, its number in the scene that was shown.
     former: [u8; Circles::MAX_NUMBERED],
     replaced: SmallVec<[Replaced; 8]>,
 }
 
 impl<'a> LightChange<'a> {
-    /// The differences between a frame that shows `shown` and one that shows `scene`, with at most [`Circles::MAX_NUMBERED`] circles
-    /// each.
+    /// The differences between frames that show `shown` and `scene`, with at most [`Circles::MAX_NUMBERED`] circles each.
     #[inline]
     pub fn new(shown: &'a Scene, scene: &'a Scene) -> Self {
-        // Without a circle that has appeared or disappeared, the numbers are the same.
+        // If no circle has appeared or disappeared, the numbers are the same.
         let former = std::array::from_fn(|number| number as u8);
         let mut change = LightChange { scene, shown, moved: Numbers::NONE, former, replaced: SmallVec::new() };
         match scene.circles.moved_since(&shown.circles) {
@@ -63,7 +62,7 @@ impl<'a> LightChange<'a> {
         change
     }
 
-    /// Finds the circles that have moved where others have appeared or disappeared.
+    /// Finds the circles that have moved when others have appeared or disappeared.
     #[inline(never)]
     fn search(&mut self) {
         let new_background = self.scene.background != self.shown.background;
@@ -94,7 +93,7 @@ impl<'a> LightChange<'a> {
         self.moved.map(move |number| (number, former(number), self.scene.circles.get(number)))
     }
 
-    /// The circles that may light what the circle of that number leaves.
+    /// The circles that may light what circle number `number` leaves.
     #[inline]
     fn others(&self, number: usize, from: &Circle, crescents: &Crescents) -> impl Iterator<Item = Circle> + Clone {
         let numbers = self.scene.circles.reaching(crescents.bounds_of_left(from)).without(number);
@@ -111,7 +110,7 @@ impl<'a> LightChange<'a> {
     /// Whether anything within `rect` may change.
     #[inline]
     pub fn reaches(&self, rect: &Rect) -> bool {
-        // A circle that reached the rectangle before its move is now at most that far away.
+        // A circle that reached the rectangle before its move is now at most this far away.
         let reach = i32::from(REACH);
         let near = Rect::new(rect.x - reach, rect.y - reach, rect.width + 2 * reach, rect.height + 2 * reach);
         !self.moved.and(self.scene.circles.reaching(&near)).is_empty()
@@ -121,7 +120,7 @@ impl<'a> LightChange<'a> {
     /// Paints the changes of the background, which is `dark` or `lit`, without objects and outlines.
     #[inline]
     pub fn paint(&self, dark: &Pixels, lit: &Pixels, canvas: &mut Canvas<'_>) {
-        // Nothing that a circle of the scene lights is dark in the end, so that the order of the changes does not matter.
+        // The order of the changes does not matter, since everything that a circle of the scene lights ends up lit.
         for (number, from, to) in self.moved() {
             let crescents = crescents(&from, &to);
             let others = self.others(number, &from, crescents);
@@ -165,7 +164,7 @@ fn for_each_run(circle: &Circle, mut paint: impl FnMut(usize, Range<usize>)) {
     columns.for_each(|DiscColumn { x, rows }| paint(x, rows));
 }
 
-/// Copies rows of a column of a background; an empty range copies nothing.
+/// Copies rows of a background column; an empty range copies nothing.
 fn copy_rows(x: usize, rows: Range<usize>, background: &Pixels, canvas: &mut Canvas<'_>) {
     copy_run(background[x][rows.clone()].as_flattened(), canvas.run_mut(x, rows));
 }
@@ -183,12 +182,12 @@ pub(super) fn outline(radius: i16) -> &'static [(i32, i32)] {
     &Shape::of(radius).outline
 }
 
-/// Creates in advance what circles of a radius need.
+/// Creates the pixel tables for a radius in advance.
 pub(super) fn prepare(radius: i16) {
     Shape::of(radius);
 }
 
-/// The pixels that change by a [short move](is_short_move).
+/// The pixels that change with a [short move](is_short_move).
 #[inline]
 fn crescents(from: &Circle, to: &Circle) -> &'static Crescents {
     let (right, down) = (to.x - from.x + REACH, to.y - from.y + REACH);
@@ -199,10 +198,11 @@ fn crescents(from: &Circle, to: &Circle) -> &'static Crescents {
 #[derive(Debug)]
 struct Shape {
     disc: Disc,
-    /// What [`distance`] is less than for the pixels of the disc alone; `None` for large discs, where there may be no such number.
+    /// Exactly the pixels of the disc have a [`distance`] below this. `None` for large discs, for which no such number may
+    /// exist.
     limit: Option<u16>,
     outline: Vec<(i32, i32)>,
-    /// By the move along both axes. Only up to [`MAX_MOVED_RADIUS`].
+    /// Indexed by the move along both axes. Only up to [`MAX_MOVED_RADIUS`].
     crescents: Vec<Crescents>,
 }
 
@@ -228,8 +228,8 @@ impl Shape {
     }
 }
 
-/// A measure of a pixel's distance from a circle's centre, by which pixels of small circles can be told from others. `x` and `y` are
-/// -127 to 126, so that squares fit into 16 bits.
+/// A measure of a pixel's distance from a circle's centre that tells pixels of small circles from others. `x` and `y` are -127
+/// to 126, so that squares fit into 16 bits.
 #[inline]
 fn distance(x: i16, y: i16) -> u16 {
     // Circles are symmetric: the column -1 is as far from the centre as the column 0.
@@ -238,7 +238,7 @@ fn distance(x: i16, y: i16) -> u16 {
     square(x).saturating_add(square(y))
 }
 
-/// The least [`distance`] of a pixel outside of a disc, if all pixels of the disc are nearer.
+/// The smallest [`distance`] of a pixel outside a disc, if all pixels of the disc are nearer.
 fn limit(disc: &Disc) -> Option<u16> {
     let radius = disc.radius() as i16;
     let quarter = (0..=radius).flat_map(|x| (0..=radius).map(move |y| (x, y)));
@@ -253,7 +253,7 @@ struct Crescents {
     /// The pixels that the circle leaves.
     left: Vec<Block>,
     entered: Vec<Block>,
-    /// The smallest rectangle around the pixels that are left.
+    /// The smallest rectangle around the pixels in `left`.
     bounds: Edges,
 }
 
@@ -284,19 +284,19 @@ impl Crescents {
     }
 }
 
-/// Pixels of a block. Most crescents have fewer.
+/// Pixels in a block. Most crescents have fewer.
 const LANES: usize = u32::BITS as usize;
 
-/// The largest distance of a changed pixel from the centre before the move, along one axis.
+/// Maximum distance of a changed pixel from the centre before the move, along one axis.
 const MAX_DISTANCE: i16 = MAX_MOVED_RADIUS + REACH;
 
 /// Number of columns or rows that may separate the pixels of a block.
 const CUTS: usize = 2 * MAX_DISTANCE as usize + 2;
 
-/// Up to [`LANES`] pixels, relative to a circle's centre, so that a set of them is the bits of one number.
+/// Up to [`LANES`] pixels, relative to a circle's centre. The bits of one number represent a set of them.
 #[derive(Debug)]
 struct Block {
-    /// Bytes in a frame from the centre's pixel.
+    /// Offset in bytes in a frame from the centre's pixel.
     steps: [i16; LANES],
     x: [i8; LANES],
     y: [i8; LANES],
@@ -329,7 +329,7 @@ impl Block {
         columns & self.above[cut(SCREEN, from.y)] & !self.above[cut(BAR_HEIGHT, from.y)]
     }
 
-    /// A bit for each pixel that another circle lights, which must reach one of them.
+    /// A bit for each pixel that another circle lights. The circle must reach one of the pixels.
     fn lit_by(&self, other: &Circle, from: &Circle) -> u32 {
         let Shape { disc, limit, .. } = Shape::of(other.radius);
         let (right, down) = (from.x - other.x, from.y - other.y);
@@ -337,7 +337,7 @@ impl Block {
         let pixels = self.x.iter().zip(&self.y).map(|(x, y)| (right + i16::from(*x), down + i16::from(*y)));
         let lanes = is_lit.iter_mut().zip(pixels);
         if let Some(limit) = limit {
-            // Without a branch, so that vector instructions test several pixels at once.
+            // Branchless, so that vector instructions test several pixels at once.
             lanes.for_each(|(is_lit, (x, y))| *is_lit = distance(x, y) < *limit);
         } else {
             lanes.for_each(|(is_lit, (x, y))| *is_lit = disc.contains((x.into(), y.into())));
@@ -365,7 +365,7 @@ impl Block {
         for lane in lanes(pixels) {
             let start = (centre + isize::from(self.steps[lane])) as usize;
             let pixel = start..start + 3;
-            // Never off the frame; without a panic, which would be a call in the loop.
+            // Never off the frame, but an index that may panic would be a call in the loop.
             let (Some(from), Some(to)) = (background.get(pixel.clone()), frame.get_mut(pixel)) else { return };
             to.copy_from_slice(from);
         }
@@ -377,7 +377,7 @@ impl Block {
 fn lanes(mut bits: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let lane = bits.trailing_zeros() as usize;
-        // Without the lowest bit.
+        // Clears the lowest bit.
         (bits != 0).then(|| bits &= bits - 1).map(|()| lane % LANES)
     })
 }
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn crescents_are_what_a_move_leaves_and_enters() {
+    fn crescents_hold_the_pixels_that_a_move_leaves_and_enters() {
         let pixels =
             |blocks: &[Block], at: &Circle| blocks.iter().map(|block| block.visible(at).count_ones()).sum::<u32>();
         let [from, to] = [40, 41].map(|y| Circle { x: 20, y, radius: 9 });

@@ -1,27 +1,24 @@
 //! Searing Spotlights: collect coins in the dark and avoid the spotlights, which are the only light.
 //!
-//! Behaviour of the original that looks like a mistake is reproduced, since agents learn from it:
+//! Behaviour of the original that looks like a bug is reproduced, since agents learn from it:
 //!
-//! - A spotlight at the end of its path is removed one step later, and the next one in the list then misses that step:
-//!   it is neither moved nor drawn, and does no damage. Likewise, a coin that follows a collected one in the list
-//!   misses that step.
-//! - Spotlights of the finite id appear at a constant interval; `spawn_interval_decay` and `reward_max_steps` have no
-//!   effect.
+//! - A spotlight at the end of its path is removed one step later, and the next one in the list then skips that step: it is
+//!   neither moved nor drawn, and does no damage. Likewise, a coin that follows a collected one in the list skips that step.
+//! - Spotlights of the finite id appear at a constant interval; `spawn_interval_decay` and `reward_max_steps` have no effect.
 //! - An episode's first frame shows the last episode's lit circles, and the agent faces up.
-//! - A background that `hide_chessboard` or `black_background` has replaced stays replaced in later episodes of the
+//! - A background that was replaced by `hide_chessboard` or `black_background` stays replaced in later episodes of the
 //!   environment.
-//! - The endless id without `coin_enabled` has a black background, and hides even the spotlights for
-//!   `coin_show_duration` steps.
+//! - The endless id without `coin_enabled` has a black background, and hides even the spotlights for `coin_show_duration`
+//!   steps.
 //! - With `num_coins: [0]` the exit is open from the first step, and `coins_collected` in the info is NaN.
-//! - Objects that are visible in the dark are drawn above or below the bar at the top, depending on which others are
+//! - Objects that are visible in the dark are drawn above or below the bar at the top, depending on which other objects are
 //!   visible.
 //!
 //! Where the original raises an error, the reset parameters have their documented meaning:
 //!
 //! - `use_exit: false`: there is no exit, and the last coin wins the episode. If there are no coins either, the episode
 //!   continues until the agent dies or `max_steps` is reached.
-//! - If there are more coins than the minimum distance allows, further coins are placed without regard to the earlier
-//!   ones.
+//! - If there are more coins than the minimum distance allows, further coins are placed without regard to earlier ones.
 //! - The endless id's `show_last_action: false`: the bar does not show the action.
 //! - `spot_min_radius` above `spot_max_radius`: all spotlights have the radius `spot_min_radius`.
 //!

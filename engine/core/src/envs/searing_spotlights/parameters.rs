@@ -4,21 +4,21 @@
 
 use crate::envs::parameters::ResetParameters;
 
-/// What distinguishes the ids of Searing Spotlights.
+/// Distinguishes the ids of Searing Spotlights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Variant {
-    /// A collected coin is replaced by a new one, and there is no exit.
+    /// Whether a collected coin is replaced by a new one. There is then no exit.
     pub endless: bool,
 }
 
-/// Largest number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another
-/// one leaves.
+/// Maximum number of spotlights at a time. The original has no limit; here a spotlight that is due waits until another one
+/// leaves.
 pub const MAX_SPOTLIGHTS: usize = 1000;
 
-/// Largest number of coins at a time.
+/// Maximum number of coins at a time.
 pub const MAX_COINS: usize = 100;
 
-/// Largest radius of a spotlight in pixels: more than the screen's diagonal.
+/// Maximum radius of a spotlight in pixels: more than the screen's diagonal.
 pub const MAX_SPOT_RADIUS: i32 = 256;
 
 /// One set of reset parameters.
@@ -34,15 +34,15 @@ pub struct Parameters {
     pub num_spawns: i64,
     /// Steps between two new spotlights.
     pub spawn_interval: i64,
-    /// Least radius of a spotlight in pixels, 0 to 256; truncated.
+    /// Minimum radius of a spotlight in pixels, 0 to 256; truncated.
     pub spot_min_radius: f64,
-    /// Largest radius of a spotlight in pixels, 0 to 256; truncated.
+    /// Maximum radius of a spotlight in pixels, 0 to 256; truncated.
     pub spot_max_radius: f64,
-    /// Least speed of a spotlight: the share of its path per step.
+    /// Minimum speed of a spotlight: the share of its path per step.
     pub spot_min_speed: f64,
-    /// Largest speed of a spotlight: the share of its path per step.
+    /// Maximum speed of a spotlight: the share of its path per step.
     pub spot_max_speed: f64,
-    /// Health points that a step in the light of spotlights costs.
+    /// Health points lost per step in the light of spotlights.
     pub spot_damage: f64,
     /// Whether the background turns red while the agent is in a spotlight.
     pub visual_feedback: bool,
@@ -78,13 +78,13 @@ pub struct Parameters {
     pub agent_visible: bool,
     /// Whether the agent starts at a random position; otherwise in the middle.
     pub sample_agent_position: bool,
-    /// Whether the bar shows the action before the current one.
+    /// Whether the bar shows the previous action.
     pub show_last_action: bool,
-    /// Whether the bar shows that the step before gave a positive reward.
+    /// Whether the bar shows that the previous step gave a positive reward.
     pub show_last_positive_reward: bool,
     /// Reward for each step in a spotlight.
     pub reward_inside_spotlight: f64,
-    /// Reward for each step outside of all spotlights.
+    /// Reward for each step outside all spotlights.
     pub reward_outside_spotlight: f64,
     /// Reward for losing all health points.
     pub reward_death: f64,

@@ -18,10 +18,10 @@ const COIN_BORDER: Rgb = [255, 165, 0];
 const EXIT_OPEN: Rgb = [48, 141, 70];
 const EXIT_CLOSED: Rgb = [55, 55, 55];
 
-/// Side of a background's tile in pixels: 50 on the original's screen of 336 pixels, truncated at this scale.
+/// Side of a background tile in pixels: 50 on the original's screen of 336 pixels, truncated at this scale.
 const TILE: usize = 12;
 
-/// A chessboard with the first of two colours, which may be equal, in its corner.
+/// A chessboard of two colours, which may be equal, with the first one in its corner.
 fn chessboard(colors: [Rgb; 2]) -> Box<Pixels> {
     let pixel = |x: usize, y: usize| colors[(x / TILE + y / TILE) % 2];
     Box::new(std::array::from_fn(|x| std::array::from_fn(|y| pixel(x, y))))
@@ -30,9 +30,9 @@ fn chessboard(colors: [Rgb; 2]) -> Box<Pixels> {
 /// The pictures of backgrounds and objects at one darkness.
 #[derive(Debug)]
 pub(super) struct Pictures {
-    /// The colours of the tiles, by [`Background`].
+    /// The colours of the tiles, indexed by [`Background`].
     tiles: [[Rgb; 2]; 4],
-    /// By [`Background`], created on first use, since most darknesses occur for one step only.
+    /// Indexed by [`Background`]. Created on first use, since most darknesses last only one step.
     backgrounds: [OnceLock<Box<Pixels>>; 4],
     pub coin: Sprite,
     pub exit_closed: Sprite,
@@ -41,7 +41,7 @@ pub(super) struct Pictures {
 }
 
 impl Pictures {
-    /// The pictures under a black surface of some `alpha`.
+    /// The pictures as seen through a black surface with the given `alpha`.
     fn shaded(&self, alpha: u8) -> Self {
         Pictures {
             tiles: self.tiles.map(|colors| colors.map(|color| color.map(|channel| blend_keyed(0, channel, alpha)))),
@@ -60,10 +60,10 @@ impl Pictures {
     }
 }
 
-/// What all environments with the same reset parameters share: the configuration and the pictures.
+/// Shared by all environments with the same reset parameters: the configuration and the pictures.
 #[derive(Debug)]
 pub struct Assets {
-    /// What the rules need.
+    /// Configuration of the rules.
     pub config: Config,
     /// The pictures in full light.
     pub(super) lit: Pictures,
@@ -75,7 +75,7 @@ impl Assets {
     /// Draws the pictures.
     pub fn new(variant: Variant, parameters: Parameters) -> Self {
         let tiles = [[WHITE, BLUE], [WHITE, RED], [WHITE; 2], [BLACK; 2]];
-        // Created in advance, so that no step needs to.
+        // Created in advance, so that no step has to.
         (parameters.spot_min_radius as i16..=parameters.spot_max_radius as i16).for_each(light::prepare);
         let config = Config::new(variant, parameters);
         let parameters = &config.parameters;
@@ -94,7 +94,7 @@ impl Assets {
         }
     }
 
-    /// The pictures outside of the light, at a darkness of 0 to 255.
+    /// The pictures outside the light, at a darkness of 0 to 255.
     #[inline]
     pub(super) fn dark(&self, darkness: u8) -> &Pictures {
         self.dark[usize::from(darkness)].get_or_init(|| Box::new(self.lit.shaded(darkness)))

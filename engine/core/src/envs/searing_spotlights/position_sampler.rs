@@ -1,7 +1,7 @@
-//! Random positions of agent, coins and exit, with a minimum distance between them.
+//! Random positions for agent, coins and exit, with a minimum distance between them.
 //!
-//! Source: `GridPositionSampler` of the original's `pygame_assets.py`, which searches an array of all pixels. Here a
-//! row of pixels is a bit set, so that 84 positions are counted at a time.
+//! Source: `GridPositionSampler` of the original's `pygame_assets.py`, which searches an array of all pixels. Here a row of
+//! pixels is a bit set, so that 84 positions are counted at a time.
 
 use crate::envs::screen::SCREEN;
 use crate::random::Generator;
@@ -34,7 +34,7 @@ impl PositionSampler {
         }
     }
 
-    /// Blocks positions of a row, if there is such a row.
+    /// Blocks positions of a row, if the row exists.
     #[inline]
     fn block_row(&mut self, row: i32, positions: u128) {
         if let Some(taken) = self.taken.get_mut(row as usize) {
@@ -43,8 +43,8 @@ impl PositionSampler {
         }
     }
 
-    /// Draws one of the free positions uniformly, and blocks the positions around it. If none is free, as with very
-    /// many coins, all are freed first; the original raises an error there.
+    /// Draws one of the free positions uniformly, and blocks the positions around it. If none is free, as with very many coins,
+    /// all are freed first; the original raises an error in that case.
     pub fn sample(&mut self, radius: i32, random: &mut Generator) -> (i32, i32) {
         let mut count: u32 = self.free.iter().map(|free| u32::from(*free)).sum();
         if count == 0 {
@@ -56,7 +56,7 @@ impl PositionSampler {
         for ((row, taken), free) in (0..).zip(&self.taken).zip(&self.free) {
             if number < u32::from(*free) {
                 let mut positions = !taken & ROW;
-                // Removes the free positions before it, so that it is the lowest.
+                // Removes the free positions before the drawn one, which is then the lowest.
                 (0..number).for_each(|_| positions &= positions - 1);
                 position = (positions.trailing_zeros() as i32, row);
                 break;

@@ -1,7 +1,7 @@
 //! The ids of Searing Spotlights, their reset parameters and their info columns.
 //!
-//! Source: `default_reset_parameters` of the original. The original checks no value. The limits here are wide enough
-//! for every use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
+//! Source: `default_reset_parameters` of the original. The original checks no values. The limits here are wide enough for every
+//! use, and narrow enough that no value breaks the rules, needs much memory or makes a step slow.
 
 use super::features::FEATURES;
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};

@@ -1,7 +1,7 @@
 //! The rules of Searing Spotlights: one implementation for both ids.
 //!
-//! Source: `reset` and `step` of the original's `searing_spotlights.py` and `endless_searing_spotlights.py`. The order
-//! of the random draws is part of the rules.
+//! Source: `reset` and `step` of the original's `searing_spotlights.py` and `endless_searing_spotlights.py`. The order of the
+//! random draws is part of the rules.
 
 use super::config::{BAR_HEIGHT, Config};
 use super::parameters::{MAX_SPOTLIGHTS, Parameters};
@@ -16,10 +16,10 @@ use crate::random::Generator;
 
 const WALKABLE: Bounds = (0, BAR_HEIGHT as i32, SCREEN as i32, SCREEN as i32);
 
-/// Least distance in pixels between the centres of coins and exit and the screen's border.
+/// Minimum distance in pixels between the centres of coins and exit and the screen's border.
 const SPAWN_MARGIN: i32 = 7;
 
-/// Least distances in pixels from the agent, from coins and exit, and between two coins of the endless id.
+/// Minimum distances in pixels from the agent, from coins and exit, and between two coins of the endless id.
 const AGENT_SPACE: i32 = 28;
 const OBJECT_SPACE: i32 = 21;
 const ENDLESS_COIN_SPACE: i32 = 28;
@@ -101,7 +101,7 @@ impl State {
         if terminated {
             reward += parameters.reward_death;
         }
-        // Each sum starts at zero, as in the original, since the order of the additions decides the rounding.
+        // Each sum starts at zero, as in the original, since the order of additions determines the rounding.
         reward +=
             if config.variant.endless { self.collect_endless_coin(config, random) } else { self.collect_coins(config) };
         let coins_done = self.coins.is_empty();
@@ -152,7 +152,7 @@ impl State {
         let mut index = 0;
         while let Some(spotlight) = self.spotlights.get_mut(index) {
             if spotlight.done {
-                // The next one takes its index and is skipped: in this step it neither moves nor shines.
+                // The next one takes its index and is skipped: it neither moves nor shines in this step.
                 self.spotlights.remove(index);
             } else {
                 spotlight.advance();
@@ -173,7 +173,7 @@ impl State {
         if self.hit { parameters.reward_inside_spotlight } else { parameters.reward_outside_spotlight }
     }
 
-    /// Selects the background, and replaces it for good by black if the parameters say so.
+    /// Selects the background, and replaces it permanently with black if the parameters say so.
     fn update_background(&mut self, parameters: &Parameters) {
         let background = &mut self.backgrounds[usize::from(self.hit && parameters.visual_feedback)];
         if parameters.black_background {
@@ -189,7 +189,7 @@ impl State {
         let mut index = 0;
         while let Some(&coin) = self.coins.get(index) {
             if reaches(coin, self.agent, reach) {
-                // The next one is skipped, as with the spotlights.
+                // The next one is skipped, as with spotlights.
                 self.coins.remove(index);
                 self.coins_collected += 1;
                 reward += config.parameters.reward_coin;
@@ -199,7 +199,7 @@ impl State {
         reward
     }
 
-    /// Replaces the only coin by a new one if the agent reaches it. Returns the reward.
+    /// Replaces the only coin with a new one if the agent reaches it. Returns the reward.
     fn collect_endless_coin(&mut self, config: &Config, random: &mut Generator) -> f64 {
         let reach = f64::from(config.coin_radius + config.agent.radius());
         match self.coins.first_mut() {
@@ -223,7 +223,7 @@ fn reaches((x, y): (i32, i32), agent: Character, reach: f64) -> bool {
     distance([f64::from(x), f64::from(y)], centre(agent)) <= reach
 }
 
-/// A position two or three pixels to the right of and below another, drawn at random.
+/// A random position two or three pixels to the right of and below another.
 fn near((x, y): (i32, i32), random: &mut Generator) -> (i32, i32) {
     (x + random.integers(2, 4) as i32, y + random.integers(2, 4) as i32)
 }

@@ -1,4 +1,4 @@
-//! What a frame of Searing Spotlights shows.
+//! The scene of a Searing Spotlights frame.
 
 use smallvec::SmallVec;
 
@@ -11,13 +11,13 @@ use crate::envs::character::Character;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
     pub(super) background: Background,
-    /// Darkness outside of the circles, 0 to 255.
+    /// Darkness outside the circles, 0 to 255.
     pub(super) darkness: u8,
-    /// Only the bar and what is visible in the dark is shown.
+    /// Whether only the bar and what is visible in the dark is shown.
     pub(super) blacked_out: bool,
-    /// The circles have outlines.
+    /// Whether the circles have outlines.
     pub(super) outlined: bool,
-    /// Coins are visible in the dark.
+    /// Whether coins are visible in the dark.
     pub(super) coins_visible: bool,
     /// The lit circles on the screen; empty if there is no darkness.
     pub(super) circles: Circles,
@@ -30,11 +30,11 @@ pub struct Scene {
 /// What the bar at the top of the screen shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Bar {
-    /// Red columns; more than [`HEALTH_WIDTH`] for negative health.
+    /// Number of red columns; more than [`HEALTH_WIDTH`] for negative health.
     pub damage: u8,
-    /// The red columns beyond [`HEALTH_WIDTH`] cover the fields of the action.
+    /// Whether the red columns beyond [`HEALTH_WIDTH`] cover the fields of the action.
     pub overflows: bool,
-    /// By the branches of the action; `None` if the action is not shown.
+    /// One number for each branch of the action; `None` if the action is not shown.
     pub action: Option<[u8; 2]>,
     /// Whether the reward was positive; `None` if that is not shown.
     pub reward: Option<bool>,
@@ -55,7 +55,7 @@ impl Bar {
 }
 
 impl Scene {
-    /// What a state looks like.
+    /// The scene of a state.
     pub(super) fn new(state: &State, config: &Config) -> Scene {
         // Without a coin, the original paints the empty black surface of the coin over the screen.
         let blank = config.variant.endless && state.coins.is_empty();
@@ -71,7 +71,7 @@ impl Scene {
         }
     }
 
-    /// What the ground-truth view of a state looks like.
+    /// The scene of a state's ground-truth view.
     pub(super) fn ground_truth(state: &State, config: &Config) -> Scene {
         Scene {
             circles: state.shown_circles(),
@@ -109,13 +109,13 @@ impl State {
         circles
     }
 
-    /// The agent as the frame shows it: upwards in an episode's first frame.
+    /// The agent as the frame shows it: facing up in an episode's first frame.
     pub(super) fn shown_agent(&self) -> Character {
         if self.first_frame { Character { rotation: 0, ..self.agent } } else { self.agent }
     }
 
-    /// The agent as the ground-truth view shows it. As in the original, it is the last episode's until the first step,
-    /// but with the current scale.
+    /// The agent as the ground-truth view shows it. As in the original, it is the last episode's agent until the first step,
+    /// but at the current scale.
     fn ground_truth_agent(&self) -> Character {
         match self.former_agent {
             Some(former) if self.first_frame => former,

@@ -16,22 +16,22 @@ use crate::random::Generator;
 pub(super) struct Spotlight {
     /// In pixels.
     pub radius: i32,
-    /// Centre in pixels, as of the last step that it moved in.
+    /// Centre in pixels, as of the last step in which it moved.
     pub location: [f64; 2],
     /// Share of the path per step.
     speed: f64,
-    /// Share of the path that it has moved, 0 to 1.
+    /// Share of the path covered so far, 0 to 1.
     progress: f64,
-    /// It has reached the end of its path.
+    /// Whether it has reached the end of its path.
     pub done: bool,
     start: [f64; 2],
-    /// It starts towards the target, but ends at the bend.
+    /// It starts towards `target` but ends at `bend`.
     target: [f64; 2],
     bend: [f64; 2],
 }
 
 impl Spotlight {
-    /// Draws a spotlight just off the screen.
+    /// A random spotlight just off the screen.
     pub fn spawn(parameters: &Parameters, random: &mut Generator) -> Self {
         // numpy truncates both ends.
         let (low, high) = (parameters.spot_min_radius, parameters.spot_max_radius + 1.0);
@@ -58,7 +58,7 @@ impl Spotlight {
         }
     }
 
-    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
+    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
     pub fn is_valid(&self) -> bool {
         let near =
             |position: &[f64; 2]| position.iter().all(|coordinate| coordinate.abs() < f64::from(MAX_COORDINATE) / 4.0);

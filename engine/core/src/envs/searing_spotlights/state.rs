@@ -27,9 +27,9 @@ pub(super) enum Background {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct State {
     pub(super) agent: Character,
-    /// The agent of the episode before, which the ground-truth view shows until the first step of an episode.
+    /// The previous episode's agent, which the ground-truth view shows until the first step of an episode.
     pub(super) former_agent: Option<Character>,
-    /// The frame is the first of its episode.
+    /// Whether the frame is the first of its episode.
     pub(super) first_frame: bool,
     pub(super) health: f64,
     /// Red columns of the health bar; more than [`HEALTH_WIDTH`](super::config::HEALTH_WIDTH) for negative health.
@@ -37,12 +37,12 @@ pub struct State {
     pub(super) spotlights: Vec<Spotlight>,
     pub(super) spawn_timer: i64,
     pub(super) spawns_left: i64,
-    /// The circles that the spotlights lit in the last step, in drawing order. An episode starts with those of the
-    /// episode before.
+    /// The circles that the spotlights lit in the last step, in drawing order. An episode starts with those of the previous
+    /// one.
     pub(super) lit: Vec<Circle>,
-    /// The lit circles have outlines.
+    /// Whether the lit circles have outlines.
     pub(super) outlined: bool,
-    /// Darkness outside of the lit circles, 0 to 255.
+    /// Darkness outside the lit circles, 0 to 255.
     pub(super) darkness: u8,
     /// Centres of the coins that are left.
     pub(super) coins: Vec<(i32, i32)>,
@@ -51,15 +51,14 @@ pub struct State {
     pub(super) coins_collected: u32,
     pub(super) exit: Option<Exit>,
     pub(super) last_action: [i32; 2],
-    /// The action of the step before the last one, which the bar shows.
+    /// The action of the last step but one, which the bar shows.
     pub(super) shown_action: [i32; 2],
     pub(super) last_reward_positive: bool,
-    /// Whether the step before the last one gave a positive reward, which the bar shows.
+    /// Whether the last step but one gave a positive reward, which the bar shows.
     pub(super) shown_reward_positive: bool,
-    /// A spotlight touched the agent in the last step.
+    /// Whether a spotlight touched the agent in the last step.
     pub(super) hit: bool,
-    /// The backgrounds without and with a hit. As in the original, a replaced background stays replaced in later
-    /// episodes.
+    /// The backgrounds without and with a hit. As in the original, a replaced background stays replaced in later episodes.
     pub(super) backgrounds: [Background; 2],
     /// The current background.
     pub(super) background: Background,
@@ -72,9 +71,9 @@ pub struct State {
 /// The exit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Exit {
-    /// Its centre in pixels.
+    /// Centre in pixels.
     pub location: (i32, i32),
-    /// The agent can leave by it.
+    /// Whether the agent can leave by it.
     pub open: bool,
 }
 
@@ -110,7 +109,7 @@ impl State {
         }
     }
 
-    /// Whether every number is in a range that the rules can continue from. A forged snapshot may hold any numbers.
+    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
     pub(super) fn is_valid(&self) -> bool {
         let near = |(x, y): (i32, i32)| x.unsigned_abs() < MAX_COORDINATE && y.unsigned_abs() < MAX_COORDINATE;
         self.agent.is_valid()
@@ -128,7 +127,7 @@ impl State {
             && self.coins.iter().copied().chain(self.exit.map(|exit| exit.location)).all(near)
             && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
             && self.coins_collected < u32::MAX / 2
-            // Without a limit it is `i64::MAX`.
+            // `i64::MAX` without a limit.
             && self.spawns_left >= 0
             && [self.spawn_timer, self.steps, self.coin_steps].iter().all(|count| (0..i64::MAX / 2).contains(count))
     }
@@ -143,7 +142,7 @@ impl State {
         self.health / parameters.agent_health
     }
 
-    /// Coins, and health points.
+    /// Number of coins, and health points.
     pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
         let coins = self.coins_collected;
         let coins = match config.variant.endless {

@@ -1,4 +1,4 @@
-//! Tests of what the recorded traces do not cover: options that the original cannot play, limits, features, snapshots.
+//! Tests what the recorded traces do not cover: options that the original cannot play, limits, features, snapshots.
 
 use std::sync::Arc;
 
@@ -61,7 +61,7 @@ fn walk(environment: &mut SearingSpotlights, random: &mut Generator, to: (i32, i
     panic!("nothing at {to:?}");
 }
 
-/// An option within its limits, often at one of them.
+/// A value within the option's limits, often at one of them.
 fn any_value(parameter: &Parameter) -> BoxedStrategy<Json> {
     match parameter.kind {
         ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
@@ -209,7 +209,7 @@ fn features_agree_with_the_frame() {
 
 #[test]
 fn a_width_beyond_32_bits_wraps() {
-    // What `pygame.draw.rect` of pygame 2.4 paints for a bar of this `width`.
+    // Red columns that `pygame.draw.rect` of pygame 2.4 paints for a bar of this `width`.
     for (width, red) in [(41_i64, 41), (1 << 30, 84), (1 << 31, 0), ((1 << 32) - 5, 0), ((1 << 32) + 5, 5)] {
         let damage = (width as f64 + 0.5) / 42.0;
         let options = json!({"spot_min_radius": 200.0, "spot_max_radius": 200.0, "spot_min_speed": 0.1,
@@ -225,14 +225,14 @@ fn a_width_beyond_32_bits_wraps() {
     }
 }
 
-/// Plays with as many spotlights as `initial_spawns`, and repaints each frame from one of the frames before it.
+/// Plays with as many spotlights as `initial_spawns`, and repaints each frame from an earlier frame.
 fn repaint_episodes(spec: &'static EnvSpec, options: &Json, seed: u64) {
     let (mut environment, mut random) = started(spec, options, seed);
     let assets = Arc::clone(&environment.assets);
     let mut shown = environment.scene();
     let mut repainted = frame(&environment, 0);
     for step in 0..120 {
-        // Some actions keep still, so that objects stay where they are while the light changes.
+        // Some actions do not move the agent, so that objects stay where they are while the light changes.
         let action = [random.integers(0, 3) as i32, random.integers(0, 3) as i32 * (step / 8 % 2)];
         if environment.step(&action, &mut random).terminated {
             environment.reset(&assets, &mut random);

@@ -1,4 +1,4 @@
-//! The drawing of the bar at the top of the screen: health, the last action, and whether the last reward was positive.
+//! Draws the bar at the top of the screen: health, the last action, and whether the last reward was positive.
 
 use std::ops::Range;
 
@@ -8,10 +8,10 @@ use super::scene::Bar;
 use crate::envs::screen::SCREEN;
 use crate::raster::{Canvas, Rect, Rgb};
 
-/// A column of the bar, of one colour.
+/// A column of the bar, in one colour.
 type Column = [Rgb; BAR_HEIGHT];
 
-// In memory and not made from a colour, so that a column is two loads and two stores, not one store for each byte.
+// Stored, not computed from a colour, so that a column is two loads and two stores instead of one store per byte.
 static BLACK: Column = [[0, 0, 0]; BAR_HEIGHT];
 static GREY: Column = [[50, 50, 50]; BAR_HEIGHT];
 static HEALTH: Column = [[0, 255, 0]; BAR_HEIGHT];
@@ -19,14 +19,14 @@ static DAMAGE: Column = [[255, 0, 0]; BAR_HEIGHT];
 static POSITIVE_REWARD: Column = [[255, 255, 0]; BAR_HEIGHT];
 static ACTIONS: [Column; 3] = [[[120, 120, 120]; BAR_HEIGHT], [[116, 1, 113]; BAR_HEIGHT], [[255, 94, 14]; BAR_HEIGHT]];
 
-/// The health takes the left half, and each branch of the action one of the other quarters.
+/// Health takes the left half, and each branch of the action one of the other two quarters.
 const QUARTER: usize = SCREEN / 4;
 const HALF: usize = HEALTH_WIDTH;
 
 /// Columns of the action's branches.
 const ACTION_FIELDS: [Range<usize>; 2] = [HALF..HALF + QUARTER, HALF + QUARTER..SCREEN];
 
-/// Columns of the reward's field between the fields of the action, and of the field if the action is not shown.
+/// Columns of the reward's field: between the fields of the action, and without them.
 const REWARD_BETWEEN: Range<usize> = QUARTER * 11 / 4..QUARTER * 11 / 4 + QUARTER / 2;
 const REWARD_ALONE: Range<usize> = HALF..SCREEN;
 
@@ -64,7 +64,7 @@ impl Bar {
         let (damage, shown_damage) = (usize::from(self.damage), usize::from(shown.damage));
         fill(canvas, damage..shown_damage.min(HALF), &HEALTH);
         fill(canvas, shown_damage..damage.min(HALF), &DAMAGE);
-        // The field of the reward covers a part of both fields.
+        // The reward's field covers a part of both fields.
         let covered = if self.reward.is_some() { REWARD_BETWEEN } else { HALF + QUARTER..HALF + QUARTER };
         let fields = [HALF..covered.start, covered.end..SCREEN];
         for ((now, before), field) in action.into_iter().zip(shown_action).zip(fields) {

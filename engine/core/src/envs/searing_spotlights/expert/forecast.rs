@@ -1,4 +1,4 @@
-//! Forecasts of a spotlight's positions from its observed positions.
+//! Forecasts a spotlight's positions from its observed positions.
 
 use super::plan::Place;
 use crate::envs::screen::SCREEN;
@@ -13,7 +13,7 @@ const SPEED_DEVIATION: f64 = 0.4;
 /// Prior standard deviation of the acceleration, whose prior mean is 0.
 const ACCELERATION: f64 = 0.006;
 
-/// Number of consecutive frames that a spotlight may be missing from. A spotlight may skip a step.
+/// Number of consecutive frames in which a spotlight may be missing. A spotlight may skip a step.
 const PATIENCE: u32 = 3;
 
 /// A spotlight's motion, a parabola in time, estimated from its observed positions.
@@ -85,7 +85,7 @@ impl Forecast {
         (centre, variance.max(0.0).sqrt())
     }
 
-    /// Least squares with the prior as additional observations.
+    /// Fits the motion by least squares, with the prior as additional observations.
     fn fit(&mut self) {
         let mut normal = [[0.0; 3]; 3];
         normal[1][1] = (SPEED_DEVIATION * SPEED_DEVIATION).recip();
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_parabola_is_foreseen() {
+    fn a_parabola_is_forecast() {
         let at = |time: f64| [10.0 + 0.7 * time - 0.002 * time * time, 60.0 - 0.4 * time + 0.003 * time * time];
         let mut forecast = Forecast::new(9, at(0.0).map(|coordinate| coordinate as i32));
         let (_, at_first) = forecast.at(20);

@@ -10,8 +10,7 @@ use crate::envs::screen::SCREEN;
 use forecast::Forecast;
 use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, Plan, after, choose, dash};
 
-/// Distances in pixels between the centres of agent and coin or exit at which the agent reaches them, with a safety
-/// margin.
+/// Distances in pixels between the centres of agent and coin or exit at which the agent reaches them, minus a safety margin.
 const COIN_REACH: i32 = 9;
 const EXIT_REACH: i32 = 11;
 
@@ -28,7 +27,7 @@ const STEPS_PER_HIT: u32 = 10;
 const FINITE_HEALTH: f32 = 5.0;
 const ENDLESS_HEALTH: f32 = 10.0;
 
-/// Largest margin in pixels around a forecast spotlight.
+/// Maximum margin in pixels around a forecast spotlight.
 const MAX_MARGIN: f64 = 6.0;
 
 /// Share of the margin in the search for the path with the fewest hits.
@@ -36,18 +35,18 @@ const HURRY: f64 = 0.1;
 /// Share of the margin in the search for a path out of the light.
 const ESCAPE: f64 = 0.2;
 
-/// Shares of the margin for the forecasts' uncertainty, and whether to avoid the border; the most cautious first.
+/// Shares of the margin for the forecasts' uncertainty, and whether to avoid the border; most cautious first.
 const CAUTIONS: [(f64, bool); 6] = [(1.0, true), (0.5, true), (1.0, false), (0.5, false), (0.2, false), (0.0, false)];
 
 /// Radius of the agent in pixels.
 const AGENT_RADIUS: f64 = 6.0;
 
-/// Plays Searing Spotlights from the feature observation. It assumes the default movement and sizes, so that it needs
-/// the default `agent_speed`, `agent_scale`, `coin_scale` and `exit_scale`, and a lit first frame.
+/// Plays Searing Spotlights from the feature observation. It assumes the default movement and sizes, so it needs the default
+/// `agent_speed`, `agent_scale`, `coin_scale` and `exit_scale`, and a lit first frame.
 ///
-/// It wins almost every episode of the finite id. In the endless id most episodes last more than 10,000 steps. The
-/// others end since slow spotlights cover the surroundings of a coin for most of its 160 steps, so that the agent is
-/// too late or loses its health.
+/// It wins almost every episode of the finite id. In the endless id most episodes last more than 10,000 steps. The others end
+/// because slow spotlights cover the surroundings of a coin for most of its 160 steps, so that the agent is too late or loses
+/// its health.
 #[derive(Debug)]
 pub struct SpotlightsExpert {
     variant: Variant,
@@ -59,7 +58,7 @@ pub struct SpotlightsExpert {
     /// Health points left.
     health: u32,
     target: Option<Place>,
-    /// Steps left to reach the target; with fewer steps, the expert takes higher risks.
+    /// Steps left to reach the target. With fewer steps, the expert takes greater risks.
     patience: u32,
 }
 
@@ -127,8 +126,8 @@ impl SpotlightsExpert {
         self.spotlights.extend(unmatched.into_iter().map(|(radius, place)| Forecast::new(radius, place)));
     }
 
-    /// The most cautious plan that reaches the goal; else the plan with the fewest hits that reaches it, if time is
-    /// short; else the most cautious plan without hits.
+    /// The most cautious plan that reaches the goal; otherwise, if time is short, the plan with the fewest hits that reaches
+    /// it; otherwise the most cautious plan without hits.
     fn plan(&self, agent: Place, goal: Goal) -> Plan {
         let mut waiting: Option<Plan> = None;
         for (caution, avoid_border) in CAUTIONS {
@@ -157,7 +156,8 @@ impl SpotlightsExpert {
                 let margin = (caution * (1.0 + deviation)).min(MAX_MARGIN);
                 danger.add(centre, f64::from(spotlight.radius) + AGENT_RADIUS + 0.5 + margin);
             }
-            // Near the border, a new spotlight leaves no time to escape. The first steps allow to leave the border.
+            // Near the border, a new spotlight leaves no time to escape. The first steps are exempt, so that the agent can
+            // leave the border.
             if avoid_border && step > 4 {
                 danger.add_border();
             }

@@ -1,4 +1,4 @@
-//! Path planning to a goal through places that become dangerous and safe over time.
+//! Plans paths to a goal through places that become dangerous and safe over time.
 //!
 //! Sets of places are bit sets, one for each row, so that one operation moves all places of a row.
 
@@ -10,9 +10,9 @@ pub(super) type Place = [i32; 2];
 /// Planning horizon in steps.
 pub(super) const HORIZON: usize = 28;
 
-/// Least coordinates of the agent's centre.
+/// Minimum coordinates of the agent's centre.
 const LOW: Place = [6, 10];
-/// Largest coordinates of the agent's centre.
+/// Maximum coordinates of the agent's centre.
 const HIGH: Place = [78, 78];
 
 /// The place to wait at without a goal.
@@ -185,7 +185,7 @@ impl Goal {
     }
 }
 
-/// The next action, and what the rest of the plan leads to.
+/// The next action, and the outcome of the rest of the plan.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Plan {
     pub action: [i32; 2],
@@ -195,9 +195,9 @@ pub(super) struct Plan {
     pub arrives: bool,
 }
 
-/// The first action of the path with the fewest dangerous steps until the horizon and, among those, the earliest
-/// arrival at the goal or the least distance to it. `dangers` has an entry for the current step, which is ignored, and
-/// one for each future step.
+/// The first action of the path with the fewest dangerous steps up to the horizon and, among those, the earliest arrival at the
+/// goal or the smallest distance to it. `dangers` has an entry for the current step, which is ignored, and one for each future
+/// step.
 pub(super) fn choose(start: Place, goal: Goal, dangers: &[Danger]) -> Plan {
     let start = moved(start, [0, 0]);
     let next = MOVES.map(|(action, pixels)| (action, moved(start, pixels)));
@@ -218,8 +218,8 @@ pub(super) fn choose(start: Place, goal: Goal, dangers: &[Danger]) -> Plan {
     Plan { action: [0, 0], hits: dangers.len(), arrives: false }
 }
 
-/// For each step: the places from which the rest of the path needs no dangerous step, or one more than from the places
-/// of `easier`.
+/// For each step, the places from which the rest of the path needs no dangerous step, or one more than from the places of
+/// `easier`.
 fn survivable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
     let everywhere = Places([u128::MAX; SCREEN]);
     let mut sets = vec![everywhere.clone(); dangers.len() + 1];
@@ -238,8 +238,8 @@ fn survivable(dangers: &[Danger], easier: Option<&[Places]>) -> Vec<Places> {
     sets
 }
 
-/// The first action of the path to the goal with the fewest dangerous steps, if there is one with at most `max_hits` of
-/// them. Ignores what happens after the arrival.
+/// The first action of the path to the goal with the fewest dangerous steps, if one exists with at most `max_hits` of them.
+/// Ignores what happens after the arrival.
 pub(super) fn dash(start: Place, goal: Goal, dangers: &[Danger], max_hits: usize) -> Option<Plan> {
     let safe: Vec<Places> = dangers.iter().map(Danger::safe).collect();
     let (action, hits) = shortest_path(moved(start, [0, 0]), goal, &safe, max_hits)?;
@@ -252,8 +252,8 @@ fn safe_action(start: Place, goal: Goal, safe: &[Places]) -> ([i32; 2], bool) {
         .map_or_else(|| (approach(start, goal, safe), false), |(action, _)| (action, true))
 }
 
-/// The first action and the number of dangerous steps of the shortest path among those to the goal with the fewest
-/// dangerous steps.
+/// The first action and the number of dangerous steps of the shortest path to the goal among those with the fewest dangerous
+/// steps.
 fn shortest_path(start: Place, goal: Goal, safe: &[Places], max_hits: usize) -> Option<([i32; 2], usize)> {
     let goals = goal.places();
     // For each number of dangerous steps, the places after each step.
@@ -282,7 +282,7 @@ fn shortest_path(start: Place, goal: Goal, safe: &[Places], max_hits: usize) -> 
     None
 }
 
-/// The first action of the path with the least distance to the goal at its end.
+/// The first action of the path that ends nearest to the goal.
 fn approach(start: Place, goal: Goal, safe: &[Places]) -> [i32; 2] {
     let mut reached = vec![Places::only(start)];
     for (step, safe) in safe.iter().enumerate().take(HORIZON + 1).skip(1) {
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn walks_straight_where_nothing_threatens() {
+    fn walks_straight_without_danger() {
         let dangers = vec![Danger::none(); HORIZON + 1];
         let goal = Goal { place: [70, 40], reach: 3 };
         let mut place = [20, 40];
