@@ -289,7 +289,7 @@ impl<S: SectionTable> TryFrom<LayoutFields> for Layout<S> {
     }
 }
 
-/// A description of a layout is invalid.
+/// A layout's description is invalid.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum LayoutError {
     /// There are no environments, or too many.

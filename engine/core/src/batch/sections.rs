@@ -17,7 +17,7 @@ pub const SNAPSHOT_BYTES: usize = 256 * 1024;
 ///
 /// A [`Layout`](super::Layout) describes where each of them is. The trait is sealed: other crates cannot implement it.
 pub trait SectionTable: Sealed + Copy + Eq + fmt::Debug + fmt::Display + 'static {
-    /// All sections, in the order of their memory.
+    /// All sections, in memory order.
     const ALL: &'static [Self];
 
     /// Blocks after the last section that belong to the writer.

@@ -6,8 +6,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Action space of an environment, named after Gymnasium's spaces. In JSON it is `{"Discrete": 4}` or `{"MultiDiscrete": [3,
-/// 3]}`.
+/// Action space of an environment, named after Gymnasium's spaces. In JSON, `{"Discrete": 4}` or `{"MultiDiscrete": [3, 3]}`.
 ///
 /// An action is one `i32` for each branch, from 0 to less than the branch's number of choices. Deserialising rejects a space
 /// without branches, and a branch without choices.

@@ -64,7 +64,7 @@ impl Character {
     }
 
     /// Turns in the direction of the action and returns it as a unit vector; no movement returns (0, 0) and turns nothing.
-    /// Without a branch, since random actions are unpredictable.
+    /// Branchless, since random actions are unpredictable.
     fn turn(&mut self, action: &[i32]) -> [f64; 2] {
         const TOWARDS: [f64; 3] = [0.0, -1.0, 1.0];
         // Indexed by the branches of the action. The first is not used.

@@ -12,7 +12,7 @@ use super::spec::EnvSpec;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
-/// The rules and the look of one id: all that an environment needs in order to run in a pool or an engine.
+/// The rules and rendering of one id: all that an environment needs to run in a pool or an engine.
 ///
 /// A value is the state of one environment, which a snapshot stores and [`paint`](Task::paint) draws. One value plays many
 /// episodes: [`Default`] creates it, and [`reset`](Task::reset) comes before every other call. Draw all random numbers from the

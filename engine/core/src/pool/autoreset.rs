@@ -36,7 +36,7 @@ impl Autoreset {
     /// All modes.
     pub const ALL: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled];
 
-    /// Gymnasium's name of the mode, in lower case.
+    /// Gymnasium's name for the mode, in lower case.
     pub const fn name(self) -> &'static str {
         match self {
             Autoreset::NextStep => "next_step",

@@ -226,7 +226,7 @@ pub enum ResetRequest<'a> {
     /// All; environment `i` of the pool is seeded with `seed + first_env + i` (wrapping), where `first_env` is
     /// [`PoolConfig::first_env`].
     Seed(u64),
-    /// As given for each environment.
+    /// Individually, as `reset` says for each environment.
     Each {
         /// For each environment: 0 does not reset it, 1 starts an episode with the next seed of [`Seeding`], and 2 starts one
         /// with its item of `seed`. Other values count as 2.

@@ -40,7 +40,7 @@ pub(super) struct EnvRange<'a, E: Environment> {
     pub out: BatchMut<'a>,
 }
 
-/// The remaining environments of one thread's share; `None` if none are left. Aligned so that shares do not share cache lines.
+/// The remaining environments of one thread's share; `None` if none are left. Aligned to avoid false sharing.
 #[repr(align(128))]
 struct Share<'a, E: Environment>(Mutex<Option<EnvRange<'a, E>>>);
 
@@ -114,7 +114,7 @@ impl<'a, E: Environment> EnvRange<'a, E> {
         outcome.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Splits the range before its `middle`-th environment.
+    /// Splits the range into its first `middle` environments and the rest.
     fn split_at(self, middle: usize) -> (Self, Self) {
         let (first, stack) = (self.first, self.stack);
         let (left_slots, right_slots) = self.slots.split_at_mut(middle);

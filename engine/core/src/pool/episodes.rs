@@ -1,4 +1,4 @@
-//! Reset parameters for next episodes, and the seeds and reset parameters of running episodes.
+//! Reset parameters for the next episodes, and the seeds and reset parameters of running ones.
 
 use serde::{Deserialize, Serialize};
 

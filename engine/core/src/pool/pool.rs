@@ -21,7 +21,7 @@ use crate::raster::PixelFormat;
 /// Environments of one id, stepped in lockstep.
 ///
 /// Every call that advances the environments writes a batch of [`Layout::blocks`] blocks into the caller's memory. In a buffer
-/// that the pool has written before, it writes only changed pixels.
+/// that the pool has written before, it writes only the pixels that changed.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
