@@ -68,7 +68,7 @@ def as_json(data: dict) -> str:
 
 
 def plot() -> None:
-    """Plot the learning curves of each task beside its evaluations."""
+    """Plot the learning curves of each task next to its evaluations."""
     import matplotlib
 
     matplotlib.use("Agg")

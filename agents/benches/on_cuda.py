@@ -58,7 +58,7 @@ def networks(agent: str) -> Settings:
 
 
 def computed(agent: Agent, draws: torch.Generator) -> dict[str, torch.Tensor]:
-    """What an agent computes of a drawn segment of 16 steps: outputs while acting, then loss and gradients; all on the CPU."""
+    """An agent's results on a random segment of 16 steps: outputs while acting, loss and gradients; moved to the CPU."""
     steps, envs, device = 16, 4, agent.device
     frames = torch.randint(0, 256, (steps, envs, 84, 84, 3), dtype=torch.uint8, generator=draws)
     vectors = torch.randn(steps, envs, 16, generator=draws)
@@ -149,7 +149,7 @@ def training(settings: Settings, device: torch.device, updates: int) -> dict[str
 def markdown(report: dict[str, Any]) -> str:
     """The report as Markdown."""
     lines = [f"# The agents on {report['device']}", "", f"{report['versions']}.", "", "## Equality with the CPU", ""]
-    lines += [f"Largest difference, relative to the largest value; at most {TOLERANCE:g} is equal.", ""]
+    lines += [f"Largest difference, relative to the largest value; at most {TOLERANCE:g} counts as equal.", ""]
     lines += ["| agent | difference | of | equal |", "| --- | --- | --- | --- |"]
     for row in report["equality"]:
         equal = "yes" if row["equal"] else "**no**"
@@ -171,7 +171,7 @@ def markdown(report: dict[str, Any]) -> str:
             f"| {row['agent']} | {batch} | {compiled} | {row['steps_per_second']:,.0f} | {shares} | {memory} |"
         )
     for left_out in report["left_out"]:
-        lines += ["", f"Not measured, since the time was up: {left_out}."]
+        lines += ["", f"Not measured: {left_out}."]
     return "\n".join(lines) + "\n"
 
 
@@ -180,7 +180,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="`cuda`, `cuda:INDEX` or `cpu` (default: %(default)s)")
     parser.add_argument("--updates", type=int, default=2, help="timed updates of each training (default: %(default)s)")
-    parser.add_argument("--minutes", type=float, default=8.0, help="start no training after (default: %(default)s)")
+    parser.add_argument("--minutes", type=float, default=8.0, help="start no training later (default: %(default)s)")
     parser.add_argument("--json", type=Path, help="write the report to this JSON file")
     parser.add_argument("--markdown", type=Path, help="write the report to this Markdown file")
     args = parser.parse_args()
@@ -201,7 +201,7 @@ def main() -> int:
     report["equality"] = equality(device)
     if cuda:
         report["copies"] = copies(device)
-        # As `endless-train`.
+        # As in `endless-train`.
         torch.backends.cudnn.allow_tf32 = True
         torch.set_float32_matmul_precision("high")
     paper = replace(PRESETS["paper"], env=ENV)

@@ -3,10 +3,10 @@
     python speed.py --original PYTHON --cleanrl FOLDER
 
 PYTHON is an interpreter with the original (memory-gym 1.0.2), torch, and the dependencies of CleanRL's ppo_trxl; FOLDER is
-CleanRL's folder `ppo_trxl`. Both programs have the same number of environments, steps, minibatches, epochs, window and
-threads, and run alternately. The time between the ends of the first and the last update is measured in seconds, and in CPU
-seconds of all processes, which are less sensitive to other load on the machine. CleanRL's network lacks the 512 hidden units
-of the policy and value heads.
+CleanRL's folder `ppo_trxl`. Both programs use the same numbers of environments, steps, minibatches, epochs and threads and the
+same window, and run alternately. The time from the end of the first update to the end of the last is measured in seconds, and
+in CPU seconds of all processes, which are less sensitive to other load on the machine. CleanRL's network lacks the 512 hidden
+units of the policy and value heads.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def cpu_seconds(session: int) -> float:
 
 
 def timed(command: list[str], threads: int, pattern: str, folder: str) -> list[tuple[float, float]]:
-    """Run a command; returns the time and the CPU time at each output line that matches `pattern`."""
+    """Run a command; returns the wall time and the CPU time at each output line that matches `pattern`."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "SDL_VIDEODRIVER": "dummy", "PYTHONUNBUFFERED": "1"}
     if command[0] != sys.executable:
         environment.pop("PYTHONPATH", None)

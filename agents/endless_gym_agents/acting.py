@@ -1,8 +1,8 @@
-"""The dense layers of the agent for acting, with weights in the form that needs the fewest operations.
+"""The agent's dense layers for acting, with weights laid out to need the fewest operations.
 
-While acting, batches are small and the cost of a step is the number of operations. The layers here are single `addmm` calls on
-transposed copies of the agent's parameters; the policy and the value head are computed together. `Agent.refresh` says when
-`ActingWeights` are made again.
+While acting, batches are small, so the number of operations determines the cost of a step. Each layer here is a single `addmm`
+call on a transposed copy of the agent's parameters, and the policy and value heads are computed together. `Agent.refresh`
+documents when `ActingWeights` are rebuilt.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from endless_gym_agents.heads import PolicyHead, ValueHead
 
 #: Bias (outputs,) and transposed weight (inputs, outputs) of a linear layer.
 Affine: TypeAlias = tuple[Tensor, Tensor]
-#: The logit of a choice that does not exist, in a branch with fewer choices than others. Finite, since infinity gives NaN.
+#: Logit that pads branches with fewer choices than the largest. Finite, since infinity gives NaN.
 NO_CHOICE = -1e9
 
 _version = attrgetter("_version")
@@ -37,18 +37,18 @@ def linear_relu(x: Tensor, layer: Affine) -> Tensor:
 
 
 def weights_version(parameters: Sequence[Tensor]) -> int:
-    """A number that rises with each change of the parameters in place, except by the kernels of fused optimizers."""
+    """A number that rises with each in-place change of the parameters, except those by fused optimizer kernels."""
     return sum(map(_version, parameters))
 
 
 @dataclass
 class ActingWeights:
-    """The layers after the memory, and the layer of vector observations.
+    """The layers after the memory, and the layer for vector observations.
 
     Attributes:
-        version: `weights_version` of the parameters that they were made from.
-        vector: Layer of the vector observations; None without any.
-        embedding: Layer before the memory; None without one.
+        version: `weights_version` of the parameters at the time of the copy.
+        vector: Layer for vector observations; None if there are none.
+        embedding: Layer before the memory; None if there is none.
         body: Layer after the memory.
         hidden: Hidden layers of the policy and the value head side by side.
         output: Output layers of both heads: the logits of all branches, each padded to the largest one, and the value.
@@ -90,7 +90,7 @@ def acting_weights(
     policy: PolicyHead,
     value: ValueHead,
 ) -> ActingWeights:
-    """Make `ActingWeights` of the agent's layers; `dtype` is the type to compute in."""
+    """Make `ActingWeights` from the agent's layers; `dtype` is the type to compute in."""
     (policy_bias, policy_weight), (value_bias, value_weight) = (
         transposed(layer, dtype) for layer in (policy.hidden[0], value.layers[0])
     )

@@ -126,8 +126,8 @@ class AgentOutput:
     Attributes:
         logits: Log-probabilities of all choices of each branch, list of float32 (M, choices).
         value: Value estimates, float32 (M,).
-        frame: Logits of the reconstructed frames, float32 (M, channels, 84, 84); None without reconstruction head.
-        ground_truth: Estimates of the ground truth, float32 (M, entries); None without ground-truth head.
+        frame: Logits of the reconstructed frames, float32 (M, channels, 84, 84); None without a reconstruction head.
+        ground_truth: Estimates of the ground truth, float32 (M, entries); None without a ground-truth head.
     """
 
     logits: list[Tensor]
@@ -223,7 +223,7 @@ class Agent(nn.Module):
         return sum(parameter.numel() for parameter in self.parameters())
 
     def compile_parts(self) -> None:
-        """Compile, with `torch.compile`, the submodules whose input shapes are constant or nearly so; on CUDA as CUDA graphs."""
+        """Apply `torch.compile` to the submodules whose input shapes are constant or nearly so; on CUDA, as CUDA graphs."""
         blocks = self.memory.blocks if isinstance(self.memory, TransformerMemory) else []
         heads = (self.policy, self.value, self.reconstruction, self.ground_truth)
         for part in (self.encoder, self.body, *heads, *blocks):
@@ -231,7 +231,7 @@ class Agent(nn.Module):
                 part.compile(mode="reduce-overhead" if self.device.type == "cuda" else None)
 
     def initial_memory(self, num_envs: int) -> AgentMemory:
-        """A new memory for `num_envs` environments, each of whose next observation is the first of an episode."""
+        """A new memory for `num_envs` environments, all at the start of an episode."""
         reset_mask = torch.ones(num_envs, dtype=torch.bool, device=self.device)
         return AgentMemory(reset_mask, self.transform.initial_state(num_envs), self.memory.initial_state(num_envs))
 
@@ -285,7 +285,7 @@ class Agent(nn.Module):
             observed: What `observe` returned.
             memory: Memory of the same n environments.
             noise: Gumbel noise, float32 (n, branches, choices), as `noise` returns it; None for the most likely choices.
-            embedded: What `embed` returns for `observed`, if it is known.
+            embedded: What `embed` returned for `observed`; computed if None.
         """
         weights = self.acting_weights()
         reset_mask = None if memory.reset_mask is memory.no_reset else memory.reset_mask
@@ -318,15 +318,15 @@ class Agent(nn.Module):
         return drawn.exponential_(generator=generator).log_().neg_()
 
     def refresh(self) -> None:
-        """Make the weights for acting again at the next step.
+        """Rebuild the weights for acting at the next step.
 
-        That happens by itself after `forward` with gradients, and after changes of the parameters that PyTorch records, which the
-        step of a fused optimizer is not. A call is needed after a change that is neither.
+        This happens automatically after `forward` with gradients, and after parameter changes that PyTorch records (a fused
+        optimizer's step is not recorded). Call it after any other change.
         """
         self._weights = None
 
     def acting_weights(self) -> ActingWeights:
-        """The weights for acting; made again if the parameters have changed, see `refresh`."""
+        """The weights for acting; rebuilt if the parameters have changed, see `refresh`."""
         if not self._watched:
             self._watched = list(self.parameters())
         version = weights_version(self._watched)
@@ -345,7 +345,7 @@ class Agent(nn.Module):
             observation: Transformed observations of the steps `minibatch.indices`, tensors (M, ...) on the agent's device; with
                 `rows`, (rows, ...).
             minibatch: A minibatch that `memory.minibatches` returned.
-            rows: Row of each step's observation, int64 (M,), if equal observations are given once; see `Segment.distinct`.
+            rows: Row of each step's observation, int64 (M,), if equal observations are passed only once; see `Segment.distinct`.
         """
         if torch.is_grad_enabled():
             self.refresh()
@@ -399,7 +399,7 @@ class Agent(nn.Module):
         """A vector environment's observation by key, whether its observation space is a dict or not."""
         if isinstance(observation, Mapping):
             return observation
-        # Of the kinds of observations that are no dict, only one fits the agent.
+        # A bare array fits only an agent whose observation has one part.
         return {next(iter(self.observation_shapes)): observation} if len(self.observation_shapes) == 1 else {}
 
     def _embed(self, observed: Observation, weights: ActingWeights) -> Tensor:
@@ -415,13 +415,13 @@ class Agent(nn.Module):
             return encoded if weights.embedding is None else linear_relu(encoded, weights.embedding)
 
     def autocast(self) -> contextlib.AbstractContextManager[Any]:
-        """The context of the type that the network computes in."""
+        """The autocast context in which the network computes."""
         if not self.settings.bf16:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, torch.bfloat16)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Agent:
-        # The parameters move, for example to another device.
+        # PyTorch calls this when the parameters move, for example to another device.
         self.refresh()
         self._watched = []
         super()._apply(fn, recurse)

@@ -11,8 +11,9 @@ from contextlib import contextmanager
 class Clock:
     """Accumulates the seconds of named phases.
 
-    The time is that of the host. GPU kernels run asynchronously, and count for the phase that waits for them: those of a rollout
-    for `inference`, which waits for the actions, and those of an update for `learning`, which ends with a copy of the metrics.
+    Times are measured on the host. GPU kernels run asynchronously and count toward the phase that waits for them: those of a
+    rollout toward `inference`, which waits for the actions, and those of an update toward `learning`, which ends with a copy of
+    the metrics.
 
     Attributes:
         seconds: Accumulated seconds by phase.

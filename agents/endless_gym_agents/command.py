@@ -15,7 +15,7 @@ INTERRUPTED = 130
 
 
 def run(name: str, work: Callable[[], object]) -> int:
-    """Run a command, and report errors of the user in one line on standard error.
+    """Run a command, and report user errors in one line on standard error.
 
     Args:
         name: Name of the command.

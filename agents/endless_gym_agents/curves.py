@@ -1,5 +1,4 @@
-"""Learning curves from evaluations, from training logs and from the paper, and their aggregation over environments as in the
-paper.
+"""Learning curves from evaluations, training logs and the paper, and their aggregation over environments as in the paper.
 
 A curve contains the scores of one environment, float64 (runs, checkpoints), over the number of environment steps before each
 checkpoint.
@@ -34,7 +33,7 @@ FAMILIES: dict[Family, tuple[str, str, str]] = {
 }
 #: Labels of the score axis of the aggregated plots.
 AXES: dict[Family, str] = {"finite": "Task progress", "endless": "Normalised score"}
-#: In this environment all agents of the paper use observation reconstruction; there, `gru_rec` takes the place of `gru`.
+#: In this environment all agents of the paper use observation reconstruction, so `gru_rec` takes the place of `gru`.
 _WITH_RECONSTRUCTION = "Endless-SearingSpotlights-v0"
 
 
@@ -112,7 +111,7 @@ def evaluated(experiment: Experiment) -> Curve:
             f"the runs of {experiment.env}, {experiment.label}, have no checkpoints at a common number of steps"
         )
     scores = experiment.scores(name)
-    # With reset parameters the task differs from that of the paper; the label shows them.
+    # Reset parameters change the paper's task, so the label shows them.
     options = "".join(f", {option}={value}" for option, value in experiment.options.items())
     return Curve(experiment.env, experiment.label + options, "evaluated", steps, scores)
 
@@ -173,7 +172,7 @@ def aggregate(family: Family, curves: Sequence[Curve]) -> list[Curve]:
     aggregated = []
     for (source, name), own in found.items():
         if _WITH_RECONSTRUCTION not in own and (source, f"{name}_rec") in found:
-            # The curve with reconstruction in the environment where the paper uses it.
+            # Take the curve with reconstruction in the environment where the paper uses it.
             others = found[source, f"{name}_rec"].items()
             own = own | {env: curve for env, curve in others if env == _WITH_RECONSTRUCTION}
         if set(own) == set(FAMILIES[family]):

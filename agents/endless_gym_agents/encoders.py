@@ -31,7 +31,7 @@ def orthogonal(layer: Layer, gain: float = math.sqrt(2)) -> Layer:
     return layer
 
 
-#: Frames per chunk on the CPU. The activations between two layers of a chunk stay in the CPU's cache, which saves a quarter of
+#: Frames per chunk on the CPU. The activations between a chunk's layers then stay in the CPU's cache, which saves a quarter of
 #: the time.
 FRAMES_PER_CHUNK = 128
 

@@ -38,7 +38,7 @@ class EnjoyArguments:
     seeds: tuple[int, ...] = (EVALUATION_SEEDS.start,)
     """seeds of the episodes, which are shown in order"""
     out: Path = Path("episode.gif")
-    """output file, .gif (256 colours for each frame), .webp (without loss) or .mp4"""
+    """output file, .gif (256 colours per frame), .webp (lossless) or .mp4"""
     action_seed: int = 0
     """seed of the action sampling"""
     greedy: bool = False

@@ -1,4 +1,4 @@
-"""The training environments, in groups: an engine process steps one group while the agent computes the actions of another."""
+"""The training environments, in groups: an engine process steps one group while the agent computes the actions for another."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class StepResult:
 class Environments:
     """Groups of environments: `send` a group's actions, `receive` the result later.
 
-    An engine process starts a step at `send`. Environments in this process step in `receive`, on their threads: a step takes
-    microseconds, less than starting it from a Python thread.
+    An engine process starts a step at `send`. Environments in this process step in `receive`, on their own threads: a step
+    takes microseconds, less than it would take to start it from a Python thread.
 
     The seed of each episode is drawn from 0 to 99,999, as in the paper's training.
 
@@ -62,7 +62,7 @@ class Environments:
         Args:
             settings: The settings of the run.
             episode_options: Chooses the options of each episode, as for `make_vec`; only with environments in this process, since
-                an engine that replaces a failed one plays the same steps again.
+                the replacement for a failed engine replays steps.
             ranks: The ranks of the run, each with a share of the environments; `None` for this process alone.
 
         Raises:
@@ -97,7 +97,7 @@ class Environments:
         def start() -> EndlessVectorEnv:
             envs = serve(settings.env, **arguments)
             if settings.view:
-                # Another engine has another name.
+                # A replacement engine has a new name.
                 self._end_view()
                 self._view = ViewProcess(envs)
                 print(f"view the environments at {self._view.url}", flush=True)
@@ -132,7 +132,7 @@ class Environments:
         return StepResult(observation, reward, done, info.get("ground_truth"), episodes)
 
     def mark(self, report: Callable[[str], None]) -> None:
-        """Make the current state the one from which another engine goes on if the engine process fails.
+        """Mark the current state as the one from which a replacement continues if the engine process fails.
 
         Args:
             report: Called with a line of text for each failure from now on.
@@ -143,7 +143,7 @@ class Environments:
 
     @property
     def failure(self) -> str | None:
-        """Reason for giving up the engine, after which the environments run in this process; None while there is one."""
+        """Why the engine was given up, so that the environments now run in this process; None if it was not."""
         return None if self._engine is None else self._engine.failure
 
     def snapshots(self) -> list[list[bytes]]:
@@ -166,7 +166,7 @@ class Environments:
         self.close()
 
     def _end_view(self) -> None:
-        """End the page that shows the environments, if there is one."""
+        """Stop serving the page that shows the environments, if there is one."""
         if self._view is not None:
             self._view.end()
             self._view = None

@@ -40,8 +40,8 @@ def evaluate(
         ended: Called with the number of episodes that have ended, after each step in which some have.
 
     Returns:
-        The final infos of all episodes with `seed`, and `task_progress` in finite environments; all seeds in order, repeated
-        `repetitions` times.
+        The final infos of all episodes, each with `seed`, and with `task_progress` in finite environments; all seeds in order,
+        repeated `repetitions` times.
     """
     settings, env_spec = agent.settings, spec(agent.settings.env)
     options = settings.options()
@@ -67,7 +67,7 @@ def evaluate(
             )
             done = terminated | truncated
             memory.reset(done)
-            # After its first episode an environment continues with another one, which is ignored.
+            # Autoreset starts further episodes, which are ignored.
             first = [env for env in np.flatnonzero(done) if not results[env]]
             for env in first:
                 final = info["final_info"]

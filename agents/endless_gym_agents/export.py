@@ -1,4 +1,4 @@
-"""Export a trained GRU agent as one small file, as the page in the browser reads it.
+"""Export a trained GRU agent as one small file, in the format that the browser page reads.
 
 ```console
 python -m endless_gym_agents.export runs/mine --out mine.agent.bin
@@ -15,8 +15,8 @@ The file has these parts, with all numbers in little-endian order:
 | | header: JSON in UTF-8 |
 | | all tensors in the order of the header's `tensors`, row-major float32 |
 
-The header names the environment, its reset parameters, the settings and the length of the training, the measured success, and the
-shape of each tensor. Only what acting needs is exported: the value head is not.
+The header contains the environment, its reset parameters, the settings and length of the training, the measured success, and
+the name and shape of each tensor. Only what acting needs is exported, so the value head is not.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from endless_gym_agents.settings import Settings, from_dict, to_dict
 MAGIC = b"ENDLAGNT"
 #: Version of the format. It changes when an older reader cannot read the file.
 FORMAT_VERSION = 1
-#: Parameters of the agent that acting does not need.
+#: Prefix of the parameters that acting does not need.
 NOT_EXPORTED = "value."
-#: Seed of the episodes of recorded vectors, and of the sampled actions.
+#: Seed of the episodes and of the sampled actions of recorded vectors.
 VECTORS_SEED = 200_000
 
 _PREFIX = struct.Struct("<8sII")
@@ -68,19 +68,19 @@ class ExportArguments:
 
 
 def export(checkpoint: Checkpoint) -> bytes:
-    """The file of a trained agent, with its success on the seeds of the paper's evaluation.
+    """The exported file of a trained agent, with its success on the seeds of the paper's evaluation.
 
     Args:
         checkpoint: Checkpoint of an agent `gru` with feature observations.
 
     Raises:
-        ValueError: The agent is of a kind that the format does not have.
+        ValueError: The format does not support this kind of agent.
     """
     settings, agent = checkpoint.settings, checkpoint.agent
     check(settings, agent)
     weights = {name: tensor for name, tensor in agent.state_dict().items() if not name.startswith(NOT_EXPORTED)}
     env_spec = spec(settings.env)
-    # The folder of the run is a path of the machine that has trained.
+    # The folder of the run is a path on the training machine.
     recorded = to_dict(settings) | {"run": "", "resume": ""}
     header = {
         "env": env_spec.id,
@@ -101,11 +101,11 @@ def export(checkpoint: Checkpoint) -> bytes:
 def evaluations(agent: Agent) -> list[dict[str, Any]]:
     """The agent's success on the seeds of the paper's evaluation, with sampled actions.
 
-    With several values of `command_count` each is evaluated by itself, since the final infos of an episode do not name it.
+    Several values of `command_count` are evaluated separately, since the final infos of an episode do not contain it.
 
     Returns:
-        For each evaluation: `options`, `episodes`, `mean_reward`, and in finite environments `success`, the share of the episodes
-        with the whole task done, 0 to 1.
+        For each evaluation: `options`, `episodes`, `mean_reward`, and in finite environments `success`, the fraction of episodes
+        in which the whole task was done, 0 to 1.
     """
     trained = agent.settings
     options = trained.options()
@@ -128,11 +128,11 @@ def evaluations(agent: Agent) -> list[dict[str, Any]]:
 
 
 def check(settings: Settings, agent: Agent) -> None:
-    """Raise an error if the format does not have this agent.
+    """Raise an error if the format does not support this agent.
 
     Raises:
-        ValueError: The agent is no GRU of one layer with embedding and without residual connection, or observes more than
-            features.
+        ValueError: The agent is not a one-layer GRU with an embedding and without a residual connection, or it observes more
+            than features.
     """
     memory = settings.recurrence
     wrong = {
@@ -187,7 +187,7 @@ def read(file: Path) -> tuple[dict[str, Any], Agent]:
 
 
 def record_vectors(agent: Agent, steps: int) -> dict[str, Any]:
-    """Play episodes one after the other, and record what the network receives and computes.
+    """Play episodes one after the other, and record the network's inputs and outputs.
 
     Args:
         agent: An agent with feature observations.

@@ -33,7 +33,7 @@ class PolicyHead(nn.Module):
 
 
 class Perceptron(nn.Module):
-    """Two fully connected layers, such as for an estimate of `info["ground_truth"]`."""
+    """Two fully connected layers, for example to estimate `info["ground_truth"]`."""
 
     def __init__(self, input_width: int, width: int, outputs: int, gain: float = math.sqrt(2)) -> None:
         """Make the head with `width` hidden units; `gain` scales the initial weights of the output layer."""

@@ -8,12 +8,12 @@ from typing import Any
 from endless_gym.specs import Spec
 from endless_gym_agents.metrics import counts_failures, is_finite
 
-#: Share of the best possible result from which on a task counts as learnt.
+#: Fraction of the best possible result at which a task counts as learnt.
 SHARE = 0.9
 
 
 def learnt(spec: Spec, options: Mapping[str, Any], means: Mapping[str, float]) -> str | None:
-    """The reason why the task counts as learnt, for a message; `None` if it does not, as always in an endless environment.
+    """Why the task counts as learnt, for a message; `None` if it does not. Always `None` in endless environments.
 
     Args:
         spec: Specification of the environment.
@@ -24,7 +24,7 @@ def learnt(spec: Spec, options: Mapping[str, Any], means: Mapping[str, float]) -
         return None
     name, best = "success", 1.0
     if counts_failures(spec.id):
-        # The rewards show what the infos do not.
+        # The infos count a failed last command as executed; the reward does not.
         parameters = {**spec.reset_parameters, **options}
         counts = [int(count) for count in parameters["command_count"]]
         commands = sum(counts) / len(counts)

@@ -15,7 +15,7 @@ from endless_gym_agents.settings import Settings, to_dict
 
 #: Log file in the folder of a run, with one JSON object per update.
 PROGRESS = "progress.jsonl"
-#: Number of episodes that the means are computed over.
+#: Number of most recent episodes over which means are computed.
 RECENT = 100
 
 

@@ -1,7 +1,7 @@
 """Generalised advantage estimation, and the loss terms of PPO and its auxiliary tasks.
 
-Tensors are float32 unless stated otherwise. T is the number of steps of a segment, N of its environments, M of the steps of a
-minibatch. Every loss is a scalar, the mean over the minibatch.
+Tensors are float32 unless stated otherwise. T is the number of steps in a segment, N the number of environments, and M the
+number of steps in a minibatch. Every loss is a scalar, the mean over the minibatch.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def generalised_advantages(
     """
     not_done = (~dones).to(rewards.dtype)
     advantages = rewards + gamma * torch.cat([values[1:], last_value.unsqueeze(0)]) * not_done - values  # the TD errors
-    # The sum over `steps` decayed TD errors from each step on, and the decay over so many steps. Both are doubled until the sums
-    # reach the end, which takes 3 * log2(T) operations instead of T.
+    # `advantages` sums `steps` decayed TD errors from each step on; `decay` is the decay over that many steps. Each iteration
+    # doubles `steps` until the sums reach the end, which takes 3 * log2(T) operations instead of T.
     decay, steps = gamma * gae_lambda * not_done, 1
     while steps < len(advantages):
         longer = torch.addcmul(advantages[:-steps], decay[:-1], advantages[steps:])
@@ -42,7 +42,7 @@ def generalised_advantages(
 
 
 def normalised(advantages: Tensor, reference: Tensor | None = None) -> Tensor:
-    """Scale advantages of any shape such that `reference`, by default they themselves, has mean 0 and standard deviation 1."""
+    """Scale advantages of any shape so that `reference`, by default `advantages`, has mean 0 and standard deviation 1."""
     reference = advantages if reference is None else reference
     return (advantages - reference.mean()) / (reference.std() + 1e-8)
 
@@ -57,7 +57,7 @@ def policy_loss(log_probs: Tensor, old_log_probs: Tensor, advantages: Tensor, cl
         log_probs: Log-probabilities of the taken actions under the current policy, (M, branches).
         old_log_probs: Log-probabilities under the policy that collected the rollout, (M, branches).
         advantages: (M,).
-        clip_range: Epsilon: the ratio is clipped to 1 - epsilon to 1 + epsilon.
+        clip_range: Epsilon: the ratio is clipped to the range 1 - epsilon to 1 + epsilon.
     """
     ratio = (log_probs - old_log_probs).exp()
     weight = advantages.unsqueeze(1)
@@ -94,6 +94,6 @@ def ground_truth_loss(estimates: Tensor, truth: Tensor) -> Tensor:
 
 
 def explained_variance(values: Tensor, returns: Tensor) -> Tensor:
-    """Fraction of the variance of `returns` that `values` explain, of equal shape; NaN if the returns have no variance."""
+    """Fraction of the variance of `returns` that `values`, of the same shape, explain; NaN if the returns have no variance."""
     variance = returns.var()
     return (1.0 - (returns - values).var() / variance).masked_fill(variance == 0, float("nan"))

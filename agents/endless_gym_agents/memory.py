@@ -3,12 +3,12 @@
 A memory is a module between the encoder and the heads. It computes its outputs in two ways:
 
 * Acting: one step of n environments at a time. `step` reads the state and returns the output together with an update;
-  `update_state` writes the update into the state. The reset mask says which environments start an episode at this step; nothing
-  from before that step may influence their output.
+  `update_state` writes the update into the state. The reset mask marks the environments that start an episode at this step;
+  earlier steps must not influence their output.
 * Learning: many steps at once, with gradients. `minibatches` divides a segment of T steps in N environments into minibatches, and
   `forward` computes the outputs of one minibatch.
 
-With the same weights both give the same outputs.
+With the same weights, both give the same outputs.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from torch import Tensor, nn
 
 @dataclass
 class Minibatch:
-    """M steps of this rank's segment, in the order that `Memory.forward` expects, and the steps that other ranks add to them.
+    """M steps of this rank's segment, in the order that `Memory.forward` expects, and the minibatch's steps on all ranks.
 
     Attributes:
         indices: Index t * n + i of each step in the flattened segment of this rank's n environments, int64 (M,), on the memory's
-            device. A rank may have no step of a minibatch.
-        everywhere: Index t * N + e of each step of all ranks in the flattened segments of all N environments, int64, in any
+            device. A rank may have no steps in a minibatch.
+        everywhere: Index t * N + e of each step on all ranks in the flattened segments of all N environments, int64, in any
             order.
     """
 
@@ -54,7 +54,7 @@ MinibatchT = TypeVar("MinibatchT", bound=Minibatch)
 
 
 class Minibatches(Generic[MinibatchT]):
-    """Minibatches that are made when they are needed, so that the memory of one is used at a time."""
+    """Minibatches that are made on demand, so that only one at a time occupies memory."""
 
     def __init__(self, parts: Sequence[Tensor], make: Callable[[Tensor], MinibatchT]) -> None:
         """Make the minibatches; minibatch i is `make(parts[i])`."""
@@ -76,7 +76,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
 
     #: Size of the output vectors.
     width: int
-    #: Fully connected layer between the encoder and the memory; None without one.
+    #: Fully connected layer between the encoder and the memory; None if there is none.
     embedding: nn.Sequential | None
 
     def embed(self, x: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         """Prepare the state for recording a segment of `steps` steps."""
 
     def refresh(self, dtype: torch.dtype) -> None:
-        """Prepare the weights for `step`, to compute in `dtype`; called first, and when the weights have changed."""
+        """Prepare the weights for `step`, to compute in `dtype`; called before the first step and after the weights change."""
 
     @abstractmethod
     def step(self, x: Tensor, state: StateT, reset_mask: Tensor | None) -> tuple[Tensor, UpdateT]:
@@ -101,7 +101,7 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         Args:
             x: Encoded and embedded observations, float (n, input width).
             state: State of the same n environments.
-            reset_mask: Whether the observation is the first of an episode, bool (n,); None if none is, as in most steps.
+            reset_mask: Whether the observation is the first of an episode, bool (n,); None if none is, as at most steps.
 
         Returns:
             The output, float (n, width), and the update for `update_state`.
@@ -121,15 +121,15 @@ class Memory(nn.Module, ABC, Generic[StateT, UpdateT, MinibatchT]):
         own: range | None = None,
         epochs: int = 1,
     ) -> Minibatches[MinibatchT]:
-        """Shuffle a recorded segment and divide it into minibatches, of which every rank has the same number.
+        """Shuffle a recorded segment and divide it into minibatches; every rank gets the same number.
 
         Args:
             states: The state of each group of environments after the segment, in the order of their columns in the segment.
             reset_mask: Whether each step is the first of an episode, bool (T, N), on the CPU; with the columns of all ranks.
-            num_minibatches: Number of minibatches of an epoch; there are fewer if the segment has fewer sequences.
-            generator: Generator of the shuffle, on the CPU; in the same state at every rank.
+            num_minibatches: Number of minibatches per epoch; there are fewer if the segment has fewer sequences.
+            generator: Generator of the shuffle, on the CPU; in the same state on every rank.
             own: The columns of this rank's environments; `None` for all.
-            epochs: How often the segment is shuffled and divided; the minibatches follow one another.
+            epochs: How often the segment is shuffled and divided; the epochs' minibatches follow one another.
         """
 
     @abstractmethod
@@ -169,12 +169,12 @@ def balanced_split(sizes: Sequence[int], num_parts: int, generator: torch.Genera
 
 
 def shuffled(sizes: Sequence[int], num_parts: int, epochs: int, generator: torch.Generator) -> list[Tensor]:
-    """What `balanced_split` returns for each of the epochs, one after another; arguments as there."""
+    """The parts from `balanced_split` for each epoch in turn; arguments as there."""
     return [part for _ in range(epochs) for part in balanced_split(sizes, num_parts, generator)]
 
 
 def is_own(envs: Tensor, own: range) -> Tensor:
-    """Whether environments are among those of a rank, bool of the shape of `envs`."""
+    """Whether environments belong to a rank, bool of the shape of `envs`."""
     return (envs >= own.start) & (envs < own.stop)
 
 

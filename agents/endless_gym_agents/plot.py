@@ -78,9 +78,9 @@ class Scale:
     """The horizontal axis of a plot.
 
     Attributes:
-        name: What `Curve.steps` counts, in the files.
+        name: What `Curve.steps` counts, as named in the files.
         label: Label of the axis.
-        unit: How many of them are one on the axis.
+        unit: Steps or seconds per unit of the axis.
     """
 
     name: str
@@ -98,7 +98,7 @@ def draw(name: str, axis: str, curves: Sequence[Curve], spread: Spread, out: Pat
         name: Title of the plot and stem of the file names.
         axis: Label of the score axis.
         curves: The curves.
-        spread: What is shown of the runs.
+        spread: How the runs are shown.
         out: Output folder; created if it does not exist.
         scale: The horizontal axis.
 
@@ -201,7 +201,7 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         curves = aggregate(arguments.aggregate, [*own, *paper])
         complete = {curve.label for curve in curves if curve.source == "evaluated"}
         partial = {curve.label for curve in own if curve.env in FAMILIES[arguments.aggregate]} - complete
-        # An agent with reconstruction can complete one without; see `aggregate`.
+        # `aggregate` can complete an agent with the curve of its variant with reconstruction.
         partial = {label for label in partial if label.removesuffix("_rec") not in complete}
         if partial or (own and not complete):
             raise ValueError(

@@ -23,7 +23,7 @@ def linear_decay(initial: float, final: float, update: int, decay_updates: int) 
 
 
 def make_optimizer(agent: Agent, learning_rate: float) -> torch.optim.AdamW:
-    """AdamW with PyTorch's default coefficients, as one operation for all parameters where PyTorch has it."""
+    """AdamW with PyTorch's default coefficients, fused where PyTorch supports it."""
     fused = agent.device.type in ("cpu", "cuda")
     return torch.optim.AdamW(agent.parameters(), lr=learning_rate, fused=fused)
 
@@ -48,8 +48,8 @@ def minibatch_loss(
         returns: Returns of all steps of the segment, float32 (T * N,).
         settings: Coefficients and clip range.
         entropy_coefficient: Weight of the entropy bonus in this update.
-        reference: The advantages by which those of the minibatch are normalised, if they are: those of its steps at all ranks,
-            float32 (steps,). `None` for the minibatch's own.
+        reference: Advantages whose mean and standard deviation normalise those of the minibatch, if `settings` asks for it: those
+            of the minibatch's steps on all ranks, float32 (steps,). `None` for this rank's own.
 
     Returns:
         The loss, a scalar with gradient; and scalars without gradient by name: the loss and its terms, the approximate KL
@@ -105,7 +105,7 @@ def learn(
         states: The memory state of each group of environments after the segment.
         update: Number of this update, counted from 0; learning rate and entropy coefficient decay with it.
         settings: Hyperparameters.
-        generator: Generator that shuffles the minibatches, on the CPU; in the same state at every rank.
+        generator: Generator that shuffles the minibatches, on the CPU; in the same state on every rank.
         ranks: The ranks of the run, each with a segment of its own environments; `None` for this process alone.
 
     Returns:
@@ -123,7 +123,7 @@ def learn(
         segment.reward, segment.value, segment.done, segment.last_value, settings.gamma, settings.gae_lambda
     )
     returns, flat = (own_advantages + segment.value).flatten(), segment.flat()
-    # A few numbers for each step, so that every rank knows those of all environments.
+    # Every rank gets these few numbers per step of all environments.
     reset_mask, values = ranks.columns(segment.reset_mask).cpu(), ranks.columns(segment.value).flatten()
     advantages = ranks.columns(own_advantages).flatten()
     own = ranks.share(reset_mask.shape[1])
@@ -163,13 +163,13 @@ def learn(
 
 
 def add_gradients(agent: Agent, ranks: Ranks, share: float) -> None:
-    """Add the gradients of all ranks, each of the mean loss of its `share` of a minibatch's steps."""
+    """Sum the gradients over all ranks, each weighted by the rank's `share` of the minibatch's steps."""
     if ranks.size == 1:
         return
     gradients = []
     for parameter in agent.parameters():
         if parameter.grad is None:
-            # This rank has no step of the minibatch.
+            # This rank has no steps in the minibatch.
             parameter.grad = torch.zeros_like(parameter)
         gradients.append(parameter.grad.mul_(share))
     ranks.add(gradients)

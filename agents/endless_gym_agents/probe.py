@@ -1,9 +1,8 @@
 """`endless-probe`: what a trained agent's memory contains of the ground truth.
 
 The frozen agent plays episodes of seeds that training never uses. A linear and a small nonlinear probe learn to predict
-`info["ground_truth"]` of a step from the output of the memory at that step, on some of the episodes; they are tested on the
-others. They are compared with the mean of the ground truth, and with the same probes of the encoded observation, which has no
-memory.
+`info["ground_truth"]` at a step from the memory's output at that step. They are trained on some of the episodes and tested on
+the others. The baselines are the mean of the ground truth, and the same probes on the encoded observation, which has no memory.
 
 ```console
 endless-probe runs/mine
@@ -44,9 +43,9 @@ class ProbeArguments:
     episodes: int = 100
     """number of episodes; four fifths train the probes, the others test them"""
     max_steps: int = 512
-    """steps of an episode that are recorded at most"""
+    """largest number of recorded steps per episode"""
     action_seed: int = 0
-    """seed of the action sampling, of the division of the episodes and of the probes"""
+    """seed of the action sampling, of the split into training and test episodes, and of the probes"""
     device: str = "auto"
     """`cpu`, `cuda`, `cuda:1`, ...; `auto` for CUDA if available, else the CPU"""
     threads: int = 0
@@ -84,7 +83,7 @@ class Score:
         baseline: Mean squared error of the mean of the training steps.
         explained: 1 minus error divided by baseline: 1 is perfect, 0 is the baseline. 0 if the column does not vary.
         accuracy: Share of the steps at which the closest of the column's values is the true one; None if it has more than 10.
-        majority: That share for the most frequent value of the training steps; None as for `accuracy`.
+        majority: The same share for always predicting the most frequent value of the training steps; None as for `accuracy`.
     """
 
     column: str
@@ -99,12 +98,12 @@ class Score:
 
 @torch.no_grad()
 def record(agent: Agent, seeds: Sequence[int], max_steps: int = 512, action_seed: int = 0) -> Recording:
-    """Play one episode of each seed, all in parallel, and record the agent's memory beside the ground truth.
+    """Play one episode of each seed, all in parallel, and record the agent's memory together with the ground truth.
 
     Args:
         agent: The agent; its settings name the environment. It is not changed.
         seeds: Seeds of the episodes.
-        max_steps: Steps of an episode that are recorded at most.
+        max_steps: Largest number of recorded steps per episode.
         action_seed: Seed of the generator that samples the actions.
 
     Raises:
@@ -136,7 +135,7 @@ def record(agent: Agent, seeds: Sequence[int], max_steps: int = 512, action_seed
             observation, _, terminated, truncated, info = envs.step(env_spec.batched_actions(action.cpu().numpy()))
             done = terminated | truncated
             memory.reset(done)
-            # After its first episode an environment continues with another one, which is ignored.
+            # Autoreset starts further episodes, which are ignored.
             running &= ~torch.from_numpy(done)
             if not running.any():
                 break
@@ -178,7 +177,7 @@ def probe(recording: Recording, columns: Sequence[str], seed: int = 0) -> list[S
     Args:
         recording: Steps of at least two episodes.
         columns: Names of the columns of the ground truth.
-        seed: Seed of the division of the episodes and of the probes.
+        seed: Seed of the split into training and test episodes, and of the probes.
 
     Raises:
         ValueError: There are fewer than two episodes.
@@ -187,7 +186,7 @@ def probe(recording: Recording, columns: Sequence[str], seed: int = 0) -> list[S
     if len(episodes) < 2:
         raise ValueError(f"a probe needs 2 or more episodes, to train and to test, got {len(episodes)}")
     order = episodes[torch.randperm(len(episodes), generator=torch.Generator().manual_seed(seed))]
-    # Whole episodes: the steps of one episode are alike.
+    # Split by whole episodes, since the steps of one episode are similar.
     test = torch.isin(recording.episode, order[: max(1, len(order) // 5)])
     truth, expected = recording.truth[~test], recording.truth[test]
     baseline = (expected - truth.mean(0)).square().mean(0)

@@ -150,7 +150,7 @@ def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment
 
 
 def table(experiment: Experiment) -> Table:
-    """A table with all metrics of the last checkpoint, and the metric of the paper of the earlier ones.
+    """A table with all metrics of the last checkpoint, and the paper's metric for the earlier ones.
 
     Final infos that count failures as successes are marked, and the caption says which metric to trust.
     """

@@ -1,6 +1,6 @@
-"""The processes of a data-parallel run, which `torchrun` starts: each collects and learns from its share of the environments.
+"""The processes of a data-parallel run, started by `torchrun`: each collects and learns from its share of the environments.
 
-N ranks compute what one process with all environments computes. Environments and action noise are numbered over all ranks; every
+N ranks compute the same as one process with all environments. Environments and action noise are numbered over all ranks; every
 rank divides the steps of all environments into the same minibatches and learns from its own part of each; gradients are summed,
 weighted by the number of steps.
 
@@ -24,7 +24,7 @@ from torch.distributed.rendezvous import rendezvous
 
 T = TypeVar("T")
 
-#: After this time without an answer from another rank, a rank gives up. A rank that has ended is noticed at once.
+#: Time after which a rank stops waiting for another rank. A rank that has ended is noticed at once.
 TIMEOUT = timedelta(minutes=10)
 
 
@@ -38,14 +38,14 @@ class Ranks:
     Attributes:
         rank: Number of this process, 0 to `size - 1`.
         size: Number of processes.
-        local_rank: Number of this process among those of this machine.
+        local_rank: Number of this process among those on this machine.
         local_size: Number of processes on this machine.
-        restarts: How often `torchrun` has started the run again.
+        restarts: How often `torchrun` has restarted the run.
     """
 
     def __init__(self) -> None:
         """Read the environment variables that `torchrun` sets."""
-        # Both are needed to find the other processes, so that a stray `RANK` of a cluster's scheduler does not count.
+        # Require both, so that a stray `RANK` from a cluster's scheduler is ignored.
         given = os.environ if "RANK" in os.environ and "MASTER_ADDR" in os.environ else {}
         self.rank, self.size = int(given.get("RANK", 0)), int(given.get("WORLD_SIZE", 1))
         self.local_rank, self.local_size = int(given.get("LOCAL_RANK", 0)), int(given.get("LOCAL_WORLD_SIZE", 1))
@@ -59,7 +59,7 @@ class Ranks:
 
     @contextmanager
     def connected(self) -> Iterator[None]:
-        """Connects the ranks: by NCCL for tensors on a CUDA device, by gloo for others.
+        """Connect the ranks, with NCCL for tensors on CUDA devices and gloo for others.
 
         Raises:
             RankLost: Another rank ended, or did not answer.
@@ -67,19 +67,19 @@ class Ranks:
         if self.size == 1:
             yield
             return
-        # Its functions have the process group of the time of the import as a default argument. If it were imported later (as
-        # torch._dynamo does, which optimizers import), it would keep the group and its threads until the interpreter ends.
+        # Functions in this module capture the current process group as a default argument at import. A later import (by
+        # torch._dynamo, which optimizers import) would keep the group and its threads alive until the interpreter exits.
         import torch.distributed.nn.functional
 
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
         with self._watched("could not be reached"):
             store, rank, size = next(rendezvous("env://", timeout=TIMEOUT))
-            # The store may be that of the run before a restart, with the addresses of processes that have ended.
+            # After a restart, the store may still contain the addresses of processes that have ended.
             store = PrefixStore(f"restart-{self.restarts}", store)
             distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
         with self._watched("has ended or does not answer"):
             yield
-            # After an error, other ranks may not answer any more.
+            # Not after an error: other ranks may no longer answer.
             distributed.destroy_process_group()
 
     @contextmanager
@@ -89,7 +89,7 @@ class Ranks:
         except distributed.DistError as error:
             raise RankLost(self._lost(what, error)) from error
         except RuntimeError as error:
-            # What gloo raises has no type of its own.
+            # gloo raises plain RuntimeErrors.
             if "gloo" in str(error) or "onnection" in str(error):
                 raise RankLost(self._lost(what, error)) from error
             raise
@@ -100,12 +100,12 @@ class Ranks:
 
     @property
     def threads(self) -> int | None:
-        """The threads for the environments of this rank, a share of the cores; `None` for the only rank: one per core."""
+        """Threads that step this rank's environments: its share of the cores; `None`, one per core, for a machine's only rank."""
         return None if self.local_size == 1 else max(1, len(self.cores))
 
     @property
     def cores(self) -> list[int]:
-        """The cores that are this rank's share of those that the process could use when it started."""
+        """The rank's share of the cores that the process could use when it started."""
         share = len(self._cores) // self.local_size
         return self._cores[self.local_rank * share :][:share]
 
@@ -132,15 +132,15 @@ class Ranks:
             )
 
     def share(self, total: int) -> range:
-        """The numbers that belong to this rank of `total` consecutive ones; `total` is a multiple of the number of ranks."""
+        """The rank's share of `total` consecutive numbers; `total` is a multiple of the number of ranks."""
         size = total // self.size
         return range(self.rank * size, (self.rank + 1) * size)
 
     def columns(self, tensor: Tensor) -> Tensor:
-        """The columns of all ranks side by side, (T, N), from this rank's, (T, n)."""
+        """Concatenate the columns of all ranks: (T, N), from this rank's (T, n)."""
         if self.size == 1:
             return tensor
-        # Not every backend knows booleans.
+        # Not every backend supports booleans.
         sent = tensor.byte() if tensor.dtype == torch.bool else tensor
         sent = sent.contiguous()
         parts = [torch.empty_like(sent) for _ in range(self.size)]
@@ -148,7 +148,7 @@ class Ranks:
         return torch.cat(parts, dim=1).to(tensor.dtype)
 
     def add(self, tensors: Iterable[Tensor]) -> None:
-        """Replace tensors by their sums over all ranks, in one operation. All ranks then have the same bytes."""
+        """Replace tensors by their sums over all ranks, in one operation. The results are bitwise equal on all ranks."""
         if self.size == 1:
             return
         tensors = list(tensors)
@@ -164,10 +164,10 @@ class Ranks:
                 distributed.broadcast(tensor, 0)
 
     def of_first(self, make: Callable[[], T]) -> T:
-        """What `make` returns at rank 0, where alone it is called. Its error there is an error everywhere.
+        """Call `make` on rank 0 only, and return its result on all ranks. Its error is raised on rank 0.
 
         Raises:
-            RankLost: There was an error at rank 0.
+            RankLost: On the other ranks: `make` failed on rank 0.
         """
         if self.size == 1:
             return make()
@@ -187,7 +187,7 @@ class Ranks:
         return value
 
     def gathered(self, value: Any) -> list[Any] | None:
-        """The values of all ranks at rank 0, with tensors on the CPU; `None` elsewhere."""
+        """The values of all ranks on rank 0, with tensors on the CPU; `None` on the others."""
         if self.size == 1:
             return [value]
         values = [None] * self.size if self.is_first else None
@@ -195,7 +195,7 @@ class Ranks:
         return values
 
     def everywhere(self, value: Any) -> list[Any]:
-        """The values of all ranks, at every rank."""
+        """The values of all ranks, on every rank."""
         if self.size == 1:
             return [value]
         values = [None] * self.size

@@ -1,4 +1,4 @@
-"""The connection to Ray, of a search and of the paper's experiments: started on this machine, or a cluster."""
+"""The connection to Ray, on this machine or a cluster, for a search or for the paper's experiments."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-#: Bytes of a local Ray's object store. What runs on Ray shares only a few numbers.
+#: Size of a local Ray's object store in bytes; small, since jobs share only a few numbers.
 _STORE = 100_000_000
-#: Ray's setting whether it kills what its processes have started when these end, as an environment variable.
+#: Environment variable that tells Ray whether to kill the children of its worker processes when the workers exit.
 _KILL_CHILDREN = "RAY_kill_child_processes_on_worker_exit"
 
 
 def check_installed(*names: str) -> None:
-    """Check that Ray, and the further packages with these names, can be imported.
+    """Check that Ray and the packages with these names are installed.
 
     Raises:
-        ValueError: One is not installed.
+        ValueError: One of them is not installed.
     """
     for name in ("ray", *names):
         if importlib.util.find_spec(name) is None:
@@ -28,7 +28,7 @@ def check_installed(*names: str) -> None:
 
 
 def with_address(arguments: Sequence[str]) -> list[str]:
-    """Command-line arguments in which `--ray` has an address, also if it was given without: `local`."""
+    """Command-line arguments in which `--ray` has an address: `local` if none was given."""
     given = list(arguments)
     if "--ray" in given:
         after = given.index("--ray") + 1
@@ -39,11 +39,11 @@ def with_address(arguments: Sequence[str]) -> list[str]:
 
 @contextmanager
 def connected(address: str, spare_children: bool = False) -> Iterator[None]:
-    """Connects this process to Ray, unless it is, and disconnects it. A local Ray ends then.
+    """Connect this process to Ray for the `with` block, unless it already is connected. A local Ray ends with the block.
 
     Args:
         address: `local` to start Ray on this machine, or the address of a cluster.
-        spare_children: Whether a local Ray lets processes live that its own have started, when these end.
+        spare_children: Whether the children of a local Ray's worker processes may outlive them.
 
     Raises:
         ValueError: There is no such cluster.
@@ -57,7 +57,7 @@ def connected(address: str, spare_children: bool = False) -> Iterator[None]:
     if address == "local":
         given |= {"include_dashboard": False, "object_store_memory": _STORE}
         if (quoted := shlex.quote(sys.executable)) != sys.executable:
-            # Ray starts its processes by a shell, to which it gives the interpreter's path without quotes.
+            # Ray starts its processes through a shell and does not quote the interpreter's path.
             given["runtime_env"] = {"py_executable": quoted}
         if spare_children:
             os.environ.setdefault(_KILL_CHILDREN, "0")
@@ -72,7 +72,7 @@ def connected(address: str, spare_children: bool = False) -> Iterator[None]:
 
 
 def gpus(wanted: float | None, device: str) -> float:
-    """The GPUs of each run: those that are wanted, or by default 1 if Ray has any and the device is not `cpu`."""
+    """GPUs per run: `wanted`, or by default 1 if Ray has any and the device is not `cpu`, else 0."""
     import ray
 
     if wanted is not None:

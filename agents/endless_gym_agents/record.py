@@ -37,7 +37,7 @@ class RecordArguments:
     episodes: int = 1000
     """number of episodes"""
     error_rates: tuple[float, ...] = (0.0,)
-    """probability that a step takes a random action instead of the agent's; the episodes take several in turn"""
+    """probability that a step takes a random action instead of the agent's; episodes cycle through several values"""
     seed: int = 0
     """episode i has the seed SEED + i"""
     action_seed: int = 0
@@ -51,7 +51,7 @@ class RecordArguments:
     root: Path | None = None
     """folder of the data sets; by default MINARI_DATASETS_PATH, or ~/.minari/datasets"""
     overwrite: bool = False
-    """replace a data set of that id"""
+    """replace an existing data set with that id"""
     author: str | None = None
     """author in the metadata"""
     threads: int = 0
@@ -63,7 +63,7 @@ class RecordArguments:
 
 
 class AgentPlayer:
-    """A trained agent. Its actions follow from the action seed and from the episodes that are played at the same time."""
+    """A trained agent. The action seed and the episodes played at the same time determine its actions."""
 
     def __init__(self, agent: Agent, action_seed: int = 0, greedy: bool = False) -> None:
         """Make the player.
@@ -81,7 +81,7 @@ class AgentPlayer:
         self.observation: ObservationName | None = agent.settings.environment.observation
 
     def actor(self, num_envs: int, first_episode: int) -> Actor:
-        """The agent in that number of environments, with a memory and a generator of its own."""
+        """The agent acting in `num_envs` environments, with a new memory and generator."""
         agent, memory = self._agent, self._agent.initial_memory(num_envs)
         state = np.random.SeedSequence([self._action_seed, first_episode]).generate_state(1, np.uint64)
         generator = torch.Generator(agent.device).manual_seed(int(state[0] >> 1))

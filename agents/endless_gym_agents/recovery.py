@@ -1,4 +1,4 @@
-"""An engine process that is replaced when it fails, so that a training run goes on as if nothing had happened."""
+"""An engine process that is replaced when it fails, so that training continues as if nothing had happened."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from endless_gym.vector import EndlessVectorEnv
 
 T = TypeVar("T")
 
-#: Number of engines that are started again without a completed update in between.
+#: Number of engine restarts without a completed update in between.
 MAX_RESTARTS = 3
 
 
 class RecoverableEngine:
-    """Vector environments in an engine process, and what is needed to bring other environments to the same state.
+    """Vector environments in an engine process, with the record needed to bring other environments to the same state.
 
-    The environments are deterministic: snapshots of a consistent point, followed by the actions sent since, give the same state
-    in a new engine. `mark` moves the point forward. The methods are those of `EndlessVectorEnv`; they return the same results
-    whether the engine fails or not.
+    Environments are deterministic: restoring the snapshots of a consistent point and replaying the actions sent since gives the
+    same state in a new engine. `mark` moves the point forward. The methods are those of `EndlessVectorEnv`; they return the same
+    results whether the engine fails or not.
 
     Attributes:
         report: Called with a line of text for each failure and each recovery.
-        failure: Reason for giving up the engine, after which the environments run in this process; None while there is one.
+        failure: Why the engine was given up, so that the environments now run in this process; None if it was not.
     """
 
     def __init__(
@@ -39,8 +39,8 @@ class RecoverableEngine:
         """Start the engine.
 
         Args:
-            policy: What to do when the engine fails. `restart`: start another one, and give it up after `MAX_RESTARTS` restarts
-                without a `mark`. `save`: give it up at once. `fail`: raise the error.
+            policy: What to do when the engine fails. `restart`: start another one; give up after `MAX_RESTARTS` restarts without
+                a `mark`. `save`: give up at once. `fail`: raise the error.
             serve: Starts an engine. The seeds of its environments must be given, so that each engine plays the same episodes.
             make: Makes the same environments in this process.
         """
@@ -49,8 +49,8 @@ class RecoverableEngine:
         self._policy, self._serve, self._make = policy, serve, make
         self._envs = serve()
         groups = range(self._envs.num_groups)
-        # For each group the snapshots of the point, None for the first reset; the actions since; and whether the last ones are
-        # without a result.
+        # For each group: the snapshots of the point (None for the first reset), the actions since, and whether the result of the
+        # last actions is pending.
         self._points: list[Mapping[int, bytes] | None] = [None for _ in groups]
         self._actions: list[list[NDArray[np.int64]]] = [[] for _ in groups]
         self._pending = [False for _ in groups]
@@ -83,7 +83,7 @@ class RecoverableEngine:
         return result
 
     def mark(self) -> None:
-        """Make the current state, with no result pending, the point from which another engine can go on."""
+        """Make the current state, with no result pending, the point from which another engine can continue."""
         points = [
             {env: self.snapshot(env, group) for env in range(self._envs.num_envs)} for group in range(len(self._points))
         ]
@@ -103,7 +103,7 @@ class RecoverableEngine:
                 self._recover("does not answer" if isinstance(error, TimeoutError) else "has ended")
 
     def _recover(self, reason: str) -> None:
-        """Replaces the engine."""
+        """Replace the engine."""
         while True:
             self._envs.close()
             self._restarts += 1
@@ -128,7 +128,7 @@ class RecoverableEngine:
                 reason = f"cannot be replaced ({error})"
 
     def _replay(self, envs: EndlessVectorEnv) -> None:
-        """Brings new environments to the state of the failed ones, and uses them from now on."""
+        """Bring new environments to the state of the failed ones, and use them from now on."""
         self._envs = envs
         for group, (point, log) in enumerate(zip(self._points, self._actions, strict=True)):
             envs.reset(group=group)

@@ -1,9 +1,9 @@
 """GRU and LSTM layers over packed sequences, for learning on the CPU.
 
 A minibatch often has few sequences with many steps. PyTorch's layers then spend most of the backward pass on the gradient of the
-recurrent weights, which they add up step by step in matrices of the size of the weights. Here it is one matrix product for all
-steps. All factors that do not depend on the gradients of later steps are also computed for all steps at once, so a step of the
-backward pass of a GRU has three operations. On CUDA, PyTorch's layers call cuDNN, which works in this way too.
+recurrent weights, which they accumulate step by step. Here it is one matrix product over all steps. All factors that do not
+depend on the gradients of later steps are also computed for all steps at once, so a step of a GRU's backward pass takes three
+operations. On CUDA, PyTorch's layers call cuDNN, which does the same.
 
 M is the number of steps of all sequences, S the number of sequences, H the hidden size. Steps are in the order of a
 `PackedSequence`: first step 0 of all sequences, then step 1 of the sequences that have one, and so on. Longer sequences come
@@ -46,7 +46,7 @@ class PackedGRU(torch.autograd.Function):
         reset_update, reset, update, candidate = (
             gates[:, part].split(sizes) for part in (both, slice(None, width), slice(width, 2 * width), last)
         )
-        # A product of few rows with a matrix that is not contiguous is slow.
+        # A product of few rows with a non-contiguous matrix is slow.
         transposed = weight.t().contiguous()
         rows, rows_projected, before = outputs.split(sizes), projected.split(sizes), []
         for t, size in enumerate(sizes):
@@ -67,7 +67,7 @@ class PackedGRU(torch.autograd.Function):
         gates, projected, before, weight = ctx.saved_tensors
         width = before.shape[1]
         reset, update, candidate = gates.unflatten(1, (3, width)).unbind(1)
-        # What the gradient of a hidden state is multiplied by, for the gradients before the activations.
+        # Factors from the gradient of a hidden state to the gradients before the activations.
         to_candidate = (1 - update) * (1 - candidate.square())
         factors = torch.stack(
             [
@@ -135,7 +135,7 @@ class PackedLSTM(torch.autograd.Function):
         """Gradients of inputs and weight."""
         gates, squashed, before, cells_before, weight = ctx.saved_tensors
         entry, forget, candidate, exit_ = gates.unflatten(1, (4, before.shape[1])).unbind(1)
-        # What the gradient of a cell state, and that of a hidden state, is multiplied by.
+        # Factors from the gradients of the cell state and of the hidden state to the gradients before the activations.
         factors = torch.stack(
             [candidate * entry * (1 - entry), cells_before * forget * (1 - forget), entry * (1 - candidate.square())],
             dim=1,
@@ -164,7 +164,7 @@ def packed_layers(x: Tensor, weights: Sequence[Sequence[Tensor]], hidden: Tensor
     Args:
         x: Inputs, float (M, inputs).
         weights: `weight_ih`, `weight_hh`, `bias_ih` and `bias_hh` of each layer, as in `all_weights` of PyTorch's layers.
-        hidden: States before the first steps, float (parts, layers, S, H). One part is a GRU, two are an LSTM: hidden state and
+        hidden: States before the first steps, float (parts, layers, S, H). A GRU has one part, an LSTM two: hidden state and
             cell state. They get no gradient.
         sizes: Number of sequences that have each step.
     """

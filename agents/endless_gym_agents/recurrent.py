@@ -2,8 +2,8 @@
 
 For learning, a segment is cut into sequences at the start of each episode and after every `sequence_length` steps. A sequence
 starts from the hidden state that was stored while acting (there is no burn-in), and gradients stop at its start. Sequences are
-packed (`PackedSequence`): no step is padded, and the number of sequential steps is the length of the longest sequence. On the CPU
-the layers of `recurrence` learn, and elsewhere those of PyTorch.
+packed (`PackedSequence`): there is no padding, and the number of sequential steps is the length of the longest sequence. Learning
+uses the layers of `recurrence` on the CPU, and PyTorch's elsewhere.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from endless_gym_agents.settings import Recurrence
 
 
 class RecurrentState(MemoryState):
-    """The hidden state, and the stored states that the sequences of the current segment start from.
+    """The hidden state, and the stored states from which the sequences of the current segment start.
 
     Attributes:
         hidden: float32 (parts, layers, n, hidden size). A GRU has one part, an LSTM two: hidden state and cell state.
@@ -77,7 +77,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
             device: Device of the states.
 
         Raises:
-            ValueError: A residual connection without embedding, with inputs that do not have the hidden size.
+            ValueError: A residual connection without embedding whose inputs do not have the hidden size.
         """
         super().__init__()
         self.settings = settings
@@ -193,7 +193,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         return y + x if self.settings.residual else y
 
     def _float32(self) -> contextlib.AbstractContextManager[Any]:
-        """Disables autocast, which would run cuDNN's recurrent layers in float16 where bfloat16 is requested."""
+        """Disable autocast, which would run cuDNN's recurrent layers in float16 where bfloat16 is requested."""
         if not torch.is_autocast_enabled(self.device.type):
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, enabled=False)

@@ -1,9 +1,9 @@
 """Equal frames are encoded once, which saves most of the encoder's work where observations repeat.
 
-In Mortar Mayhem and Mystery Path, an agent that stands still, or that returns to a place, sees the same frame again. The
-encoder and the layer after it have no memory, so equal frames have equal outputs: while acting, a frame is encoded where it
-occurs first in a segment; while learning, a minibatch encodes each of its different frames once (`Segment.distinct`), and the
-gradients of equal frames are added before the encoder.
+In Mortar Mayhem and Mystery Path, an agent that stands still or returns to a place sees the same frame again. The encoder and
+the layer after it have no memory, so equal frames have equal outputs. While acting, a frame is encoded at its first occurrence
+in a segment. While learning, a minibatch encodes each distinct frame once (`Segment.distinct`), and the gradients of equal
+frames are added before the encoder.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class EmbeddedFrames:
         return self._embeddings.index_select(0, self.first[indices.start : indices.stop])
 
     def _find(self, index: int) -> int:
-        """Note and return the index of the first frame with the same bytes as the frame `index`."""
+        """Record and return the index of the first frame with the same bytes as the frame `index`."""
         frame = self._bytes[index]
         first = self._by_hash.setdefault(hash(frame.tobytes()), index)
         if first != index and not np.array_equal(self._bytes[first], frame):

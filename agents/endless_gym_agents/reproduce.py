@@ -1,7 +1,7 @@
-"""`endless-reproduce`: repeat the experiments of the paper, with figures and tables beside the published ones.
+"""`endless-reproduce`: repeat the experiments of the paper, with figures and tables next to the published ones.
 
-Each run is an `endless-train` process with a folder of its own, which several experiments may share. Repeating the command skips
-what is done and resumes what was interrupted.
+Each run is an `endless-train` process with its own folder; several experiments may share a run. Repeating the command skips
+finished runs and resumes interrupted ones.
 
 ```console
 endless-reproduce --list                       # the experiments
@@ -45,9 +45,9 @@ class ReproduceArguments:
     dry_run: bool = False
     """print the commands that are left to run, and run nothing"""
     status: bool = False
-    """print what is done, what is left and how long it takes, and run nothing"""
+    """print what is done, what is left and the estimated remaining time, and run nothing"""
     report: bool = False
-    """write figures and tables of what is done, and run nothing"""
+    """write figures and tables of the finished runs, and run nothing"""
     out: Path = Path("reproduction")
     """folder of the runs, figures and tables"""
     scale: str = "1"
@@ -56,16 +56,16 @@ class ReproduceArguments:
     seeds: tuple[int, ...] = ()
     """seeds of the runs; by default 1 to the number that the paper uses, 5 for most"""
     jobs: int = 0
-    """runs side by side; 0 for one per GPU, or without GPUs one per core. With --ray for all machines; 0 for as many as the
-    resources permit"""
+    """runs at the same time; 0 for one per GPU, or without GPUs one per core. With --ray, on all machines together; 0 for as
+    many as the resources permit"""
     device: str = "auto"
     """`cpu`, `cuda`, ...; `auto` for CUDA if available, else the CPU. Each run sees one GPU"""
     nice: int = 19
     """added to the niceness of the runs, 0 to 19; 19 leaves the cores to all other processes"""
     keep_checkpoints: bool = False
-    """keep the checkpoints of evaluated runs, some gigabytes each, and not only the last one"""
+    """keep all checkpoints of evaluated runs, some gigabytes per run, instead of only the last"""
     ray: str = ""
-    """run on Ray. The flag alone starts Ray on this machine; with an address the runs are on that cluster, whose machines must
+    """run on Ray. The flag alone starts Ray on this machine; with an address, the runs are on that cluster, whose machines must
     share the folder --out"""
     job_cpus: int = 1
     """with --ray: CPU cores of a run"""
@@ -74,7 +74,7 @@ class ReproduceArguments:
 
 
 def listed(experiments: list[Experiment], scale: float) -> Table:
-    """A table of experiments at a scale; `runs` is the number of runs and of their seeds."""
+    """A table of experiments at a scale; the column `runs` shows the number of runs times the number of seeds."""
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     for name in ("name", "paper", "runs", "updates", "title"):
         right = name in ("runs", "updates")
@@ -89,7 +89,7 @@ def listed(experiments: list[Experiment], scale: float) -> Table:
 
 
 def machine_of(arguments: ReproduceArguments) -> running.Machine:
-    """What the runs are started on; with `--ray` the number of jobs is that of this machine until Ray is connected.
+    """The resources for the runs; with `--ray`, the number of jobs is that of this machine until Ray is connected.
 
     Raises:
         ValueError: A number is out of range.
@@ -101,7 +101,7 @@ def machine_of(arguments: ReproduceArguments) -> running.Machine:
     if arguments.job_gpus is not None and arguments.job_gpus < 0:
         raise ValueError(f"--job-gpus must be 0 or more, got {arguments.job_gpus}")
     here = running.machine(arguments.jobs, "cpu", arguments.nice)
-    # Ray gives each run its GPUs.
+    # Ray assigns GPUs to each run.
     return replace(here, device=arguments.device, gpus=(), job_cores=arguments.job_cpus)
 
 
@@ -121,15 +121,15 @@ def execute(arguments: ReproduceArguments) -> None:
         if arguments.json:
             print(json.dumps([planning.as_json(experiment, scale) for experiment in experiments], indent=1))
         else:
-            # Names and numbers are whole also where the terminal, or a pipe, is narrow.
+            # Do not truncate names and numbers in narrow terminals or pipes.
             Console(highlight=False, width=max(console.width, 120)).print(listed(experiments, scale))
         return
     machine, out = machine_of(arguments), arguments.out
     if arguments.ray:
         ray_session.check_installed()
-        out = out.resolve()  # The other processes have other working directories.
+        out = out.resolve()  # Ray's processes have other working directories.
     parts = {one.name: planning.jobs(one, out, scale, arguments.seeds) for one in experiments}
-    # Runs that several experiments share are run once.
+    # Runs shared by several experiments are run once.
     planned = list({job.folder: job for jobs in parts.values() for job in jobs}.values())
     planning.check_folders(planned)
     if arguments.dry_run:

@@ -114,7 +114,7 @@ class Experiments:
 
     def of(self, settings: Settings) -> Experiment:
         """The experiment of a run with these settings; created if it does not exist."""
-        # The engine and its threads do not affect learning, and runs of different lengths belong to one experiment.
+        # The engine and its threads do not affect learning, and runs of different lengths belong to the same experiment.
         environment = replace(settings.environment, engine="thread", num_threads=0)
         networks = (settings.recurrence, settings.transformer, settings.model)
         key = (settings.env, settings.agent, settings.bf16, environment, networks, replace(settings.ppo, updates=0))

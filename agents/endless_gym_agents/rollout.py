@@ -1,9 +1,9 @@
 """Collection of rollouts: segments of T steps in N environments.
 
-The environments are divided into groups. While the agent computes the actions of one group, the other groups are stepped. A
-segment continues the episodes of the previous one.
+The environments are divided into groups. While the agent computes the actions of one group, the other groups step. A segment
+continues the episodes of the previous one.
 
-Only what the actions need is computed between an observation and the actions: the observation is copied to its place in the
+Between an observation and the actions, only what the actions need is computed: the observation is copied to its place in the
 segment, the network reads it there, and the copy of the actions is the only operation that waits for the device. The memory is
 updated while the environments step; log-probabilities and values are computed from the stored outputs at the end of the segment.
 """
@@ -42,7 +42,7 @@ class Segment:
         done: Whether the step ended its episode, bool (T, N).
         ground_truth: Ground truth of the observation, float32 (T, N, entries); None if the agent does not estimate it.
         last_value: Bootstrap value: the value estimate of the observation after the last step, float32 (N,).
-        first_occurrence: Index t * N + n of the first step with an equal observation, int64 (T, N); None if it is not known.
+        first_occurrence: Index t * N + n of the first step with an equal observation, int64 (T, N); None if unknown.
     """
 
     observation: Observation
@@ -68,13 +68,13 @@ class Segment:
         return replace(self, **parts)
 
     def distinct(self, indices: Tensor) -> tuple[Observation, Tensor | None]:
-        """The observations of steps of a flattened segment; equal ones once, if it is known which are equal.
+        """The observations of steps of a flattened segment; equal ones only once if `first_occurrence` is known.
 
         Args:
             indices: Indices of M steps, int64 (M,).
 
         Returns:
-            The observations, (rows, ...) each, and the row of each step, int64 (M,); `None` if each step has a row of its own.
+            The observations, (rows, ...) each, and the row of each step, int64 (M,), or `None` if row i belongs to step i.
         """
         rows = None
         if self.first_occurrence is not None:
@@ -84,13 +84,13 @@ class Segment:
 
 @dataclass
 class Columns:
-    """The part of a segment that belongs to one group of n environments: for each step a view of the tensors.
+    """The part of a segment that belongs to one group of n environments, as views of the tensors for each step.
 
     Attributes:
         observation: Transformed observations by key.
         action: int64 (n, branches).
         outputs: Logits and value, float32 (n, outputs).
-        outcome: Rewards and ends of episodes, float32 (2, n); before each step, and after the last.
+        outcome: Rewards and ends of episodes, float32 (2, n), before each step and after the last.
         ground_truth: float32 (n, entries); empty if the agent does not estimate it.
     """
 
@@ -123,7 +123,7 @@ class RolloutCollector:
             agent: The agent that acts.
             environments: The environments.
             steps: Steps of a segment.
-            generator: Generator that samples the actions, on the agent's device; in the same state at every rank.
+            generator: Generator that samples the actions, on the agent's device; in the same state on every rank.
             ranks: The ranks of the run; `None` for this process alone.
         """
         self.agent, self.environments, self.steps, self.generator = agent, environments, steps, generator
@@ -147,7 +147,7 @@ class RolloutCollector:
             self._ground_truth = torch.zeros((*shape, environments.spec.ground_truth), device=device)
         are_frames = list(agent.observation_shapes) == [FRAME] and isinstance(agent.transform, Identity)
         self._frames: EmbeddedFrames | None = None
-        # `torch.compile` would compile the encoder again for each number of frames.
+        # `torch.compile` would recompile the encoder for each number of frames.
         if are_frames and device.type == "cpu" and not agent.settings.compile:
             self._frames = EmbeddedFrames(self._observation[FRAME].flatten(0, 1))
         self._parts = [self._columns(self._slice(group)) for group in range(groups)]
@@ -167,7 +167,7 @@ class RolloutCollector:
         self.agent.refresh()
         if self._frames is not None:
             self._frames.clear()
-        # Drawn for the environments of all ranks, so that actions do not depend on how these are divided.
+        # Drawn for the environments of all ranks, so that actions do not depend on the number of ranks.
         noise = self.agent.noise((self.steps, self._envs_everywhere), self.generator)
         noise = noise[:, self._own.start : self._own.stop]
         for group, memory in enumerate(self.memories):
@@ -202,7 +202,7 @@ class RolloutCollector:
             memory.load_state_dict(memory_state)
 
     def start_episodes(self, environments: list[list[list[bytes]]]) -> None:
-        """Start episodes after those of another number of ranks.
+        """Start new episodes after resuming a run that had a different number of ranks.
 
         Args:
             environments: The snapshots of each rank, by group.
@@ -219,7 +219,7 @@ class RolloutCollector:
         with clock.measure("inference"):
             slots, update = part.observation[step], TransformState()
             if isinstance(agent.transform, Identity):
-                # Straight into the segment, where the network reads it.
+                # Copy straight into the segment, where the network reads it.
                 for key, value in agent.as_mapping(current.observation).items():
                     self._uploads[group].copy(key, value, slots[key])
                 observed = slots
@@ -243,7 +243,7 @@ class RolloutCollector:
                 self._uploads[group].copy("ground truth", current.ground_truth, part.ground_truth[step])
 
     def _embedded(self, group: int, step: int) -> Tensor | None:
-        """What `Agent.embed` returns for an observation in the segment; None if equal observations are not encoded once."""
+        """What `Agent.embed` returns for an observation in the segment; None without the cache of equal frames."""
         if self._frames is None:
             return None
         columns = self._slice(group)
@@ -255,7 +255,7 @@ class RolloutCollector:
         result = self.environments.receive(group)
         self.current[group] = result
         outcome = self._parts[group].outcome[step + 1]
-        # In one copy.
+        # One copy for both.
         self._uploads[group].copy("outcome", np.array([result.reward, result.done], np.float32), outcome)
         memory = self.memories[group]
         memory.reset_mask = outcome[1].bool() if result.done.any() else memory.no_reset
@@ -263,7 +263,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def _segment(self) -> Segment:
-        """The collected segment, with what is computed from the outputs of all its steps."""
+        """The collected segment, with the log-probabilities and values from the outputs of all its steps."""
         ends = self._outcome[:, 1].bool()
         return Segment(
             observation=self._observation,

@@ -49,7 +49,7 @@ def run_trial(trial: Trial, settings: Settings) -> None:
     def watch(update: int, means: Mapping[str, Any]) -> bool:
         nonlocal done
         done = update
-        # The worker of a search that was killed stops as if it had been interrupted.
+        # If the search itself was killed, its worker stops as if interrupted.
         return trial.observe(update, means.get("episode/reward")) or not (parent is None or parent.is_alive())
 
     try:
@@ -70,12 +70,12 @@ def run_trial(trial: Trial, settings: Settings) -> None:
 
 
 def run_trials(trials: Trials, threads: int | None = None) -> None:
-    """Run trials in this process, one after the other, until none is left to begin.
+    """Run trials in this process, one after the other, until none is left.
 
     Args:
         trials: The trials.
-        threads: Threads of the agent and of the environments where the settings choose none. Several processes then run trials,
-            and the output of each goes to its log; None for one process.
+        threads: Threads of the agent and of the environments where the settings choose none, if several processes run trials;
+            the output of each trial then goes to its log. None for one process.
     """
     while (trial := trials.begin()) is not None:
         if threads is None:
@@ -86,7 +86,7 @@ def run_trials(trials: Trials, threads: int | None = None) -> None:
 
 
 def execute(arguments: SearchArguments) -> None:
-    """Run the search, and report the best settings so far, also if it is interrupted."""
+    """Run the search, and report the best settings so far, even if it is interrupted."""
     arguments = arguments.validated()
     if arguments.ray:
         # Tune imports pyarrow, which Ray alone does not install.

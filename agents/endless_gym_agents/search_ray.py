@@ -1,7 +1,7 @@
 """A hyperparameter search whose trials run on Ray Tune, on this machine or on a cluster.
 
-Tune starts the trials, and starts them again after failures. The study decides which trials there are and which are pruned, in
-the process of the search, as it does without Ray. The same search can therefore be continued with Ray or without.
+Tune starts the trials, and restarts them after failures. As without Ray, the study, in the process of the search, chooses the
+trials and decides which are pruned. A search can therefore be continued with or without Ray.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TUNE = "tune"
 
 
 def run_on_ray(trials: Trials, trainer: Trainer) -> None:
-    """Run trials on Ray Tune until none is left to begin.
+    """Run trials on Ray Tune until none is left.
 
     Args:
         trials: The trials; `arguments.ray` is `local` or the address of a cluster.
@@ -38,18 +38,18 @@ def run_on_ray(trials: Trials, trainer: Trainer) -> None:
         ValueError: There is no such cluster, or a trial failed too often.
     """
     arguments = trials.arguments
-    # The runs log for themselves. Tune would take Ctrl-C for the end of the search.
+    # The runs write their own logs, and Tune would treat Ctrl-C as the end of the search.
     quiet = {"TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1", "TUNE_DISABLE_SIGINT_HANDLER": "1", "RAY_AIR_NEW_OUTPUT": "0"}
     for name, value in quiet.items():
         os.environ.setdefault(name, value)
     study = _Study(trials)
     try:
-        # Ray would kill the engine together with its trainer. Nobody would remove their shared memory then, which the engine
-        # does when its trainer has ended, before it ends itself.
+        # Otherwise Ray would kill the engine together with its trainer. The engine must outlive the trainer to remove their
+        # shared memory.
         with ray_session.connected(arguments.ray, spare_children=True):
             _tune(study, trainer, ray_session.gpus(arguments.trial_gpus, arguments.settings.device))
     finally:
-        # Only now, since another process may begin the trials from here on.
+        # Only after Ray has stopped, since another process may begin the trials from here on.
         study.interrupt()
     if study.failed:
         numbers = ", ".join(map(str, study.failed))
@@ -66,7 +66,7 @@ def _tune(study: _Study, trainer: Trainer, gpus: float) -> None:
     from ray.tune.search import Searcher
 
     class Proposals(Searcher):  # type: ignore[misc]
-        """Gives Tune the trials of the study, and tells the study how they end."""
+        """Passes the study's trials to Tune, and tells the study how they end."""
 
         def suggest(self, trial_id: str) -> Any:
             return study.begin(trial_id) or Searcher.FINISHED
@@ -75,10 +75,10 @@ def _tune(study: _Study, trainer: Trainer, gpus: float) -> None:
             study.end(trial_id, error)
 
         def save(self, checkpoint_path: str) -> None:
-            """Nothing: the study is stored."""
+            """Do nothing: the study is already stored."""
 
         def restore(self, checkpoint_path: str) -> None:
-            """Nothing: the study is stored."""
+            """Do nothing: the study is already stored."""
 
     class Pruning(FIFOScheduler):  # type: ignore[misc]
         """Stops the trials that the study prunes."""
@@ -107,7 +107,7 @@ def _tune(study: _Study, trainer: Trainer, gpus: float) -> None:
 
 
 def _trainable(trainer: Trainer, period: int, cpus: int) -> Callable[[dict[str, Any]], None]:
-    """The function that a process of Ray calls to train a trial, and calls again in another process after a failure."""
+    """The function that a Ray process calls to train a trial; after a failure, another process calls it again."""
 
     def run(config: dict[str, Any]) -> None:
         from ray import tune
@@ -118,7 +118,7 @@ def _trainable(trainer: Trainer, period: int, cpus: int) -> Callable[[dict[str, 
         def watch(update: int, means: Mapping[str, Any]) -> bool:
             nonlocal reward, done
             done, reward = update, means.get("episode/reward", reward)
-            # Each report waits until the search has read the one before.
+            # Each report waits until the search has read the previous one.
             if update % period == 0 and reward is not None and update < last:
                 tune.report({"update": update, "reward": reward})
             return False
@@ -143,7 +143,7 @@ class _Study:
 
     Attributes:
         trials: The trials of the search.
-        failed: Numbers of the trials that failed more often than they are resumed.
+        failed: Numbers of the trials that exceeded the limit of failures.
     """
 
     def __init__(self, trials: Trials) -> None:
@@ -153,21 +153,21 @@ class _Study:
         self._ended: dict[str, str] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tune pickles what it is given, to restore a search from its own files. This one is restored from the study.
+        # Tune pickles its arguments to restore a search from its own files; this search is restored from the study instead.
         return {}
 
     def begin(self, tune_id: str) -> dict[str, Any] | None:
-        """The configuration of the next trial; None if none is left to begin."""
+        """The configuration of the next trial; None if none is left."""
         trial = self.trials.begin()
         if trial is None:
             return None
         self._active[tune_id] = trial
         settings = to_dict(trial.settings)
-        # The other processes have other working directories.
+        # Ray's processes have other working directories.
         return {"settings": settings | {"run": str(Path(trial.settings.run).resolve())}}
 
     def observe(self, tune_id: str, result: Mapping[str, Any]) -> bool:
-        """Note a result; returns whether the trial is to be pruned."""
+        """Record a result, and return whether the trial should be pruned."""
         if "end" in result:
             self._ended[tune_id] = result["end"]
         return self._active[tune_id].observe(result["update"], result["reward"])
@@ -186,7 +186,7 @@ class _Study:
             trial.interrupt()
 
     def interrupt(self) -> None:
-        """The trials that are still active were interrupted."""
+        """Mark the trials that are still active as interrupted."""
         for trial in self._active.values():
             trial.interrupt()
         self._active.clear()

@@ -1,7 +1,7 @@
 """The search space of the paper's hyperparameter search, from its table.
 
-A parameter has the name of its flag of `endless-train`, with underscores. Its first choice is the value that the search starts
-from; the other values of the table follow.
+A parameter has the name of its flag of `endless-train`, with underscores. Its first choice is the value from which the search
+starts; the table's other values follow.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def space(base: Settings, only: Sequence[str] = ()) -> Space:
     """The search space for given settings.
 
     Args:
-        base: Settings that the search starts from; the agent determines which parameters exist.
+        base: Initial settings of the search; the agent determines which parameters exist.
         only: Names of the parameters to include; empty for all.
 
     Raises:
@@ -73,7 +73,7 @@ def space(base: Settings, only: Sequence[str] = ()) -> Space:
 
 
 def with_choices(settings: Settings, choices: Mapping[str, Choice]) -> Settings:
-    """The settings with the given values of parameters."""
+    """The settings with parameters set to the given values."""
     for name, choice in choices.items():
         group, _, entry = name.rpartition(".")
         changed: dict[str, Any] = {entry: choice}

@@ -1,8 +1,8 @@
 """The trials of a hyperparameter search, in an Optuna study that several processes may share.
 
-The process of a running trial holds a lock on a file of the search's folder. The system releases the lock when the process ends
-for any reason, so that other processes find the trials of dead processes and resume them from their checkpoints. The next trial
-is chosen under the lock of the study.
+The process that runs a trial holds a lock on a file in the search's folder. The operating system releases the lock when the
+process ends for any reason, so other processes can find the trials of dead processes and resume them from their checkpoints.
+The next trial is chosen under the study's lock.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from endless_gym_agents.train import choose_device
 
 #: Files in the folder of a search: the Optuna study, the best settings, and the folder of the locks.
 STUDY, BEST, LOCKS = "study.db", "best.json", "locks"
-#: Seconds that a process waits for another one's write to the study.
+#: Seconds that a process waits for another process to finish writing to the study.
 _WRITE_TIMEOUT = 60.0
 #: User attributes of a trial: index of its single change, number of the trial that it resumes, folder of the run, and whether it
-#: failed in a way that would repeat itself.
+#: failed in a way that would recur.
 _SINGLE, _RESUMES, _FOLDER, _FAILED = "single", "goes_on", "folder", "failed"
 
 
@@ -65,15 +65,15 @@ class SearchArguments:
     period: int = 50
     """updates between two pruning decisions"""
     minutes: float = 0.0
-    """start no more trials after this time, nor replace workers; 0 for no limit"""
+    """minutes after which no more trials start and no workers are replaced; 0 for no limit"""
     workers: int = 0
-    """trials that run at a time on this machine, each in a process of its own; 0 for one, in this process. With --ray the limit
-    for all machines; 0 for as many as the resources permit"""
+    """trials that run at the same time on this machine, each in its own process; 0 for one, in this process. With --ray, the
+    limit for all machines together; 0 for as many as the resources permit"""
     max_failures: int = 3
-    """largest number of killed workers that the search replaces; with --ray, of times that it resumes a failed trial. A trial
-    that failed more often is resumed when the command is repeated"""
+    """largest number of killed workers that the search replaces; with --ray, largest number of times that it resumes a failed
+    trial. A trial that failed more often is resumed when the command is repeated"""
     ray: str = ""
-    """run the trials on Ray Tune. The flag alone starts Ray on this machine; with an address the trials run on that cluster,
+    """run the trials on Ray Tune. The flag alone starts Ray on this machine; with an address, the trials run on that cluster,
     whose machines must share the folder of the search"""
     trial_cpus: int = 1
     """with --ray: CPU cores of a trial"""
@@ -114,16 +114,16 @@ class SearchArguments:
 
 @dataclass
 class Trial:
-    """A trial that this process has begun, with the lock that says so.
+    """A trial that this process has begun, with its lock.
 
     Attributes:
         trials: The trials of the search.
         asked: The `optuna.Trial`.
         settings: Settings of its run, validated.
         lock: The locked file of the trial.
-        reward: The last reward that was observed; None before the first episode has ended.
-        pruned: Whether it is to be pruned.
-        reported: The last update that was reported.
+        reward: The last observed reward; None before the first episode has ended.
+        pruned: Whether the trial should be pruned.
+        reported: The last reported update.
     """
 
     trials: Trials
@@ -140,14 +140,14 @@ class Trial:
         return int(self.asked.number)
 
     def observe(self, update: int, reward: float | None) -> bool:
-        """Note the mean reward at an update.
+        """Record the mean reward at an update.
 
         Args:
-            update: Number of the update. One that a resumed trial repeats is not reported again.
+            update: Number of the update. Updates that a resumed trial repeats are not reported again.
             reward: Mean reward of the last 100 episodes; None if no episode has ended.
 
         Returns:
-            Whether the trial is to be pruned.
+            Whether the trial should be pruned.
         """
         self.reward = self.reward if reward is None else reward
         is_due = update % self.trials.arguments.period == 0 and self.reported < update < self.settings.ppo.updates
@@ -158,7 +158,7 @@ class Trial:
         return self.pruned
 
     def complete(self) -> None:
-        """The run is done, or pruned: tell the study."""
+        """Tell the study that the run is done or pruned."""
         if self.pruned:
             self.trials.say(f"trial {self.number} is pruned")
         elif self.reward is None:
@@ -167,17 +167,19 @@ class Trial:
         self._tell("COMPLETE" if done else "PRUNED", self.reward if done else None)
 
     def interrupt(self) -> None:
-        """The run was interrupted: another trial resumes it."""
+        """Tell the study that the run was interrupted; another trial resumes it."""
         self._tell("FAIL")
 
     def postpone(self, reason: str) -> None:
-        """The run failed: another trial resumes it, but not in this call of the search, in which it would fail again."""
+        """Tell the study that the run failed. Another trial resumes it in a later call of the search; in this one it would fail
+        again.
+        """
         self.trials.say(f"trial {self.number} {reason}")
         self.trials.postponed.add(self.number)
         self._tell("FAIL")
 
     def fail(self, reason: str) -> None:
-        """The run failed in a way that would repeat itself: it is never resumed."""
+        """Tell the study that the run failed in a way that would recur; it is never resumed."""
         self.trials.say(f"trial {self.number} {reason}")
         self.asked.set_user_attr(_FAILED, True)
         self._tell("FAIL")
@@ -185,22 +187,22 @@ class Trial:
     def _tell(self, state: str, value: float | None = None) -> None:
         from optuna.trial import TrialState
 
-        # The state first: a running trial without a lock has been left by its process.
+        # Set the state before releasing the lock: a running trial without a lock counts as abandoned.
         self.trials.study.tell(self.number, value, state=TrialState[state])
         Path(self.lock.name).unlink(missing_ok=True)
         self.lock.close()
 
 
 class Trials:
-    """The trials of a search, stored in an Optuna study. Several processes may have the same.
+    """The trials of a search, stored in an Optuna study that several processes may share.
 
     Attributes:
         arguments: The arguments.
         folder: Folder of the search.
         space: The search space.
         study: The Optuna study.
-        end: When no more trials are begun, in the time of `time.monotonic`; infinity for no limit.
-        postponed: Numbers of the trials that failed and that only a later call of the search resumes.
+        end: Time after which no more trials begin, on the clock `time.monotonic`; infinity for no limit.
+        postponed: Numbers of the failed trials that only a later call of the search resumes.
     """
 
     def __init__(self, arguments: SearchArguments, console: Console, end: float | None = None) -> None:
@@ -257,7 +259,7 @@ class Trials:
         """Begin the next trial: one that was interrupted, a single change, or a combination.
 
         Returns:
-            The trial; None if none is left to begin, or the time is over.
+            The trial; None if none is left or the time is up.
         """
         import optuna
 
@@ -266,8 +268,8 @@ class Trials:
         with self._locked():
             self._enqueue()
             while self._left():
-                # Every trial has a seed of its own: processes must not propose the same, and a restarted search must not repeat
-                # the samples of its first part.
+                # A different seed for each trial: processes must not propose the same, and a restarted search must not repeat its
+                # earlier samples.
                 seed = self.arguments.settings.seed + len(self.study.trials)
                 self.study.sampler = optuna.samplers.TPESampler(seed=seed)
                 asked = self.study.ask()
@@ -292,13 +294,13 @@ class Trials:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        """Holds the lock of the study."""
+        """Hold the lock of the study."""
         with (self.folder / LOCKS / "study").open("w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
     def _lock_of(self, number: int) -> IO[str] | None:
-        """The locked file of a trial; None if another process has locked it. Only with the lock of the study."""
+        """The locked file of a trial; None if another process has locked it. The caller must hold the lock of the study."""
         file = (self.folder / LOCKS / f"trial-{number:04d}").open("w")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -372,11 +374,11 @@ class Trials:
     def report(self) -> None:
         """Write the best settings and all trials to `best.json`, and print the ten best; does nothing if no trial is complete.
 
-        The file is replaced as a whole: readers find all of the old one or all of the new one.
+        The file is replaced atomically.
         """
         from optuna.trial import TrialState
 
-        with self._locked():  # Another process of the search writes the same files.
+        with self._locked():  # Other processes of the search write the same files.
             done = self.study.get_trials(states=(TrialState.COMPLETE,))
             done.sort(key=lambda trial: -(trial.value or 0.0))
             pruned = len(self.study.get_trials(states=(TrialState.PRUNED,)))
@@ -407,11 +409,11 @@ class Trials:
 
 
 def resumable(settings: Settings) -> tuple[Settings, list[dict[str, Any]]]:
-    """The settings with which a trial's run is resumed or begun.
+    """The settings with which a trial's run is resumed or started.
 
     Args:
-        settings: Settings of the run, with its folder. A folder without a checkpoint, of a run that was interrupted before its
-            first, is removed.
+        settings: Settings of the run, with its folder. The folder is removed if the run was interrupted before its first
+            checkpoint.
 
     Returns:
         The settings, and the rows of `progress.jsonl` so far.

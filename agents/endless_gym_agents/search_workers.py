@@ -27,7 +27,7 @@ Work = Callable[[Trials, int | None], None]
 
 
 def with_threads(settings: Settings, threads: int) -> Settings:
-    """The settings with these threads of the agent, and as many that step the environments, where they choose none."""
+    """The settings with this number of threads for the agent and for the environments, where they choose none."""
     environment = settings.environment
     environment = dataclasses.replace(environment, num_threads=environment.num_threads or threads)
     return dataclasses.replace(settings, threads=settings.threads or threads, environment=environment)
@@ -35,9 +35,9 @@ def with_threads(settings: Settings, threads: int) -> Settings:
 
 @contextlib.contextmanager
 def output_of(settings: Settings) -> Iterator[None]:
-    """Context in which what is printed, and the traceback of an error, go to a log beside the folder of a run.
+    """Redirect printed output and the traceback of an error to a log next to the folder of a run.
 
-    Several runs print at a time, and Ray shows no output of its processes.
+    Several runs may print at the same time, and Ray does not show the output of its processes.
     """
     with open(f"{settings.run}.log", "a") as log, contextlib.redirect_stdout(log):
         try:
@@ -69,7 +69,7 @@ def run_workers(trials: Trials, work: Work) -> None:
         )
         process.start()
         alive[slot] = process
-        if stopped:  # while it was being started, so that `stop` did not know it
+        if stopped:  # while the process was starting, so `stop` did not signal it
             os.kill(alive[slot].pid, signal.SIGINT)
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -112,8 +112,8 @@ def run_workers(trials: Trials, work: Work) -> None:
 
 
 def _worker(arguments: SearchArguments, end: float, machine: running.Machine, slot: int, work: Work) -> None:
-    """The main function of a worker; `end` is that of the search, whose clock is that of all processes of the machine."""
-    # The terminal's Ctrl-C reaches the search alone, which passes it on.
+    """The main function of a worker; `end` is `Trials.end` of the search, on a clock that all processes of a machine share."""
+    # Ctrl-C in the terminal reaches only the search, which forwards it.
     os.setsid()
     if machine.gpus and arguments.settings.device in ("auto", "cuda"):
         os.environ["CUDA_VISIBLE_DEVICES"] = machine.gpus[slot % len(machine.gpus)]

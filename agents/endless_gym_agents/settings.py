@@ -1,7 +1,7 @@
 """The settings of a training run, and their presets.
 
 Every field is a command-line flag of `endless-train`. `--preset` selects the defaults, which the other flags override. Names
-follow the hyperparameter table of the paper where it has one.
+follow the hyperparameter table of the paper where possible.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TRAINING_SEEDS = range(100_000)
 #: Environment steps of one update in the paper: 32 environments, 512 steps each.
 PAPER_STEPS_PER_UPDATE = 32 * 512
 
-#: The least value of settings that are numbers.
+#: Numeric settings by their smallest allowed value.
 _LEAST = {
     1: (
         *("environment.num-envs", "environment.groups"),
@@ -40,7 +40,7 @@ _LEAST = {
 
 
 def paper_run_length(env: str, agent: str) -> int:
-    """Updates of the paper's runs, as its published curves have them; for what it does not train, those of the closest.
+    """Updates of the paper's runs, according to its published curves; for runs that it does not have, those of the closest one.
 
     Args:
         env: Canonical environment id.
@@ -66,10 +66,10 @@ class Environment:
     observation: Literal["rgb", "features"] = "rgb"
     """`rgb`: frames, as in the paper. `features`: a short vector that describes the frame, for fast training without a GPU"""
     num_envs: int = 32
-    """number of environments, in all groups and at all ranks of a data-parallel run; the number of workers in the paper"""
+    """total number of environments in all groups and on all ranks of a data-parallel run; the number of workers in the paper"""
     groups: int = 1
-    """groups of environments. With two, an engine process steps one group while the agent computes the actions of the other; that
-    pays only where a step takes about as long as the actions"""
+    """groups of environments. With two, an engine process steps one group while the agent computes the actions for the other;
+    this pays off only if a step takes about as long as computing the actions"""
     engine: Literal["thread", "process"] = "thread"
     """`thread`: environments in this process. `process`: in an engine process, over shared memory"""
     num_threads: int = 0
@@ -113,19 +113,19 @@ class Transformer:
     query_encoding: bool = False
     """add the absolute or learned encoding to the queries as well"""
     query_previous: bool = False
-    """make the first block's input from the embedding and the last block's input at the previous step, without
-    gradient, by a layer with ReLU"""
+    """compute the first block's input with a ReLU layer from the embedding and the last block's input at the previous step,
+    without gradient"""
     shared_heads: bool = True
     """share the query, key and value projections among the heads of a block, as in the experiments of the paper"""
     gating: bool = False
     """GRU-type gates of GTrXL in place of the residual connections; set by the agent `gtrxl`"""
     gate_bias: float = 0.0
-    """initial bias of the gates; the larger, the closer a block is to the identity at the start. The paper uses 0 and 2"""
+    """initial bias of the gates; with a larger one, blocks start closer to the identity. The paper uses 0 and 2"""
     initialisation: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """weight initialisation of the blocks"""
     sequence_length: int = 1
-    """number of consecutive steps that are shuffled together into minibatches. 1, as in the paper: single steps. With longer
-    sequences learning is faster and needs less memory, but the gradients of long episodes have more noise"""
+    """number of consecutive steps that are shuffled together into minibatches. 1, as in the paper: single steps. Longer
+    sequences make learning faster and need less memory, but the gradients of long episodes are noisier"""
 
 
 @dataclass(frozen=True)
@@ -150,8 +150,8 @@ class PPO:
     """Proximal policy optimisation and loss coefficients."""
 
     updates: int = 0
-    """number of updates of the run; one update uses `num_envs * steps` environment steps. 0 for as many environment steps as in
-    the paper: 50,000 of its updates in endless environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and
+    """number of updates of the run; one update uses `num_envs * steps` environment steps. 0 for as many environment steps as the
+    paper's runs: 50,000 of its updates in endless environments, 30,000 in MortarMayhem, 25,000 or fewer in MysteryPath and
     SearingSpotlights, 10,000 in the grids"""
     decay_updates: int = 10_000
     """updates over which learning rate and entropy coefficient decay linearly to their final values"""
@@ -199,9 +199,9 @@ class Settings:
     frames) or position (encoded step number as an observation)"""
     preset: PresetName = "paper"
     """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
-    throughput: many environments and short rollouts, with gradients through 32 steps where the paper's go through 512;
+    throughput: many environments and short rollouts, with gradients through 32 steps instead of the paper's 512;
     throughput-512: many environments with the paper's 512 steps;
-    quick: small networks and feature observations, minutes on two CPU cores, and a stop when the task is learnt"""
+    quick: small networks and feature observations; takes minutes on two CPU cores, and stops when the task is learnt"""
     seed: int = 1
     """seed of the initial weights, the episode seeds and all sampling"""
     device: str = "auto"
@@ -211,7 +211,7 @@ class Settings:
     bind_cores: bool = False
     """bind each rank of a data-parallel run, with its environments, to its share of the machine's cores"""
     compile: bool = False
-    """compile the network with `torch.compile`, on CUDA in the mode `reduce-overhead`, which replays CUDA graphs. The first
+    """compile the network with `torch.compile`; on CUDA in the mode `reduce-overhead`, which replays CUDA graphs. The first
     updates then take minutes longer"""
     bf16: bool = False
     """bfloat16 autocast for the network; weights and losses stay float32"""
@@ -222,7 +222,7 @@ class Settings:
     checkpoint_interval: int = 100
     """updates between two checkpoints; the last update always writes a checkpoint"""
     keep_checkpoints: bool = False
-    """keep all checkpoints, for evaluation, instead of the last one only"""
+    """keep all checkpoints, for evaluation, instead of only the last"""
     on_engine_failure: Literal["restart", "save", "fail"] = "restart"
     """what to do when the engine process ends or does not answer. restart: start another one, which continues exactly; after
     three restarts without a completed update, as `save`. save: complete the update in this process, write a checkpoint and stop.
@@ -325,7 +325,7 @@ class Settings:
         return self.transformer.window or max(2, self._longest_episode() or 256)
 
     def _longest_episode(self) -> int:
-        """Longest possible episode in steps; 0 in endless environments and without step limit."""
+        """Longest possible episode in steps; 0 in endless environments and without a step limit."""
         return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
 
 
@@ -356,8 +356,8 @@ def _presets() -> dict[str, Settings]:
         },
         recurrence={"embedding": False},
     )
-    # The same number of environment steps per update as `paper`; sequences start from stored states. Gradients go back 32 steps
-    # at most, where the paper's go back 512.
+    # The same number of environment steps per update as `paper`; sequences start from stored states. Gradients go back at most
+    # 32 steps, instead of the paper's 512.
     throughput = _replace(
         dataclasses.replace(paper, preset="throughput"),
         environment={"num_envs": 512},
@@ -365,7 +365,7 @@ def _presets() -> dict[str, Settings]:
         recurrence={"sequence_length": 32},
         transformer={"sequence_length": 32},
     )
-    # Four times the environments of `paper`, minibatches of the same size, and gradients through as many steps.
+    # Four times the environments of `paper`, minibatches of the same size, and gradients through the same number of steps.
     throughput_512 = _replace(
         dataclasses.replace(paper, preset="throughput-512"),
         environment={"num_envs": 128},

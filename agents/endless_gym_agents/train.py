@@ -43,10 +43,10 @@ def train(
     watch: Callable[[int, dict[str, float]], bool] | None = None,
     episode_options: EpisodeOptions | None = None,
 ) -> Path:
-    """Train an agent: a new run, or from the last checkpoint of a run.
+    """Train an agent in a new run, or resume a run from its last checkpoint.
 
-    Each of the processes that `torchrun` starts calls it with the same settings. A run that `torchrun` starts again goes on from
-    its last checkpoint.
+    Under `torchrun`, every process calls this function with the same settings. A run that `torchrun` restarts continues from its
+    last checkpoint.
 
     Args:
         settings: Settings of the run.
@@ -85,7 +85,7 @@ def train_rank(
     watch: Callable[[int, dict[str, float]], bool] | None,
     episode_options: EpisodeOptions | None,
 ) -> Path:
-    """The part of `train` that the processes of a run do together."""
+    """The part of `train` that runs while the ranks are connected."""
     resumed: dict[str, Any] | None = None
     folder, has_begun = (
         (settings.resume, True) if settings.resume else ranks.of_first(lambda: make_folder(settings, ranks))
@@ -142,7 +142,7 @@ def train_rank(
             checkpoint.save(run, state, settings.keep_checkpoints)
 
         logger = Logger(run, settings, update) if ranks.is_first else SilentLogger()
-        # Written only after everything above has succeeded; the changed settings of a resumed run are its settings from now on.
+        # Written only after everything above has succeeded. A resumed run keeps its changed settings.
         if ranks.is_first:
             (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
         if resumed is None:
@@ -204,11 +204,11 @@ def make_folder(settings: Settings, ranks: Ranks) -> tuple[str, bool]:
     """Make the folder of a new run.
 
     Returns:
-        The folder, and whether it contains a checkpoint of this run, from before `torchrun` started it again.
+        The folder, and whether it contains a checkpoint of this run, from before `torchrun` restarted it.
 
     Raises:
         FileExistsError: The folder contains another run.
-        ValueError: The run was started again, and its folder has no fixed name.
+        ValueError: The run was restarted, and its folder has no fixed name.
     """
     if ranks.restarts and not settings.run:
         raise ValueError("a run that torchrun starts again needs --run, to find its checkpoint; got no folder")
@@ -225,8 +225,8 @@ def make_folder(settings: Settings, ranks: Ranks) -> tuple[str, bool]:
 class Interrupt:
     """Context manager that turns the first SIGINT into a request to stop; the second one raises `KeyboardInterrupt`.
 
-    For a rank of several, SIGTERM is such a request, too. `torchrun` passes signals on that the terminal has already sent, so
-    that signals within two seconds count as one.
+    With several ranks, SIGTERM is such a request, too. `torchrun` forwards signals that the terminal has already sent, so signals
+    within two seconds count as one.
 
     Attributes:
         requested: Whether the run should stop after the current update.
@@ -247,7 +247,7 @@ class Interrupt:
 
     def __exit__(self, *exception: object) -> None:
         for number, handler in self._before.items():
-            # `torchrun` ends all ranks by SIGTERM when one has ended: this one closes its environments first.
+            # When one rank has ended, `torchrun` sends SIGTERM to the others; ignore it until the environments are closed.
             signal.signal(number, signal.SIG_IGN if number == signal.SIGTERM else handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
@@ -293,7 +293,7 @@ def check_resumable(settings: Settings, before: Settings) -> None:
 
 
 def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int) -> None:
-    """Restore the state of a generator; seed it instead if the state, uint8 (bytes,), is of another type of device.
+    """Restore the state of a generator; seed it instead if the state, uint8 (bytes,), is from another type of device.
 
     Args:
         generator: The generator.
@@ -309,7 +309,7 @@ def restore_generator(generator: torch.Generator, state: torch.Tensor, seed: int
 def choose_device(name: str, ranks: Ranks | None = None) -> torch.device:
     """The device with the name `cpu`, `cuda` or `cuda:INDEX`, or for `auto` CUDA if available, else the CPU.
 
-    A CUDA device has an index, which is 0 unless the name has another. Each of several ranks on a machine has a GPU of its own.
+    A CUDA device always has an index, by default 0. Several ranks on a machine each get their own GPU.
 
     Raises:
         ValueError: The name is invalid, or the device is not available.

@@ -1,7 +1,7 @@
 """Copies between the host and the agent's device; only the copy of the actions waits.
 
-On the CPU, NumPy copies, since its calls cost less, and nothing waits. On CUDA they go through page-locked
-memory and are asynchronous.
+On the CPU, NumPy makes the copies, since its calls cost less, and nothing waits. On CUDA, copies go through page-locked memory
+and are asynchronous.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from endless_gym.interop import torch_view
 
 
 class HostCopy:
-    """A tensor of the device on the host: `start` begins the copy, and `wait` waits for it.
+    """A copy of a device tensor on the host: `start` begins the copy, and `wait` waits for it.
 
     Attributes:
-        array: The tensor on the host, valid after `wait` and until the next `start`.
+        array: The copy on the host, valid after `wait` and until the next `start`.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> None:
@@ -34,7 +34,7 @@ class HostCopy:
         """Begin to copy `tensor`; on CUDA, later operations on the same stream do not delay the copy."""
         self._tensor.copy_(tensor, non_blocking=True)
         if self._done is not None:
-            # Of the tensor's device, which need not be the current one.
+            # The tensor's device need not be the current one.
             self._done.record(torch.cuda.current_stream(tensor.device))
 
     def wait(self) -> None:
@@ -44,22 +44,22 @@ class HostCopy:
 
 
 class Upload:
-    """Copies arrays of the host, by name, to tensors of the device.
+    """Copies host arrays, by name, to device tensors.
 
-    For CUDA the array is first copied to page-locked memory of this process. An engine's shared memory is not page-locked itself:
-    it is unmapped when the engine fails, and CUDA would go on reading the pages of the failed one.
+    For CUDA, the array is first copied to page-locked memory of this process. The engine's shared memory is not page-locked
+    itself: it is unmapped when the engine fails, and CUDA would keep reading the old pages.
     """
 
     def __init__(self, device: torch.device) -> None:
-        """Make the copies to `device`."""
+        """Prepare for copies to `device`."""
         self._on_host, self._cuda = device.type == "cpu", device.type == "cuda"
         self._staged: dict[str, Tensor] = {}
 
     def copy(self, name: str, array: NDArray[Any], target: Tensor) -> None:
         """Begin to copy `array` to `target`, of equal shape; the array may change afterwards.
 
-        The copy before under this name must be complete; it is when the actions of a later step have arrived, since copies are
-        in order.
+        The previous copy under this name must be complete. It is once the actions of a later step have arrived, since copies are
+        executed in order.
         """
         if self._on_host:
             np.copyto(target.numpy(), array)

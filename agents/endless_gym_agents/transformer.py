@@ -5,29 +5,29 @@ block's query comes from its current input, and its keys and values come from th
 belong to the same episode. A block is pre-norm: LayerNorm, attention, residual connection or gate, LayerNorm, fully connected
 layer with ReLU, residual connection or gate.
 
-Keys and values are not projected once for each window that contains a token:
+The keys and values of a token are not recomputed for each window that contains it:
 
 * Acting: a KV cache holds the keys and values of the window, in a ring of fixed size (`transformer_cache`). Each step projects
-  the newest token only, for all blocks at once. The cache is recomputed when the weights have changed.
+  only the newest token, for all blocks at once. The cache is recomputed when the weights have changed.
 * Learning: a sequence of C steps is processed at once with the tokens of the sequence and of the `window - 1` steps before it. A
-  band mask (causal, as wide as the window, and within one episode) says which query attends to which token.
-* Learning with sequences of one step: the steps of a minibatch are grouped by the environment and the part of the segment that
-  they lie in, and all queries of a group attend to the same tokens under a mask (`Groups`). The key projection is applied to the
-  query and the value projection to the weighted sum of the tokens instead. That is the same by associativity, and faster with
-  few queries for each token.
+  band mask (causal, as wide as the window, and within one episode) determines which query attends to which token.
+* Learning with sequences of one step: the steps of a minibatch are grouped by environment and part of the segment, and all
+  queries of a group attend to the same tokens under a mask (`Groups`). The key projection is applied to the query instead of the
+  tokens, and the value projection to the weighted sum of the tokens. By associativity this gives the same result, and it is
+  faster with few queries per token.
 
 A query attends to the token of an earlier step if the distance in steps is at most `window - 1`, and at most the query's position
 in its episode. At the first step of an episode there is no token to attend to, and the attention output before the final
 projection is 0.
 
 With `Transformer.query_previous`, a layer with ReLU makes the first block's input, hence the first query, from the
-embedding and "the previous output of the TrXL block" (section 5.6.3 of the paper, which does not say more). In the
+embedding and "the previous output of the TrXL block" (section 5.6.3 of the paper, which gives no details). In the
 authors' code (MarcoMeter/neroRL, branch `test/query_2`, commit 638502a) that is the last block's input, not its output,
-at the previous time step: as stored while acting, without gradient and without positional encoding, and 0 at the first
-step of an episode. That is the last block's newest token. It is known before learning begins, so the steps of a
-sequence need not be computed one after the other. The earlier branch `test/query` (b71311a) means the same token with
-its positional encoding, but selects that of the first environment of the batch for all, and, once the window is full,
-that of the current step. This is not followed.
+at the previous time step: as stored while acting, without gradient or positional encoding, and 0 at the first step of an
+episode. In other words, it is the last block's newest token. It is known before learning begins, so the steps of a
+sequence need not be computed one after the other. The earlier branch `test/query` (b71311a) intends the same token with
+its positional encoding, but selects that of the first environment of the batch for all environments, and, once the
+window is full, that of the current step. This is not reproduced here.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from endless_gym_agents.transformer_cache import Projection, RingCache, ring_age
 
 #: Columns of the cache beyond the window while no segment is recorded. When they are full, the window moves to the front.
 SPARE_COLUMNS = 64
-#: What is added to the score of a token that a query does not attend to. Finite, so that the softmax of a fully masked row and
-#: its gradient are finite with every attention kernel; the output of such a row is set to 0.
+#: Added to the score of a token that a query does not attend to. Finite, so that the softmax of a fully masked row and its
+#: gradient are finite with every attention kernel; the output of such a row is set to 0.
 MASKED = -1e30
-#: Least number of steps in a part of a segment whose single steps attend to the same tokens.
+#: Smallest number of steps in a part of a segment whose single steps attend to the same tokens.
 SHORTEST_PART = 32
 
 
@@ -78,11 +78,11 @@ def normalised(tokens: Tensor) -> Tensor:
 
 @dataclass
 class Groups:
-    """Where the queries of single steps lie in G groups of K places for each head. Some places are empty.
+    """Assignment of the queries of single steps to G groups with K places per head. Some places are empty.
 
     Attributes:
         shape: G, heads and K.
-        query: Row of the query in each place among float (heads * n, size), int64 (G * heads * K,); of any query in an
+        query: Row of the query in each place among float (heads * n, size), int64 (G * heads * K,); an arbitrary row for an
             empty place.
         place: Place of each query, int64 (heads * n,).
     """
@@ -103,7 +103,7 @@ class Groups:
 
 
 class Attention(nn.Module):
-    """Multi-head attention with separate projection, so that the keys and values of a token are computed once and reused."""
+    """Multi-head attention with a separate projection, so that the keys and values of a token are computed once and reused."""
 
     def __init__(self, settings: Transformer) -> None:
         """Make the projections; see `Transformer` for the settings."""
@@ -115,7 +115,7 @@ class Attention(nn.Module):
         self.keys = nn.Linear(inner, inner, bias=False)
         self.values = nn.Linear(inner, inner, bias=False)
         self.fc_out = nn.Linear(settings.width, settings.width)
-        # As in the paper's implementation, scores are divided by the root of the full width, not of the head size.
+        # As in the paper's implementation, scores are divided by the square root of the full width, not of the head size.
         self.scale = settings.width**-0.5
         self.relative = settings.positional_encoding == "relative"
         if self.relative:
@@ -145,11 +145,11 @@ class Attention(nn.Module):
         Args:
             x: Inputs of the queries, float (n, queries, width).
             tokens: Normalised tokens with positions added, float (n, tokens, width).
-            norm: Layer normalisation of the tokens; its gain and its bias are to be applied.
+            norm: Layer normalisation of the tokens; its gain and bias are applied here.
             bias: Attention mask, float32 (n, 1, queries, tokens); 0 where the query attends to the token, else `MASKED`.
             first: Whether the query attends to no token, bool (n, queries, 1).
             distance: Steps from the token to the query, int64 (queries, tokens); used by the relative encoding.
-            groups: Where the single queries of x, float (n, 1, width), lie in groups of K. Then `tokens` is (G, tokens, width),
+            groups: Places of the single queries of x, float (n, 1, width), in groups of K. Then `tokens` is (G, tokens, width),
                 `bias` (G, 1, K, tokens), and `distance` (G, 1, K, tokens).
 
         Returns:
@@ -175,7 +175,7 @@ class Attention(nn.Module):
             summed = summed.transpose(1, 2)
         else:
             summed = self._few_queries(queries, tokens, keys, values, bias, groups).transpose(0, 1).unsqueeze(1)
-        # The bias of the normalisation adds the same to all scores of a query, which the softmax ignores, and to all values.
+        # The normalisation's bias adds a constant to all scores of a query, which the softmax ignores, and one to all values.
         summed = summed + self.project(self.values, norm.bias.unsqueeze(0)).squeeze(1)
         out: Tensor = self.fc_out(summed.flatten(-2).masked_fill(first, 0.0))
         return out
@@ -183,8 +183,8 @@ class Attention(nn.Module):
     def _folded(self, layer: nn.Linear, norm: nn.LayerNorm) -> Tensor:
         """The projection of normalised tokens, with the gain of the normalisation: float (heads, head size, inputs).
 
-        The inputs are the whole token, or with shared heads the head's slice of it. Tokens have no gradient, except with learned
-        positions, so no operation for the gain or its gradient has the size of the tokens.
+        The inputs are the whole token, or with shared heads the head's slice of it. Folding the gain into the projection avoids
+        operations of the size of the tokens for the gain and, except with learned positions, for its gradient.
         """
         if layer.in_features != self.size:
             return layer.weight.view(self.heads, self.size, -1) * norm.weight
@@ -210,7 +210,7 @@ class Attention(nn.Module):
             tokens: Normalised tokens, float (G, tokens, width).
             keys: What `_folded` returned.
             values: What `_folded` returned.
-            bias: What is added to the scores, float (G, heads or 1, K, tokens).
+            bias: Added to the scores, float (G, heads or 1, K, tokens).
             groups: The places of the queries.
 
         Returns:
@@ -267,7 +267,7 @@ class Block(nn.Module):
     """One pre-norm block of the Transformer-XL."""
 
     def __init__(self, settings: Transformer) -> None:
-        """Make the block with the weight initialisation that the settings name."""
+        """Make the block with the weight initialisation of the settings."""
         super().__init__()
         width = settings.width
         self.norm_query, self.norm_tokens, self.norm_fc = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
@@ -289,11 +289,11 @@ class Block(nn.Module):
         return out
 
     def _initialise(self, kind: str, layers: int) -> None:
-        """Initialise the matrices, those of the gates among them; the biases of the relative encoding stay 0."""
+        """Initialise the matrices, including those of the gates; the biases of the relative encoding stay 0."""
         for module in self.modules():
             if not isinstance(module, nn.Linear):
                 continue
-            # A gate's layers hold a matrix for each of its parts.
+            # A gate's layer holds several square matrices, one for each part of the gate.
             gates = 1 if module.weight.shape[0] == module.weight.shape[1] else module.out_features // module.in_features
             for weight in module.weight.chunk(gates):
                 if kind == "orthogonal":
@@ -311,7 +311,7 @@ class Block(nn.Module):
 class ActingBlock:
     """A block for one step of n environments, with few operations; see `acting`.
 
-    What is not transposed or converted are the parameters themselves.
+    Weights that need no transposition or conversion are shared with the block, not copied.
     """
 
     def __init__(self, block: Block, dtype: torch.dtype) -> None:
@@ -339,7 +339,7 @@ class ActingBlock:
             keys: float (n, heads, tokens, head size).
             values: float (n, heads, tokens, head size).
             bias: Attention mask, float (n, 1, 1, tokens); 0 or `MASKED`.
-            first: Whether the query attends to no token, bool (n, 1); None if all attend to some.
+            first: Whether the query attends to no token, bool (n, 1); None if every query attends to some.
             encoded: Projected encodings of the distances of the tokens, float (heads, tokens, head size); None without relative
                 encoding.
         """
@@ -371,7 +371,7 @@ class TransformerState(MemoryState):
         position: Step number within its episode, int64 (n, columns).
         next_position: Position of the next step unless it starts an episode, int64 (n,).
         fill: Number of columns in use.
-        cache: Keys and values of the window; None while they are to be computed.
+        cache: Keys and values of the window; None if they must be computed again.
     """
 
     def __init__(self, settings: Transformer, num_envs: int, device: torch.device) -> None:
@@ -417,14 +417,14 @@ class TransformerMinibatch(Minibatch):
 
     Attributes:
         tokens: The cached inputs of each block, float (layers, sequences, P + C, width); with positions added, normalised and in
-            the type to compute in, or float32 without all this if the positional encoding is learned.
+            the compute dtype. If the positional encoding is learned, raw float32.
         position: Position of each token in its episode, int64 (sequences, P + C).
         query_position: Position of each query in its episode, int64 (sequences, C).
         bias: Attention mask, float32 (sequences, 1, C, P + C); 0 where the query attends to the token, else `MASKED`.
         distance: Steps from each token to each query, int64 (C, P + C).
-        groups: With C = 1, where the queries lie in groups of K. Then `tokens`, `position`, `bias` and `distance` have G groups
-            in place of sequences, K queries in place of C, and the tokens that any query of the group may attend to.
-        previous: The last block's input at the step before each query, 0 if that is of another episode, float32
+        groups: With C = 1, the places of the queries in groups of K. Then `tokens`, `position`, `bias` and `distance` have G
+            groups in place of sequences, K queries in place of C, and the tokens that any query of the group may attend to.
+        previous: The last block's input at the step before each query, 0 if that belongs to another episode, float32
             (sequences, C, width); None without `Transformer.query_previous`.
     """
 
@@ -437,7 +437,7 @@ class TransformerMinibatch(Minibatch):
     previous: Tensor | None = None
 
 
-#: Makes a minibatch of the chosen sequences, sorted and on the CPU, and of `indices` and `everywhere` of `Minibatch`.
+#: Makes a minibatch from the chosen sequences, sorted and on the CPU, and from `indices` and `everywhere` of `Minibatch`.
 MakeMinibatch: TypeAlias = Callable[[Tensor, Tensor, Tensor], TransformerMinibatch]
 
 
@@ -445,7 +445,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
     """A fully connected layer, followed by attention blocks.
 
     Attributes:
-        fusion: Layer of the embedding and the last block's previous input; None without `Transformer.query_previous`.
+        fusion: Layer that combines the embedding with the last block's previous input; None without `Transformer.query_previous`.
     """
 
     #: Positional encoding by position in the episode, float32 (positions, width); None without an absolute or learned encoding.
@@ -456,7 +456,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
 
         Args:
             input_width: Size of the encoded observations.
-            settings: Settings of the blocks, with `window` at its final value.
+            settings: Settings of the blocks, with the default of `window` resolved.
             positions: Rows of the table of positional encodings.
             device: Device of the states.
         """
@@ -483,8 +483,8 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         self.acting_fusion: Affine | None = None
         #: See `ring_ages`.
         self.ages = ring_ages(settings.window, device)
-        #: Whether the attention while acting is as short as the episodes. On the CPU the largest position is known without
-        #: waiting for a device.
+        #: Whether attention while acting spans only the longest current episode. On the CPU, the largest position is known
+        #: without waiting for a device.
         self.spans = device.type == "cpu"
         self._attended, self._masked = torch.zeros((), device=device), torch.full((), MASKED, device=device)
 
@@ -605,7 +605,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         offsets = torch.arange(past + length, device=self.device)
         distance = offsets[past:].unsqueeze(1) - offsets
         outside = (distance < 1) | (distance > self.past)
-        # The first column of each sequence, counted through all environments.
+        # The first column of each sequence in the flattened columns of all environments.
         starts = torch.arange(envs).unsqueeze(1) * columns + torch.arange(steps // length) * length
         starts = starts.flatten().to(self.device)
 
@@ -684,7 +684,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         tokens = state.inputs[:, :, skipped:]
         if isinstance(self.table, nn.Parameter):
             return tokens
-        # They have no gradient, so this is done once for a segment, not for each minibatch.
+        # Tokens have no gradient, so this is done once per segment, not for each minibatch.
         return normalised(self.encoded(tokens, state.position[:, skipped:])).to(self._dtype)
 
     def encoded(self, tokens: Tensor, position: Tensor) -> Tensor:
@@ -697,7 +697,7 @@ class TransformerMemory(Memory[TransformerState, TransformerUpdate, TransformerM
         return functional.embedding(position.clamp(max=self.positions - 1), self.table)
 
     def cache(self, state: TransformerState) -> RingCache:
-        """The keys and values of the state's tokens; computed with the current weights if there are none of these weights."""
+        """The keys and values of the state's tokens; recomputed if the weights have changed."""
         if state.cache is None or state.cache.generation != self._generation:
             window = slice(state.fill - self.past, state.fill)
             tokens = self.encoded(state.inputs[:, :, window], state.position[:, window])

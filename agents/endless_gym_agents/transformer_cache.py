@@ -1,7 +1,7 @@
 """The KV cache of the Transformer-XL for acting: keys and values of the last steps, in a ring of fixed size.
 
-All environments step together, so the step of a slot is known on the host: no operation waits for the device, and all shapes are
-constant. The ring has as many slots as the window; the slot of the current step holds the step that has just left the window.
+All environments step together, so the step of each slot is known on the host: no operation waits for the device, and all shapes
+are constant. The ring has as many slots as the window; the slot of the current step still holds the step that has just left it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from torch.nn import functional
 def ring_ages(slots: int, device: torch.device) -> Tensor:
     """Ages of the slots of a ring in steps, for every current slot: int64 (2 * slots,).
 
-    With the current slot s, the age of slot j is entry `slots - s + j`. The current slot has no step yet, and the largest age.
+    If s is the current slot, the age of slot j is entry `slots - s + j`. The current slot has no step yet, so its age is the
+    largest int64.
     """
     ages = torch.arange(2 * slots, device=device).neg() % slots
     return ages.masked_fill(ages == 0, torch.iinfo(torch.int64).max)
@@ -28,7 +29,7 @@ class Projection:
     def __init__(
         self, norms: Sequence[nn.LayerNorm], keys: Sequence[nn.Linear], values: Sequence[nn.Linear], heads: int
     ) -> None:
-        """Stack the weights of the blocks; they do not follow later changes.
+        """Copy and stack the weights of the blocks; later changes have no effect.
 
         Args:
             norms: The layer normalisation of the tokens of each block.
@@ -58,7 +59,7 @@ class RingCache:
 
     Attributes:
         slot: Slot of the current step.
-        generation: Which weights the keys and values were computed with; see `TransformerMemory.refresh`.
+        generation: Number of the weights that computed the keys and values; see `TransformerMemory.refresh`.
         distances: Projected encodings of the ages of `ring_ages` for each block, float (heads, 2 * slots, head size); None
             without relative encoding.
     """
@@ -71,11 +72,11 @@ class RingCache:
         dtype: torch.dtype,
         distances: list[Tensor] | None,
     ) -> None:
-        """Make the cache of the window before the current step.
+        """Make the cache for the window before the current step.
 
         Args:
             projection: Projects the tokens.
-            tokens: The last tokens with positions added, one less than the ring has slots, float32 (layers, n, slots - 1, width).
+            tokens: The last `slots - 1` tokens with positions added, float32 (layers, n, slots - 1, width).
             generation: See the attribute.
             dtype: Type of the keys and values.
             distances: See the attribute.
@@ -99,7 +100,7 @@ class RingCache:
         return self._all if length == self.slots else self._split(self._ring.narrow(3, start, length))
 
     def append(self, tokens: Tensor) -> None:
-        """Write the tokens of the current step, float32 (layers, n, width), with positions added, and go to the next slot."""
+        """Write the current step's tokens, float32 (layers, n, width), with positions added, and advance to the next slot."""
         self._columns[self.slot].copy_(self.projection(tokens))
         self.slot = (self.slot + 1) % self.slots
 

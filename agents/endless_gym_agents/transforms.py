@@ -14,13 +14,13 @@ from torch import Tensor
 
 from endless_gym_agents.encoders import FRAME, Observation, Shapes
 
-#: Entries of the encoded step number, and the number of steps with an encoding of their own.
+#: Entries of the encoded step number, and the number of distinct encodings.
 POSITION_WIDTH, POSITIONS = 16, 512
 #: Key of the encoded step number in the observation.
 POSITION = "position"
 
 
-#: What a transform keeps of n environments between two steps: tensors (n, ...) by name.
+#: State of a transform for n environments between two steps: tensors (n, ...) by name.
 TransformState: TypeAlias = dict[str, Tensor]
 
 
@@ -51,7 +51,7 @@ class ObservationTransform(ABC):
 
 
 class Identity(ObservationTransform):
-    """The environments' own observation."""
+    """The environments' observation, unchanged."""
 
     def __init__(self, shapes: Shapes) -> None:
         """Make the transform for observations of these shapes."""
@@ -67,7 +67,7 @@ class Identity(ObservationTransform):
 
 
 class FrameStack(ObservationTransform):
-    """The last `count` observations along the last axis, oldest first; frames become grey.
+    """Stacks the last `count` observations along the last axis, oldest first; frames are converted to grey.
 
     The first observation of an episode fills the whole stack.
     """

@@ -69,14 +69,14 @@ def write(file: Path, frames: Iterable[Frame], fps: int) -> None:
     """Write a video; if writing is interrupted, no partial file remains.
 
     Args:
-        file: Output file, with the suffix `.gif`, `.webp` (without loss) or `.mp4`.
+        file: Output file, with the suffix `.gif`, `.webp` (lossless) or `.mp4`.
         frames: At least one frame, uint8 (HEIGHT, WIDTH, 3) each.
         fps: Frames per second.
 
     Raises:
         ValueError: As for `check`.
         FileNotFoundError: As for `check`.
-        OSError: ffmpeg has failed; the message contains its error.
+        OSError: ffmpeg failed; the message contains its error.
     """
     check(file)
     suffix, images = file.suffix.lower(), map(Image.fromarray, frames)

@@ -10,7 +10,7 @@ from typing import Any
 from endless_gym.program import program
 from endless_gym.vector import EndlessVectorEnv
 
-#: In a process group of its own, so that Ctrl-C reaches the training alone, which then ends the page.
+#: A separate process group, so that Ctrl-C reaches only the training, which then stops the server.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
@@ -48,7 +48,7 @@ class ViewProcess:
         self.url = line.split()[-1]
 
     def end(self) -> None:
-        """End the server, and wait for its end."""
+        """Stop the server, and wait until it has ended."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 
 class Operations(TorchDispatchMode):
-    """Context that counts operations, without those that only make a view: they compute nothing on a device.
+    """Context that counts operations, except those that only make a view, since they compute nothing.
 
     Attributes:
         calls: Number of calls by name of the operation.

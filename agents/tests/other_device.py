@@ -1,6 +1,6 @@
 """A stand-in for a CUDA device on machines without one.
 
-A tensor of this device wraps a CPU tensor. As on CUDA, an operation on tensors of both devices is an error, and so is access to
+A tensor of this device wraps a CPU tensor. As on CUDA, it is an error to mix tensors of both devices in an operation or to access
 the data without a copy. Run as a program, this trains on the device and on the CPU, and prints the results of both as JSON:
 
     python other_device.py FOLDER FLAGS_AS_JSON ...
@@ -49,7 +49,7 @@ class Device(TorchDispatchMode):
         return computed(operation, args, kwargs or {})
 
 
-#: Operations whose result, or its shape, is needed on the host. On CUDA the host waits for them.
+#: Operations whose result, or the shape of it, is needed on the host. On CUDA the host waits for them.
 WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "unique_dim"}
 #: Number of operations for which CUDA would wait: copies to the CPU, and those of `WAITING`.
 waits: Counter[str] = Counter()
@@ -89,7 +89,7 @@ def computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def lstm_cell(x: Any, h: Any, cell: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
-    """The fused LSTM cell, which PyTorch calls on devices other than the CPU; what it keeps for the gradients are the gates."""
+    """The fused LSTM cell, which PyTorch calls on devices other than the CPU; it saves the gates for the backward pass."""
     gates = x + h if bias_x is None else x + h + bias_x + bias_h
     into, forget, new, out = gates.chunk(4, 1)
     after = forget.sigmoid() * cell + into.sigmoid() * new.tanh()
@@ -103,7 +103,7 @@ def lstm_cell_backward(grad_h: Any, grad_c: Any, before: Any, after: Any, gates:
 
 
 def gru_cell(x: Any, h: Any, hidden: Any, bias_x: Any = None, bias_h: Any = None) -> Any:
-    """The fused GRU cell; what it keeps for the gradients are the gates and the hidden state."""
+    """The fused GRU cell; it saves the gates and the hidden state for the backward pass."""
     x, h = (x, h) if bias_x is None else (x + bias_x, h + bias_h)
     (reset_x, update_x, new_x), (reset_h, update_h, new_h) = x.chunk(3, 1), h.chunk(3, 1)
     new = (new_x + (reset_x + reset_h).sigmoid() * new_h).tanh()
@@ -117,7 +117,7 @@ def gru_cell_backward(grad: Any, kept: Any, has_bias: bool) -> Any:
     return to_x, to_h, to_hidden, to_x.sum(0) if has_bias else None, to_h.sum(0) if has_bias else None
 
 
-#: Operations that PyTorch calls on devices other than the CPU only.
+#: Operations that PyTorch calls only on devices other than the CPU.
 REPLACED = {
     "_thnn_fused_gru_cell": gru_cell,
     "_thnn_fused_gru_cell_backward": gru_cell_backward,

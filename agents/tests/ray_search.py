@@ -1,4 +1,4 @@
-"""A search of three trials on Ray Tune, two at a time, for `test_agents_ray.py`. The rewards are given, the runs are real.
+"""A search of three trials on Ray Tune, two at a time, for `test_agents_ray.py`. The rewards are fixed; the runs are real.
 
 Trial 0 kills its process after update 3, once. Trial 1 has the lowest reward, and waits until trial 0 is complete.
 """

@@ -4,10 +4,10 @@
 
 Needs git, torch, numpy and einops. The authors' code is fetched to a temporary folder; only numbers are kept, in
 `authors.json.gz`: the weights by the authors' names, the inputs, the outputs while acting and while learning, and the gradients
-of `sum(output * factor)`. The main branch has absolute, learned and no positional encoding. Of the branch with the relative one
-only the attention is recorded: its blocks put the query itself into the memory, in the place of the newest token. The
-branch with the previous output in the first query is recorded with gates: its blocks without them have a ReLU that
-those of the main branch do not have.
+of `sum(output * factor)`. The main branch has absolute, learned and no positional encoding. From the branch with relative
+encoding, only the attention is recorded, since its blocks put the query itself into the memory in place of the newest token.
+The branch with the previous output in the first query is recorded with gates, since its blocks without gates have a ReLU that
+the main branch does not have.
 """
 
 import argparse
@@ -29,8 +29,8 @@ COMMIT, RELATIVE = "8dd62bdee66c2825d6fcea6fffefcdeb4f010609", "5419b0c80599179f
 PREVIOUS = "638502a8c33110a6d3b22432c686dd54deabd79c"
 DATA = Path(__file__).parent / "authors.json.gz"
 INPUT, WIDTH, SEQUENCES, LENGTH = 5, 8, 3, 4
-#: Window and longest episode of the Transformer-XL, and the step in the episode of each row of the batch. At step 0 the authors'
-#: code attends to an empty window uniformly, where ours attends to nothing.
+#: Window and longest episode of the Transformer-XL, and the step in the episode of each row of the batch. Step 0 is left out:
+#: there, the authors' code attends uniformly to an empty window, while ours attends to nothing.
 WINDOW, LONGEST, STEPS = 5, 12, (1, 2, 4, 6, 9)
 
 
@@ -87,8 +87,8 @@ def transformer(
 ) -> dict[str, Any]:
     """One step of several environments with given memories; the authors' code is the same for acting and learning.
 
-    With `previous`, the module is that of `PREVIOUS`, and gets the last block's input at the step before, as from its
-    sampler.
+    With `previous`, the module is that of `PREVIOUS`, and gets the last block's input at the previous step, as its sampler
+    provides it.
     """
     config = {
         "num_blocks": 2,
@@ -181,7 +181,7 @@ def main() -> None:
             "gtrxl, bias 0": transformer(Transformer, "absolute", 0.0),
             "gtrxl, bias 2": transformer(Transformer, "absolute", 2.0),
             "attention, relative": relative(Path(folder) / "relative/neroRL/nn/transformer.py"),
-            # What is now the absolute encoding has the name `relative` in that branch.
+            # That branch calls the absolute encoding `relative`.
             "gtrxl, previous": transformer(previous, "relative", 0.0, previous=True),
         }
     commits = {"commit": COMMIT, "relative_commit": RELATIVE, "previous_commit": PREVIOUS}

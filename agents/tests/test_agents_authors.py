@@ -1,4 +1,4 @@
-"""The memories against recorded results of the code of the paper's authors, with its weights; see `record_authors.py`."""
+"""The memories against recorded results of the code of the paper's authors, with the same weights; see `record_authors.py`."""
 
 import gzip
 import json
@@ -19,7 +19,7 @@ RECORDED = json.loads(gzip.decompress((Path(__file__).parent / "authors.json.gz"
 CPU = torch.device("cpu")
 WINDOW, LONGEST = 5, 12
 
-#: Our names of the authors' weights, in the place of regular expressions.
+#: Replacements, by regular expression, that turn the authors' names of weights into ours.
 NAMES = {
     "^pos_embedding$": "table",
     "^linear_(embedding|transform)": "embedding.0",
@@ -34,7 +34,7 @@ NAMES = {
     ".gate2.": ".gate_fc.",
     ".bg$": ".bias",
 }
-#: The authors' matrices that those of our gates stack.
+#: The authors' matrices that each matrix of our gates stacks.
 GATES = {"from_y": ("Wr", "Wz", "Wg"), "from_x": ("Ur", "Uz"), "from_reset": ("Ug",)}
 
 
@@ -121,7 +121,7 @@ def test_transformer_equals_that_of_the_authors(name: str) -> None:
         state.inputs[:, row, columns] = memories[row, :past].transpose(0, 1)
         state.position[row, columns] = torch.arange(step - past, step)
     state.next_position = steps
-    # The authors act and learn with the same function; ours are two.
+    # The authors act and learn with the same function; we have two.
     memory.begin_segment(state, 1)
     no_reset = torch.zeros(len(x), dtype=torch.bool)
     with torch.no_grad():

@@ -39,7 +39,7 @@ def test_parts_that_need_no_gpu_run_on_the_cpu(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_without_cuda_it_says_so_and_fails() -> None:
+def test_without_cuda_it_fails_with_a_message() -> None:
     done = run()
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "on_cuda.py: PyTorch finds no CUDA device; `--device cpu` tests this program without one\n"

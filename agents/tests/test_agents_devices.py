@@ -1,4 +1,4 @@
-"""Agents on a device other than the CPU: all tensors are on the right device, and the results are those of the CPU."""
+"""Agents on a device other than the CPU: all tensors are on the right device, and the results equal the CPU's."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Errors of the user are one line on standard error, with exit status 1, and leave no file."""
+"""User errors print one line on standard error, exit with status 1, and leave no file."""
 
 import importlib.util
 import json
@@ -77,7 +77,7 @@ PROGRAMS = {
         ("endless-reproduce endless --ray auto --job-gpus -1", "--job-gpus must be 0 or more, got -1"),
     ],
 )
-def test_an_error_is_one_line(
+def test_user_error_prints_one_line_and_leaves_no_file(
     command: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "text.pt").write_text("not a checkpoint\n")

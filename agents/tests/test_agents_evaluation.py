@@ -66,7 +66,7 @@ def small(*paths: Path, **changes: object) -> EvalArguments:
         ("Endless-MysteryPath-v0", {}, {"reward": 0.4, "tiles_visited": 4}, 0, None),
     ],
 )
-def test_task_progress_follows_from_infos_and_reward(
+def test_task_progress_is_computed_from_infos_and_reward(
     env: str, options: dict[str, object], final: dict[str, float], path: int, expected: float | None
 ) -> None:
     progress = task_progress(spec(env), options, final, path)
@@ -149,7 +149,7 @@ def test_progress_callback_counts_every_episode(runs: Path) -> None:
     assert min(counts) > 0
 
 
-def test_runs_of_an_experiment_differ_only_in_what_does_not_affect_learning() -> None:
+def test_settings_that_do_not_affect_learning_share_an_experiment() -> None:
     given, experiments = settings("gru", env=GRID, seed=1), Experiments()
     apart = {"seed": 2, "run": "b", "preset": "paper", "device": "cuda", "threads": 3, "bind_cores": True, "view": True}
     apart |= {"compile": True, "on_engine_failure": "fail", "time_limit": 1.0, "wandb": True}

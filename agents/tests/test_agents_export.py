@@ -1,4 +1,4 @@
-"""Exported agents, as the page in the browser reads them."""
+"""Exported agents, in the format that the browser page reads."""
 
 import json
 import struct
@@ -32,7 +32,7 @@ def test_the_committed_file_computes_the_committed_vectors() -> None:
         assert recorded[exact] == committed[exact]
     np.testing.assert_allclose(recorded["logits"], committed["logits"], rtol=1e-5, atol=1e-5)
     assert sum(recorded["reset"]) >= 3
-    # A visitor sees it succeed.
+    # Visitors of the page should see it succeed.
     assert header["evaluation"][0]["success"] > 0.9
 
 
@@ -75,7 +75,7 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
         ({"recurrence": {"embedding": False}}, "--recurrence.embedding must be on"),
     ],
 )
-def test_an_agent_that_the_format_lacks_is_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+def test_unsupported_agents_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         export.export(checkpoint.load(trained(tmp_path, **changes)))
 

@@ -1,4 +1,4 @@
-"""Every weight learns. AdamW decays a weight also without a gradient, so that it changes does not show that it learns."""
+"""Every weight gets a gradient. Changing weights would not show that, since AdamW decays weights without a gradient, too."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ STEPS, ENVS = 12, 3
 
 
 def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> list[str]:
-    """Names of the weights that no gradient of the total loss reaches; of the others some entry has a gradient."""
+    """Names of the weights whose gradient of the total loss is missing or entirely 0."""
     loss_of(agent, segment, memory.state, agent.settings.ppo, 0.01).backward()
     return [name for name, weight in agent.named_parameters() if weight.grad is None or not weight.grad.any()]
 
@@ -25,7 +25,7 @@ def without_gradient(agent: Agent, segment: Segment, memory: AgentMemory) -> lis
 def test_every_weight_gets_a_gradient(name: str) -> None:
     agent = agent_of(name)
     memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
-    # The second segment: the hidden states of recurrent layers are no longer zero.
+    # In the second segment, the hidden states of recurrent layers are no longer zero.
     play(agent, memory, observed, ends(STEPS, ENVS))
     segment = segment_of(agent, memory, {"features": observed}, STEPS, ENVS)
     assert without_gradient(agent, segment, memory) == []
@@ -33,7 +33,7 @@ def test_every_weight_gets_a_gradient(name: str) -> None:
 
 @pytest.mark.parametrize("name", TRANSFORMERS)
 def test_gradients_are_the_same_for_each_sequence_length(name: str) -> None:
-    """Sequences of one step are computed in another way than longer ones."""
+    """Sequences of one step are computed by a different algorithm than longer ones."""
     agent = agent_of(name)
     memory, observed = agent.initial_memory(ENVS), observations(STEPS, ENVS)
     play(agent, memory, observed, ends(STEPS, ENVS))

@@ -41,7 +41,7 @@ def test_task_is_learnt_at_nine_tenths_of_its_best_result(
 @pytest.mark.parametrize(
     ("changes", "stops"), [({}, True), ({"stop_when_learnt": False}, False), ({"target_reward": 9.0}, False)]
 )
-def test_a_run_stops_and_says_so(
+def test_run_stops_with_a_message_when_the_task_is_learnt(
     changes: dict[str, object], stops: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ppo = {"steps": 32, "minibatches": 1, "updates": 25}

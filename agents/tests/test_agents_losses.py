@@ -73,7 +73,7 @@ def played(kind: str) -> tuple[Agent, Segment, MemoryState]:
 @pytest.mark.parametrize("normalisation", ["none", "minibatch"])
 @pytest.mark.parametrize("kind", ["none", "gru", "trxl"])
 def test_minibatch_loss_is_the_weighted_sum(kind: str, normalisation: str) -> None:
-    """Computed in a loop over the steps from the outputs of the network."""
+    """The expected sum is computed from the outputs of the network in a loop over the steps."""
     ppo = {"ground_truth_coefficient": 0.3, "advantage_normalisation": normalisation, "clip_range": 0.1}
     given = settings(kind, ppo=ppo)
     torch.manual_seed(3)

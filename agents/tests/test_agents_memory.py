@@ -1,4 +1,4 @@
-"""The memories: their outputs against plain references, and that no information leaks from the future or other episodes."""
+"""The memories: outputs equal plain references, and no information leaks from the future or from other episodes."""
 
 import math
 
@@ -87,7 +87,7 @@ def test_forward_equals_act(agent: Agent, minibatches: int) -> None:
 
 
 def test_epochs_follow_one_another(agent: Agent) -> None:
-    """The minibatches of two epochs are those of two divisions with the same generator."""
+    """Two epochs have the same minibatches as two single epochs with the same generator."""
     memory = agent.initial_memory(ENVS)
     reset_mask, *_ = play(agent, memory, observations(STEPS, ENVS), ends(STEPS, ENVS))
 
@@ -101,8 +101,8 @@ def test_epochs_follow_one_another(agent: Agent) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
-def test_rank_may_have_no_step_of_a_minibatch(name: str) -> None:
-    """A rank with one of three environments: its steps are in some of the minibatches, and the others can be made, too."""
+def test_rank_may_have_no_steps_in_a_minibatch(name: str) -> None:
+    """A rank with one of three environments has steps in some of the minibatches, and the others can be made, too."""
     agent = agent_of(name)
     memory, done = agent.initial_memory(1), ends(STEPS, 1)
     reset_mask, *_ = play(agent, memory, observations(STEPS, 1), done)
@@ -248,7 +248,7 @@ def test_memory_resumes_from_its_state_dict() -> None:
 
 
 def test_kv_cache_is_recomputed_when_a_segment_begins() -> None:
-    """After an update of the weights, the outputs are those of the new weights."""
+    """After an update of the weights, the outputs use the new weights."""
     agent, observed, done = make("trxl"), observations(2 * STEPS, ENVS), ends(2 * STEPS, ENVS)
     memory = agent.initial_memory(ENVS)
     play(agent, memory, observed[:STEPS], done[:STEPS])

@@ -32,9 +32,9 @@ PAPER = PRESETS["paper"]
         ("trxl", {"transformer": Transformer(positional_encoding="relative")}, 2_803_111 + 3 * (96**2 + 2 * 384)),
         # Two gates of six matrices and a bias in each block.
         ("gtrxl", {}, 2_803_111 + 3 * 2 * (6 * 384**2 + 384)),
-        # An LSTM has four where a GRU has three.
+        # An LSTM has four gates, a GRU three.
         ("lstm", {}, 4_049_575 + 2 * 512 * 512 + 2 * 512),
-        # As the GRU agent, without embedding and GRU: the body takes the 3136 outputs of the convolutions.
+        # Like the GRU agent, but without embedding and GRU: the body takes the 3136 outputs of the convolutions.
         ("none", {}, 4_049_575 - 1_606_144 - 1_575_936 + (3136 - 512) * 512),
     ],
 )
@@ -75,7 +75,7 @@ def test_preset_paper_equals_the_table_of_the_paper() -> None:
         ("Endless-MortarMayhem-v0", (), 256, 2048),
         ("Endless-MysteryPath-v0", (), 256, 2048),
         ("Endless-SearingSpotlights-v0", (), 256, 2048),
-        # A window of 256, or of the longest episode; 274 steps and the one that ends it.
+        # The longest episode: 274 steps and the one that ends it.
         ("MortarMayhem-v0", (), 275, 275),
         ("MortarMayhem-v0", ("command_count=[2, 1]",), 51, 51),
         ("MysteryPath-v0", (), 512, 512),
@@ -137,7 +137,7 @@ def test_settings_round_trip_through_dicts(name: str) -> None:
     assert from_dict(to_dict(given.validated())) == given.validated()
 
 
-def test_settings_of_earlier_versions_have_the_defaults_of_later_ones() -> None:
+def test_settings_of_earlier_versions_get_defaults_for_new_fields() -> None:
     values = to_dict(PAPER)
     del values["transformer"]["query_previous"]
     assert from_dict(values) == PAPER
@@ -214,7 +214,7 @@ def test_an_observation_of_another_kind_is_an_error(observation: str, given: str
                 call(frames, agent.initial_memory(2))
             with pytest.raises(ValueError, match="make the environments with observation="):
                 call({given: frames}, agent.initial_memory(2))
-        # Entries that the agent does not use are left out.
+        # Entries that the agent does not use are ignored.
         agent.act(both.reset(seed=1)[0], agent.initial_memory(2))
 
 

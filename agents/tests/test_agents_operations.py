@@ -1,7 +1,7 @@
-"""Budgets of the operations and of the waits for the device of an `act` and of an update.
+"""Budgets for the number of operations, and of waits for the device, in an `act` and in an update.
 
-The speed of tiny networks and small minibatches is limited by the number of operations, on the CPU and on a GPU. Operations that
-only make a view are not counted.
+The number of operations limits the speed of tiny networks and small minibatches, on the CPU and on a GPU. Operations that only
+make a view are not counted.
 """
 
 import json
@@ -20,8 +20,8 @@ from endless_gym_agents.settings import Settings
 
 STEPS, GROUPS = 16, 2
 
-#: Operations of one step of one group, and of one minibatch, each with its share of what is done once for a segment or an
-#: update. The Transformer-XL has two blocks, and the actions two branches. A change that needs more must say why.
+#: Operations per step of one group, and per minibatch, each with its share of the work done once per segment or update. The
+#: Transformer-XL has two blocks, and the actions two branches. A change that raises a budget must say why.
 BUDGETS = {
     "none": (14, 200),
     "gru": (29, 345),
@@ -43,7 +43,7 @@ def small(name: str) -> Settings:
 
 
 def counted(agent: str, device: str = "cpu") -> dict[str, float]:
-    """Operations of the second segment and update; the first one makes what is made once."""
+    """Operations of the second segment and update; the first includes one-time work."""
     given = small(agent)
     with collecting(given, device) as collector:
         optimizer = make_optimizer(collector.agent, 1e-3)
@@ -112,7 +112,7 @@ for agent in ("gru", "trxl", "stack"):
         found = json.loads(line)
         # Each action is copied to the CPU, and nothing else waits.
         assert found["collect"] == {"copy_": STEPS * GROUPS}, line
-        # Each group's observation, also the last one, goes to the device once, and its rewards and ends of episodes together.
+        # Each group's observation, including the last, is uploaded once; rewards and ends of episodes are uploaded together.
         assert found["uploads"] == [[[2, 4], STEPS * GROUPS], [[4, 17], (STEPS + 1) * GROUPS]], line
         # The reset mask and the metrics; the Transformer-XL also needs the length of the longest episode.
         assert sum(found["learn"].values()) <= 2 + 1, line

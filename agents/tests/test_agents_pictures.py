@@ -169,7 +169,7 @@ def test_spreads_runs_and_iqm(tmp_path: Path) -> None:
 
 
 def test_aggregated_curves_match_the_text_of_the_paper() -> None:
-    """The paper states peaks of 0.98 (GRU) and 0.39 (Transformer-XL) in the endless tasks, and those below in the finite ones."""
+    """The paper states peaks of 0.98 (GRU) and 0.39 (Transformer-XL) in the endless tasks; for finite ones see `expected`."""
     peaks = {}
     for family, envs in plot.FAMILIES.items():
         curves = [curve for env in envs for curve in published(env, ("gru", "trxl", "gru_rec", "trxl_rec"))]
@@ -183,7 +183,7 @@ def test_aggregated_curves_match_the_text_of_the_paper() -> None:
 
 def test_evaluations_are_normalised_like_the_paper(tmp_path: Path) -> None:
     best = {env: scale(env) for env in plot.FAMILIES["endless"]}
-    # The paper: at best, the mean of the five GRU runs is 115 commands.
+    # According to the paper, the mean of the five GRU runs is at best 115 commands.
     assert best["Endless-MortarMayhem-v0"] == pytest.approx(115.8, abs=0.1)
     names = ("commands_completed", "tiles_visited", "coins_collected")
     labels = ("gru", "gru", "gru_rec")  # as in the paper's plot

@@ -51,7 +51,7 @@ def test_only_the_nonlinear_probe_reads_a_nonlinear_memory() -> None:
 
 
 @pytest.mark.parametrize("agent", ["gru", "trxl", "none"])
-def test_recording_has_what_the_heads_see(agent: str, tmp_path: Path) -> None:
+def test_recording_contains_the_inputs_of_the_heads(agent: str, tmp_path: Path) -> None:
     """The value head applied to the recorded memory gives the values of acting; recording does not change the agent."""
     made = saved(tmp_path, settings(agent, env=ID))
     before = {name: value.clone() for name, value in made.state_dict().items()}

@@ -33,9 +33,9 @@ SEARCH = [*SMALL.split(), "--parameters", "ppo.epochs", "--stage", "single"]
 
 @contextlib.contextmanager
 def started(folder: Path, *command: str | Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A program in the folder, which writes to the file `output`; at the end all processes of its session are killed.
+    """Start a program in the folder, with its output in the file `output`; on exit, kill all processes of its session.
 
-    Ray's processes are in the session of the program, which can therefore be ended as a whole.
+    Ray's processes are in the session of the program, so they are killed, too.
     """
     with (folder / "output").open("w") as output:
         process = subprocess.Popen(
@@ -56,7 +56,7 @@ def started(folder: Path, *command: str | Path) -> Iterator[subprocess.Popen[byt
 
 
 def wait_for_updates(process: subprocess.Popen[bytes], folder: Path, *runs: Path) -> None:
-    """Wait until the runs have made two updates."""
+    """Wait until each run has completed two updates."""
     while not all((run / "progress.jsonl").exists() and len(_rows(run)) >= 2 for run in runs):
         assert process.poll() is None, (folder / "output").read_text()
         time.sleep(0.01)
@@ -79,7 +79,7 @@ def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], s
     folder = tmp_path / "search"
     study = optuna.load_study(study_name="search", storage=f"sqlite:///{folder / 'study.db'}")
     ended = [(trial.params["ppo.epochs"], trial.state.name, trial.value) for trial in study.trials]
-    # Also the trial whose process was killed is one trial: Tune resumed it.
+    # The trial whose process was killed is still a single trial: Tune resumed it.
     assert ended == [(3, "COMPLETE", 1.0), (2, "PRUNED", 0.5), (4, "COMPLETE", 2.0)]
     reported = [list(trial.intermediate_values) for trial in study.trials]
     assert reported == [[1, 2, 3, 4, 5]] * 3
@@ -101,7 +101,7 @@ def test_search_on_ray(tmp_path: Path, ray_folder: str, segments: Callable[[], s
 def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
     tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C in a terminal, which all processes of its group receive."""
+    """Ctrl-C in a terminal signals all processes of the group."""
     given = [*SEARCH, "--folder", str(tmp_path / "search"), "--ppo.updates", "100000"]
     runs = [tmp_path / "search" / f"trial-000{number}" for number in (0, 1)]
     program = [sys.executable, "-m", "endless_gym_agents.search"]
@@ -109,7 +109,7 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
         wait_for_updates(process, tmp_path, *runs)
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(60) == 130, (tmp_path / "output").read_text()
-        # The engines end by themselves when their trainers have.
+        # The engines end on their own after their trainers.
         assert not psutil.wait_procs(_session(process.pid), timeout=30)[1]
     assert "endless-search: stopped" in (tmp_path / "output").read_text()
     assert not _left_by(ray_folder)
@@ -134,7 +134,7 @@ def test_an_interrupted_search_on_ray_leaves_nothing_and_resumes(
 def test_an_experiment_on_ray_is_stopped_and_resumed(
     tmp_path: Path, ray_folder: str, segments: Callable[[], set[str]]
 ) -> None:
-    """Ctrl-C stops its run after an update, with a checkpoint; the same command completes it, and then has nothing to do."""
+    """Ctrl-C stops the run after an update, with a checkpoint; the same command then completes it, and then does nothing."""
     (own,) = EXPERIMENT["runs"]
     runs = [own | {"flags": own["flags"] | {"environment.engine": "process"}}]
     (tmp_path / "mine.json").write_text(json.dumps(EXPERIMENT | {"runs": runs}))
@@ -164,7 +164,7 @@ def test_an_experiment_on_ray_is_stopped_and_resumed(
 
 
 def _left_by(ray_folder: str) -> list[str]:
-    """The command lines of Ray's processes."""
+    """The command lines of Ray's remaining processes."""
     return [" ".join(line) for line in map(_command_line, psutil.process_iter()) if ray_folder in " ".join(line)]
 
 

@@ -36,7 +36,7 @@ def load(dataset: str) -> Any:
 
 
 @pytest.mark.parametrize("agent", ["gru", "trxl", "stack"])
-def test_the_agent_plays_as_it_is_evaluated(agent: str, tmp_path: Path) -> None:
+def test_recorded_episodes_equal_evaluated_ones(agent: str, tmp_path: Path) -> None:
     made = make(agent, tmp_path)
     recorded = record(
         ID,
@@ -54,7 +54,7 @@ def test_the_agent_plays_as_it_is_evaluated(agent: str, tmp_path: Path) -> None:
     assert [episode.rewards.sum() for episode in episodes] == pytest.approx([result["reward"] for result in results])
 
 
-def test_sampled_actions_follow_from_the_seed_alone(tmp_path: Path) -> None:
+def test_sampled_actions_depend_only_on_the_seed(tmp_path: Path) -> None:
     made = make("gru", tmp_path)
 
     def actions(name: str, seed: int, threads: int) -> list[list[int]]:

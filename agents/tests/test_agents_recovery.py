@@ -1,4 +1,4 @@
-"""Training runs whose engine process is killed: the same results as without, a checkpoint, or an error."""
+"""Training runs whose engine process is killed have the same results, or save a checkpoint, or raise an error."""
 
 import os
 import random
@@ -103,10 +103,10 @@ def test_restarts_are_counted_anew_in_each_update(
 
 
 @pytest.mark.parametrize("policy", ["restart", "save"])
-def test_a_run_without_an_engine_saves_its_checkpoint(
+def test_run_saves_a_checkpoint_when_the_engine_is_given_up(
     policy: str, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # From the second update on, and not in an update whose end is an interval of checkpoints.
+    # The engine fails from the second update on, after which no regular checkpoint is due.
     given = replace(
         small("gru", tmp_path / "run", UPDATES, engine="process"), on_engine_failure=policy, checkpoint_interval=100
     )
@@ -127,7 +127,7 @@ def test_a_run_without_an_engine_saves_its_checkpoint(
     compare(Path(given.run), undisturbed)
 
 
-def test_a_run_can_fail_at_once(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policy_fail_raises_at_once(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = replace(small("gru", tmp_path / "run", UPDATES, engine="process"), on_engine_failure="fail")
     with monkeypatch.context() as patch:
         kill_before(patch, "receive", {100})
@@ -149,7 +149,7 @@ def test_a_resumed_run_recovers(undisturbed: Path, tmp_path: Path, monkeypatch: 
 
 @pytest.mark.slow
 def test_an_engine_that_does_not_answer_is_replaced() -> None:
-    """A stopped process is alive, and no signal but SIGKILL ends it."""
+    """A stopped process is alive, and only SIGKILL ends it."""
     arguments = {"num_envs": 2, "groups": 2, "seed": 1, "autoreset": "same_step"}
     serving = partial(serve, GRID, timeout=5.0, **arguments)
     engine = RecoverableEngine("restart", serving, partial(make_vec, GRID, **arguments))

@@ -1,4 +1,4 @@
-"""The layers over packed sequences: outputs and gradients of PyTorch's."""
+"""The layers over packed sequences have the same outputs and gradients as PyTorch's layers."""
 
 import pytest
 import torch

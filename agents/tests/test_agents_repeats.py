@@ -1,4 +1,4 @@
-"""Equal frames are encoded once, while acting and while learning, and give what encoding each of them gives."""
+"""Equal frames are encoded once, while acting and while learning, with the same results as encoding each of them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def collected(given: Settings, segments: int = 1) -> tuple[Agent, Segment, list[
 
 @contextmanager
 def encoded_frames(agent: Agent) -> Iterator[list[int]]:
-    """Numbers of the frames that are encoded at a time."""
+    """The number of frames in each call of the encoder."""
     counts: list[int] = []
 
     def count(_: nn.Module, inputs: tuple[Tensor, ...]) -> None:
@@ -68,7 +68,7 @@ def embeddings(frames: Tensor) -> Tensor:
 
 
 def test_frames_with_equal_hashes_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only frames that equal the first one with their hash are recognised."""
+    """Only frames that equal the first frame with their hash are recognised."""
     monkeypatch.setattr(repeats, "hash", lambda _: 0, raising=False)
     frames = frames_of([5, 6, 5, 5, 7, 6, 5, 8])
     embedded, asked = EmbeddedFrames(frames), []
@@ -97,7 +97,7 @@ def test_segment_equals_one_whose_frames_are_all_encoded(agent: str) -> None:
     assert 1 < different < len(frames) / 2
     # One more for each environment: the value after the last step.
     assert encoded == different + ENVS
-    # Acting equals learning, with each frame encoded for itself.
+    # Acting equals learning with each frame encoded separately.
     for minibatch in made.memory.minibatches(states, segment.reset_mask, 2, torch.Generator().manual_seed(0)):
         with torch.no_grad():
             output = made({FRAME: frames[minibatch.indices]}, minibatch)
@@ -132,7 +132,7 @@ def test_losses_and_gradients_equal_those_of_encoding_each_frame(agent: str) -> 
 
 @pytest.mark.parametrize("given", [small(observation="features"), small("stack"), small(compile=True)])
 def test_other_observations_are_encoded_one_by_one(given: Settings) -> None:
-    """Features, frames with a history, and all where the encoder is compiled for a number of frames."""
+    """Features, stacked frames, and frames for a compiled encoder, which would be recompiled for each number of frames."""
     with collecting(given) as collector:
         segment, _ = collector.collect(Clock())
     assert segment.first_occurrence is None

@@ -39,7 +39,7 @@ def start(folder: Path, out: str) -> "subprocess.Popen[str]":
 
 
 def completed(folder: Path, out: str) -> str:
-    """What the command prints that does the rest."""
+    """The output of the command that completes the remaining work."""
     process = start(folder, out)
     text, _ = process.communicate(timeout=280)
     assert process.returncode == 0, text
@@ -58,7 +58,7 @@ def wait_for_updates(run: Path, count: int) -> None:
 
 
 def log_of(job: planning.Job, updates: int, seconds: float) -> None:
-    """A run's log with that many updates of that many seconds."""
+    """Write a run's log with this many updates of this many seconds each."""
     job.folder.mkdir(parents=True)
     rows = [
         json.dumps({"update": 1 + n, "seconds/a": seconds / 4, "seconds/b": seconds * 3 / 4}) for n in range(updates)
@@ -68,7 +68,7 @@ def log_of(job: planning.Job, updates: int, seconds: float) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_flags_of_an_experiment_give_its_settings(name: str) -> None:
-    """The settings of a run are those that its command line gives, also at a small scale."""
+    """The command line of a run gives its settings, also at a small scale."""
     experiment = definitions.load(name)
     for one in (experiment, planning.scaled(experiment, planning.TINY)):
         run = one.runs[-1]
@@ -79,7 +79,7 @@ def test_flags_of_an_experiment_give_its_settings(name: str) -> None:
     assert all(run.settings().ppo.updates <= 2 for run in planning.scaled(experiment, planning.TINY).runs)
 
 
-def test_runs_of_one_name_are_the_same_run() -> None:
+def test_runs_with_the_same_name_have_the_same_settings() -> None:
     known: dict[tuple[str, str], dict[str, Any]] = {}
     for name in NAMES:
         experiment = definitions.load(name)
@@ -136,7 +136,7 @@ def test_a_scale_makes_everything_smaller() -> None:
 
 
 def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -> None:
-    """Two of six jobs have begun; the others take as long as those of the same agent, or as the mean of all."""
+    """Two of six jobs have begun; the others are estimated by those of the same agent, or by the mean of all."""
     runs = [
         {"name": agent, "env": "MortarMayhem-v0", "flags": {"agent": agent, "ppo.updates": 10}}
         for agent in ("gru", "lstm", "trxl")
@@ -151,10 +151,10 @@ def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -
     # gru: 6 and 10 updates of 2 s; lstm: 5 and 10 of 8 s; trxl: twice 10 of 5 s.
     assert planning.remaining_seconds(planned, 1) == pytest.approx(12 + 20 + 40 + 80 + 50 + 50)
     assert planning.remaining_seconds(planned, 3) == pytest.approx(252 / 3)
-    # No division makes the longest job shorter.
+    # More machines do not shorten the longest job.
     assert planning.remaining_seconds(planned, 100) == pytest.approx(80)
     assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 4.2 minutes, and its evaluation")
-    # One evaluation is measured: five others of the same duration.
+    # One evaluation is measured; the five others are expected to take as long.
     (planned[1].folder / "evaluation.json").write_text('{"seconds": 12.0}')
     assert planning.remaining_seconds(planned, 1) == pytest.approx(252 + 5 * 12)
     assert running.left(planned, 1).endswith("9 of 60 updates; the rest takes 5.2 minutes")
@@ -170,7 +170,7 @@ def test_the_status_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "MortarMayhem-Grid-v0 gru seed 1, update 6 of 6, evaluation left\n" in capsys.readouterr().out
 
 
-def test_a_run_of_other_settings_is_refused(tmp_path: Path) -> None:
+def test_a_run_with_other_settings_is_refused(tmp_path: Path) -> None:
     experiment = definitions.parse("mine", json.dumps(EXPERIMENT))
     (job,) = planning.jobs(experiment, tmp_path, 1)
     job.folder.mkdir(parents=True)
@@ -238,7 +238,7 @@ def test_list_is_readable_and_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.fixture(scope="module")
 def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an undisturbed run, in its folder `through`."""
+    """A folder with an undisturbed run in its subfolder `through`."""
     folder = tmp_path_factory.mktemp("reproduced")
     own(folder)
     completed(folder, "through")
@@ -249,7 +249,7 @@ def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["kill", "interrupt"])
 def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_path: Path) -> None:
-    """A run that is killed, or stopped by Ctrl-C, continues; then everything is done, and nothing runs again."""
+    """A run that was killed or stopped by Ctrl-C is completed; repeating the command then runs nothing."""
     own(tmp_path)
     begun, run = start(tmp_path, "stopped"), run_folder(tmp_path, "stopped")
     wait_for_updates(run, 3)
@@ -278,7 +278,7 @@ def test_stopped_run_equals_an_uninterrupted_one(how: str, through: Path, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list({definitions.load(name).kind: name for name in NAMES}.values()))
-def test_the_smallest_version_of_each_kind_of_experiment(name: str, tmp_path: Path) -> None:
+def test_smallest_version_of_each_kind_of_experiment_runs(name: str, tmp_path: Path) -> None:
     """One run with one update, through evaluation and report."""
     file, experiment = tmp_path / f"{name}.json", definitions.load(name)
     given = json.loads((Path(definitions.__file__).parent / f"{name}.json").read_text())

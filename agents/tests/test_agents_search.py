@@ -55,7 +55,7 @@ def test_search_space_is_the_table_of_the_paper() -> None:
     assert trxl["transformer.initialisation"] == ("xavier", "orthogonal", "kaiming", "tfixup")
     assert "transformer.layers" not in gru
     assert "recurrence.layers" not in trxl
-    # The table has 8 parameters for all with 16 other choices; 4 with 5 for recurrence; 5 with 10 for the Transformer-XL.
+    # The table has 8 common parameters with 16 alternatives, 4 with 5 for recurrence, and 5 with 10 for the Transformer-XL.
     assert (len(gru), len(single_changes(gru))) == (12, 1 + 16 + 5)
     assert (len(trxl), len(single_changes(trxl))) == (13, 1 + 16 + 10)
     rebuilt = changed(PRESETS["paper"], ppo={"reconstruction_coefficient": 0.1})
@@ -103,8 +103,8 @@ def test_search_from_start_to_end(tmp_path: Path) -> None:
         Trials(small(tmp_path, parameters=("ppo.minibatches",)), QUIET)
 
 
-def test_the_best_settings_are_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader that has the old file open reads it to its end."""
+def test_the_best_settings_are_replaced_atomically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader that has the old file open can read all of it."""
 
     def played(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> None:
         watch(given.ppo.updates, {"episode/reward": float(given.ppo.epochs)})
@@ -130,8 +130,8 @@ def test_no_trial_is_begun_after_the_time_limit(tmp_path: Path) -> None:
     assert Trials(small(tmp_path, stage="single"), QUIET).remaining() == (0, 3)
 
 
-def test_a_failed_trial_is_resumed_by_the_next_call_only(tmp_path: Path) -> None:
-    """Ray reports a trial that failed too often. One that ran out of memory is never resumed."""
+def test_a_failed_trial_is_resumed_only_by_the_next_call(tmp_path: Path) -> None:
+    """Ray reports a trial that failed too often; one that ran out of memory is never resumed."""
     first = search_ray._Study(Trials(small(tmp_path, trials=2, stage="combinations"), QUIET))
     configuration = first.begin("a")
     assert configuration is not None
@@ -159,7 +159,7 @@ def test_a_failed_trial_is_resumed_by_the_next_call_only(tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("with_checkpoint", [True, False])
 def test_interrupted_trial_resumes(with_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search that is interrupted after the first update has the results of an uninterrupted search."""
+    """A search that is interrupted after the first update has the same results as an uninterrupted search."""
     through = Trials(small(tmp_path / "through", stage="single"), QUIET)
     search.run_trials(through)
 
@@ -213,7 +213,7 @@ def test_trials_that_fall_behind_are_pruned(
 
 
 def killed_once(trials: Trials, threads: int | None) -> None:
-    """The work of a worker whose first two trials wait for each other; the process of the first trial is then killed, once."""
+    """Work of a worker: the first two trials wait for each other, then the process of the first one is killed, once."""
     folder = trials.folder
 
     def trained(given: Settings, watch: Callable[[int, dict[str, float]], bool]) -> Path:
@@ -235,7 +235,7 @@ def killed_once(trials: Trials, threads: int | None) -> None:
 
 
 @pytest.mark.slow
-def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -> None:
+def test_workers_resume_only_the_trial_of_a_killed_worker(tmp_path: Path) -> None:
     def given(name: str) -> SearchArguments:
         given = small(tmp_path / name, stage="single", workers=2)
         return replace(given, settings=changed(given.settings, ppo={"updates": 4}, checkpoint_interval=1))
@@ -258,7 +258,7 @@ def test_workers_resume_the_trial_of_a_killed_one_and_no_other(tmp_path: Path) -
 
 
 def killed_and_replaced(trials: Trials, threads: int | None) -> None:
-    """The work of a worker that is killed, once."""
+    """Work of a worker that is killed, once."""
     with (trials.folder / "ends").open("a") as ends:
         print(repr(trials.end), file=ends)
     if len((trials.folder / "ends").read_text().splitlines()) == 1:
@@ -266,7 +266,7 @@ def killed_and_replaced(trials: Trials, threads: int | None) -> None:
 
 
 @pytest.mark.slow
-def test_the_time_limit_of_a_replaced_worker_is_that_of_the_search(tmp_path: Path) -> None:
+def test_a_replaced_worker_keeps_the_time_limit_of_the_search(tmp_path: Path) -> None:
     trials = Trials(small(tmp_path, stage="single", workers=1, minutes=5.0), QUIET)
     search_workers.run_workers(trials, killed_and_replaced)
     assert (tmp_path / "ends").read_text() == f"{trials.end!r}\n" * 2
@@ -291,7 +291,7 @@ def test_the_log_of_a_trial_says_why_it_failed(tmp_path: Path) -> None:
 
 
 def interrupted_or_late(trials: Trials, threads: int | None) -> None:
-    """The work of a worker that only a signal ends in time."""
+    """Work of a worker that only a signal ends in time."""
     time.sleep(30)
     (trials.folder / "late").touch()
 
@@ -316,7 +316,7 @@ def test_a_signal_while_workers_are_started_stops_them(tmp_path: Path, monkeypat
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_stop_with_their_search(number: signal.Signals, tmp_path: Path) -> None:
-    """Also if it is killed: they stop after their update, with checkpoints, as if they had been interrupted."""
+    """Even if the search is killed, the workers stop after their update, with checkpoints, as if interrupted."""
     command = [sys.executable, "-m", "endless_gym_agents.search", "--preset", "quick", "--folder", str(tmp_path)]
     sizes = ["--environment.num-envs", "4", "--ppo.steps", "16", "--ppo.minibatches", "1", "--ppo.updates", "100000"]
     choice = ["--env", "MortarMayhem-Grid-v0", "--parameters", "ppo.epochs", "--stage", "single", "--workers", "2"]

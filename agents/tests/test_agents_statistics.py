@@ -20,12 +20,12 @@ def test_interquartile_mean_is_the_mean_of_the_middle_half(scores: list[float], 
 
 
 def test_bootstrap_of_three_runs() -> None:
-    """There are 27 samples of 0, 3 and 9 with replacement; their sums are at most 0, 3, 18 and 21 in 1, 4, 23 and 26 of them."""
+    """Of the 27 samples of 0, 3 and 9 with replacement, 1, 4, 23 and 26 have a sum of at most 0, 3, 18 and 21."""
     assert stratified_bootstrap([0, 3, 9], confidence=0.8) == (1.0, 7.0)
 
 
 def test_bootstrap_is_stratified_by_task() -> None:
-    """Without variance between the runs of each task the interval is a point."""
+    """Without variance between the runs of each task, the interval is a point."""
     assert stratified_bootstrap([[0, 10], [0, 10], [0, 10], [0, 10]]) == (5.0, 5.0)
 
     # If whole runs were drawn, 0 and 2 would always average to 1.
@@ -33,7 +33,7 @@ def test_bootstrap_is_stratified_by_task() -> None:
 
 
 def test_bootstrap_is_of_the_interquartile_mean() -> None:
-    """Three or more of four draws are the 1 in 5 % of the samples: their interquartile mean is then 1, their mean less."""
+    """In 5 % of the samples, three or more of four draws are the 1. The interquartile mean is then 1; the mean is mostly less."""
     assert stratified_bootstrap([0, 0, 0, 1]) == (0.0, 1.0)
 
 
@@ -43,7 +43,7 @@ def test_bootstrap_is_reproducible() -> None:
     assert stratified_bootstrap(scores, seed=1) != stratified_bootstrap(scores, seed=2)
 
 
-def test_bootstrap_interval_has_its_coverage() -> None:
+def test_bootstrap_interval_has_its_nominal_coverage() -> None:
     samples = np.random.default_rng(0).normal(size=(200, 40))
     covered = [low < 0 < high for low, high in (stratified_bootstrap(sample, repetitions=300) for sample in samples)]
     assert 0.87 < np.mean(covered) < 0.99

@@ -63,7 +63,7 @@ def same(one: Any, two: Any) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["none", "position", "stack", "gru", "lstm", "trxl", "gtrxl"])
 def test_forward_equals_the_rollout_with_the_same_weights(agent: str, tmp_path: Path) -> None:
-    """Log-probabilities and values of two segments are those of the rollout; between them the agent learns."""
+    """Log-probabilities and values of two segments equal those of the rollout; the agent learns in between."""
     given = small(agent, tmp_path)
     with collecting(given) as collector:
         made = collector.agent
@@ -189,7 +189,7 @@ def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
-    """As after an interruption of the first update."""
+    """Update 0 is the last checkpoint if the first update was interrupted."""
     run = train(replace(small("gru", tmp_path / "run", 2), time_limit=1e-9, keep_checkpoints=True))
     assert len(progress(run)) == 1
     (run / "checkpoints" / "last.pt").unlink()

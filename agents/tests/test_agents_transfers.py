@@ -8,8 +8,8 @@ import torch
 from endless_gym_agents.transfers import HostCopy
 
 
-def test_the_copy_is_waited_for_on_the_stream_of_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An event that is recorded without a stream is one of the current device, which need not be the tensor's."""
+def test_copy_waits_on_the_stream_of_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An event recorded without a stream belongs to the current device, which need not be the tensor's."""
     calls = []
     done = SimpleNamespace(record=calls.append, synchronize=lambda: calls.append("wait"))
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: f"stream of {device}")

@@ -14,7 +14,7 @@ from endless_gym_agents.curves import _published
 
 RESULTS = Path(__file__).parents[2] / "tests/reference/published_results.json.gz"
 
-#: Environment, its name in the published results, the metric that the package keeps, and what it adds to the agents' names.
+#: Environment, its name in the published results, the metric that the package keeps, and its suffix for the agents' names.
 METRICS = [
     ("Endless-MortarMayhem-v0", "emm", "commands_completed", ""),
     ("Endless-MysteryPath-v0", "emp", "tiles_visited", ""),
@@ -43,7 +43,7 @@ def test_published_curves_are_read_unchanged(env: str, name: str, metric: str, s
 
 
 def test_task_progress_of_mystery_path_fits_the_published_rewards() -> None:
-    """A tile gives 0.1, the goal 1.0. The paths have 9.2 tiles in the mean; the shorter ones are finished more often."""
+    """A tile gives 0.1, the goal 1.0. The paths have 9.2 tiles on average; the shorter ones are finished more often."""
     published = results()
     curves = _published()["curves"]["MysteryPath-v0"]
     assert len(curves) == 7

@@ -1,4 +1,4 @@
-"""Data-parallel training: what `torchrun` starts computes what one process computes, and ends as a whole."""
+"""Data-parallel training: the processes of `torchrun` compute the same as a single process, and end together."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def ranks_of(process: subprocess.Popen[str]) -> dict[int, int]:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts a run of several ranks; what it prints is beside its folder, in a file. After the test it is killed."""
+    """Starts a run of several ranks, with its output in a file next to its folder. The run is killed after the test."""
     processes = []
 
     def start(run: Path, ranks: int, *arguments: str, restarts: int = 0) -> subprocess.Popen[str]:
@@ -103,7 +103,7 @@ def start() -> Iterator[Start]:
     [
         ("gru", 2, "--ppo.advantage-normalisation minibatch --environment.engine process"),
         ("lstm", 4, "--ppo.advantage-normalisation none --environment.groups 1"),
-        # One sequence in each minibatch: it belongs to one rank, and the other has no step.
+        # Each minibatch has one sequence, which belongs to one rank; the other rank has no steps.
         ("trxl", 2, "--environment.num-envs 2 --environment.groups 1 --transformer.sequence-length 16"),
     ],
 )
@@ -126,9 +126,7 @@ def test_ranks_compute_what_one_process_computes(
 
 
 @pytest.mark.slow
-def test_a_killed_rank_ends_the_run_which_starts_again(
-    tmp_path: Path, segments: Callable[[], set[str]], start: Start
-) -> None:
+def test_run_restarts_when_a_rank_is_killed(tmp_path: Path, segments: Callable[[], set[str]], start: Start) -> None:
     run, engines = tmp_path / "run", ("--agent", "gru", "--environment.engine", "process")
     undisturbed = start(tmp_path / "undisturbed", 2, *engines, "--ppo.updates", "12")
     finished(undisturbed, tmp_path / "undisturbed")
@@ -160,18 +158,18 @@ def test_all_ranks_end_within_seconds_of_one(tmp_path: Path, segments: Callable[
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(tmp_path: Path, start: Start) -> None:
+def test_interrupted_run_resumes_with_the_same_or_another_number_of_ranks(tmp_path: Path, start: Start) -> None:
     run = tmp_path / "run"
     process = start(run, 2, "--agent", "trxl", *ENDLESS)
     wait_until(lambda: len(rows(run)) >= 2, process, run)
-    # As Ctrl-C in a terminal does, which torchrun then passes on.
+    # Like Ctrl-C in a terminal, which torchrun also forwards.
     os.killpg(process.pid, signal.SIGINT)
     process.wait(timeout=100)
     text, done = log(run).read_text(), len(rows(run))
     assert f"{done} of 100000 updates done" in text
     assert last(run)["update"] == done
 
-    # Exactly, with the same ranks: two more updates are those of a run that was not interrupted.
+    # With the same ranks it resumes exactly: two more updates equal those of an uninterrupted run.
     more = ["--ppo.updates", str(done + 2)]
     undisturbed = start(tmp_path / "undisturbed", 2, "--agent", "trxl", *more)
     resume = ["--nproc-per-node=2", "-m", "endless_gym_agents.train", "--", "--resume", str(run), *more]
@@ -189,7 +187,7 @@ def test_an_interrupted_run_resumes_with_as_many_ranks_or_others(tmp_path: Path,
 
 @pytest.mark.slow
 def test_no_thread_outlives_the_connection(tmp_path: Path) -> None:
-    """A thread of gloo that runs while the interpreter ends can end the process by a signal."""
+    """A gloo thread that still runs when the interpreter exits can crash the process with a signal."""
     program = tmp_path / "program.py"
     program.write_text(
         f"""

@@ -88,7 +88,7 @@ class Experiment:
         name: Name, as `endless-reproduce` takes it.
         title: Title.
         section: Section or appendix of the paper.
-        about: What is compared, and what the paper says about it.
+        about: What is compared, and what the paper reports.
         kind: What is run and reported.
         seeds: Number of repetitions of each run.
         runs: The runs.
@@ -112,7 +112,7 @@ class Experiment:
 
 
 def settings_of(env: str, flags: Mapping[str, Value]) -> Settings:
-    """The settings that flags of `endless-train` stand for.
+    """The settings that flags of `endless-train` describe.
 
     Raises:
         ValueError: An unknown flag, or a value of another type.
@@ -216,7 +216,7 @@ def parse(name: str, text: str) -> Experiment:
     return made
 
 
-#: What JSON has for the annotations of the classes above, without what follows in brackets.
+#: JSON type for each annotation in the classes above, by the annotation's name without type arguments.
 _TYPES: dict[str, type] = {"str": str, "Kind": str, "Aggregate": str, "int": int, "tuple": list}
 _TYPES |= dict.fromkeys(("Evaluation", "Search", "Mapping"), dict)
 

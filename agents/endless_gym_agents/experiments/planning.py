@@ -1,4 +1,4 @@
-"""From an experiment to jobs: their flags at a scale, their folders, what is done of them, and how long the rest takes."""
+"""Turns an experiment into jobs: their flags at a scale, folders, progress and estimated remaining time."""
 
 from __future__ import annotations
 
@@ -101,11 +101,11 @@ def read_scale(text: str) -> float:
 
 
 def scaled(experiment: Experiment, scale: float) -> Experiment:
-    """A smaller version of an experiment; the same with scale 1.
+    """A smaller version of an experiment; with scale 1, the experiment itself.
 
-    Seeds, updates, the updates of the decay and between checkpoints, trials and episodes are multiplied by the scale;
-    environments, steps of a rollout, seeds of the evaluation and parameters of a search by its square root. Networks and tasks
-    stay.
+    Seeds, updates, decay updates, updates between checkpoints, trials and episodes are multiplied by the scale; environments,
+    steps of a rollout, seeds and repetitions of the evaluation and parameters of a search by its square root. Networks and
+    tasks stay the same.
 
     Args:
         experiment: The experiment.
@@ -149,11 +149,11 @@ def scaled(experiment: Experiment, scale: float) -> Experiment:
 
 
 def jobs(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] = ()) -> list[Job]:
-    """The jobs of an experiment at a scale, the first seed of all runs before the second.
+    """The jobs of an experiment at a scale, ordered by seed, then by run.
 
     Args:
         experiment: The experiment at its full size.
-        out: Folder of all experiments.
+        out: Folder for all experiments.
         scale: Scale of the experiment.
         seeds: Seeds; empty for 1 to the number that the experiment names.
 
@@ -173,12 +173,12 @@ def jobs(experiment: Experiment, out: Path, scale: float, seeds: Sequence[int] =
 
 
 def folder_of(out: Path, scale: float) -> Path:
-    """Folder of the runs and reports of a scale."""
+    """Folder of the runs and reports at a scale."""
     return out if scale == 1 else out / f"scale-{scale:g}"
 
 
 def check_folders(planned: Sequence[Job]) -> None:
-    """Check that the runs in the folders are those of the jobs.
+    """Check that any runs already in the folders belong to the jobs.
 
     Raises:
         ValueError: A folder has a run with other settings.
@@ -208,7 +208,7 @@ def flags(values: Mapping[str, Value]) -> list[str]:
 
 
 def commands(job: Job, device: str, engine_threads: int) -> list[list[str]]:
-    """What is left to run of a job: command lines, one after the other; the first word is a program of the package.
+    """The command lines that a job still has to run, in order; the first word of each is a program of this package.
 
     Args:
         job: The job.
@@ -255,14 +255,14 @@ def evaluation_seconds(job: Job) -> float | None:
 
 
 def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -> Callable[[Job], float] | None:
-    """A measurement of each job; where there is none, the mean of the jobs of the same environment and agent, or else of all.
+    """Estimate a measurement for jobs without one: the mean over the same environment and agent, or else over all jobs.
 
     Args:
         planned: The jobs.
-        measured: The measurement of a job; None without one.
+        measured: Returns the measurement of a job, or None.
 
     Returns:
-        The measurement or its estimate; None if no job has a measurement.
+        A function that returns a job's measurement or its estimate; None if no job has a measurement.
     """
     known = [(job, value) for job in planned if (value := measured(job)) is not None]
     if not known:
@@ -280,13 +280,13 @@ def _estimate(planned: Sequence[Job], measured: Callable[[Job], float | None]) -
 
 
 def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None:
-    """Estimated time that the jobs that are not done still take; None before the first measured update.
+    """Estimated seconds until all jobs are done; None before the first measured update.
 
-    Evaluations count once the first one is done.
+    Evaluations are included once the first one is done.
 
     Args:
         planned: The jobs.
-        side_by_side: Number of jobs that run at a time.
+        side_by_side: Number of jobs that run at the same time.
     """
 
     def median(job: Job) -> float | None:
@@ -305,7 +305,7 @@ def remaining_seconds(planned: Sequence[Job], side_by_side: int) -> float | None
 
 
 def as_json(experiment: Experiment, scale: float) -> dict[str, Any]:
-    """An experiment for `--list --json`: as its file, with the updates and steps of each run at the scale."""
+    """An experiment for `--list --json`: the content of its file, plus the updates and steps of each run at the scale."""
     small = scaled(experiment, scale)
     values = json.loads(json.dumps(dataclasses.asdict(small)))
     for row, run in zip(values["runs"], small.runs, strict=True):

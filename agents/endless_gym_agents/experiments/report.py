@@ -1,4 +1,4 @@
-"""Figures and tables of an experiment, ours beside the published ones, in a folder with a README."""
+"""Figures and tables of an experiment, our results next to the published ones, in a folder with a README."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from endless_gym_agents.plot import HOURS, draw
 from endless_gym_agents.settings import PAPER_STEPS_PER_UPDATE, paper_run_length
 from endless_gym_agents.statistics import interquartile_mean
 
-#: A row of a table: text or numbers by column; columns that a row lacks stay empty.
+#: A row of a table: text or numbers by column; missing columns stay empty.
 Row = dict[str, str | float]
 
 
 def write(jobs: Sequence[Job], folder: Path, scale: float) -> Path:
-    """Write the report of an experiment from what is done of it.
+    """Write the report of an experiment from its finished jobs.
 
     Args:
         jobs: All jobs of the experiment.
@@ -123,7 +123,7 @@ def _curves(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
         name = task.replace(" ", "-").replace("=", "-")
         figures.append(draw(name, axis, [*curves, *published(env, labels)], "std", folder))
         if curves[0].steps[-1] < 0.1 * max((one.steps[-1] for one in published(env, labels)), default=0):
-            # Beside the published curves these would be a dot.
+            # Next to the published curves, ours would be a dot.
             figures.append(draw(f"{name}-ours", axis, curves, "std", folder))
     if jobs and jobs[0].experiment.aggregate:
         family = jobs[0].experiment.aggregate
@@ -136,7 +136,7 @@ def _curves(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]]:
 
 
 def _row(task: str, run: Run, curve: Curve) -> Row:
-    """The scores of a run at its end and at its best checkpoint."""
+    """The scores of a run at its last and at its best checkpoint."""
     name, _ = metrics.metric(run.env)
     row: Row = {"environment": task, "run": run.name, "metric": name}
     found = [("", curve)] + [(" (paper)", one) for one in published(run.env, [run.published])]
@@ -197,7 +197,7 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
     panels: dict[str, list[Curve]] = {}
     for run, own in _by_run(jobs):
         updates = [planning.update_seconds(job) for job in own]
-        # The first update compiles, and starts the environments.
+        # The first update includes compilation and the start of the environments.
         seconds = np.array([value for one in updates for value in (one[1:] or one)])
         whole = paper_run_length(run.env, run.settings().agent)
         numbers = {"mean": seconds.mean(), "std": seconds.std(), "min": seconds.min(), "max": seconds.max()}
@@ -205,7 +205,7 @@ def _wall_time(jobs: Sequence[Job], folder: Path) -> tuple[list[Row], list[Path]
         numbers["hours"] = seconds.mean() * whole / 3600
         rows.append(_beside(run, {name: float(number) for name, number in numbers.items()}))
         for curve in published(run.env, [run.published]):
-            # The published scores over the paper's time, and over ours.
+            # The published scores over the paper's training time and over ours.
             times = {curve.label: run.values["mean"]} if "mean" in run.values else {}
             times[f"{curve.label} in our time"] = float(seconds.mean())
             for label, mean in times.items():

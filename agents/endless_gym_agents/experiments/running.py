@@ -1,4 +1,4 @@
-"""Runs the commands of jobs side by side, each in a process of its own, and stops them so that they can be resumed."""
+"""Runs the commands of jobs in parallel, each in a separate process, and stops them so that they can be resumed."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _MODULES = {
     "endless-search": "endless_gym_agents.search",
     _SPEED: "endless_gym_agents.experiments.stepping",
 }
-#: Seconds between two looks at the processes, and between two estimates of the remaining time.
+#: Seconds between polls of the processes, and between estimates of the remaining time.
 _POLL, _REPORT = 0.1, 60.0
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What jobs run on.
+    """The resources that jobs run on.
 
     Attributes:
-        jobs: Number of jobs that run at a time.
+        jobs: Number of jobs that run at the same time.
         gpus: Visible GPUs, as in `CUDA_VISIBLE_DEVICES`; empty for the CPU.
         device: Device of the agents, as for `endless-train`.
         nice: Added to the niceness of the processes, 0 to 19.
@@ -59,7 +59,7 @@ class Machine:
         return self.job_cores or max(1, cores() // self.jobs)
 
     def environment(self, slot: int) -> dict[str, str]:
-        """Environment variables that the job in a slot gets in addition."""
+        """Additional environment variables for the job in a slot."""
         added = {"OMP_NUM_THREADS": "1"}
         return added | {"CUDA_VISIBLE_DEVICES": self.gpus[slot % len(self.gpus)]} if self.gpus else added
 
@@ -70,7 +70,7 @@ def cores() -> int:
 
 
 def machine(jobs: int, device: str, nice: int = 19) -> Machine:
-    """The machine with a number of jobs; 0 for one per GPU, or without GPUs one per core.
+    """The local machine with a number of jobs at the same time; 0 for one per GPU, or without GPUs one per core.
 
     Raises:
         ValueError: A number is out of range.
@@ -88,7 +88,7 @@ def machine(jobs: int, device: str, nice: int = 19) -> Machine:
 def shown(command: Sequence[str], machine: Machine, slot: int = 0) -> str:
     """A command line for a shell, with its environment variables."""
     variables = " ".join(f"{name}={value}" for name, value in machine.environment(slot).items())
-    if command[0] == _SPEED:  # It is no program of its own.
+    if command[0] == _SPEED:  # Not an installed program.
         command = ["python", "-m", _MODULES[_SPEED], *command[1:]]
     return f"{variables} nice -n {machine.nice} {shlex.join(command)}"
 
@@ -130,7 +130,7 @@ class Runner:
         Args:
             machine: What the jobs run on.
             say: Called with each line of progress.
-            keep_checkpoints: Keep all checkpoints of runs that have been evaluated, and not only the last.
+            keep_checkpoints: Keep all checkpoints of evaluated runs, not only the last.
         """
         self.machine, self.say, self.keep_checkpoints = machine, say, keep_checkpoints
         self._active: list[_Active] = []
@@ -138,7 +138,7 @@ class Runner:
         self.stopped = False
 
     def run(self, planned: Sequence[Job]) -> None:
-        """Run what is left of the jobs."""
+        """Run the jobs that are not done."""
         waiting = [job for job in planned if job.state() != "done"]
         before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
         said = time.monotonic()
@@ -161,9 +161,9 @@ class Runner:
                 signal.signal(number, handler)
 
     def _start(self, job: Job, slot: int) -> bool:
-        """Start the first command of a job; false if another process runs it."""
+        """Start the first command of a job; false if another process is running or has completed it."""
         job.folder.parent.mkdir(parents=True, exist_ok=True)
-        # The lock belongs to the open file that the job's process inherits: it holds as long as one of both lives.
+        # The job's process inherits the open file, so the lock holds while either process lives.
         lock = Path(f"{job.folder}.lock").open("w")  # noqa: SIM115
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -195,7 +195,7 @@ class Runner:
         return popen(command, self.machine.nice, self.machine.environment(slot), log, (lock.fileno(),))
 
     def _look(self, active: _Active) -> None:
-        """Go on with a job whose process has ended."""
+        """If a job's process has ended, start its next command or finish the job."""
         status = active.process.poll()
         if status is None:
             return
@@ -237,7 +237,7 @@ def popen(
     Args:
         command: A program of the package and its arguments.
         nice: Added to the niceness, 0 to 19.
-        environment: Environment variables in addition.
+        environment: Additional environment variables.
         log: Where its output goes.
         inherited: File descriptors that it inherits.
     """
@@ -249,13 +249,13 @@ def popen(
         stderr=subprocess.STDOUT,
         env={**os.environ, **environment},
         pass_fds=inherited,
-        # The terminal's Ctrl-C reaches this process alone, which passes it on.
+        # Ctrl-C in the terminal reaches only this process, which forwards it.
         start_new_session=True,
     )
 
 
 def left(planned: Sequence[Job], side_by_side: int) -> str:
-    """A line that says what is done and left, and how long the rest takes."""
+    """One line with the progress of the jobs and the estimated remaining time."""
     states = [job.state() for job in planned]
     trained, total = sum(min(job.updates_done(), job.updates) for job in planned), sum(job.updates for job in planned)
     text = f"{states.count('done')} of {len(planned)} jobs done, {states.count('interrupted')} begun"

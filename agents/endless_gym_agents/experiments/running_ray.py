@@ -1,7 +1,7 @@
 """Runs the commands of jobs on Ray: each job is an actor that starts its process on a machine of the cluster, and signals it.
 
-What is done, the locks and the order of the jobs are those of `running`, in the process of the command. Experiments can therefore
-be continued with Ray or without.
+Progress, locks and the order of jobs are handled by `running`, in the process of the command, so experiments can be continued
+with or without Ray.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class RayRunner(running.Runner):
 
 
 def jobs_that_fit(job_cpus: int, gpus: float) -> int:
-    """How many jobs of these CPU cores and GPUs the connected Ray can run at a time, at least 1."""
+    """Number of jobs with these CPU cores and GPUs that the connected Ray can run at the same time, at least 1."""
     import ray
 
     there = ray.cluster_resources()
@@ -59,9 +59,9 @@ class _RayProcess:
         if self._status is None and _is_there(self._end):
             try:
                 self._status = int(ray.get(self._end))
-            except ray.exceptions.RayError:  # The machine, or the actor, is lost.
+            except ray.exceptions.RayError:  # The machine or the actor died.
                 self._status = -signal.SIGKILL
-            ray.kill(self._host)  # gives its resources back
+            ray.kill(self._host)  # releases its resources
         return self._status
 
     def send_signal(self, sig: int, /) -> None:
@@ -71,7 +71,7 @@ class _RayProcess:
             return
         if _is_there(self._ready):
             self._host.send_signal.remote(int(sig))
-        else:  # It waits for resources.
+        else:  # Still waiting for resources.
             ray.kill(self._host)
             self._status = -sig
 
@@ -83,7 +83,7 @@ def _is_there(reference: Any) -> bool:
 
 
 class _Host:
-    """The actor of a job: the parent of its process, which ends with it."""
+    """The actor of a job, and the parent of its process, which ends with the actor."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -94,7 +94,7 @@ class _Host:
     def run(self, command: Sequence[str], nice: int, environment: dict[str, str], log: str) -> int:
         """Run a command to its end, and return its exit status."""
         with open(log, "a") as output:
-            # Ray blocks it in its processes, and a child inherits that from the thread that starts it.
+            # Ray blocks SIGINT in its processes, and a child inherits the mask of the thread that starts it.
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             self._process = running.popen(command, nice, environment, output)
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
