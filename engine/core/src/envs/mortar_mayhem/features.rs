@@ -22,8 +22,8 @@ pub(super) const LARGEST_ARENA: f32 = 6.0;
 pub const FEATURES: &[Column] = &[
     Column { name: "agent_x", description: "x of the agent's centre as a share of the screen's width" },
     Column { name: "agent_y", description: "y of the agent's centre as a share of the screen's height" },
-    Column { name: "heading_x", description: "x of the unit vector that the agent faces along" },
-    Column { name: "heading_y", description: "y of the unit vector that the agent faces along" },
+    Column { name: "heading_x", description: "x of the agent's heading, a unit vector" },
+    Column { name: "heading_y", description: "y of the agent's heading, a unit vector" },
     Column { name: "command_right", description: "1 while this command is shown" },
     Column { name: "command_down", description: "1 while this command is shown" },
     Column { name: "command_left", description: "1 while this command is shown" },

@@ -16,30 +16,31 @@ const AGENT_SCALE: Parameter = Parameter::float(
     0.25,
     0.0,
     MAX_AGENT_SCALE,
-    "Size of the agent; 0.25 is a radius of 6 pixels. Without effect on a grid.",
+    "Size of the agent; 0.25 is a radius of 6 pixels. No effect on a grid.",
 );
 const AGENT_SPEED: Parameter =
     Parameter::float("agent_speed", 3.0, 0.0, 84.0, "Speed of the agent in pixels per step.");
 const ARENA_SIZE: Parameter = Parameter::int("arena_size", 5, 2, 6, "Tiles along a side of the arena.");
-const ALLOWED_COMMANDS: &str = "Number of different commands that may occur, from the start of this list: right, down, \
+const ALLOWED_COMMANDS: &str = "Number of different commands, from the start of this list: right, down, \
                                 left, up, stay, right down, right up, left down, left up.";
-const COMMAND_COUNT: &str = "Number of commands to execute. A list to draw from.";
+const COMMAND_COUNT: &str = "Number of commands to execute. Each episode draws one from the list.";
 const COMMAND_SHOW_DURATION: Parameter = Parameter::list(
     "command_show_duration",
     &[3],
     0,
     MAX_DURATION,
-    "Steps that one command is shown. A list to draw from.",
+    "Steps for which a command is shown. Each episode draws one from the list.",
 );
 const COMMAND_SHOW_DELAY: Parameter = Parameter::list(
     "command_show_delay",
     &[1],
     0,
     MAX_DURATION,
-    "Steps between two shown commands. A list to draw from.",
+    "Steps between two shown commands. Each episode draws one from the list.",
 );
-const EXPLOSION_DURATION: &str = "Steps that the agent must stay on the commanded tile. A list to draw from.";
-const EXPLOSION_DELAY: &str = "Steps within which the agent must execute one command. A list to draw from.";
+const EXPLOSION_DURATION: &str =
+    "Steps for which the agent must stay on the commanded tile. Each episode draws one from the list.";
+const EXPLOSION_DELAY: &str = "Steps that the agent has for one command. Each episode draws one from the list.";
 const VISUAL_FEEDBACK: Parameter =
     Parameter::bool("visual_feedback", true, "Whether the wrong tiles turn red when a command is checked.");
 const REWARD_COMMAND_FAILURE: Parameter =
@@ -112,7 +113,7 @@ const MORTAR_MAYHEM_B_GRID: &[Parameter] = &[
 ];
 
 const ENDLESS_MORTAR_MAYHEM: &[Parameter] = &[
-    Parameter::int("max_steps", -1, i64::MIN, i64::MAX, "Steps that an episode may last; not limited if less than 1."),
+    Parameter::int("max_steps", -1, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1."),
     AGENT_SCALE,
     AGENT_SPEED,
     Parameter::int("allowed_commands", 9, 4, 9, ALLOWED_COMMANDS),
@@ -131,7 +132,7 @@ const FINITE_INFO: &[InfoColumn] = &[
     InfoColumn {
         name: "success",
         is_integer: true,
-        description: "1 if the last command was reached, as the original counts it: also if it failed",
+        description: "1 if the last command was reached, even if the agent failed at it, as in the original",
     },
     InfoColumn {
         name: "commands_completed",

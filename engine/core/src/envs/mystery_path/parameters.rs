@@ -25,7 +25,7 @@ pub const MAX_STAMINA: i64 = 1_000_000_000;
 /// One set of reset parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameters {
-    /// Steps that an episode may last; not limited if less than 1.
+    /// Maximum steps per episode; unlimited if less than 1.
     pub max_steps: i64,
     /// Size of the agent, 0 to 4; 0.25 is a radius of 6 pixels.
     pub agent_scale: f64,

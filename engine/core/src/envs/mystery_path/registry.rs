@@ -12,13 +12,7 @@ use crate::envs::screen::SCREEN;
 use crate::envs::spec::{Column, EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
-    Parameter::int(
-        "max_steps",
-        default,
-        i64::MIN,
-        i64::MAX,
-        "Steps that an episode may last; not limited if less than 1.",
-    )
+    Parameter::int("max_steps", default, i64::MIN, i64::MAX, "Maximum steps per episode; unlimited if less than 1.")
 }
 
 const fn reward_path_progress(default: f64) -> Parameter {
@@ -30,7 +24,7 @@ const AGENT_SCALE: Parameter = Parameter::float(
     DEFAULT_AGENT_SCALE,
     0.0,
     MAX_AGENT_SCALE,
-    "Size of the agent; 0.25 is a radius of 6 pixels. Without effect on a grid.",
+    "Size of the agent; 0.25 is a radius of 6 pixels. No effect on a grid.",
 );
 // A step is at most as long as the screen is wide, so that the endless agent never skips a segment.
 const AGENT_SPEED: Parameter =
@@ -40,7 +34,7 @@ const CARDINAL_ORIGIN_CHOICE: Parameter = Parameter::list(
     &[0, 1, 2, 3],
     0,
     3,
-    "Side of the screen where the path starts: 0 left, 1 right, 2 top, 3 bottom. A list to draw from.",
+    "Side of the screen where the path starts: 0 left, 1 right, 2 top, 3 bottom. Each episode draws one from the list.",
 );
 const SHOW_ORIGIN: Parameter = Parameter::bool("show_origin", false, "Whether the path's first tile is shown.");
 const SHOW_GOAL: Parameter = Parameter::bool("show_goal", false, "Whether the path's last tile is shown.");
@@ -81,7 +75,7 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
     max_steps(-1),
     AGENT_SCALE,
     AGENT_SPEED,
-    Parameter::bool("show_origin", false, "Without effect, as in the original."),
+    Parameter::bool("show_origin", false, "No effect, as in the original."),
     Parameter::bool("show_past_path", true, "Whether the path behind the agent is shown."),
     Parameter::bool("show_background", false, "Whether a tiled background scrolls with the agent."),
     Parameter::bool("show_stamina", false, "Whether a bar shows the steps that are left to make progress."),
@@ -91,10 +85,10 @@ const ENDLESS_MYSTERY_PATH: &[Parameter] = &[
         5.0,
         -100.0,
         100.0,
-        "Tiles to the left of the agent that are on the screen, limited to 0 to 5.5. Truncated, it is also the number \
+        "Number of tiles on the screen to the left of the agent, limited to 0 to 5.5. Truncated, it is also the number \
          of columns of the past path that are shown.",
     ),
-    Parameter::int("stamina_level", 20, 1, MAX_STAMINA, "Steps within which the agent must reach the next tile."),
+    Parameter::int("stamina_level", 20, 1, MAX_STAMINA, "Maximum number of steps to reach the next tile."),
     REWARD_FALL_OFF,
     reward_path_progress(0.1),
     Parameter::reward(
@@ -173,7 +167,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
     (
         EnvSpec {
             id: "Endless-MysteryPath-v0",
-            summary: "An invisible path without end; falling off before the farthest point, or twice at one tile, ends it",
+            summary: "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode",
             action_space: ActionSpace::Discrete(4),
             actions: FOLLOW,
             vector_observation: 0,

@@ -25,7 +25,7 @@ macro_rules! coin {
         [
             Column {
                 name: concat!("coin_", $number, "_seen"),
-                description: "1 if this coin's centre is seen; coins that are not seen are left out, not counted",
+                description: "1 if this coin's centre is seen; only coins that are seen are numbered",
             },
             Column { name: concat!("coin_", $number, "_x"), description: "x of its centre, as a share of the width" },
             Column { name: concat!("coin_", $number, "_y"), description: "y of its centre, as a share of the height" },
@@ -38,7 +38,7 @@ macro_rules! spotlight {
         [
             Column {
                 name: concat!("spotlight_", $number, "_radius"),
-                description: "radius of a lit circle that reaches into the screen, as a share of the width; 0 for none",
+                description: "radius of a lit circle that overlaps the screen, as a share of the width; 0 for none",
             },
             Column {
                 name: concat!("spotlight_", $number, "_x"),
@@ -56,24 +56,21 @@ const FIRST: [Column; COIN] = [
     Column { name: "agent_seen", description: "1 if the agent's centre is seen" },
     Column { name: "agent_x", description: "x of its centre as a share of the screen's width; 0 if not seen" },
     Column { name: "agent_y", description: "y of its centre as a share of the screen's height; 0 if not seen" },
-    Column { name: "heading_x", description: "x of the unit vector that it faces along; 0 if not seen" },
-    Column { name: "heading_y", description: "y of the unit vector that it faces along; 0 if not seen" },
+    Column { name: "heading_x", description: "x of its heading, a unit vector; 0 if not seen" },
+    Column { name: "heading_y", description: "y of its heading, a unit vector; 0 if not seen" },
     Column { name: "health", description: "green share of the health bar" },
     Column { name: "hit", description: "1 if red tiles are seen" },
+    Column { name: "last_action_x", description: "the previous action as the bar shows it: -1 left, 1 right" },
+    Column { name: "last_action_y", description: "the previous action as the bar shows it: -1 up, 1 down" },
     Column {
-        name: "last_action_x",
-        description: "the action before the current one, as the bar shows it: -1 left, 1 right",
+        name: "last_reward_positive",
+        description: "1 if the bar shows that the previous step gave a positive reward",
     },
-    Column {
-        name: "last_action_y",
-        description: "the action before the current one, as the bar shows it: -1 up, 1 down",
-    },
-    Column { name: "last_reward_positive", description: "1 if the bar shows a positive reward of the step before" },
-    Column { name: "light", description: "brightness outside of the lit circles: 1 at first, 0 in the dark" },
+    Column { name: "light", description: "brightness outside the lit circles: 1 at first, 0 in the dark" },
     Column { name: "exit_seen", description: "1 if the exit's centre is seen" },
     Column { name: "exit_x", description: "x of its centre as a share of the screen's width; 0 if not seen" },
     Column { name: "exit_y", description: "y of its centre as a share of the screen's height; 0 if not seen" },
-    Column { name: "exit_open", description: "1 if the exit is seen to be open" },
+    Column { name: "exit_open", description: "1 if the exit is seen and open" },
 ];
 
 const COIN_COLUMNS: [[Column; 3]; COINS] =

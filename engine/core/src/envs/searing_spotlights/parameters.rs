@@ -24,7 +24,7 @@ pub const MAX_SPOT_RADIUS: i32 = 256;
 /// One set of reset parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameters {
-    /// Steps that an episode may last; not limited if less than 1.
+    /// Maximum steps per episode; unlimited if less than 1.
     pub max_steps: i64,
     /// Steps within which the agent must collect the endless id's coin; not limited if less than 1.
     pub steps_per_coin: i64,

@@ -12,7 +12,7 @@ use crate::envs::spec::{Column, EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
     const ANY: (i64, i64) = (i64::MIN, i64::MAX);
-    Parameter::int("max_steps", default, ANY.0, ANY.1, "Steps that an episode may last; not limited if less than 1.")
+    Parameter::int("max_steps", default, ANY.0, ANY.1, "Maximum steps per episode; unlimited if less than 1.")
 }
 
 const fn initial_spawns(default: i64) -> Parameter {
@@ -28,20 +28,25 @@ const SPOT_MIN_RADIUS: Parameter = Parameter::float(
     7.5,
     0.0,
     MAX_SPOT_RADIUS as f64,
-    "Least radius of a spotlight in pixels, truncated.",
+    "Minimum radius of a spotlight in pixels, truncated.",
 );
 const SPOT_MAX_RADIUS: Parameter = Parameter::float(
     "spot_max_radius",
     13.75,
     0.0,
     MAX_SPOT_RADIUS as f64,
-    "Largest radius of a spotlight in pixels, truncated.",
+    "Maximum radius of a spotlight in pixels, truncated.",
 );
-const SPOT_MIN_SPEED: Parameter =
-    Parameter::float("spot_min_speed", 0.0025, 0.0, 1e6, "Least speed of a spotlight: the share of its path per step.");
-const SPOT_MAX_SPEED: Parameter = Parameter::float("spot_max_speed", 0.0075, 0.0, 1e6, "Largest speed of a spotlight.");
+const SPOT_MIN_SPEED: Parameter = Parameter::float(
+    "spot_min_speed",
+    0.0025,
+    0.0,
+    1e6,
+    "Minimum speed of a spotlight: the share of its path per step.",
+);
+const SPOT_MAX_SPEED: Parameter = Parameter::float("spot_max_speed", 0.0075, 0.0, 1e6, "Maximum speed of a spotlight.");
 const SPOT_DAMAGE: Parameter =
-    Parameter::float("spot_damage", 1.0, 0.0, 1e9, "Health points that a step in the light of spotlights costs.");
+    Parameter::float("spot_damage", 1.0, 0.0, 1e9, "Health points lost per step in the light of spotlights.");
 const VISUAL_FEEDBACK: Parameter =
     Parameter::bool("visual_feedback", true, "Whether the background turns red while the agent is in a spotlight.");
 const BLACK_BACKGROUND: Parameter = Parameter::bool(
@@ -78,16 +83,16 @@ const SAMPLE_AGENT_POSITION: Parameter = Parameter::bool(
     "Whether the agent starts at a random position; otherwise in the middle.",
 );
 const SHOW_LAST_ACTION: Parameter =
-    Parameter::bool("show_last_action", true, "Whether the bar at the top shows the action before the current one.");
+    Parameter::bool("show_last_action", true, "Whether the bar at the top shows the previous action.");
 const SHOW_LAST_POSITIVE_REWARD: Parameter = Parameter::bool(
     "show_last_positive_reward",
     true,
-    "Whether the bar at the top shows that the step before gave a positive reward.",
+    "Whether the bar at the top shows that the previous step gave a positive reward.",
 );
 const REWARD_INSIDE_SPOTLIGHT: Parameter =
     Parameter::reward("reward_inside_spotlight", 0.0, "Reward for each step in a spotlight.");
 const REWARD_OUTSIDE_SPOTLIGHT: Parameter =
-    Parameter::reward("reward_outside_spotlight", 0.0, "Reward for each step outside of all spotlights.");
+    Parameter::reward("reward_outside_spotlight", 0.0, "Reward for each step outside all spotlights.");
 const REWARD_DEATH: Parameter = Parameter::reward("reward_death", 0.0, "Reward for losing all health points.");
 const REWARD_COIN: Parameter = Parameter::reward("reward_coin", 0.25, "Reward for collecting a coin.");
 
@@ -102,13 +107,13 @@ const SEARING_SPOTLIGHTS: &[Parameter] = &[
         1_000_000_000,
         "Steps between two new spotlights, in addition to `spawn_interval_threshold`.",
     ),
-    Parameter::int("spawn_interval_threshold", 10, 0, 1_000_000_000, "Steps that are added to each interval."),
+    Parameter::int("spawn_interval_threshold", 10, 0, 1_000_000_000, "Steps added to each interval."),
     Parameter::float(
         "spawn_interval_decay",
         0.95,
         0.0,
         1e6,
-        "Without effect, as in the original, where it was meant to shorten the interval.",
+        "No effect, as in the original, where it was meant to shorten the interval.",
     ),
     SPOT_MIN_RADIUS,
     SPOT_MAX_RADIUS,
@@ -120,13 +125,13 @@ const SEARING_SPOTLIGHTS: &[Parameter] = &[
     HIDE_CHESSBOARD,
     LIGHT_DIM_OFF_DURATION,
     LIGHT_THRESHOLD,
-    Parameter::list("num_coins", &[1], 0, MAX_COINS as i64, "Number of coins. A list to draw from."),
+    Parameter::list("num_coins", &[1], 0, MAX_COINS as i64, "Number of coins. Each episode draws one from the list."),
     COIN_SCALE,
     COINS_VISIBLE,
     Parameter::bool(
         "use_exit",
         true,
-        "Whether the agent must leave by an exit that opens when all coins are collected.",
+        "Whether the agent must leave by an exit, which opens when all coins are collected.",
     ),
     Parameter::float("exit_scale", 0.5, 0.0, 8.0, "Size of the exit; 1 is a side of 20 pixels."),
     Parameter::bool("exit_visible", false, "Whether the exit is visible in the dark."),
@@ -141,7 +146,7 @@ const SEARING_SPOTLIGHTS: &[Parameter] = &[
     REWARD_OUTSIDE_SPOTLIGHT,
     REWARD_DEATH,
     Parameter::reward("reward_exit", 1.0, "Reward for leaving by the open exit."),
-    Parameter::reward("reward_max_steps", 0.0, "Without effect, as in the original."),
+    Parameter::reward("reward_max_steps", 0.0, "No effect, as in the original."),
     REWARD_COIN,
 ];
 
@@ -152,7 +157,7 @@ const ENDLESS_SEARING_SPOTLIGHTS: &[Parameter] = &[
         160,
         i64::MIN,
         i64::MAX,
-        "Steps within which the agent must collect a new coin; not limited if less than 1.",
+        "Maximum number of steps to collect a coin; unlimited if less than 1.",
     ),
     initial_spawns(3),
     Parameter::int("spawn_interval", 50, 0, 1_000_000_000, "Steps between two new spotlights."),
@@ -190,7 +195,7 @@ const ENDLESS_SEARING_SPOTLIGHTS: &[Parameter] = &[
 const AGENT_HEALTH_LEFT: InfoColumn = InfoColumn {
     name: "agent_health",
     is_integer: false,
-    description: "share of the health points that is left; not above 0 if the agent died",
+    description: "share of the health points left; 0 or less if the agent died",
 };
 
 const FINITE_INFO: &[InfoColumn] = &[
