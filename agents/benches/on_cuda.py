@@ -180,7 +180,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="`cuda`, `cuda:INDEX` or `cpu` (default: %(default)s)")
     parser.add_argument("--updates", type=int, default=2, help="timed updates of each training (default: %(default)s)")
-    parser.add_argument("--minutes", type=float, default=8.0, help="start no training later (default: %(default)s)")
+    parser.add_argument(
+        "--minutes", type=float, default=8.0, help="start no training after this time (default: %(default)s)"
+    )
     parser.add_argument("--json", type=Path, help="write the report to this JSON file")
     parser.add_argument("--markdown", type=Path, help="write the report to this Markdown file")
     args = parser.parse_args()

@@ -50,7 +50,7 @@ class ActingWeights:
         vector: Layer for vector observations; None if there are none.
         embedding: Layer before the memory; None if there is none.
         body: Layer after the memory.
-        hidden: Hidden layers of the policy and the value head side by side.
+        hidden: Hidden layers of the policy and value heads, concatenated.
         output: Output layers of both heads: the logits of all branches, each padded to the largest one, and the value.
         branches: Number of branches.
         choices: Choices of the largest branch.

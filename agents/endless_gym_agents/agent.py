@@ -76,7 +76,7 @@ class AgentMemory:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything as tensors and numbers by name, for a checkpoint."""
-        # The keys are those of the checkpoint format.
+        # The checkpoint format fixes these keys.
         return {"first": self.reset_mask, "observer": self.transform_state, "state": self.state.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -41,7 +41,7 @@ def run(name: str, work: Callable[[], object]) -> int:
 def main(
     name: str, arguments: type[T], execute: Callable[[T], object], text: str | None, given: list[str] | None = None
 ) -> int:
-    """Parse the arguments `given` to a command, by default those of the process, and `run` it; `text` is its docstring."""
+    """Parse the arguments `given` to a command, by default the process's, and `run` it; `text` is its module's docstring."""
     parsed = tyro.cli(arguments, prog=name, description=description(text), args=given)
     return run(name, lambda: execute(parsed))
 

@@ -83,7 +83,7 @@ def _published() -> dict[str, Any]:
 
 
 def published(env: str, labels: Sequence[str] | None = None) -> list[Curve]:
-    """The curves of the paper for an environment: those of the agents in `labels` that exist, or all."""
+    """The paper's curves for an environment: of the agents in `labels` where they exist, or of all agents."""
     known, step = _published()["curves"].get(env, {}), _published()["steps_per_checkpoint"]
     chosen = known if labels is None else [name for name in labels if name in known]
     curves = []
@@ -152,8 +152,8 @@ def scale(env: str) -> float:
 def aggregate(family: Family, curves: Sequence[Curve]) -> list[Curve]:
     """Aggregate the normalised scores over the environments of a family.
 
-    The steps of an aggregated curve are those that all its curves have. Each environment contributes the same number of runs:
-    that of the environment with the fewest.
+    An aggregated curve has the steps that all its curves share. Each environment contributes the same number of runs: as many as
+    the environment with the fewest has.
 
     Args:
         family: The environments.

@@ -1,4 +1,4 @@
-"""`endless-enjoy`: record a video of a trained agent, with its observation beside the ground-truth view.
+"""`endless-enjoy`: record a video of a trained agent, with its observation next to the ground-truth view.
 
 ```console
 endless-enjoy runs/mine                                        # one episode, as a GIF

@@ -160,7 +160,7 @@ def read(file: Path) -> tuple[dict[str, Any], Agent]:
     """
     content = file.read_bytes()
     if len(content) < _PREFIX.size or not content.startswith(MAGIC):
-        raise ValueError(f"{file} is no exported agent; expected a file that starts with {MAGIC.decode()}")
+        raise ValueError(f"{file} is not an exported agent; expected a file that starts with {MAGIC.decode()}")
     _, version, length = _PREFIX.unpack_from(content)
     if version != FORMAT_VERSION:
         raise ValueError(f"exported agent {file} must be of version {FORMAT_VERSION}, got {version}; export it again")

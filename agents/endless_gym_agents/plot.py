@@ -49,9 +49,9 @@ class PlotArguments:
     out: Path = Path("plots")
     """output folder for the plots and their data"""
     published: tuple[str, ...] = ("gru", "trxl", "gru_rec", "trxl_rec")
-    """agents of the paper to include, where the paper has them; `--published` without a value for none"""
+    """agents of the paper to include, where it has their curves; `--published` without a value for none"""
     env: tuple[str, ...] = ()
-    """environments to plot; by default those of the given results, or without results all of the paper"""
+    """environments to plot; by default those of the given results, or without results all environments of the paper"""
     aggregate: Literal["no", "finite", "endless"] = "no"
     """one plot over all environments of this kind instead of one plot per environment; scores are the task progress in finite
     environments, and divided by the best mean of the paper's GRU in endless ones"""

@@ -48,8 +48,8 @@ def minibatch_loss(
         returns: Returns of all steps of the segment, float32 (T * N,).
         settings: Coefficients and clip range.
         entropy_coefficient: Weight of the entropy bonus in this update.
-        reference: Advantages whose mean and standard deviation normalise those of the minibatch, if `settings` asks for it: those
-            of the minibatch's steps on all ranks, float32 (steps,). `None` for this rank's own.
+        reference: With normalisation per minibatch, the advantages of the minibatch's steps on all ranks, float32 (steps,), whose
+            mean and standard deviation are used; `None` for those of `minibatch`.
 
     Returns:
         The loss, a scalar with gradient; and scalars without gradient by name: the loss and its terms, the approximate KL
@@ -123,7 +123,7 @@ def learn(
         segment.reward, segment.value, segment.done, segment.last_value, settings.gamma, settings.gae_lambda
     )
     returns, flat = (own_advantages + segment.value).flatten(), segment.flat()
-    # Every rank gets these few numbers per step of all environments.
+    # Gather a few numbers per step, so that every rank has those of all environments.
     reset_mask, values = ranks.columns(segment.reset_mask).cpu(), ranks.columns(segment.value).flatten()
     advantages = ranks.columns(own_advantages).flatten()
     own = ranks.share(reset_mask.shape[1])

@@ -67,7 +67,7 @@ class Ranks:
         if self.size == 1:
             yield
             return
-        # Functions in this module capture the current process group as a default argument at import. A later import (by
+        # Functions of this PyTorch module capture the process group at import as a default argument. A later import (by
         # torch._dynamo, which optimizers import) would keep the group and its threads alive until the interpreter exits.
         import torch.distributed.nn.functional
 

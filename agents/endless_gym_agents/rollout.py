@@ -74,7 +74,7 @@ class Segment:
             indices: Indices of M steps, int64 (M,).
 
         Returns:
-            The observations, (rows, ...) each, and the row of each step, int64 (M,), or `None` if row i belongs to step i.
+            The observations, (rows, ...) each, and the row of each step, int64 (M,); `None` if there is one row per step.
         """
         rows = None
         if self.first_occurrence is not None:

@@ -41,7 +41,7 @@ def run_trial(trial: Trial, settings: Settings) -> None:
         settings: Its settings, possibly with other numbers of threads.
 
     Raises:
-        KeyboardInterrupt: The run was interrupted; its checkpoint is that of its last update.
+        KeyboardInterrupt: The run was interrupted, with a checkpoint of its last update.
     """
     parent = multiprocessing.parent_process()
     done = 0

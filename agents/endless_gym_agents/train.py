@@ -247,7 +247,7 @@ class Interrupt:
 
     def __exit__(self, *exception: object) -> None:
         for number, handler in self._before.items():
-            # When one rank has ended, `torchrun` sends SIGTERM to the others; ignore it until the environments are closed.
+            # When one rank has ended, `torchrun` sends SIGTERM to the others; ignore it so that the environments are closed.
             signal.signal(number, signal.SIG_IGN if number == signal.SIGTERM else handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

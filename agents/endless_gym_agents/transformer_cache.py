@@ -1,7 +1,8 @@
 """The KV cache of the Transformer-XL for acting: keys and values of the last steps, in a ring of fixed size.
 
 All environments step together, so the step of each slot is known on the host: no operation waits for the device, and all shapes
-are constant. The ring has as many slots as the window; the slot of the current step still holds the step that has just left it.
+are constant. The ring has as many slots as the window has steps; the current slot still holds the step that has just left the
+window.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Observation transforms: the paper's naive baselines, which extend the observation instead of adding a memory.
 
 A transform turns the environments' observation into the agent's: unchanged, with the last grey frames stacked, or with the
-encoded step number of the episode. Its state is kept between steps like that of a memory; see `memory`.
+encoded step number of the episode. It has a state between steps, as a memory does; see `memory`.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def saved(run: Path, given: Settings, **state: Any) -> Agent:
 def make(agent: str, shapes: dict[str, tuple[int, ...]] = FEATURES, **changes: Any) -> Agent:
     torch.manual_seed(3)
     made = Agent(settings(agent, **changes), shapes, BRANCHES)
-    # As after some training: the biases and the output layer of the policy are no longer near zero.
+    # As after some training, the biases and the output layer of the policy are not near zero.
     for parameter in made.parameters():
         parameter.data += 0.2 * torch.randn_like(parameter)
     return made

@@ -56,7 +56,7 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
     content, file = FILE.read_bytes(), tmp_path / "broken.bin"
     version = struct.pack("<I", 9)
     for broken, message in [
-        (b"", "is no exported agent; expected a file that starts with ENDLAGNT"),
+        (b"", "is not an exported agent; expected a file that starts with ENDLAGNT"),
         (content[:8] + version + content[12:], "must be of version 1, got 9; export it again"),
         (content[:40], "is truncated: its header has"),
         (content[:-1], "bytes of weights, got"),

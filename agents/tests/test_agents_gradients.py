@@ -1,4 +1,4 @@
-"""Every weight gets a gradient. Changing weights would not show that, since AdamW decays weights without a gradient, too."""
+"""Every weight gets a gradient. That weights change is not enough, since AdamW also decays weights without a gradient."""
 
 from dataclasses import replace
 

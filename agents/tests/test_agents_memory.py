@@ -102,7 +102,7 @@ def test_epochs_follow_one_another(agent: Agent) -> None:
 
 @pytest.mark.parametrize("name", [name for name in KINDS if KINDS[name][0] != "stack"])
 def test_rank_may_have_no_steps_in_a_minibatch(name: str) -> None:
-    """A rank with one of three environments has steps in some of the minibatches, and the others can be made, too."""
+    """A rank with one of three environments has steps in only some of the minibatches; the others are empty."""
     agent = agent_of(name)
     memory, done = agent.initial_memory(1), ends(STEPS, 1)
     reset_mask, *_ = play(agent, memory, observations(STEPS, 1), done)

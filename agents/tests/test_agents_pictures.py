@@ -33,7 +33,7 @@ def rgb(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGB"))
 
 
-def test_frame_shows_the_observation_beside_the_view() -> None:
+def test_frame_shows_the_observation_next_to_the_view() -> None:
     frame = np.zeros((84, 84, 3), np.uint8)
     frame[10, 20] = (255, 0, 0)  # x 10, y 20
     view = np.random.default_rng(0).integers(256, size=(336, 336, 3), dtype=np.uint8)
@@ -68,7 +68,7 @@ def test_gif_shows_the_episodes(run: Path, tmp_path: Path, capsys: pytest.Captur
 def test_webp_shows_every_pixel(tmp_path: Path) -> None:
     agent = make_agent(settings("none", env=GRID), spec(GRID))
     frames = list(enjoy.EpisodeRecorder(agent, 0, max_steps=12).frames((5,)))
-    # Noise, too: every colour, and no two pixels alike.
+    # Random noise contains every colour, and hardly any equal neighbours.
     frames.append(np.random.default_rng(0).integers(256, size=frames[0].shape, dtype=np.uint8))
     distinct = [frame for at, frame in enumerate(frames) if at == 0 or not np.array_equal(frame, frames[at - 1])]
     video.write(tmp_path / "video.webp", frames, 25)

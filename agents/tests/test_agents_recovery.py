@@ -95,9 +95,7 @@ def test_a_run_whose_engine_is_killed_equals_an_undisturbed_run(
     assert re.search(r"a new engine process continues the update, after \d+ steps that were played again", output)
 
 
-def test_restarts_are_counted_anew_in_each_update(
-    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_restarts_are_counted_per_update(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kill_before(monkeypatch, "receive", {3, 17, 40, 41, 60, 90, 127})
     compare(train(small("gru", tmp_path / "run", UPDATES, engine="process")), undisturbed)
 

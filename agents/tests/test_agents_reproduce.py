@@ -136,7 +136,7 @@ def test_a_scale_makes_everything_smaller() -> None:
 
 
 def test_the_remaining_time_is_estimated_from_measured_updates(tmp_path: Path) -> None:
-    """Two of six jobs have begun; the others are estimated by those of the same agent, or by the mean of all."""
+    """Two of six jobs have begun; the estimate for the others is the mean over the same agent, or over all."""
     runs = [
         {"name": agent, "env": "MortarMayhem-v0", "flags": {"agent": agent, "ppo.updates": 10}}
         for agent in ("gru", "lstm", "trxl")

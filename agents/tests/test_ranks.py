@@ -32,7 +32,7 @@ ARGUMENTS = " ".join(
 ).split()
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
 Start = Callable[..., subprocess.Popen[str]]
-#: Updates of a run that does not end by itself.
+#: More updates than a test waits for.
 ENDLESS = ["--ppo.updates", "100000"]
 
 

@@ -32,7 +32,7 @@ class Run:
     """One row of an experiment.
 
     Attributes:
-        name: Name of the run; runs with equal name and environment are the same run, also in different experiments.
+        name: Name of the run; runs with the same name and environment are the same run, even in different experiments.
         env: Environment id.
         flags: Flags of `endless-train` without dashes, and their values.
         published: Name of the published curve in `endless-plot`; empty if there is none.

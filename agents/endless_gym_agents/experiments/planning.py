@@ -33,7 +33,7 @@ class Job:
         experiment: The experiment, at its scale.
         run: The run, with the flags at that scale.
         seed: Seed of the training.
-        folder: Folder of the run; the same for all experiments that contain it.
+        folder: Folder of the run, shared by all experiments that contain the run.
     """
 
     experiment: Experiment
@@ -58,7 +58,7 @@ class Job:
         return int(rows[-1]["update"]) if rows else 0
 
     def trained(self) -> bool:
-        """Whether the last checkpoint is that of the last update."""
+        """Whether the run has a checkpoint of its last update."""
         last = self.folder / checkpoint.FOLDER / checkpoint.LAST
         if self.updates_done() < self.updates or not last.exists():
             return False
