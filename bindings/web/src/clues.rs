@@ -1,8 +1,8 @@
-//! What an episode has shown so far and a player should remember, read from the features by the names of the engine's table.
+//! The commands that an episode has shown so far and a player should remember, read from the features by their names.
 
 use endless_gym_core::envs::EnvSpec;
 
-/// Start of the names of the features that are 1 while a command is shown.
+/// Prefix of the features that are 1 while a command is shown.
 const COMMAND: &str = "command_";
 
 /// The commands that were shown, in order.
@@ -27,7 +27,7 @@ impl Clues {
         self.shown.clear();
     }
 
-    /// Notes a command that was not visible in the observation before.
+    /// Records a command that was not visible in the previous observation.
     pub fn observe(&mut self, features: &[f32]) {
         let visible = self.columns.iter().position(|(index, _)| features.get(*index) == Some(&1.0));
         if let Some(command) = visible.filter(|_| visible != self.visible) {
@@ -36,7 +36,7 @@ impl Clues {
         self.visible = visible;
     }
 
-    /// The commands, such as `right down`; empty where none are shown.
+    /// The commands, such as `right down`; empty if there are none.
     pub fn shown(&self) -> &[String] {
         &self.shown
     }

@@ -1,4 +1,4 @@
-//! The errors of the page's engine. Those of reset parameters, actions and traces are the core's, unchanged.
+//! Errors of the page's engine. Errors of reset parameters, actions and traces come unchanged from the core.
 
 use endless_gym_core::envs::UnknownEnvironment;
 use endless_gym_core::pool::{ExpertsError, NoExpert, PoolError};
@@ -7,7 +7,7 @@ use thiserror::Error;
 
 use crate::agent::AgentFileError;
 
-/// A request that cannot be carried out.
+/// Why a request cannot be executed.
 #[derive(Debug, Error)]
 pub enum WebError {
     #[error("the request cannot be read: {0}")]

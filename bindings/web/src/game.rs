@@ -1,4 +1,4 @@
-//! One environment that a person, its expert or a trace plays, with a recording.
+//! One environment that a person, an expert, an agent or a trace plays, with a recording.
 
 use std::rc::Rc;
 
@@ -30,13 +30,13 @@ pub struct Game {
     seed: Option<u64>,
     recorder: Recorder,
     expert: Box<dyn Expert>,
-    /// The expert has seen every observation of the episode so far.
+    /// Whether the expert has seen every observation of the episode so far.
     expert_is_in: bool,
-    /// What the agent remembers, if it has played the episode from its start.
+    /// The agent's memory, if it has played the episode from its start.
     agent_memory: Option<Memory>,
     clues: Clues,
     action: Vec<i32>,
-    /// The trace that is replayed, and the number of the episode.
+    /// The replayed trace, and the number of its current episode.
     script: Option<(Trace, usize)>,
     observation: Vec<u8>,
     view: Vec<u8>,
@@ -44,7 +44,7 @@ pub struct Game {
 }
 
 impl Game {
-    /// Starts an episode of a new environment, so that it follows from these arguments alone.
+    /// Starts an episode of a new environment, so that it depends only on these arguments.
     pub fn start(id: &str, options: OptionMap, seed: u64) -> Result<Self, WebError> {
         Self::new(id, options, Some(seed), None)
     }
@@ -105,7 +105,7 @@ impl Game {
         Batch::new(self.pool.layout(), &self.blocks)
     }
 
-    /// Plays one step. After the last step of a trace's episode, a step of the trace starts its next one.
+    /// Plays one step. After the last step of a trace's episode, a trace step starts the next episode.
     pub fn step(&mut self, player: Player) -> Result<(), WebError> {
         match player {
             Player::Person(action) => {
@@ -139,7 +139,7 @@ impl Game {
         self.observe()
     }
 
-    /// Has the agent choose the action.
+    /// Lets the agent choose the action.
     fn ask(&mut self, agent: &Agent) -> Result<(), WebError> {
         let spec = self.pool.spec();
         if !agent.fits(spec) {
@@ -154,13 +154,13 @@ impl Game {
         Ok(())
     }
 
-    /// Takes in what the last reset or step has changed.
+    /// Updates clues and pictures after a reset or step.
     fn observe(&mut self) -> Result<(), WebError> {
         self.clues.observe(Batch::new(self.pool.layout(), &self.blocks).features());
         self.draw()
     }
 
-    /// The environment.
+    /// The environment id.
     pub fn id(&self) -> &'static str {
         self.pool.spec().id
     }
@@ -170,7 +170,8 @@ impl Game {
         self.batch().episode_length()[0] as usize
     }
 
-    /// Draws both pictures. The ground-truth view shows the next picture of a clue with each call, so one call a step.
+    /// Draws both pictures. Call it once per step, since each call advances the clue's picture in the ground-truth
+    /// view.
     fn draw(&mut self) -> Result<(), WebError> {
         self.pool.ground_truth_view(0, &mut self.magnified)?;
         put_view(&self.magnified, &mut self.view);
@@ -189,14 +190,14 @@ impl Game {
         &self.view
     }
 
-    /// The recording, as the file of a trace.
+    /// The recording, as a trace file.
     pub fn file(&self) -> Result<Vec<u8>, WebError> {
         let mut file = Vec::new();
         self.recorder.write(&mut file)?;
         Ok(file)
     }
 
-    /// What the page shows beside the pictures.
+    /// The episode's state, which the page shows next to the pictures.
     pub fn state(&self) -> Result<Json, WebError> {
         let batch = self.batch();
         let done = batch.terminated()[0] == 1;
@@ -212,7 +213,7 @@ impl Game {
         Ok(json!({
             "id": self.pool.spec().id,
             "options": options,
-            // As text: JavaScript's numbers do not have 64 bits.
+            // As text, since JavaScript numbers cannot hold 64-bit integers.
             "seed": self.seed.map(|seed| seed.to_string()),
             "length": self.length(),
             "reward": batch.reward()[0],

@@ -1,4 +1,4 @@
-//! Environments of one id that play by themselves.
+//! Self-playing environments of one id.
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs;
@@ -44,7 +44,7 @@ impl Group {
         Ok(Group { pool, blocks, policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 })
     }
 
-    /// Steps every environment. An ended episode is followed by the next one in the step after.
+    /// Steps every environment. The step after an episode's end starts the next one.
     pub fn step(&mut self) -> Result<(), WebError> {
         let branches = self.pool.spec().action_space.branches();
         let batch = Batch::new(self.pool.layout(), &self.blocks);

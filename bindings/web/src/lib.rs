@@ -1,8 +1,10 @@
-//! The core for the page: one game that a person, an expert, a trained agent or a trace plays, and a wall of many environments.
+//! The page's engine: one game that a person, an expert, a trained agent or a trace plays, and a wall of many
+//! environments.
 //!
-//! The interface to JavaScript is a few functions that pass numbers. [`input`] makes room for a request, JSON or the bytes of a
-//! trace; [`call`] and [`open`] answer in [`output`], with JSON, an error's text or bytes. Pictures are read from the memory, RGBA,
-//! \[row\]\[column\]. No function takes a pointer, so nothing here is unsafe, and the page needs no generated code.
+//! The interface to JavaScript is a few functions that pass numbers. [`input`] allocates memory for a request: JSON, or
+//! the bytes of a trace. [`call`] and [`open`] write their answer to [`output`]: JSON, an error's text or bytes.
+//! JavaScript reads pictures directly from memory, as RGBA indexed \[row\]\[column\]. No function takes a pointer, so
+//! nothing here is unsafe, and the page needs no generated code.
 
 mod agent;
 mod clues;
@@ -17,7 +19,7 @@ use std::cell::RefCell;
 
 use request::{App, Request};
 
-/// What [`call`] and [`open`] return: the kind of bytes in [`output`].
+/// What [`call`] and [`open`] return: the kind of data in [`output`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(u32)]
 enum Kind {
@@ -32,7 +34,7 @@ thread_local! {
     static OUTPUT: RefCell<Vec<u8>> = RefCell::default();
 }
 
-/// Room for a request of `length` bytes.
+/// Allocates memory for a request of `length` bytes.
 #[unsafe(no_mangle)]
 pub extern "C" fn input(length: usize) -> *mut u8 {
     INPUT.with_borrow_mut(|input| {
@@ -42,31 +44,33 @@ pub extern "C" fn input(length: usize) -> *mut u8 {
     })
 }
 
-/// Carries out the request in the input, JSON. Returns the kind of the output: 0 JSON, 1 the text of an error, 2 bytes.
+/// Executes the JSON request in the input. Returns the kind of the output: 0 for JSON, 1 for the text of an error, 2
+/// for bytes.
 #[unsafe(no_mangle)]
 pub extern "C" fn call() -> u32 {
     reply(|app, input| serde_json::from_slice::<Request>(input).map_err(error::WebError::Request)?.carry_out(app))
 }
 
-/// Opens the trace in the input, replays it, and makes it the game. Returns as [`call`] does.
+/// Opens the trace in the input, replays it, and makes it the game. Returns the kind of the output, like [`call`].
 #[unsafe(no_mangle)]
 pub extern "C" fn open() -> u32 {
     reply(request::open)
 }
 
-/// Reads the agent in the input, the file that `endless_gym_agents.export` writes. Returns as [`call`] does.
+/// Reads the agent in the input, a file that `endless_gym_agents.export` writes. Returns the kind of the output, like
+/// [`call`].
 #[unsafe(no_mangle)]
 pub extern "C" fn load_agent() -> u32 {
     reply(request::load_agent)
 }
 
-/// The answer to the last call, or after a trap what the engine said.
+/// The answer to the last call, or after a trap the panic's message.
 #[unsafe(no_mangle)]
 pub extern "C" fn output() -> *const u8 {
     OUTPUT.with_borrow(Vec::as_ptr)
 }
 
-/// Bytes of [`output`].
+/// Length of [`output`] in bytes.
 #[unsafe(no_mangle)]
 pub extern "C" fn output_length() -> usize {
     OUTPUT.with_borrow(Vec::len)
@@ -84,20 +88,20 @@ pub extern "C" fn view() -> *const u8 {
     APP.with_borrow(|app| app.game.as_ref().map_or(std::ptr::null(), |game| game.view().as_ptr()))
 }
 
-/// Steps every environment of the wall `count` times. Returns as [`call`] does.
+/// Steps every environment of the wall `count` times. Returns the kind of the output, like [`call`].
 #[unsafe(no_mangle)]
 pub extern "C" fn step_wall(count: u32) -> u32 {
     reply(|app, _| request::step_wall(app, count))
 }
 
-/// Draws the wall: RGBA, of the size that the answer to its request states; null without a wall.
+/// Draws the wall as RGBA, of the size in the answer to the wall's request; null without a wall.
 #[unsafe(no_mangle)]
 pub extern "C" fn draw_wall() -> *const u8 {
     APP.with_borrow_mut(|app| app.wall.as_mut().map_or(std::ptr::null(), |wall| wall.draw().as_ptr()))
 }
 
 fn reply(answer: impl FnOnce(&mut App, &[u8]) -> Result<request::Reply, error::WebError>) -> u32 {
-    // The text of a panic, which JavaScript only sees as a trap.
+    // Keep a panic's message, since JavaScript sees only a trap.
     #[cfg(target_arch = "wasm32")]
     std::panic::set_hook(Box::new(|panic| {
         let said = panic.to_string().into_bytes();

@@ -1,4 +1,4 @@
-//! Frames as a canvas of a browser wants them: RGBA, \[row\]\[column\].
+//! Converts frames to the format of a browser's canvas: RGBA, \[row\]\[column\].
 
 use endless_gym_core::envs::SCREEN;
 use endless_gym_core::envs::view::VIEW;
@@ -6,8 +6,7 @@ use endless_gym_core::envs::view::VIEW;
 /// Bytes of a frame.
 pub const RGBA_BYTES: usize = SCREEN * SCREEN * 4;
 
-/// Writes an observation, indexed \[x\]\[y\]\[channel\], into `out`, whose rows are `stride` pixels long, with its first pixel at
-/// the start of `out`.
+/// Writes an observation, indexed \[x\]\[y\]\[channel\], to the start of `out`, whose rows are `stride` pixels long.
 pub fn put_observation(observation: &[u8], out: &mut [u8], stride: usize) {
     let (pixels, out) = (observation.as_chunks::<3>().0, out.as_chunks_mut::<4>().0);
     for y in 0..SCREEN {
@@ -18,7 +17,7 @@ pub fn put_observation(observation: &[u8], out: &mut [u8], stride: usize) {
     }
 }
 
-/// Writes a ground-truth view, indexed \[row\]\[column\]\[channel\] and magnified, in its original size.
+/// Writes a magnified ground-truth view, indexed \[row\]\[column\]\[channel\], reduced to the frame's size.
 pub fn put_view(view: &[u8], out: &mut [u8]) {
     const SCALE: usize = VIEW / SCREEN;
     let (pixels, out) = (view.as_chunks::<3>().0, out.as_chunks_mut::<4>().0);

@@ -16,7 +16,7 @@ use crate::game::{Game, Player};
 use crate::group::Group;
 use crate::wall::Wall;
 
-/// What the page plays.
+/// The state of the page.
 #[derive(Default)]
 pub struct App {
     pub game: Option<Game>,
@@ -25,8 +25,8 @@ pub struct App {
     pub agents: HashMap<String, Rc<Agent>>,
 }
 
-/// Reset parameters as a form has them: each value is text. Text that is no JSON is the text itself, so that the engine says what
-/// it should have been.
+/// Reset parameters from a form, with text values. Text that is not JSON becomes a string, so that the engine reports
+/// the allowed values.
 type Options = Map<String, Json>;
 
 #[derive(Deserialize)]
@@ -34,7 +34,7 @@ type Options = Map<String, Json>;
 pub enum Request {
     /// The table of environments.
     Specs,
-    /// Whether reset parameters are valid.
+    /// Checks reset parameters.
     Check {
         id: String,
         options: Options,
@@ -45,7 +45,7 @@ pub enum Request {
         options: Options,
         seed: String,
     },
-    /// Plays a step with the action of a person, of the expert, of the loaded agent or of the trace.
+    /// Plays a step with a person's action; the next three with that of the expert, the loaded agent or the trace.
     Step {
         action: Vec<i32>,
     },
@@ -111,7 +111,7 @@ impl Request {
     }
 }
 
-/// Replays a trace's file, and makes it the game.
+/// Replays a trace file, and makes it the game.
 pub fn open(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
     let trace = Trace::read(file)?;
     let outcome = replay(memory_gym(), &trace)?;
@@ -126,7 +126,7 @@ pub fn open(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
     })))
 }
 
-/// Reads the file of an agent, which then plays the episodes of its environment.
+/// Reads an agent's file. The agent can then play episodes of its environment.
 pub fn load_agent(app: &mut App, file: &[u8]) -> Result<Reply, WebError> {
     let agent = Rc::new(Agent::read(file)?);
     let description = agent.description();
@@ -140,7 +140,7 @@ pub fn step_wall(app: &mut App, count: u32) -> Result<Reply, WebError> {
     Ok(Reply::Json(wall.state()))
 }
 
-/// The entry of the table, with the texts that the engine itself uses for limits and defaults.
+/// An entry of the table, with the engine's own texts for limits and defaults.
 fn spec(spec: &EnvSpec) -> Json {
     let mut value = json!(spec);
     value["action_branches"] = json!(spec.action_space.branches());

@@ -1,4 +1,4 @@
-//! The interface, as JavaScript uses it.
+//! Tests the interface as JavaScript uses it.
 
 use super::*;
 use endless_gym_core::envs::SCREEN;
@@ -42,7 +42,7 @@ fn every_environment_is_played_saved_and_opened_again() {
         let opened: Json = serde_json::from_slice(&answer()).unwrap();
         assert_eq!(opened["differences"], 0, "{}: {}", spec.id, opened["first"]);
         assert_eq!(opened["steps"], state["length"]);
-        // The page replays it step by step, with the same numbers.
+        // Replaying it step by step, as the page does, gives the same numbers.
         let mut replayed = opened["state"].clone();
         while replayed["recording"]["over"] == false {
             replayed = request(&json!("step_of_trace")).unwrap();
@@ -55,7 +55,7 @@ fn every_environment_is_played_saved_and_opened_again() {
 }
 
 #[test]
-fn errors_are_the_engines() {
+fn errors_are_those_of_the_engine() {
     for (wrong, message) in [
         (json!({"start": {"id": "Pong-v0", "options": {}, "seed": "1"}}), "no environment `Pong-v0`; there are Mort"),
         (
@@ -91,7 +91,7 @@ fn the_expert_plays_from_the_first_step_or_not_at_all() {
     let late = request(&json!("step_of_expert")).unwrap_err();
     assert!(late.starts_with("the expert must play an episode from its first step"), "{late}");
     assert!(request(&json!({"step": {"action": [0, 3]}})).unwrap_err().contains("must be in MultiDiscrete([3, 3])"));
-    // Its episode is still there.
+    // The episode continues after an error.
     assert_eq!(request(&json!({"step": {"action": [0, 0]}})).unwrap()["length"], 2);
 }
 

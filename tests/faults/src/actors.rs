@@ -13,10 +13,10 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use crate::event::Event;
 
-/// Bytes of a process's standard error that are kept.
+/// Maximum number of bytes kept of a process's standard error.
 const KEPT: usize = 4000;
 
-/// How long the rest of a process's standard error is waited for.
+/// How long to wait for the rest of a process's standard error.
 const REMAINDER: Duration = Duration::from_secs(2);
 
 /// A process of a round. It is killed when this is dropped.
@@ -29,7 +29,7 @@ pub struct Actor {
 }
 
 impl Actor {
-    /// Starts a process. What it reports goes to `events`, with its process id.
+    /// Starts a process. Its reports go to `events`, with its process id.
     pub fn start(mut command: Command, events: &Sender<(u32, Event)>) -> Result<Self, String> {
         let piped = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = piped.spawn().map_err(|error| format!("{command:?}: {error}"))?;
@@ -37,7 +37,7 @@ impl Actor {
         if let Some(stdout) = child.stdout.take() {
             std::thread::spawn(move || {
                 let lines = BufReader::new(stdout).lines().map_while(Result::ok);
-                // A killed process may leave a part of a line.
+                // A killed process may leave a partial line.
                 for event in lines.filter_map(|line| serde_json::from_str(&line).ok()) {
                     if events.send((id, event)).is_err() {
                         break;
@@ -74,7 +74,7 @@ impl Actor {
         }
     }
 
-    /// Kills the process, which cannot clean up.
+    /// Kills the process without letting it clean up.
     pub fn kill(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -92,7 +92,7 @@ impl Actor {
         }
     }
 
-    /// How it has ended, if it has.
+    /// Its exit status, if it has ended.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
     }
@@ -111,7 +111,7 @@ impl Actor {
 
     /// What it wrote to standard error before it ended, in one line.
     pub fn complaint(&self) -> String {
-        // A process that it has forked may keep the pipe open.
+        // A process that it forked may keep the pipe open.
         let start = Instant::now();
         while self.reader.as_ref().is_some_and(|reader| !reader.is_finished()) && start.elapsed() < REMAINDER {
             std::thread::sleep(Duration::from_millis(1));
@@ -127,7 +127,7 @@ impl Drop for Actor {
     }
 }
 
-/// Whether a process crashed: it was ended by a signal that no process of the run sent, or by a panic.
+/// Whether a process that this run did not kill crashed: it ended by a signal or a panic.
 pub fn is_crash(status: ExitStatus) -> bool {
     status.signal().is_some() || status.code() == Some(101)
 }
@@ -137,49 +137,49 @@ pub fn own_program() -> Result<PathBuf, String> {
     std::env::current_exe().map_err(|error| format!("own program: {error}"))
 }
 
-/// The program `endless`, which is built into the same folder.
+/// The program `endless`, built into the same folder.
 pub fn engine_program() -> Result<PathBuf, String> {
     let program = own_program()?.with_file_name("endless");
     let missing = || format!("{} is missing; build it, or run `cargo xtask faults`", program.display());
     program.is_file().then(|| program.clone()).ok_or_else(missing)
 }
 
-/// This program in a role with a JSON argument.
+/// This program in a role, with a JSON argument.
 pub fn role(name: &str, argument: &impl serde::Serialize) -> Result<Command, String> {
     let mut command = Command::new(own_program()?);
     command.args(["role", name]).arg(serde_json::to_string(argument).map_err(|error| error.to_string())?);
     Ok(command)
 }
 
-/// The command as the further arguments of another one.
+/// Appends the command to the arguments of another one.
 fn within(arguments: &[&str], command: &Command) -> Command {
     let mut outer = Command::new(arguments[0]);
     outer.args(&arguments[1..]).arg(command.get_program()).args(command.get_args());
     outer
 }
 
-/// The command under a limit of its descriptors.
+/// The command with a limit on its descriptors.
 pub fn with_descriptors(command: &Command, limit: u64) -> Command {
     within(&["sh", "-c", &format!("ulimit -n {limit}; exec \"$0\" \"$@\"")], command)
 }
 
-/// The command in a mount namespace of its own, after the shell command `mount`.
+/// The command in a new mount namespace, after the shell command `mount`.
 fn with_mount(command: &Command, mount: &str) -> Command {
     let script = format!("{mount} && exec \"$0\" \"$@\"");
     within(&["unshare", "--mount", "--map-root-user", "sh", "-c", &script], command)
 }
 
-/// The command with an empty directory of its own in the place of the namespace's.
+/// The command with a new, empty directory mounted over the namespace's.
 pub fn with_own_root(command: &Command) -> Command {
     with_mount(command, "mount -t tmpfs -o mode=700 tmpfs \"$ENDLESS_GYM_ROOT\"")
 }
 
-/// The command with a /dev/shm of its own, of some megabytes.
+/// The command with a separate /dev/shm of that size.
 pub fn with_own_memory(command: &Command, megabytes: u64) -> Command {
     with_mount(command, &format!("mount -t tmpfs -o size={megabytes}M tmpfs /dev/shm"))
 }
 
-/// The command as the user nobody.
+/// The command run as the user nobody.
 pub fn as_nobody(command: &Command) -> Command {
     within(&["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"], command)
 }

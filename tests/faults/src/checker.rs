@@ -1,4 +1,4 @@
-//! Comparison of an engine's group with a pool in this process that plays the same.
+//! Compares an engine's group with a pool in this process that plays the same requests.
 
 use std::collections::VecDeque;
 
@@ -12,7 +12,7 @@ use endless_gym_service::{BatchLease, ServiceError, ServiceSpecification, Traine
 use crate::options;
 use crate::shape::Shape;
 
-/// A request to a group, which its twin plays when the answer has arrived.
+/// A request to a group. The group's twin plays it when the answer arrives.
 #[derive(Clone, Debug)]
 pub enum Request {
     Seed { seed: u64, options: Option<OptionMap> },
@@ -25,7 +25,7 @@ impl Request {
     pub fn random(draws: &mut Generator, shape: &Shape, space: &ActionSpace, with_options: bool) -> Self {
         let num_envs = shape.num_envs;
         if draws.integers(0, 40) == 0 {
-            // An unseeded episode depends on what was played before, so resets are by seed or leave out the environment.
+            // An unseeded episode depends on earlier ones, so each environment is reset with a seed or not at all.
             let reset = (0..num_envs).map(|_| 2 * draws.integers(0, 2) as u8).collect();
             let seed = (0..num_envs).map(|_| draws.integers(0, 1 << 32) as u64).collect();
             let options = (with_options && draws.integers(0, 2) == 0).then(|| options::random(draws, &shape.id));
@@ -48,14 +48,14 @@ impl Request {
     }
 }
 
-/// A pool that plays what a group plays.
+/// A pool that plays the same as a group.
 pub struct Twin {
     pool: Pool,
-    /// Several buffers in turn, as the engine has them.
+    /// Several buffers used in turn, as in the engine.
     buffers: VecDeque<Vec<Block>>,
-    /// Whether frames and snapshots may show what was played before a reset.
+    /// Whether frames and snapshots may depend on what was played before a reset.
     shows_history: bool,
-    /// Whether its state is the engine's in all details, of which an environment may keep some over a reset without showing them.
+    /// Whether its state equals the engine's in every detail. An environment may keep hidden details across a reset.
     is_exact: bool,
 }
 
@@ -67,7 +67,7 @@ impl Twin {
         Ok(Twin { pool, buffers, shows_history, is_exact: true })
     }
 
-    /// What differs in the specification of an engine.
+    /// The difference between an engine's specification and the expected one, if any.
     pub fn difference(&self, shape: &Shape, specification: &ServiceSpecification) -> Option<String> {
         let space = memory_gym().spec(&shape.id).map(|spec| &spec.action_space).ok();
         let same = specification.batch == *self.pool.layout()
@@ -84,8 +84,9 @@ impl Twin {
         Ok(found)
     }
 
-    /// As [`compare`](Twin::compare), for the first reset of an engine that has played before. What an episode shows of earlier ones,
-    /// as the original does, is taken from the engine's snapshots; all else must be as after the first reset of a new pool.
+    /// Like [`compare`](Twin::compare), for the first reset of an engine that has played before. What an episode shows
+    /// of earlier ones, as in the original, is taken from the engine's snapshots; everything else must be as after the
+    /// first reset of a new pool.
     pub fn adopt(
         &mut self,
         request: &Request,
@@ -108,8 +109,8 @@ impl Twin {
         Ok(self.pool.observe(&mut shown).map(|()| difference(self.pool.layout(), &shown, given, false)))
     }
 
-    /// Takes the snapshot of an environment and restores it, which repeats its last frame in a stack. Returns whether it is
-    /// `given`.
+    /// Takes a snapshot of an environment and restores it, which repeats its last frame in a stack. Returns whether the
+    /// snapshot equals `given`.
     pub fn snapshot(&mut self, env: usize, given: &[u8]) -> Result<bool, SnapshotError> {
         let snapshot = self.pool.snapshot(env)?;
         self.pool.restore(env, &snapshot)?;
@@ -131,7 +132,8 @@ impl Twin {
     }
 }
 
-/// The first section that differs; with `only_numbers`, of those that do not describe the frame. Padding is not compared: it may hold a rejection's text.
+/// The first section that differs; with `only_numbers`, sections that describe the frame are skipped. Padding is not
+/// compared, since it may hold a rejection's text.
 fn difference(layout: &Layout, expected: &[Block], given: &[u8], only_numbers: bool) -> Option<String> {
     let expected: &[u8] = bytemuck::cast_slice(expected);
     let ended = layout.section(BatchSection::Terminated).map_or(0, Section::offset);

@@ -1,4 +1,4 @@
-//! What a round leaves behind: processes, files in the namespace's directory, segments with its prefix.
+//! Finds what a round leaves behind: processes, files in the namespace's directory, and segments with its prefix.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant, SystemTime};
 use endless_gym_service::{Namespace, ROOT_VARIABLE, running_engines};
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
 
-/// Longer than the ages from which files count as abandoned.
+/// Older than the age at which files count as abandoned.
 const ABANDONED: Duration = Duration::from_secs(60);
 
-/// How long removal may take, on a machine that is busy with other work.
+/// How long removal may take, even on a busy machine.
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// The files of a namespace: those in its directory and its segments.
@@ -34,7 +34,7 @@ fn below(folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// The processes of a namespace other than this one: those that have its directory in their environment.
+/// The processes of a namespace other than this one: those with its directory in their environment variables.
 pub fn processes(namespace: &Namespace) -> Vec<u32> {
     let variable = format!("{ROOT_VARIABLE}={}", namespace.root().display());
     let ids = fs::read_dir("/proc").into_iter().flatten().flatten();
@@ -47,13 +47,14 @@ pub fn processes(namespace: &Namespace) -> Vec<u32> {
         .collect()
 }
 
-/// What is left after all processes have ended and a process has listed the engines.
+/// What is left after all processes have ended and one has listed the engines.
 ///
-/// Files of processes that died while they started or ended are recognised by their age. Instead of waiting, they are made old.
+/// Files of processes that died while they started or ended are recognised by their age. Instead of waiting, this ages
+/// them.
 pub fn leftovers(namespace: &Namespace) -> Vec<String> {
     let start = Instant::now();
     loop {
-        // A process that was killed may take a while to end.
+        // A killed process may take a while to end.
         let processes = processes(namespace).into_iter().map(|id| format!("process {id}"));
         let error = running_engines(namespace).err().map(|error| format!("engines cannot be listed: {error}"));
         let files = files(namespace).into_iter().map(|path| path.display().to_string());

@@ -1,4 +1,4 @@
-//! How each fault is done.
+//! Executes each kind of fault.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -16,13 +16,13 @@ use crate::scene::{LIMIT, Scene};
 /// How long a regular end may take.
 const END: Duration = LIMIT;
 
-/// How long a process with few descriptors has to play or to end.
+/// How long a process with few descriptors may take to play or to end.
 const FEW_DESCRIPTORS: Duration = LIMIT;
 
 const BALLAST: &str = "/dev/shm/ballast";
 
 impl Scene<'_> {
-    /// Does a fault. Returns the time at which it was over: from then on batches must come again.
+    /// Executes a fault. Returns the time at which it was over; after it, batches must arrive again.
     pub fn apply(&mut self, fault: Fault) -> Result<Duration, String> {
         let milliseconds = Duration::from_millis;
         match fault {
@@ -140,7 +140,7 @@ impl Scene<'_> {
         self.look()
     }
 
-    /// Waits for a process that ends by itself.
+    /// Waits for a process that ends on its own.
     fn wait_for(&mut self, mut actor: Actor) -> Result<(), String> {
         match actor.wait(END) {
             Some(status) if status.success() => {}
@@ -169,7 +169,7 @@ impl Scene<'_> {
         }
         self.start(Role::Trainer)?;
         let over = now();
-        // The child is still running when the next trainer must play.
+        // The next trainer must play while the child is still running.
         self.next_batch(over, LIMIT)?;
         if let Some(child) = i32::try_from(child).ok().and_then(Pid::from_raw) {
             let _ = kill_process(child, Signal::KILL);
@@ -177,7 +177,7 @@ impl Scene<'_> {
         Ok(over)
     }
 
-    /// A process with too few descriptors plays or ends with an error; it must not take part without ever answering.
+    /// A process with too few descriptors must play or end with an error; it must not run without ever answering.
     fn few_descriptors(&mut self, role: Role, limit: u64) -> Result<(), String> {
         self.kill(role);
         let command = self.command(role)?;

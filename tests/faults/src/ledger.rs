@@ -1,8 +1,8 @@
-//! Which batches the trainers of a round received: none may be missing or come twice.
+//! Records which batches the trainers of a round received: none may be missing or repeated.
 
 use std::collections::BTreeMap;
 
-/// The batches of a group that one trainer reported.
+/// The range of a group's batches that one trainer reported.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Span {
     first: u64,
@@ -11,24 +11,25 @@ struct Span {
 
 /// The batches of every run of the engine, by group and trainer.
 ///
-/// It is judged when all reports have been read: those of a killed trainer may still be in its pipe when its successor plays.
+/// It is checked after all reports have been read, since a killed trainer's may still be in its pipe while its
+/// successor plays.
 #[derive(Debug, Default)]
 pub struct Ledger(BTreeMap<(u64, usize), BTreeMap<u64, Span>>);
 
 impl Ledger {
-    /// The trainer with this number has received a batch. It checks by itself that its batches have no gaps.
+    /// The trainer with this number has received a batch. Each trainer itself checks that its batches have no gaps.
     pub fn add(&mut self, incarnation: u64, group: usize, trainer: u64, step: u64) {
         let spans = self.0.entry((incarnation, group)).or_default();
         let span = spans.entry(trainer).or_insert(Span { first: step, last: step });
         (span.first, span.last) = (span.first.min(step), span.last.max(step));
     }
 
-    /// What is missing, or came twice. Trainers are numbered as they started. Each may have received one batch of a group, or
-    /// requested it, without a report.
+    /// The missing and repeated batches. Trainers are numbered in the order of their start. Each may have received or
+    /// requested one batch of a group without reporting it.
     pub fn faults(&self) -> Vec<String> {
         let mut found = Vec::new();
         for ((_, group), spans) in &self.0 {
-            // The first trainer of an engine follows others who may have received nothing that they reported.
+            // The first trainer in the ledger may follow others that reported nothing.
             for ((old, before), (new, after)) in spans.iter().zip(spans.iter().skip(1)) {
                 let unknown = new - old;
                 if !(before.last + 1..=before.last + 1 + unknown).contains(&after.first) {
@@ -57,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn one_batch_for_each_trainer_may_be_unknown() {
+    fn each_trainer_may_leave_one_batch_unreported() {
         assert_eq!(faults(&[(0, 1), (0, 2), (1, 3)]), 0);
         assert_eq!(faults(&[(0, 1), (0, 2), (1, 4)]), 0);
         assert_eq!(faults(&[(0, 1), (0, 2), (1, 5)]), 1);

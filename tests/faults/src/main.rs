@@ -1,5 +1,6 @@
-//! Faults for real processes: an engine, its trainer, observers and visitors are killed, stopped and starved in a sequence that
-//! follows from a seed, and every byte that the trainer receives is compared with a pool in its own process.
+//! Fault injection with real processes: an engine, its trainer, observers and visitors are killed, stopped and starved
+//! in a sequence derived from a seed, and the trainer compares every byte that it receives with a pool in its own
+//! process.
 
 mod actors;
 mod checker;
@@ -23,7 +24,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-/// Faults for real processes, and long runs.
+/// Fault injection with real processes, and long runs.
 #[derive(Parser)]
 #[command(name = "endless-gym-faults", bin_name = "cargo xtask", version)]
 struct Cli {
@@ -37,7 +38,7 @@ enum Task {
     Faults(run::Args),
     /// Play all environments with random options for a long time, and watch memory and descriptors.
     Soak(soak::Args),
-    /// Play one round, in the namespace of the environment, and print what it found as JSON.
+    /// Play one round in the namespace of the environment variable, and print its outcome as JSON.
     #[command(hide = true)]
     Round { seed: u64, number: u64 },
     /// Take part in a round.

@@ -6,7 +6,7 @@ use endless_gym_core::pool::OptionMap;
 use endless_gym_core::random::Generator;
 use serde_json::Value as Json;
 
-/// Some of an id's parameters, each with a random value; usually one that is not far from the default.
+/// Some of an id's parameters with random values, usually not far from the defaults.
 pub fn random(draws: &mut Generator, id: &str) -> OptionMap {
     let parameters = memory_gym().spec(id).map(|spec| spec.parameters).unwrap_or_default();
     let mut options = OptionMap::new();

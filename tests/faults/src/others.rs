@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_millis(400);
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Habit {
     pub seed: u64,
-    /// Batches that it keeps.
+    /// Number of batches that it holds.
     pub holds: usize,
     /// Longest time between two batches in milliseconds.
     pub pause: i64,
@@ -106,7 +106,7 @@ pub fn visit(seed: u64, times: usize) {
         if draws.integers(0, 8) == 0 {
             let config = ConnectConfig { timeout: Duration::ZERO, ..ConnectConfig::new(SERVICE) };
             match Trainer::connect(&config) {
-                // The trainer has died at this moment, or not started yet.
+                // The trainer has just died, or has not started yet.
                 Ok(trainer) => drop(trainer),
                 Err(error) => Event::error("visit", &error, None).report(),
             }
@@ -116,7 +116,7 @@ pub fn visit(seed: u64, times: usize) {
     Event::End.report();
 }
 
-/// What a process of another user tries: to list, to connect, and to remove.
+/// Tries as another user to list engines, to connect, and to remove files.
 pub fn intrude() {
     let namespace = Namespace::default();
     if running_engines(&namespace).is_ok_and(|engines| !engines.is_empty()) {

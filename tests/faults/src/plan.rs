@@ -1,4 +1,5 @@
-//! Which faults happen when. A plan follows from a seed and the number of its round alone, so that a printed pair repeats it.
+//! Plans which faults happen when. A plan depends only on a seed and a round number, so that printing both suffices to
+//! repeat it.
 
 use endless_gym_core::random::{Generator, SeedSequence};
 use serde::{Deserialize, Serialize};
@@ -13,40 +14,41 @@ pub enum Role {
     Observer,
 }
 
-/// One fault. Times are in milliseconds, moments of a start or an end in microseconds.
+/// One fault. Times are in milliseconds; moments within a start or an end are in microseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Fault {
-    /// SIGKILL; a successor starts after a time.
+    /// SIGKILL; a successor starts after `down`.
     Kill { role: Role, down: u64 },
-    /// A successor of a killed process is killed itself while it starts.
+    /// A process is killed, and so is its successor while it starts.
     KillStarting { role: Role, moment: u64 },
-    /// A process is asked to end and killed while it does.
+    /// A process is asked to end, and killed while it does.
     KillEnding { role: Role, moment: u64 },
     /// SIGSTOP and, later, SIGCONT.
     Stop { role: Role, time: u64 },
-    /// The same while a successor of a killed process starts.
+    /// The same for the successor of a killed process while it starts.
     StopStarting { role: Role, moment: u64, time: u64 },
     /// The engine ends regularly and is started again.
     Restart { down: u64 },
     /// A trainer with a forked child is killed or ends; the child lives on.
     Fork { is_killed: bool },
-    /// A process is restarted with a limit of its descriptors.
+    /// A process is restarted with a limit on its descriptors.
     Descriptors { role: Role, limit: u64 },
-    /// Modification times of all files move, as seen after a jump of the clock; then the trainer is replaced.
+    /// The modification times of all files move, as after a jump of the clock; then the trainer is replaced.
     ClockJump { seconds: i64 },
     /// The namespace's directory is removed; then the trainer or the engine is replaced.
     RemoveRoot { then: Role },
-    /// /dev/shm is full for a time, in which a process is killed and started again.
+    /// /dev/shm is full for a time, during which a process is killed and started again.
     FillMemory { role: Role, time: u64 },
     /// An observer that keeps every batch.
     HoardingObserver,
-    /// A process with another root directory of the same path, and the same /dev/shm, lists engines when the segments are old.
+    /// A process with another root directory of the same path but the same /dev/shm lists engines when the segments are
+    /// old.
     OtherContainer,
-    /// A process of another user lists engines, connects, and removes what it can.
+    /// Another user's process tries to list engines, to connect, and to remove files.
     OtherUser,
 }
 
-/// What the machine must permit for a fault or a round.
+/// A permission that a fault or a round needs from the machine.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Right {
     MountNamespaces,
@@ -54,7 +56,7 @@ pub enum Right {
 }
 
 impl Fault {
-    /// The name under which faults are counted.
+    /// The name under which the fault is counted.
     pub fn kind(self) -> String {
         let (role, what) = match self {
             Fault::Kill { role, .. } => (role, "killed"),
@@ -76,7 +78,7 @@ impl Fault {
         format!("{role:?} {what}").to_lowercase()
     }
 
-    /// What it needs.
+    /// The permission that it needs.
     pub fn right(self) -> Option<Right> {
         match self {
             Fault::FillMemory { .. } | Fault::OtherContainer => Some(Right::MountNamespaces),
@@ -93,7 +95,7 @@ pub struct Step {
     pub fault: Fault,
 }
 
-/// One round: an engine, a trainer, observers and visitors in a namespace of their own, and what happens to them.
+/// One round: an engine, a trainer, observers and visitors in a new namespace, and the faults that they suffer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     pub shape: Shape,
@@ -106,12 +108,12 @@ pub struct Plan {
     pub observers: usize,
     /// Processes that list engines and try to connect all the time.
     pub visitors: usize,
-    /// Size of the round's own /dev/shm in megabytes.
+    /// Size in megabytes of a separate /dev/shm for the round.
     pub own_memory: Option<u64>,
     pub steps: Vec<Step>,
 }
 
-/// A process takes about this long to start and connect, in microseconds.
+/// About how long a process takes to start and connect, in microseconds.
 const START: i64 = 60_000;
 
 impl Plan {
@@ -136,7 +138,7 @@ impl Plan {
         }
     }
 
-    /// What the round as a whole needs.
+    /// The permission that the whole round needs.
     pub fn right(&self) -> Option<Right> {
         self.own_memory.map(|_| Right::MountNamespaces)
     }
@@ -162,7 +164,7 @@ fn fault(draws: &mut Generator, owns_memory: bool) -> Fault {
         14 => Fault::RemoveRoot { then: if below(2) == 0 { Role::Trainer } else { Role::Engine } },
         15 => Fault::HoardingObserver,
         16 => Fault::OtherContainer,
-        // In a user namespace there is no other user.
+        // A user namespace contains no other user.
         _ if owns_memory => Fault::Kill { role, down },
         _ => Fault::OtherUser,
     }
@@ -175,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_plan_follows_from_seed_and_round() {
+    fn a_plan_depends_on_seed_and_round() {
         assert_eq!(Plan::new(1, 5), Plan::new(1, 5));
         assert_ne!(Plan::new(1, 5), Plan::new(1, 6));
         assert_ne!(Plan::new(1, 5), Plan::new(2, 5));

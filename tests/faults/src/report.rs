@@ -1,4 +1,4 @@
-//! What rounds found, and the summary of a run.
+//! The outcomes of rounds, and the summary of a run.
 
 use std::collections::BTreeMap;
 
@@ -8,29 +8,29 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
     pub kind: String,
-    /// The fault that was being tried.
+    /// The fault that was being executed.
     pub fault: String,
     pub text: String,
 }
 
-/// What a round found.
+/// The outcome of a round.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Outcome {
-    /// The faults that were tried by kind, with the time in milliseconds from the end of the fault to the next correct batch.
+    /// The kind of each fault, and the time in milliseconds from its end to the next correct batch.
     pub faults: Vec<(String, Option<f64>)>,
     pub failures: Vec<Failure>,
     /// The errors that processes reported.
     pub errors: BTreeMap<String, u64>,
-    /// Batches that a trainer compared with its twin.
+    /// Batches that trainers compared with their twins'.
     pub batches: u64,
-    /// Batches of observers that were compared with a trainer's.
+    /// Batches of observers compared with a trainer's.
     pub observed: u64,
     /// Faults that the machine does not permit, by kind.
     pub left_out: BTreeMap<String, u64>,
 }
 
 impl Outcome {
-    /// Adds a round's.
+    /// Adds a round's outcome.
     pub fn add(&mut self, other: Outcome) {
         self.faults.extend(other.faults);
         self.failures.extend(other.failures);
@@ -102,7 +102,7 @@ impl Outcome {
     }
 }
 
-/// Times in milliseconds.
+/// Quantiles of recovery times in milliseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Recovery {
     pub median: f64,

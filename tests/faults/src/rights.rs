@@ -1,11 +1,11 @@
-//! What the machine permits.
+//! Finds out what the machine permits.
 
 use std::process::{Command, Stdio};
 
 use crate::actors;
 use crate::plan::Right;
 
-/// The rights that a fault or a round may need.
+/// The permissions that the machine grants.
 #[derive(Clone, Copy, Debug)]
 pub struct Rights {
     mount_namespaces: bool,
@@ -13,7 +13,7 @@ pub struct Rights {
 }
 
 impl Rights {
-    /// Tries each.
+    /// Tries each permission.
     pub fn probe() -> Self {
         let succeeds = |mut command: Command| {
             let quiet = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
@@ -27,7 +27,7 @@ impl Rights {
         }
     }
 
-    /// Whether a right is there; `None` needs none.
+    /// Whether a permission is granted; `None` needs none.
     pub fn permit(self, right: Option<Right>) -> bool {
         match right {
             None => true,

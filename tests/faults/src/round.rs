@@ -1,4 +1,4 @@
-//! One round: start, faults, end, and what is left.
+//! Plays one round: start, faults, end, and the search for leftovers.
 
 use std::time::Duration;
 
@@ -57,7 +57,7 @@ fn faults(scene: &mut Scene<'_>, rights: Rights) -> Result<(), String> {
     Ok(())
 }
 
-/// The time from `since` to the next correct batch. It is a failure if there is none.
+/// The time from `since` to the next correct batch. Its absence is recorded as a failure.
 fn recover(scene: &mut Scene<'_>, since: Duration) -> Result<Option<Duration>, String> {
     let next = scene.next_batch(since, LIMIT)?;
     if next.is_none() {

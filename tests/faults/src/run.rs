@@ -1,4 +1,4 @@
-//! A run: rounds one after the other, each in a process and a namespace of its own.
+//! A run: successive rounds, each in a new process and namespace.
 
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
@@ -23,16 +23,16 @@ const ROUND_LIMIT: Duration = Duration::from_secs(1800);
 /// Arguments of `faults`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// How long to go on.
+    /// Duration of the run.
     #[arg(long, default_value_t = 2.0)]
     minutes: f64,
     /// The seed of all rounds [default: random].
     #[arg(long)]
     seed: Option<u64>,
-    /// Stop after so many faults.
+    /// Stop after this many faults.
     #[arg(long)]
     faults: Option<usize>,
-    /// Play this round alone.
+    /// Play only this round.
     #[arg(long)]
     round: Option<u64>,
     /// Write the summary as JSON to a file.
@@ -90,19 +90,19 @@ pub fn run(args: &Args) -> Result<(), String> {
     if total.failures.is_empty() { Ok(()) } else { Err(format!("{} failures; seed {seed}", total.failures.len())) }
 }
 
-/// Plays a round and prints what it found.
+/// Plays a round and prints its outcome.
 pub fn round(seed: u64, number: u64) -> Result<(), String> {
     let outcome = round::play(&Plan::new(seed, number), Rights::probe())?;
     println!("{}", serde_json::to_string(&outcome).map_err(|error| error.to_string())?);
     Ok(())
 }
 
-/// A namespace that no other run has.
+/// A namespace that no other run uses.
 pub fn new_namespace() -> Result<Namespace, String> {
     Ok(Namespace::at(format!("/tmp/faults-{:016x}", random_seed()?)))
 }
 
-/// Plays a round in a process of its own, so that it can have a /dev/shm of its own and its processes can be found and ended.
+/// Plays a round in a new process, so that it can have a separate /dev/shm and its processes can be found and ended.
 fn in_own_process(seed: u64, number: u64, plan: &Plan, stop: &AtomicBool) -> Result<Outcome, String> {
     let namespace = new_namespace()?;
     let mut command = Command::new(actors::own_program()?);
@@ -154,7 +154,7 @@ pub fn duration(minutes: f64) -> Result<Duration, String> {
     time.ok_or_else(|| format!("--minutes must be finite and positive, got {minutes}"))
 }
 
-/// A seed of the operating system's.
+/// A seed from the operating system.
 pub fn random_seed() -> Result<u64, String> {
     entropy().map(|bits| bits as u64).map_err(|error| error.to_string())
 }

@@ -1,4 +1,4 @@
-//! A round's processes, and the rules by which what they report and how they end is judged.
+//! A round's processes, and the rules that judge their reports and exits.
 
 use std::collections::{HashMap, HashSet};
 use std::os::unix::process::ExitStatusExt;
@@ -17,11 +17,11 @@ use crate::plan::{Fault, Plan, Role};
 use crate::report::{Failure, Outcome};
 use crate::trainer::Work;
 
-/// How long the next correct batch, or the end of a process, may take. The machine may be busy with other work, so this is far more
-/// than what is needed: it tells slow from never.
+/// How long the next correct batch, or the end of a process, may take. Far longer than needed, since the machine may be
+/// busy: it only tells slow from never.
 pub const LIMIT: Duration = Duration::from_secs(60);
 
-/// Failures of one kind that a round keeps.
+/// Maximum number of failures of one kind that a round keeps.
 const KEPT: usize = 3;
 
 /// The processes of a round.
@@ -29,31 +29,31 @@ pub struct Scene<'a> {
     pub plan: &'a Plan,
     pub namespace: Namespace,
     pub outcome: Outcome,
-    /// The fault that is being tried.
+    /// The fault that is being executed.
     pub current: Option<Fault>,
-    /// Processes that are to be started again if they end by themselves.
+    /// Processes that are restarted if they end on their own.
     pub engine: Option<Actor>,
     pub trainer: Option<Actor>,
     pub observer: Option<Actor>,
-    /// Others, which end when they want.
+    /// Other processes, which may end at any time.
     pub others: Vec<Actor>,
-    /// Processes that were given few descriptors, so that their errors are expected.
+    /// Processes with few descriptors, whose errors are expected.
     pub limited: HashSet<u32>,
-    /// The last process that was forked.
+    /// The last forked process.
     pub forked: Option<u32>,
     /// When the namespace's directory was removed.
     pub removed: Option<Duration>,
     /// When /dev/shm was full.
     pub filled: Option<Duration>,
-    /// Since when a process's last connection is, or its attempt to connect; at first its start.
+    /// When each process last began to connect, or started.
     attempts: HashMap<u32, Duration>,
-    /// Processes whose last attempt has succeeded, and the engines that they found.
+    /// Processes whose last attempt to connect succeeded, and the engines that they found.
     connected: HashSet<u32>,
     sender: Sender<(u32, Event)>,
     events: Receiver<(u32, Event)>,
     /// Engines that were ended on purpose.
     ended_engines: HashSet<u32>,
-    /// All trainers so far and their numbers: reports of a killed process may still be in its pipe.
+    /// All trainers so far and their numbers, including killed ones, whose reports may still be in their pipes.
     trainers: HashMap<u32, u64>,
     /// The process of each incarnation.
     engines: HashMap<u64, u32>,
@@ -98,7 +98,7 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Notes something that must not happen.
+    /// Records a failure.
     pub fn fail(&mut self, kind: &str, text: String) {
         let fault = self.current.map_or("no fault".to_owned(), Fault::kind);
         let same = |failure: &&Failure| failure.kind == kind && failure.fault == fault;
@@ -137,7 +137,7 @@ impl<'a> Scene<'a> {
         Ok(actor)
     }
 
-    /// Starts the process of a role, in place of the one that had it.
+    /// Starts the process of a role and replaces the previous one.
     pub fn start(&mut self, role: Role) -> Result<(), String> {
         let command = self.command(role)?;
         let actor = self.spawn(command)?;
@@ -157,7 +157,7 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Takes the process of a role out of the round's watch, since it is going to end.
+    /// Stops watching the process of a role, since it is going to end.
     pub fn take(&mut self, role: Role) -> Option<Actor> {
         let actor = self.place(role).take();
         if let Some(engine) = actor.as_ref().filter(|_| role == Role::Engine) {
@@ -183,7 +183,7 @@ impl<'a> Scene<'a> {
         Ok(())
     }
 
-    /// Waits for a correct batch later than `since`, from the present engine to the present trainer. Returns its time.
+    /// Waits for a correct batch after `since`, from the current engine to the current trainer. Returns its time.
     pub fn next_batch(&mut self, since: Duration, limit: Duration) -> Result<Option<Duration>, String> {
         let start = Instant::now();
         loop {
@@ -202,7 +202,7 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Reads what was reported, and starts again what has ended by itself.
+    /// Reads reports, and restarts processes that have ended on their own.
     pub fn look(&mut self) -> Result<(), String> {
         while let Ok((process, event)) = self.events.try_recv() {
             self.judge(process, event);
@@ -218,7 +218,7 @@ impl<'a> Scene<'a> {
                 self.fail("unexpected end", text);
             }
             drop(self.take(role));
-            // One that cannot start is not started in a tight loop.
+            // Avoid a tight loop if a process cannot start.
             std::thread::sleep(Duration::from_millis(50));
             self.start(role)?;
         }
@@ -229,24 +229,24 @@ impl<'a> Scene<'a> {
         self.plan.own_memory.is_some()
     }
 
-    /// Whether a process may complain so.
+    /// Whether a process may fail with this message.
     pub fn is_excused(&self, process: u32, complaint: &str) -> bool {
         self.limited.contains(&process)
             || (self.is_short_of_memory() && complaint.contains("/dev/shm"))
-            // Many processes take the lock in turn. If it is never free again, the round does not go on.
+            // Many processes take the lock in turn. If it were never free again, the round would not continue.
             || complaint.contains("has been locked")
     }
 
-    /// Whether a process was connecting when the memory was filled. What it has found free may then be missing, and iceoryx2, which
-    /// allocates no pages in advance, dies of SIGBUS. A process that is connected must not.
+    /// Whether a process was connecting when the memory was filled. The memory that it found free may then be missing,
+    /// and SIGBUS kills it, since iceoryx2 allocates no pages in advance. This must not happen to a connected process.
     fn lost_memory(&self, process: u32, status: ExitStatus) -> bool {
         status.signal() == Some(Signal::BUS.as_raw())
             && !self.connected.contains(&process)
             && self.began_before(process, self.filled)
     }
 
-    /// Whether the last attempt of a process to connect began before that time: what it reports may be due to what ended then, as late
-    /// as it reports it.
+    /// Whether a process last began to connect before that time. If so, even its late reports may be due to the earlier
+    /// event.
     fn began_before(&self, process: u32, time: Option<Duration>) -> bool {
         self.attempts.get(&process).zip(time).is_some_and(|(began, time)| *began <= time)
     }
@@ -259,7 +259,7 @@ impl<'a> Scene<'a> {
             }
             Event::Connected { incarnation, engine } => {
                 self.engines.insert(incarnation, engine);
-                // An engine that is found has all its memory too.
+                // An engine that was found already has all its memory.
                 self.connected.extend([process, engine]);
             }
             Event::Batch { at, incarnation, group, step, checksum, is_correct } => {
@@ -285,7 +285,7 @@ impl<'a> Scene<'a> {
                 *self.outcome.errors.entry(kind.clone()).or_default() += 1;
                 self.last_errors.insert(kind.clone(), text.clone());
                 let is_lost = matches!(kind.as_str(), "EngineLost" | "EngineRestarted");
-                // An engine without its directory starts again in the same process.
+                // An engine whose directory was removed restarts in the same process.
                 let is_removed = self.began_before(process, self.removed);
                 let has_crashed = self.engine.as_mut().is_some_and(|engine| engine.ended().is_some());
                 let is_running = engine.is_some_and(|engine| !self.ended_engines.contains(&engine)) && !has_crashed;
@@ -297,7 +297,7 @@ impl<'a> Scene<'a> {
                     "EngineLost" | "EngineRestarted" | "UnknownEngine" | "TrainerExists" | "TimedOut"
                     | "NamespaceLocked" => true,
                     "TooManyObservers" | "TooManyBatchesHeld" | "NoSuchGroup" => during == "observe",
-                    // One that joins while the files are removed sees iceoryx2 fail.
+                    // iceoryx2 may fail in a process that joins while the files are removed.
                     "RootRemoved" | "Root" | "Middleware" => is_removed,
                     _ => false,
                 };
@@ -326,9 +326,9 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Reads what is left in the pipes of processes that have ended, and judges what only all reports together show.
+    /// Reads the remaining reports of ended processes, and checks what requires all reports.
     pub fn close(&mut self) {
-        // The threads that read the pipes keep the other senders.
+        // The threads that read the pipes hold the other senders.
         drop(std::mem::replace(&mut self.sender, channel().0));
         loop {
             match self.events.recv_timeout(LIMIT) {
@@ -345,17 +345,17 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Whether the trainer has received a correct batch of that engine since then.
+    /// Whether the trainer has received a correct batch from that engine since then.
     pub fn has_played(&self, engine: u32, since: Duration) -> bool {
         self.last_batch.is_some_and(|(at, _, from)| at > since && from == engine)
     }
 
-    /// Notes that a process is a trainer.
+    /// Records that a process is a trainer.
     pub fn add_trainer(&mut self, process: u32) {
         self.trainers.insert(process, self.trainers.len() as u64);
     }
 
-    /// Notes that an engine is going to be ended on purpose.
+    /// Records that an engine is going to be ended on purpose.
     pub fn end_limited(&mut self, engine: u32) {
         self.ended_engines.insert(engine);
     }

@@ -1,4 +1,4 @@
-//! What an engine serves: the arguments of `endless serve`, and the pools that must play the same.
+//! What an engine serves: the arguments of `endless serve`, and the matching pools.
 
 use endless_gym_core::batch::Frames;
 use endless_gym_core::memory_gym;
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::options;
 
-/// The name of every round's engine.
+/// The engine's name in every round.
 pub const SERVICE: &str = "gym";
 
 /// What an engine serves.
@@ -23,12 +23,12 @@ pub struct Shape {
     pub features: bool,
     pub frames: Option<Frames>,
     pub options: OptionMap,
-    /// The engine's own seed. The trainer resets with seeds, after which it must not matter.
+    /// The engine's seed, which must not matter once the trainer has reset with seeds.
     pub seed: Option<u64>,
 }
 
 impl Shape {
-    /// A random shape: any id and format, options within their limits, at most `most` environments in all groups.
+    /// A random shape: any id and format, options within their limits, at most `most` environments in total.
     pub fn random(draws: &mut Generator, most: i64) -> Self {
         let specs: Vec<_> = memory_gym().specs().map(|spec| spec.id).collect();
         let id = *draws.choice(&specs);
@@ -58,7 +58,7 @@ impl Shape {
         }
     }
 
-    /// The arguments of `endless` that serve it.
+    /// The arguments of `endless` to serve it.
     pub fn arguments(&self) -> Vec<String> {
         let mut arguments = vec!["serve".to_owned(), format!("--service={SERVICE}"), "--child".to_owned()];
         arguments.push(format!("--env={}", self.id));
@@ -83,7 +83,7 @@ impl Shape {
         arguments
     }
 
-    /// The pool that plays what the engine's group plays.
+    /// The pool that plays the same as the engine's group.
     pub fn pool(&self, group: usize) -> PoolConfig {
         PoolConfig {
             options: ResetOptions::Shared(self.options.clone()),

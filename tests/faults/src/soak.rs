@@ -1,4 +1,5 @@
-//! A long run without faults: all ids with random options and formats, while memory, descriptors and segments are watched.
+//! A long run without faults: plays all ids with random options and formats, and watches memory, descriptors and
+//! segments.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -19,10 +20,10 @@ use crate::run::{duration, new_namespace, random_seed, stop_on_signal};
 use crate::scene::Scene;
 use crate::shape::Shape;
 
-/// Growth that is no leak: the pictures of other options take other amounts of memory.
+/// Growth that is not a leak, since pictures for other options take different amounts of memory.
 const MEMORY: u64 = 16 << 20;
-/// The pictures of one environment's options in all darknesses, which Searing Spotlights makes on first use. The test
-/// `replaced_options_leave_no_memory_behind` shows that they are freed.
+/// Pictures of one environment's options at all levels of darkness, which Searing Spotlights makes on first use. The
+/// test `replaced_options_leave_no_memory_behind` shows that they are freed.
 const DARK_PICTURES: u64 = 28 << 20;
 const DESCRIPTORS: u64 = 4;
 const SEGMENTS: u64 = 8;
@@ -30,7 +31,7 @@ const SEGMENTS: u64 = 8;
 /// Arguments of `soak`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// How long to go on; each of the ten ids has a tenth of it.
+    /// Duration of the run; each of the ten ids gets a tenth of it.
     #[arg(long, default_value_t = 60.0)]
     minutes: f64,
     /// The seed of options, formats and actions [default: random].
@@ -41,7 +42,7 @@ pub struct Args {
     json: Option<PathBuf>,
 }
 
-/// What the processes take at one moment.
+/// The resources that the processes use at one time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 struct Usage {
     engine_memory: u64,
@@ -65,9 +66,9 @@ impl Usage {
         }
     }
 
-    /// What has grown from the first to the last third of a phase after its start: even the lowest value of the last is above the
-    /// highest of the first, by more than `memory` bytes for memory. In the first two fifths, each environment makes the pictures of
-    /// its options.
+    /// The resources that have grown during a phase: the lowest value of the last third exceeds the highest of the
+    /// first by more than a limit, which is `memory` bytes for memory. The first two fifths of the phase, in which the
+    /// environments make pictures of their options, are skipped.
     fn growth(usages: &[Usage], memory: u64) -> Vec<String> {
         type Counter = (&'static str, fn(&Usage) -> u64, u64);
 
@@ -89,7 +90,7 @@ impl Usage {
     }
 }
 
-/// Bytes of a process that are in memory.
+/// Resident memory of a process in bytes.
 fn memory(process: u32) -> u64 {
     let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
@@ -165,7 +166,7 @@ fn phase(
         scene.watch(Duration::from_millis(500))?;
         usages.push(Usage::of(&scene));
         if Instant::now() >= next_observer {
-            // Observers come and go, regularly and not.
+            // Observers end regularly or are killed.
             if draws.integers(0, 2) == 0 {
                 scene.kill(Role::Observer);
             } else {
@@ -181,7 +182,7 @@ fn phase(
             print_minute(minute, &scene, plan, *usage);
         }
     }
-    // The processes are still starting in a very short run, which is not judged.
+    // A very short run is not judged, since its processes are still starting.
     if usages.len() >= 30 {
         let shape = &plan.shape;
         let dark = if shape.id.contains("SearingSpotlights") { DARK_PICTURES } else { 0 };

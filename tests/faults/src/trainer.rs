@@ -1,4 +1,4 @@
-//! The trainer: a process that plays at random, compares every batch with its twins, and goes on after every error.
+//! The trainer: a process that plays randomly, compares every batch with its twins', and continues after every error.
 
 use std::collections::VecDeque;
 use std::io::BufRead;
@@ -15,7 +15,7 @@ use crate::checker::{Request, Twin, checksum};
 use crate::event::{Event, now};
 use crate::shape::{SERVICE, Shape};
 
-/// How long one call waits.
+/// How long a call waits.
 const PATIENCE: Duration = Duration::from_millis(400);
 
 /// The argument of the role.
@@ -29,7 +29,7 @@ pub struct Work {
     pub think: i64,
 }
 
-/// What the round asks of its trainer, over standard input.
+/// The round's orders to its trainer, from standard input.
 #[derive(Clone, Default)]
 struct Orders {
     stop: Arc<AtomicBool>,
@@ -97,11 +97,11 @@ pub fn run(work: &Work) -> Result<(), String> {
     Ok(())
 }
 
-/// What a trainer knows of a group when its engine is lost.
+/// What a trainer knows about a group when its engine is lost.
 struct Requested {
     /// The number of the last batch.
     step: Option<u64>,
-    /// Whether it waits for another.
+    /// Whether the trainer waits for another one.
     is_pending: bool,
 }
 
@@ -111,7 +111,7 @@ fn connect() -> Option<Trainer> {
     Trainer::connect(&config).inspect_err(|error| Event::error("connect", error, None).report()).ok()
 }
 
-/// Reconnects, and checks what it is told about its last requests. A trainer that cannot reconnect makes a new connection.
+/// Reconnects, and checks the reported fate of the last requests. A trainer that cannot reconnect connects anew.
 fn reconnect(mut trainer: Trainer, requested: &[Requested]) -> Option<Trainer> {
     for _ in 0..3 {
         Event::Connecting { at: now() }.report();
@@ -128,8 +128,8 @@ fn reconnect(mut trainer: Trainer, requested: &[Requested]) -> Option<Trainer> {
     None
 }
 
-/// A lost engine must have returned the batches that the trainer received, and one more if it is said to have played the last
-/// request.
+/// A lost engine must have returned the batches that the trainer received, plus one if it is reported to have played
+/// the last request.
 fn check_fate(index: usize, before: &Requested, found: &GroupReconnection) {
     let (Some(step), Some(lost)) = (before.step, found.lost_step) else { return };
     let played = match found.last_request {
@@ -188,7 +188,8 @@ impl<'a> Play<'a> {
         Ok(Play { work, groups, incarnation: specification.incarnation, held: VecDeque::new() })
     }
 
-    /// Sends a request to the groups without a pending answer, and receives one batch. Returns false if the engine is another run.
+    /// Sends a request to the groups without a pending answer, and receives one batch. Returns false if the engine was
+    /// restarted.
     fn exchange(&mut self, trainer: &mut Trainer, draws: &mut Generator) -> Result<bool, Failed> {
         let (shape, space) = (&self.work.shape, trainer.specification().action_space.clone());
         for (index, group) in self.groups.iter_mut().enumerate().filter(|(_, group)| group.pending.is_none()) {
@@ -208,7 +209,7 @@ impl<'a> Play<'a> {
         if draws.integers(0, 200) == 0 {
             let found = trainer.reconnect(PATIENCE).map_err(failed("reconnect"))?;
             if found.restarted {
-                // The engine was replaced at this moment. What becomes of the new one concerns none of these requests.
+                // The engine has just been replaced, and the new one knows none of these requests.
                 for (index, (group, found)) in self.groups.iter_mut().zip(&found.groups).enumerate() {
                     check_fate(index, &group.requested(), found);
                     (group.step, group.pending) = (None, None);
@@ -264,13 +265,13 @@ impl<'a> Play<'a> {
         Ok(())
     }
 
-    /// Keeps some batches for a while: they must not change.
+    /// Holds some batches for a while, in which they must not change.
     fn hold(&mut self, lease: BatchLease, draws: &mut Generator) {
         if draws.integers(0, 4) == 0 {
             let sum = checksum(&lease);
             self.held.push_back((lease, sum));
         }
-        // An engine accepts three held batches of a group; one of them is the next.
+        // An engine allows three held batches of a group, including the next one.
         while self.held.len() > draws.integers(0, 3) as usize {
             let Some((lease, sum)) = self.held.pop_front() else { return };
             if checksum(&lease) != sum {
@@ -281,7 +282,7 @@ impl<'a> Play<'a> {
     }
 }
 
-/// Takes the snapshot of an environment, restores it, and compares it with the twin's.
+/// Takes a snapshot of an environment, restores it, and compares it with the twin's.
 fn snapshot(twin: &mut Twin, trainer: &mut Trainer, group: usize, env: usize) -> Result<(), Failed> {
     let taken = retry(|| trainer.snapshot(group, env, PATIENCE)).map_err(failed("snapshot"))?;
     retry(|| trainer.restore(group, env, &taken, PATIENCE)).map_err(failed("restore"))?;
@@ -293,7 +294,7 @@ fn snapshot(twin: &mut Twin, trainer: &mut Trainer, group: usize, env: usize) ->
     Ok(())
 }
 
-/// Repeats a call that continues to wait after a time-out; a stopped engine is continued some time.
+/// Repeats a call that can continue after a time-out, since a stopped engine is continued eventually.
 fn retry<T>(mut call: impl FnMut() -> Result<T, ServiceError>) -> Result<T, ServiceError> {
     loop {
         match call() {

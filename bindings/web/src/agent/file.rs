@@ -1,4 +1,5 @@
-//! The file of an exported agent: magic, version, length of the header, header in JSON, tensors in float32, little-endian.
+//! The file format of an exported agent: magic, version, header length, JSON header, float32 tensors; all
+//! little-endian.
 
 use std::collections::HashMap;
 
@@ -9,10 +10,10 @@ use thiserror::Error;
 const MAGIC: &[u8] = b"ENDLAGNT";
 const VERSION: u32 = 1;
 
-/// Largest number of weights; a header with more is not ours.
+/// Maximum number of weights; a header with more is invalid.
 const MAX_NUMBERS: usize = 16 << 20;
 
-/// A file that is no agent, or not one that can act.
+/// A file that is not an agent, or one that cannot act.
 #[derive(Debug, Error)]
 pub enum AgentFileError {
     #[error("the file must be an exported agent, which starts with `{}`", String::from_utf8_lossy(MAGIC))]
@@ -86,7 +87,8 @@ impl Tensors {
         Ok((header, Tensors(tensors)))
     }
 
-    /// Takes a tensor of the given shape; `None` stands for any size of 1 or more. Returns it with its last size.
+    /// Takes a tensor of the given shape, where `None` allows any size of 1 or more. Returns its last size and its
+    /// values.
     pub fn take(&mut self, name: &str, shape: &[Option<usize>]) -> Result<(usize, Vec<f32>), AgentFileError> {
         let given = self.0.remove(name);
         let fits = |found: &[usize]| {

@@ -1,4 +1,4 @@
-//! Trained agents: the file that `endless_gym_agents.export` writes, and the network that acts.
+//! Trained agents: the file that `endless_gym_agents.export` writes, and the policy network.
 
 mod file;
 mod network;
@@ -33,7 +33,7 @@ impl Agent {
         &self.header.env
     }
 
-    /// Whether it takes the features and gives the actions of that environment.
+    /// Whether its features and actions are those of that environment.
     pub fn fits(&self, spec: &EnvSpec) -> bool {
         self.header.env == spec.id
             && self.network.features() == spec.features.len()
@@ -44,7 +44,8 @@ impl Agent {
                 .copied())
     }
 
-    /// A memory before an episode with that seed. The actions are sampled from a stream that is not the environment's.
+    /// The memory at the start of an episode with that seed. Actions are sampled from a different random stream than
+    /// the environment's.
     pub fn memory(&self, seed: u64) -> Memory {
         let stream = SeedSequence::new(seed).with_spawn_key(&[1]);
         Memory { hidden: vec![0.0; self.network.hidden()], random: Generator::from_seed_sequence(&stream) }
@@ -60,7 +61,7 @@ impl Agent {
         }
     }
 
-    /// What the page says about the agent.
+    /// The agent's description for the page.
     pub fn description(&self) -> Json {
         json!({
             "env": self.header.env,
@@ -72,17 +73,17 @@ impl Agent {
     }
 }
 
-/// What an agent keeps of an episode.
+/// An agent's state within an episode.
 pub struct Memory {
     hidden: Vec<f32>,
     random: Generator,
 }
 
-/// A choice with the probabilities of the softmax, by the Gumbel-max trick as in training.
+/// Samples from the softmax with the Gumbel-max trick, as in training.
 fn sample(logits: &[f32], random: &mut Generator) -> usize {
     let mut best = (0, f64::NEG_INFINITY);
     for (choice, logit) in logits.iter().enumerate() {
-        // `1 - random` is in (0, 1], so that the first logarithm is finite.
+        // `1 - random` is in (0, 1], so the first logarithm is finite.
         let noise = -(-(1.0 - random.random()).ln()).ln();
         let value = f64::from(*logit) + noise;
         if value > best.1 {

@@ -13,7 +13,7 @@ struct Layer {
 }
 
 impl Layer {
-    /// Takes `{name}.weight` and `{name}.bias`, for any of the sizes that are `None`.
+    /// Takes `{name}.weight` and `{name}.bias`. A size of `None` allows any size.
     fn take(
         tensors: &mut Tensors,
         name: &str,
@@ -45,7 +45,7 @@ impl Layer {
 pub struct Network {
     encoder: Layer,
     embedding: Layer,
-    /// From the input, and from the hidden state, to the gates: reset, update, new.
+    /// Layers from the input and from the hidden state to the gates: reset, update, new.
     input_gates: Layer,
     hidden_gates: Layer,
     body: Layer,
@@ -54,7 +54,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// Takes the layers of a file.
+    /// Takes the layers from a file's tensors.
     pub fn new(branches: &[usize], tensors: &mut Tensors) -> Result<Self, AgentFileError> {
         let encoder = Layer::take(tensors, "encoder.vector.0", None, None)?;
         let embedding = Layer::take(tensors, "memory.embedding.0", Some(encoder.outputs()), None)?;

@@ -1,4 +1,4 @@
-//! The page's agent against outputs that PyTorch computed, and files that are broken.
+//! Compares the page's agent with outputs recorded from PyTorch, and reads broken files.
 
 use endless_gym_core::memory_gym;
 use serde::Deserialize;
@@ -38,7 +38,7 @@ fn the_network_computes_what_pytorch_computes() {
         }
     }
     assert!(episodes >= 3 && vectors.features.len() >= 90, "{episodes} episodes");
-    // The hidden state matters: without it the logits differ.
+    // Without the hidden state, the logits differ.
     let last = vectors.features.len() - 1;
     let forgotten = agent.network.step(&vectors.features[last], &mut agent.memory(0).hidden);
     let difference = forgotten.iter().zip(&vectors.logits[last]).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -46,7 +46,7 @@ fn the_network_computes_what_pytorch_computes() {
 }
 
 #[test]
-fn it_fits_its_environment_alone() {
+fn an_agent_fits_only_its_environment() {
     let agent = Agent::read(AGENT).unwrap();
     let fitting: Vec<_> = memory_gym().specs().filter(|spec| agent.fits(spec)).map(|spec| spec.id).collect();
     assert_eq!(fitting, ["MortarMayhem-Grid-v0"]);
@@ -84,11 +84,11 @@ fn a_broken_file_is_refused() {
         refused(&with(AGENT.len() - 4, &f32::NAN.to_le_bytes())),
         AgentFileError::NotFinite { given, .. } if given.is_nan()
     ));
-    // Every prefix is refused, and none panics.
+    // Every prefix is refused without a panic.
     for length in (0..AGENT.len()).step_by(97).chain([8, 11, 12, 15, 16, AGENT.len() - 1]) {
         assert!(matches!(refused(&AGENT[..length]), AgentFileError::Magic | AgentFileError::Length { .. }), "{length}");
     }
-    // A header that names other layers, or sizes that no file has.
+    // Headers with other layers, or with sizes that do not match the file.
     let renamed = |from: &str, to: &str| {
         let at = AGENT.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
         refused(&with(at, to.as_bytes()))

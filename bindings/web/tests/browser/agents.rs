@@ -1,4 +1,4 @@
-//! Trained agents on the page, and the flash.
+//! Tests trained agents on the page, and the flash.
 
 use endless_gym_core::memory_gym;
 use serde_json::{Value as Json, json};
@@ -27,14 +27,14 @@ fn an_agent_plays_from_memory() {
     browser.press("KeyG");
     browser.wait("endless.play.player === 'agent'");
     browser.value("endless.play.stop()");
-    // It starts with the reset parameters of its training, and the address says so.
+    // It starts with its training's reset parameters, which also appear in the address.
     assert_eq!(browser.value(STATE)["options"], json!({"command_count": "[1,2,3]"}));
     assert_eq!(
         browser.value("Object.fromEntries(new URLSearchParams(location.hash.slice(1)))"),
         json!({"env": ID, "seed": "200000", "by": "agent", "command_count": "[1,2,3]"})
     );
     assert!(text(&mut browser, "trained").contains("% with command count 1"), "{}", text(&mut browser, "trained"));
-    // Episode after episode: each shows its commands, and the count says how it ended.
+    // Each episode shows its commands, and the count includes its outcome.
     let mut successes = 0;
     for episode in 0..5 {
         browser.value("while (!endless.play.state.done) endless.play.oneStep()");
@@ -54,7 +54,7 @@ fn an_agent_plays_from_memory() {
         browser.value("endless.play.stop()");
         assert_eq!(browser.value("endless.play.player"), "agent");
     }
-    // One command is remembered nearly always.
+    // The agent nearly always remembers a single command.
     visit(&mut browser, &server, &format!("env={ID}&seed=200000&by=agent&command_count=%5B1%5D"));
     browser.wait("endless.play.player === 'agent'");
     let played = "for (let episode = 0; episode < 20; episode += 1) { endless.play.stop(); \
@@ -63,7 +63,7 @@ fn an_agent_plays_from_memory() {
     let counted = browser.value("endless.play.agents.counted(endless.play.state)");
     assert_eq!(counted["episodes"], 20);
     assert!(counted["successes"].as_u64() >= Some(17), "{counted}");
-    // The same seed, the same episode.
+    // The same seed gives the same episode.
     let play = "while (!endless.play.state.done) endless.play.oneStep()";
     let outcome = |browser: &mut Chromium| {
         browser.value("endless.play.restart(); endless.play.stop()");
@@ -72,12 +72,12 @@ fn an_agent_plays_from_memory() {
         (state["return"].clone(), state["length"].clone())
     };
     assert_eq!(outcome(&mut browser), outcome(&mut browser));
-    // When it was started it goes on by itself.
+    // Once started, the agent continues with the next seed.
     let seed = browser.value(STATE)["seed"].clone();
     browser.value("endless.play.setPace(10000); endless.play.restart()");
     browser.wait(&format!("{STATE}.seed !== '{}'", seed.as_str().unwrap()));
     browser.value("endless.play.stop()");
-    // A person takes over, and the agent cannot continue what it has not seen.
+    // After a person takes over, the agent cannot continue the episode.
     browser.value("endless.play.setPace(25); endless.play.restart()");
     browser.press("ArrowUp");
     browser.wait("endless.play.player === 'person'");
@@ -94,7 +94,7 @@ fn an_agent_plays_from_memory() {
 
 #[test]
 #[ignore = "needs the built page and Chromium"]
-fn agents_are_there_for_some_environments() {
+fn only_environments_with_an_agent_offer_it() {
     let (server, mut browser) = (PageServer::start(), start("no-agents"));
     for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
@@ -111,7 +111,7 @@ fn agents_are_there_for_some_environments() {
             assert_eq!(browser.value("endless.play.player"), "person");
         }
     }
-    // Links say who plays, and keep the reset parameters that they name.
+    // A link selects the player, and its reset parameters override those of the training.
     visit(&mut browser, &server, &format!("env={ID}&seed=5&by=agent&command_count=%5B2%5D"));
     browser.wait("endless.play.player === 'agent'");
     assert_eq!(browser.value(STATE)["options"], json!({"command_count": "[2]"}));
@@ -126,7 +126,7 @@ fn agents_are_there_for_some_environments() {
         assert!(text(&mut browser, "message").starts_with(message), "{}", text(&mut browser, "message"));
     }
     assert_eq!(browser.complaints, Vec::<String>::new());
-    // A file that is broken or missing is said so, and a person still plays.
+    // A broken or missing file is reported, and the person keeps playing.
     let failing = "globalThis.fetch = async () => new Response(new Uint8Array([80, 75]), { status: STATUS })";
     for (status, message) in [("200", "the file must be an exported agent"), ("404", "cannot be loaded: 404")] {
         visit(&mut browser, &server, &format!("env={ID}&seed=1"));
@@ -140,10 +140,10 @@ fn agents_are_there_for_some_environments() {
 
 #[test]
 #[ignore = "needs the built page and Chromium"]
-fn a_flash_says_what_happens_by_more_than_colour() {
+fn a_flash_shows_a_sign_besides_its_colour() {
     let (server, mut browser) = (PageServer::start(), start("flash"));
     visit(&mut browser, &server, &format!("env={ID}&seed=200000"));
-    // What each flash shows, in order.
+    // Record what each flash shows.
     browser.value(
         "globalThis.flashes = []; const screen = document.querySelector('.agent .screen'); new MutationObserver(() => { \
          if (screen.dataset.flash) flashes.push([screen.dataset.flash, screen.querySelector('.sign').textContent, \
@@ -170,9 +170,9 @@ fn a_flash_says_what_happens_by_more_than_colour() {
     let spotlights = "id: 'SearingSpotlights-v0', options: { reward_inside_spotlight: '-0.1', max_steps: '60' }";
     let found = (0..8).map(|seed| play(&mut browser, spotlights, seed, "person")).find(|found| found[0][0] == "damage");
     assert_eq!(found.expect("a spotlight finds the agent")[0], json!(["damage", "−", "flash"]));
-    // It goes away.
+    // The flash disappears.
     browser.wait("!document.querySelector('[data-flash]')");
-    // Nothing moves where no motion is wanted, and the sign is still there.
+    // With reduced motion, the sign is shown without an animation.
     let reduced = json!({"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]});
     browser.call("Emulation.setEmulatedMedia", &reduced);
     let found: Json = play(&mut browser, &mortar, 1, "expert");

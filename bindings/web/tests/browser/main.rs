@@ -1,4 +1,4 @@
-//! The page in a real browser. `cargo xtask test --only browser` builds the page and runs these tests.
+//! Tests the page in a real browser. `cargo xtask test --only browser` builds the page and runs these tests.
 
 mod agents;
 #[path = "../../../../tests/integration/support/chromium.rs"]
@@ -15,17 +15,17 @@ use server::PageServer;
 
 const WIDE: (u32, u32) = (1440, 900);
 
-/// The engine is there, and an episode or a wall is shown.
+/// The engine is loaded, and an episode or a wall is shown.
 const READY: &str = "globalThis.endless && (endless.play.state || endless.wall.state)";
 
-/// What an episode is made of, in the page.
+/// The episode's state in the page.
 const STATE: &str = "endless.play.state";
 
 fn start(name: &str) -> Chromium {
     Chromium::start(&PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("browser").join(name), WIDE)
 }
 
-/// Loads the page with what stands after `#` in its address. Each time as if it were the first.
+/// Loads the page anew, with `link` after the `#` of its address.
 fn visit(browser: &mut Chromium, server: &PageServer, link: &str) {
     browser.load("about:blank");
     browser.load(&format!("{}#{link}", server.url()));
@@ -84,7 +84,7 @@ fn every_environment_is_played_with_the_keyboard() {
         visit(&mut browser, &server, &format!("env={}&seed=3", spec.id));
         assert_eq!(browser.value(STATE)["id"], spec.id);
         assert_eq!(browser.value(STATE)["length"], 0, "nothing moves before a key");
-        // Two directions in one step, at the single step's key.
+        // Two held directions act in one single step.
         for code in ["ArrowRight", "KeyW"] {
             browser.key("rawKeyDown", code);
         }
@@ -106,7 +106,7 @@ fn every_environment_is_played_with_the_keyboard() {
         }
         browser.press("KeyN");
         assert!(browser.value(STATE)["action"].as_array().unwrap().iter().all(|number| *number == 0), "{}", spec.id);
-        // The canvas has the engine's pixels, and the ground truth is another picture.
+        // Both canvases show the engine's pixels.
         let same = |canvas: &str, picture: &str| {
             format!(
                 "(() => {{ const a = document.getElementById('{canvas}').getContext('2d').getImageData(0, 0, 84, 84).data; \
@@ -143,7 +143,7 @@ fn an_address_names_an_episode() {
         assert_eq!(browser.value("new URLSearchParams(location.hash.slice(1)).get('num_coins')"), "[3]");
     }
     assert_eq!(pictures[0], pictures[1]);
-    // What is wrong with an address is said by the engine, and another episode is shown.
+    // Faults of an address give the engine's message, and the default episode is shown.
     for (link, message) in [
         ("env=Pong-v0&seed=1", "no environment `Pong-v0`; there are MortarMayhem-v0"),
         ("env=MysteryPath-v0&seed=one", "seed must be an integer, 0 to 18446744073709551615, got `one`"),
@@ -165,7 +165,7 @@ fn an_address_names_an_episode() {
 
 #[test]
 #[ignore = "needs the built page and Chromium"]
-fn the_form_is_the_engines_table() {
+fn the_form_shows_the_engines_parameter_table() {
     let (server, mut browser) = (PageServer::start(), start("form"));
     for spec in memory_gym().specs() {
         visit(&mut browser, &server, &format!("env={}&seed=1", spec.id));
@@ -216,7 +216,7 @@ fn a_played_episode_is_saved_verified_and_opened() {
     let played = browser.value(STATE);
     browser.value("document.getElementById('save').click()");
     let file = browser.download();
-    // `endless verify` calls the same.
+    // `endless verify` calls the same function.
     let replayed = replay(memory_gym(), &Trace::open(&file).unwrap()).unwrap();
     assert_eq!((replayed.differences, json!(replayed.steps)), (0, played["length"].clone()));
 
@@ -284,13 +284,13 @@ fn a_phone_plays_by_touch() {
 #[ignore = "needs the built page and Chromium"]
 fn nothing_jumps_while_loading_and_nothing_is_cut_off() {
     let (server, mut browser) = (PageServer::start(), start("layout"));
-    // The sum of what moved, as browsers measure it.
+    // The sum of layout shifts, as browsers measure them.
     let shifts = "new Promise((done) => { let sum = 0; const observer = new PerformanceObserver((list) => { \
                   for (const entry of list.getEntries()) sum += entry.value; }); \
                   observer.observe({ type: 'layout-shift', buffered: true }); setTimeout(() => done(sum), 300) })";
     for (width, height, phone) in [(1440, 900, false), (1024, 700, false), (390, 844, true), (320, 640, true)] {
         browser.resize(width, height, phone);
-        // The longest texts, the shortest, the most numbers, commands.
+        // Environments with the longest and the shortest texts, the most numbers, and commands.
         for id in ["Endless-MysteryPath-v0", "MortarMayhem-Grid-v0", "SearingSpotlights-v0", "MortarMayhemB-v0"] {
             visit(&mut browser, &server, &format!("env={id}&seed=1"));
             let shifted = browser.value(shifts).as_f64().unwrap();
@@ -306,7 +306,7 @@ fn nothing_jumps_while_loading_and_nothing_is_cut_off() {
 
 #[test]
 #[ignore = "needs the built page and Chromium"]
-fn it_works_without_a_network_once_loaded() {
+fn the_page_works_offline_once_loaded() {
     let (server, mut browser) = (PageServer::start(), start("offline"));
     visit(&mut browser, &server, "env=MysteryPath-v0&seed=1");
     browser.value("navigator.serviceWorker.ready.then(() => true)");
@@ -339,7 +339,7 @@ fn every_control_has_a_name_and_is_reached_by_the_keyboard() {
     let unreachable = "[...document.querySelectorAll('button, input, select, summary')] \
                        .filter((control) => control.checkVisibility() && control.tabIndex < 0).length";
     assert_eq!(browser.value(unreachable), 0);
-    // The colours of text against what is behind it, dark and light: 4.5 is what WCAG asks for.
+    // The lowest contrast of text with its background, in light and dark themes: WCAG requires 4.5.
     let contrast = "(() => { const luminance = (color) => { const channels = color.match(/[\\d.]+/g).slice(0, 3).map((c) => c / 255) \
                     .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)); \
                     return 0.2126 * channels[0] + 0.7152 * channels[1] + 0.0722 * channels[2] }; \
@@ -350,7 +350,7 @@ fn every_control_has_a_name_and_is_reached_by_the_keyboard() {
                     luminance(behind(e))].sort((a, b) => b - a); return (pair[0] + 0.05) / (pair[1] + 0.05) })) })()";
     for theme in ["light", "dark"] {
         browser.value(&format!("document.documentElement.dataset.theme = '{theme}'"));
-        // Colours of buttons change over some frames.
+        // Wait for the transition of button colours.
         browser.value("new Promise((done) => setTimeout(done, 300))");
         let least = browser.value(contrast).as_f64().unwrap();
         assert!(least >= 4.5, "{theme}: {least}");

@@ -1,4 +1,4 @@
-//! A web server for the page, as simple as any that the page must work with.
+//! A minimal web server for the page, which must not depend on the server's features.
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -14,9 +14,9 @@ pub struct PageServer {
 }
 
 impl PageServer {
-    /// Serves what `cargo xtask web` has built.
+    /// Serves the page built by `cargo xtask web`.
     pub fn start() -> Self {
-        // It lies beside the folder for the files of tests.
+        // The page is next to the folder for temporary test files.
         let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).with_file_name("web");
         assert!(folder.join("index.html").exists(), "{} is not built; cargo xtask web", folder.display());
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -28,7 +28,7 @@ impl PageServer {
                     return;
                 }
                 let folder = folder.clone();
-                // A browser opens connections that it does not use yet; one of them must not hold up the others.
+                // In a thread, since browsers open connections before they use them, and one must not block the others.
                 std::thread::spawn(move || drop(answer(&folder, connection)));
             }
         });
@@ -68,7 +68,7 @@ fn answer(folder: &Path, mut connection: TcpStream) -> std::io::Result<()> {
         Some("svg") => "image/svg+xml",
         _ => "application/octet-stream",
     };
-    // The page's files lie beside each other.
+    // All files of the page are in one folder.
     let file = if name.contains('/') { None } else { std::fs::read(folder.join(name)).ok() };
     let (status, bytes) = file.map_or(("404 Not Found", Vec::new()), |bytes| ("200 OK", bytes));
     let length = bytes.len();
