@@ -1,4 +1,5 @@
-//! What the pool takes from the allocator. Each test runs in a process of its own, since others at the same time would be counted too.
+//! The pool's use of the allocator. Each test runs in a separate process, so that it does not count the allocations of
+//! other tests.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -23,13 +24,13 @@ unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
         BYTES.fetch_add(layout.size(), Ordering::Relaxed);
-        // SAFETY: as our caller promises.
+        // SAFETY: our caller upholds the contract.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         BYTES.fetch_sub(layout.size(), Ordering::Relaxed);
-        // SAFETY: as our caller promises.
+        // SAFETY: our caller upholds the contract.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -44,7 +45,7 @@ fn steps_and_resets_allocate_nothing() {
         return;
     }
     for spec in memory_gym().specs() {
-        // As few as one thread steps, and enough for two.
+        // Enough environments for two threads, and few enough for one.
         for (autoreset, num_envs, threads) in [(Autoreset::NextStep, 64, 2), (Autoreset::SameStep, 16, 1)] {
             let config = PoolConfig {
                 seeding: Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(1) },
@@ -70,26 +71,27 @@ fn steps_and_resets_allocate_nothing() {
                     player.step(&actions);
                 }
             };
-            // Long enough for every list to have been as long as it gets.
+            // Long enough for every list to reach its maximum length.
             play(1500);
             let mut allocations = || {
                 let before = ALLOCATIONS.load(Ordering::Relaxed);
                 play(500);
                 ALLOCATIONS.load(Ordering::Relaxed) - before
             };
-            // Twice, since the test harness allocates when it says, once, that a test takes long.
+            // Try twice, since the test harness allocates once when it reports that a test takes long.
             assert!(allocations() == 0 || allocations() == 0, "{}, {autoreset:?}", spec.id);
         }
     }
 }
 
-/// The options of environment `env` in round `round`: another set for each, with pictures of its own.
+/// The options of environment `env` in round `round`: a different set for each, which needs different pictures.
 fn options(round: usize, env: usize) -> NextOptions {
     let scale = 0.2 + 0.001 * ((round * 4 + env) % 64) as f64;
     NextOptions { options: [("agent_scale".to_owned(), scale.into())].into_iter().collect(), envs: vec![env] }
 }
 
-/// Gives each environment options of its own and plays long enough to use what is made on first use, such as darker pictures.
+/// Gives each environment different options, and plays long enough to create everything that is made on first use, such
+/// as darker pictures.
 fn play(player: &mut Player, round: usize) {
     let sets: Vec<_> = (0..4).map(|env| options(round, env)).collect();
     player.pool.set_options(&sets).unwrap();
@@ -110,7 +112,7 @@ fn replaced_options_leave_no_memory_behind() {
             BYTES.load(Ordering::Relaxed)
         };
         let (first, last) = (used(0..16), used(16..128));
-        // One picture more or less is in use at a time; the options of 112 rounds have thousands.
+        // The number of pictures in use varies by about one; the options of 112 rounds have thousands.
         assert!(last < first + (256 << 10), "{}: {first} bytes after 16 rounds, {last} bytes after 128", spec.id);
     }
 }

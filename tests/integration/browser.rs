@@ -1,4 +1,4 @@
-//! The page of a running engine in a real browser. `cargo xtask test --only browser` runs these tests.
+//! Tests the page of a running engine in a real browser. `cargo xtask test --only browser` runs these tests.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -17,10 +17,10 @@ const ID: &str = "MortarMayhem-Grid-v0";
 const NUM_ENVS: usize = 20;
 const FRAME: usize = 84 * 84 * 3;
 
-/// The page is shown and has received a batch.
+/// Whether the page is live and has received a batch.
 const SHOWN: &str = "globalThis.endless?.newest && document.getElementById('state').dataset.state === 'live'";
 
-/// The pixels of a canvas, in rows with alpha.
+/// The RGBA pixels of a canvas, in rows.
 const PIXELS: &str = "((canvas) => Array.from(canvas.getContext('2d').getImageData(0, 0, 84, 84).data))";
 
 fn start(name: &str) -> Chromium {
@@ -69,7 +69,7 @@ impl Training {
     }
 }
 
-/// A canvas shows that environment's observation.
+/// Asserts that a canvas shows that environment's observation.
 fn assert_shown(browser: &mut Chromium, canvas: &str, observations: &[u8], env: usize) {
     let shown = browser.value(&format!("{PIXELS}({canvas})"));
     let observation = &observations[env * FRAME..][..FRAME];
@@ -95,14 +95,14 @@ fn a_running_engine_is_shown_lost_and_found() {
     browser.load(&server.url);
     browser.wait(SHOWN);
     assert_eq!(browser.value("document.querySelectorAll('#grid canvas').length"), 16);
-    // Frames change.
+    // The frames change.
     browser.value(&format!("globalThis.before = {PIXELS}({}).join(); 0", grid(0)));
     browser.wait(&format!("{PIXELS}({}).join() !== before", grid(0)));
-    // One environment is shown large, beside the grid.
+    // One environment is enlarged next to the grid.
     browser.value("document.querySelectorAll('#grid button')[3].click()");
     browser.wait("document.getElementById('caption').textContent.startsWith('Environment 3: step ')");
     assert_eq!(browser.value("document.getElementById('enlarged').checkVisibility()"), true);
-    // Each curve is a line, and says its last value.
+    // Each curve has a line and shows its last value.
     browser
         .wait("[...document.querySelectorAll('#curves path')].every((path) => path.getAttribute('d').includes('L'))");
     let values = browser.value("[...document.querySelectorAll('#curves b')].map((value) => value.textContent)");
@@ -110,7 +110,7 @@ fn a_running_engine_is_shown_lost_and_found() {
     let numbers = browser.value("document.getElementById('numbers').textContent");
     assert!(numbers.as_str().unwrap().contains(ID), "{numbers}");
 
-    // The last batch stays, also for other environments than those that were shown.
+    // The last batch stays available, even for environments that were not shown.
     let (step, observations) = training.end();
     browser.wait(&format!("endless.about.batch.step === {step}"));
     (0..16).for_each(|env| assert_shown(&mut browser, &grid(env), &observations, env));
@@ -121,7 +121,7 @@ fn a_running_engine_is_shown_lost_and_found() {
     browser.value("document.getElementById('smaller').click()");
     assert_eq!(browser.value("document.getElementById('enlarged').checkVisibility()"), false);
 
-    // Killed, without a chance to say so.
+    // A killed engine cannot announce its end.
     engine.kill();
     browser.wait("document.getElementById('state').dataset.state === 'lost'");
     assert_eq!(browser.value("document.getElementById('state').textContent"), "lost: waiting for the engine");
@@ -151,7 +151,7 @@ fn a_page_in_the_background_gets_no_frames() {
         )
     };
     browser.value(&hide(true));
-    // The curves continue, and the last frame is still there.
+    // The curves continue, and the last frame stays visible.
     browser.wait("endless.about.batch.envs.length === 0");
     browser.value("globalThis.points = endless.curves.points.length; globalThis.shown = endless.frames; 0");
     browser.wait("endless.curves.points.length > points");
@@ -175,7 +175,7 @@ fn other_sites_and_addresses_without_the_token_are_refused() {
         browser.load(&address);
         browser.wait("document.body.innerText.startsWith('the address must have the token')");
     }
-    // How a WebSocket to the engine ends: `open` or `refused`.
+    // The outcome of a WebSocket connection to the engine: `open` or `refused`.
     let open = format!(
         "new Promise((done) => {{ const socket = new WebSocket('ws://127.0.0.1:{port}/{token}/socket?service=endless'); \
          socket.onopen = () => done('open'); socket.onerror = () => done('refused') }})"
@@ -183,7 +183,7 @@ fn other_sites_and_addresses_without_the_token_are_refused() {
     browser.load(&server.url);
     browser.wait("document.getElementById('state')?.dataset.state === 'live'");
     assert_eq!(browser.value(&open), "open", "the page's own");
-    // Another site's name leads to this machine, and its page knows the token.
+    // DNS rebinding: another site's name resolves to this machine, and its page knows the token.
     browser.load(&format!("http://{REBOUND}:{port}/?token={token}"));
     browser.wait("document.body.innerText.startsWith('the Host header must name this server')");
     assert_eq!(browser.value(&open), "refused", "with the Origin of another site");
@@ -204,9 +204,9 @@ fn nothing_jumps_and_nothing_is_cut_off() {
     let server = Server::start(place.endless(&["view", "endless"]));
     let mut browser = start("view-layout");
     let training = Training::start(&place);
-    // Less than nothing where there is a place for a scroll bar.
+    // It is negative if space is reserved for a scroll bar.
     let cut = "Math.max(0, document.documentElement.scrollWidth - document.documentElement.clientWidth)";
-    // The sum of what moved, as browsers measure it.
+    // The sum of layout shifts, as browsers measure them.
     let shifts = "new Promise((done) => { let sum = 0; const moved = []; const observer = new PerformanceObserver((list) => { \
                   for (const entry of list.getEntries()) { sum += entry.value; moved.push(...entry.sources.map(({ node, \
                   previousRect, currentRect }) => [node?.id || node?.nodeName, node?.textContent, previousRect.toJSON(), currentRect.toJSON()])) } }); \

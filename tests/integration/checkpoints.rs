@@ -37,7 +37,8 @@ fn config(spec: &'static EnvSpec) -> impl Strategy<Value = PoolConfig> {
     })
 }
 
-/// A pool and a successor that resumes what it saved after `before` steps play the same `after` steps.
+/// Checks that a pool and a successor, which resumes the state that the pool saved after `before` steps, play the same
+/// `after` steps.
 fn compare(config: &PoolConfig, before: usize, after: usize) {
     let mut player = Player::new(config);
     assert_eq!(player.pool.save().unwrap(), None);
@@ -48,7 +49,7 @@ fn compare(config: &PoolConfig, before: usize, after: usize) {
     let mut successor = Player::new(config);
     successor.pool.resume(&saved).unwrap();
     assert_eq!(successor.pool.save().unwrap().unwrap(), saved);
-    // Final observations are written at the end of an episode only: both start with a new buffer.
+    // Both start with a new buffer, since final observations are written only at the end of an episode.
     player.blocks.clone_from(&successor.blocks);
     player.observe();
     successor.observe();
@@ -75,7 +76,7 @@ fn resumed_environments_continue_identically() {
 
 #[test]
 fn a_pending_reset_of_next_step_autoreset_is_part_of_the_state() {
-    // Random agents fail within some steps, so that a save hits every phase of an episode's end.
+    // Random agents fail soon, so that saves hit every phase of an episode's end.
     for autoreset in Autoreset::ALL {
         let config = PoolConfig {
             autoreset,
@@ -87,7 +88,7 @@ fn a_pending_reset_of_next_step_autoreset_is_part_of_the_state() {
 }
 
 #[test]
-fn what_does_not_fit_is_an_error() {
+fn resuming_a_state_that_does_not_fit_is_an_error() {
     let frames = |stack| Some(Frames { stack, ..Frames::default() });
     let pool = |num_envs, frames| Player::new(&PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", num_envs) });
     let mut saving = pool(2, frames(3));

@@ -1,7 +1,7 @@
-//! Updated frames equal frames that are drawn in full, in every buffer.
+//! Tests that updated frames equal frames that are drawn in full, in every buffer.
 //!
-//! Every pool here checks what it draws, so that a step fails if a frame is wrong. The replay of the recorded
-//! traces checks the same.
+//! Every pool here checks what it draws, so that a step fails if a frame is wrong. The replay of recorded traces does
+//! so, too.
 
 use crate::support::player::random_actions;
 use crate::support::recorded::{options, pixel_format, property_cases};
@@ -27,7 +27,8 @@ fn pool(config: &PoolConfig) -> Pool {
     Pool::new(memory_gym(), config, &Threads::new(1).unwrap()).unwrap()
 }
 
-/// Plays with several buffers, to which happens what can happen to buffers, and with everything that changes environments.
+/// Plays with several buffers, which are cleared, copied, overwritten and shared, and with every operation that changes
+/// environments.
 fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mut SmallRng) -> Result<(), PoolError> {
     let spec = &pool.spec().clone();
     let mut buffers: Vec<Vec<Block>> = vec![zeroed(pool.layout().blocks()); 4];
@@ -56,7 +57,7 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
             6 => pool.reset(ResetRequest::Seed(random.random()), &mut buffers[used])?,
             7 => pool.ground_truth_view(0, &mut vec![0; envs::view::VIEW_BYTES])?,
             8 => other.step(&random_actions(spec, NUM_ENVS, random), &mut buffers[used])?,
-            // Most of the time a few of them in turn, as a trainer holds them.
+            // Usually, use a few buffers in turn, like a trainer that holds batches.
             _ => {
                 for buffer in &mut buffers[used..] {
                     pool.step(&random_actions(spec, NUM_ENVS, random), buffer)?;
@@ -69,7 +70,7 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
 
 #[test]
 #[ignore = "slow"]
-fn every_environment_is_drawn_alike_in_irregular_buffers() {
+fn every_environment_is_drawn_correctly_into_irregular_buffers() {
     for spec in memory_gym().specs() {
         let mut random = SmallRng::seed_from_u64(1);
         let (mut one, mut other) = (pool(&config(spec)), pool(&config(spec)));
@@ -78,10 +79,11 @@ fn every_environment_is_drawn_alike_in_irregular_buffers() {
     }
 }
 
-/// Circles of light are tested in blocks of 16, and up to 32 are searched for moves: numbers on both sides of each.
+/// Circles of light are tested in blocks of 16, and up to 32 are searched for moves, so use numbers on both sides of
+/// these limits.
 #[test]
 #[ignore = "slow"]
-fn many_circles_of_light_are_drawn_alike_in_irregular_buffers() {
+fn many_circles_of_light_are_drawn_correctly_into_irregular_buffers() {
     let spec = memory_gym().spec("SearingSpotlights-v0").unwrap();
     for spotlights in [15, 24, 34] {
         let options =
@@ -99,7 +101,7 @@ proptest! {
 
     #[test]
     #[ignore = "slow"]
-    fn environments_of_any_options_are_drawn_alike_in_irregular_buffers(
+    fn environments_with_any_options_are_drawn_correctly_into_irregular_buffers(
         (spec, given, others) in prop::sample::select(memory_gym().specs().collect::<Vec<_>>())
             .prop_flat_map(|spec| (Just(spec), options(spec), options(spec))),
         same_step: bool,
@@ -122,9 +124,9 @@ proptest! {
     }
 }
 
-/// A check that never fails would prove nothing.
+/// Shows that the check can fail.
 #[test]
-fn a_pixel_changed_from_outside_is_found() {
+fn the_drawing_check_finds_a_changed_pixel() {
     let spec = memory_gym().spec("MortarMayhem-Grid-v0").unwrap();
     let mut pool = pool(&config(spec));
     let layout = pool.layout().clone();
@@ -142,13 +144,13 @@ fn a_pixel_changed_from_outside_is_found() {
     assert!(matches!(error, PoolError::WrongFrame(WrongFrame { env: 1, pixel: (83, 2), .. })), "{error}");
     assert!(error.to_string().contains("environment 1 is wrong at pixel (83, 2)"), "{error}");
 
-    // What is half written is not trusted, and what is announced is no mistake.
+    // After an error, frames are drawn in full; and changing a frame after `forget_frames` is not an error.
     pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();
     corrupt(&mut buffer);
     layout.forget_frames(&mut buffer);
     pool.step(&[0; NUM_ENVS], &mut buffer).unwrap();
 
-    // Without the check, it stays.
+    // Without the check, the changed pixel stays.
     let mut unchecked =
         Pool::new(memory_gym(), &PoolConfig { check_drawing: false, ..config(spec) }, &Threads::new(1).unwrap())
             .unwrap();

@@ -1,4 +1,4 @@
-//! The programs of `engine/examples` run and print what they promise.
+//! Tests that the programs of `engine/examples` run and print what they should.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -18,8 +18,8 @@ fn run(place: &Place, name: &str, arguments: &[&str]) -> String {
     text(&output.stdout).to_owned()
 }
 
-/// The program of an example. Cargo builds all of them for `cargo test`, but none for `cargo test --test integration`. `cargo xtask test`
-/// sets the variable, so that the test does not wait for what cargo compiles beside it.
+/// The program of an example. Cargo builds examples for `cargo test`, but not for `cargo test --test integration`.
+/// `cargo xtask test` sets the variable, so that this test does not wait for cargo's other compilations.
 fn example(name: &str) -> PathBuf {
     static BUILT: Once = Once::new();
     BUILT.call_once(|| {
@@ -56,7 +56,7 @@ fn two_groups_in_flight() {
 }
 
 #[test]
-fn a_trainer_and_an_observer_beside_an_engine() {
+fn a_trainer_and_an_observer_connect_to_an_engine() {
     let place = Place::new();
     let mut engine = place.serve(&["--env", "MysteryPath-v0", "--num-envs", "8", "--service", "example"]);
     let mut observer = place.command(example("observer"));

@@ -1,11 +1,11 @@
-//! Scripted experts solve what can be solved, from what a frame shows and what they remember.
+//! Tests that scripted experts solve whatever can be solved from frames and memory.
 
 use crate::support::player::Player;
 use endless_gym::memory_gym;
 use endless_gym::pool::{Experts, PoolConfig, Seeding};
 
-/// Plays `num_envs` environments with the seeds from 0 on, for `steps` steps or until all first episodes have ended. The info
-/// of each first episode that ended.
+/// Plays `num_envs` environments with seeds from 0 on, for `steps` steps or until all first episodes have ended.
+/// Returns the info of each first episode that ended.
 fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
     let spec = memory_gym().spec(id).unwrap();
     let config =
@@ -52,7 +52,7 @@ fn endless_mortar_mayhem_goes_on() {
     assert!(ended.iter().all(Option::is_none), "{ended:?}");
 }
 
-/// How many of the first episodes with these seeds end with success, each within its step limit.
+/// How many of the first episodes succeed within `steps` steps.
 fn solved(id: &str, num_envs: usize, steps: usize) -> usize {
     let success = memory_gym().spec(id).unwrap().info.iter().position(|column| column.name == "success").unwrap();
     play(id, num_envs, steps).iter().flatten().filter(|info| info[success] == 1.0).count()
@@ -66,7 +66,7 @@ fn finite_mystery_path_is_solved() {
     }
 }
 
-/// Where the way turns left, no agent can continue: that of this id cannot walk there.
+/// The agent of this id cannot walk left, so it fails where the path turns left.
 #[test]
 fn endless_mystery_path_continues() {
     let ended = play("Endless-MysteryPath-v0", 30, 10_000).iter().flatten().count();

@@ -1,4 +1,4 @@
-//! `endless record --film`: the written files, decoded again, against the frames of a pool in this process.
+//! `endless record --film`: compares the decoded files with the frames of a pool in this process.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -149,13 +149,13 @@ fn webp_films_have_every_pixel_of_every_episode() {
         for (number, ((picture, _), frame)) in decoded.iter().zip(episodes.iter().flatten()).enumerate() {
             assert!(*picture == both(frame, scale), "{id}, picture {number}");
         }
-        // Milliseconds, but the film as a whole is as long as it has to be.
+        // Delays are in milliseconds, but the whole film has the right duration.
         let fps =
             options.get(1).map_or(f64::from(memory_gym().spec(id).unwrap().render_fps), |fps| fps.parse().unwrap());
         let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
         let expected = decoded.len() as f64 / fps + 2.0;
         assert!((duration - expected).abs() < 0.0006, "{id}: {duration} s, expected {expected} s");
-        // Length and padding, as decoders that read chunk by chunk need them.
+        // Decoders that read chunk by chunk need the right length and padding.
         let bytes = std::fs::read(&file).unwrap();
         assert_eq!(u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize + 8, bytes.len());
     }
@@ -176,11 +176,11 @@ fn films_show_one_view_or_both() {
         }
         assert_eq!(decoded[0].1, 0.1);
     }
-    // The command is hidden from the agent in none of these steps, but its place in the arena is.
+    // All these steps show the agent the command, but not where it leads.
     assert!(frames.iter().any(|(agent, ground_truth)| agent != ground_truth));
 }
 
-/// A palette has 256 colours. A picture with no more of them is exact, and others are near.
+/// A picture with at most 256 colours, the size of a palette, is exact; others are close.
 #[test]
 fn gif_films_are_as_exact_as_their_palettes() {
     let place = Place::new();
@@ -204,7 +204,7 @@ fn gif_films_are_as_exact_as_their_palettes() {
                 near += 1;
             }
         }
-        // Hundredths of a second, but the film as a whole is as long as it has to be.
+        // Delays are in hundredths of a second, but the whole film has the right duration.
         let duration: f64 = decoded.iter().map(|(_, delay)| delay).sum();
         let expected = frames.len() as f64 / f64::from(memory_gym().spec(id).unwrap().render_fps) + 1.0;
         assert!((duration - expected).abs() < 0.006, "{id}: {duration} s, expected {expected} s");
@@ -212,7 +212,7 @@ fn gif_films_are_as_exact_as_their_palettes() {
     assert!(exact > 0, "no picture has few colours: {exact}, {near}");
 }
 
-/// What ffmpeg is given. A stand-in writes its input to the file, its last argument.
+/// Checks ffmpeg's input with a stand-in that writes its input to the file in its last argument.
 #[test]
 fn mp4_films_are_encoded_by_ffmpeg() {
     let place = Place::new();
@@ -249,7 +249,7 @@ fn mp4_films_are_encoded_by_ffmpeg() {
 }
 
 #[test]
-fn random_play_follows_from_its_seeds() {
+fn random_play_depends_only_on_its_seeds() {
     let place = Place::new();
     let file = place.root().join("film.png");
     let film = |seed: &str, policy: &str| {
@@ -265,7 +265,7 @@ fn random_play_follows_from_its_seeds() {
 }
 
 #[test]
-fn what_cannot_be_recorded_is_an_error_and_leaves_no_file() {
+fn a_failed_recording_is_an_error_and_leaves_no_file() {
     let place = Place::new();
     let run = |arguments: &[&str]| {
         let output = place.endless(&[&["record"], arguments].concat()).current_dir(place.root()).output().unwrap();

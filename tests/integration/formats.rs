@@ -1,4 +1,4 @@
-//! Observations of other formats equal a plain conversion of the original's observation.
+//! Tests that observations of other formats equal a plain conversion of the original's observation.
 
 use std::collections::VecDeque;
 
@@ -14,7 +14,7 @@ use serde_json::Value as Json;
 
 const NUM_ENVS: usize = 3;
 
-/// The frame with its numbers in another order, one after the other.
+/// Converts a frame to another format, pixel by pixel.
 fn convert(frame: &[u8], format: PixelFormat) -> Vec<u8> {
     let pixel = |first: usize, second: usize| -> [u8; 3] {
         let (x, y) = if format.row_major { (second, first) } else { (first, second) };
@@ -34,7 +34,7 @@ fn convert(frame: &[u8], format: PixelFormat) -> Vec<u8> {
     }
 }
 
-/// A pool with short episodes, where a reset parameter makes them so.
+/// A pool, with short episodes if a reset parameter allows it.
 fn started(spec: &EnvSpec, frames: Frames) -> Player {
     let is_max_steps = |parameter: &&Parameter| parameter.name == "max_steps";
     let options = spec.parameters.iter().find(is_max_steps).map(|_| ("max_steps".to_owned(), Json::from(70)));
@@ -54,7 +54,7 @@ fn row(player: &Player, section: BatchSection, env: usize) -> &[u8] {
     &rows[env * width..(env + 1) * width]
 }
 
-/// Plays both pools alike, and compares every observation with the conversion of the last standard ones.
+/// Plays the same actions in both pools, and compares every observation with the conversion of the last standard ones.
 fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
     let mut standard = started(spec, Frames::default());
     let mut other = started(spec, frames);
@@ -99,7 +99,7 @@ fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
 #[ignore = "slow"]
 fn every_format_is_a_plain_conversion() {
     for (number, spec) in memory_gym().specs().enumerate() {
-        // Each environment takes its turn with some of the formats; all with the paper's grey stacks.
+        // Each environment with half of the formats, and with the paper's grayscale stacks.
         for format in pixel_formats().filter(|format| usize::from(format.row_major) == number % 2) {
             compare(spec, Frames { format, stack: 1 }, 300);
         }
@@ -112,7 +112,7 @@ fn every_format_is_a_plain_conversion() {
 }
 
 #[test]
-fn a_stack_has_its_limits() {
+fn stacks_of_0_or_65_frames_are_refused() {
     for given in [0, 65] {
         let frames = Some(Frames { stack: given, ..Frames::default() });
         let config = PoolConfig { frames, ..PoolConfig::new("MysteryPath-v0", 1) };
@@ -121,9 +121,9 @@ fn a_stack_has_its_limits() {
     }
 }
 
-/// After a restored snapshot the observation shows its frame as an episode's first.
+/// After a restored snapshot, the stack holds only its frame, as at the start of an episode.
 #[test]
-fn a_restored_stack_starts_anew() {
+fn a_restored_stack_repeats_its_frame() {
     let format = PixelFormat { channels_first: true, ..PixelFormat::default() };
     let mut player = started(memory_gym().spec("MysteryPath-v0").unwrap(), Frames { format, stack: 2 });
     let snapshot = player.pool.snapshot(0).unwrap();

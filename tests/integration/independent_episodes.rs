@@ -1,4 +1,4 @@
-//! `PoolConfig::independent_episodes`: an episode depends on its seed and its reset parameters alone.
+//! `PoolConfig::independent_episodes`: an episode depends only on its seed and its reset parameters.
 
 use crate::support::player::Player;
 use endless_gym::envs::EnvSpec;
@@ -14,7 +14,7 @@ fn reset(player: &mut Player, seed: u64, options: &OptionMap) {
     player.pool.reset_with(ResetRequest::Seed(seed), Some(options), &mut player.blocks).unwrap();
 }
 
-/// Plays steps at random.
+/// Plays random actions.
 fn play(player: &mut Player, steps: usize, random: &mut SmallRng) {
     (0..steps).for_each(|_| player.step_at_random(random));
 }
@@ -25,7 +25,7 @@ fn ground_truth_view(player: &mut Player) -> Vec<u8> {
     view
 }
 
-/// The batches of the seeded episode and of those that follow, then the state at the end.
+/// The batches of the seeded episode and of later ones, and the final state.
 fn episode(player: &mut Player, seed: u64, options: &OptionMap, steps: usize) -> Vec<Vec<u8>> {
     reset(player, seed, options);
     let mut played = vec![player.bytes().to_vec(), ground_truth_view(player)];
@@ -52,7 +52,7 @@ proptest! {
     #![proptest_config(crate::support::recorded::property_cases(150))]
 
     #[test]
-    fn a_used_environment_plays_what_a_new_one_does(
+    fn a_used_environment_plays_the_same_as_a_new_one(
         (spec, earlier, options) in with_options(), seeds in any::<[u32; 2]>(), steps in 0..150_usize,
     ) {
         let [seed, actions] = seeds.map(u64::from);
@@ -64,7 +64,7 @@ proptest! {
     }
 }
 
-/// Options and an id for which an episode of the original shows what an earlier one left.
+/// Ids and options with which an episode of the original shows leftovers of an earlier one.
 fn leaks() -> [(&'static str, OptionMap); 3] {
     let options = |value: serde_json::Value| value.as_object().unwrap().clone();
     [
@@ -75,7 +75,7 @@ fn leaks() -> [(&'static str, OptionMap); 3] {
 }
 
 #[test]
-fn only_with_the_option_a_new_environment_plays_the_same() {
+fn only_with_the_option_new_and_used_environments_play_the_same() {
     for (id, earlier) in leaks() {
         let spec = memory_gym().spec(id).unwrap();
         for independent in [false, true] {
@@ -83,7 +83,7 @@ fn only_with_the_option_a_new_environment_plays_the_same() {
             reset(&mut used, 7, &earlier);
             play(&mut used, 40, &mut SmallRng::seed_from_u64(0));
             let [fresh, used] = [&mut fresh, &mut used].map(|player| episode(player, 1, &OptionMap::new(), 40));
-            // The frames, without the views and the state.
+            // Compare the frames, without the views and the state.
             let same = fresh[2..42] == used[2..42] && fresh[0] == used[0];
             assert_eq!(same, independent, "{id}");
         }
@@ -114,7 +114,7 @@ fn short_episodes(spec: &EnvSpec) -> ResetOptions {
 }
 
 #[test]
-fn later_episodes_depend_on_the_seed_and_not_on_what_was_played() {
+fn later_episodes_depend_on_the_seed_and_not_on_earlier_actions() {
     for spec in memory_gym().specs() {
         let seeded = |independent, seed| PoolConfig {
             seeding: Seeding::Continue { seed },
@@ -125,15 +125,15 @@ fn later_episodes_depend_on_the_seed_and_not_on_what_was_played() {
         assert!(all[1..].iter().any(|start| *start != all[0]), "{}: not the same again", spec.id);
         assert!(all == starts(&seeded(true, Some(5)), 2, None), "{}: other actions", spec.id);
         assert!(all == starts(&seeded(true, None), 3, Some(5)), "{}: the seed of a reset", spec.id);
-        // Some ids have few first frames, so that different seeds may show the same ones.
+        // Some ids have few different first frames, so that different seeds may show the same ones.
         assert!((0..32).any(|_| all != starts(&seeded(true, None), 1, None)), "{}: entropy", spec.id);
-        // The first episode is the one of the original.
+        // The first episode is the original's.
         assert!(all[0] == starts(&seeded(false, Some(5)), 1, None)[0], "{}: the seed's own episode", spec.id);
     }
 }
 
 #[test]
-fn snapshots_go_on_with_the_same_seeds() -> Result<(), SnapshotError> {
+fn restored_snapshots_continue_with_the_same_seeds() -> Result<(), SnapshotError> {
     let spec = memory_gym().spec("MortarMayhem-Grid-v0").unwrap();
     let mut first = Player::new(&config(spec, true));
     reset(&mut first, 3, &OptionMap::new());

@@ -1,9 +1,10 @@
-//! The original, live: random seeds, options and actions, of which nothing may differ.
+//! Compares with the original live: random seeds, options and actions must give no difference.
 //!
-//! The engine plays first, with experts that err now and then, so that episodes get far; the original plays the same actions; the
-//! replay compares. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original. Without it these tests cannot run, so they are
-//! ignored unless asked for; `cargo xtask test --all` sets the original up and asks for them. With `ENDLESS_LIVE_STEPS`, the steps to
-//! compare for each id, as `cargo xtask live` sets it, every run is another one; without, all runs are the same.
+//! The engine plays first, with experts that err now and then, so that episodes get far. The original then plays the
+//! same actions, and a replay compares the two. `ENDLESS_ORIGINAL_PYTHON` names a Python that has the original. The
+//! tests cannot run without it, so they are ignored by default; `cargo xtask test --all` sets up the original and runs
+//! them. `ENDLESS_LIVE_STEPS`, which `cargo xtask live` sets, is the number of steps to compare for each id, with
+//! different seeds in every run; without it, all runs are the same.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
@@ -20,7 +21,7 @@ use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::{Map, Value as Json, json};
 
-/// Steps that an episode is played at most.
+/// Maximum number of steps played in an episode.
 const MAX_STEPS: usize = 400;
 
 /// The original in a separate process.
@@ -54,10 +55,10 @@ impl Original {
 #[derive(Clone, Debug)]
 struct Case {
     options: Map<String, Json>,
-    /// The first episode needs a seed: an unseeded one differs by nature.
+    /// The first episode needs a seed, since unseeded ones always differ.
     first_seed: u64,
     seeds: Vec<Option<u64>>,
-    /// How often an action is random instead of the expert's.
+    /// The share of actions that are random instead of the expert's.
     error_rate: f64,
     action_seed: u64,
 }
@@ -80,7 +81,7 @@ fn case(spec: &'static EnvSpec) -> impl Strategy<Value = Case> {
     )
 }
 
-/// Plays a case in the engine: the request that makes the original play the same.
+/// Plays a case in the engine. Returns the request that makes the original play the same.
 fn play(spec: &'static EnvSpec, case: &Case) -> Json {
     let config = PoolConfig {
         options: ResetOptions::Shared(case.options.clone()),
@@ -114,7 +115,7 @@ fn play(spec: &'static EnvSpec, case: &Case) -> Json {
     json!({"env": spec.id, "options": case.options, "views": true, "episodes": episodes})
 }
 
-/// Reset parameters of version 1.0.3 that the original from PyPI, 1.0.2, does not know; the traces cover them.
+/// Reset parameters of version 1.0.3, which the original on PyPI, 1.0.2, lacks; the traces cover them.
 const NEWER: [&str; 3] = ["reward_new_command_success", "reward_path_progress_dense", "coin_enabled"];
 
 fn compare(id: &str) {
@@ -161,7 +162,7 @@ macro_rules! live {
         )*
 
         #[test]
-        fn no_id_is_forgotten() {
+        fn every_id_is_compared() {
             let mut compared = vec![$($id),*];
             let mut all: Vec<&str> = memory_gym().specs().map(|spec| spec.id).collect();
             compared.sort_unstable();

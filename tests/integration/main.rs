@@ -1,4 +1,4 @@
-//! The tests across crates, as one program.
+//! The tests across crates, in one program.
 
 mod allocation;
 mod browser;
@@ -32,7 +32,7 @@ mod terminal;
 mod traces;
 mod view;
 
-/// A child process of other tests, in the role that its environment names.
+/// The entry point of other tests' child processes; an environment variable names their role.
 #[test]
 #[ignore = "does nothing on its own"]
 fn role() {

@@ -1,4 +1,4 @@
-//! What the registry says about actions and ground truth is what the rules do.
+//! Tests that the registry's descriptions of actions and ground truth match the rules.
 
 use crate::support::player::Player;
 use endless_gym::batch::Batch;
@@ -11,11 +11,12 @@ use serde_json::json;
 struct Named(Player);
 
 impl Named {
-    /// One environment at the start of an episode. In Mortar Mayhem the commands have been shown, so that the agent may move.
+    /// One environment at the start of an episode; in Mortar Mayhem, after the commands were shown, so that the agent
+    /// may move.
     fn new(spec: &EnvSpec, seed: u64, options: serde_json::Value) -> Self {
         let mut options = options.as_object().unwrap().clone();
         if spec.parameters.iter().any(|parameter| parameter.name == "command_show_delay") {
-            // Without frames between the commands, the first frame without one is after the last.
+            // Without pauses between the commands, the first frame without a command follows the last one.
             options.insert("command_show_delay".to_owned(), json!([0]));
         }
         let options = ResetOptions::Shared(options);
@@ -60,7 +61,7 @@ impl Named {
     }
 }
 
-/// The unit vector that an action of this name moves along.
+/// The direction in which an action of this name moves, as a unit vector.
 fn direction(name: &str) -> [f32; 2] {
     match name {
         "nothing" => [0.0, 0.0],
@@ -73,7 +74,7 @@ fn direction(name: &str) -> [f32; 2] {
 }
 
 #[test]
-fn every_number_has_a_meaning() {
+fn every_action_and_column_has_a_description() {
     for spec in memory_gym().specs() {
         let choices: Vec<_> = spec.actions.iter().map(|branch| branch.choices.len() as i32).collect();
         assert_eq!(choices, spec.action_space.branches(), "{}", spec.id);
@@ -99,7 +100,7 @@ fn actions_move_the_agent_as_their_names_say() {
                 for seed in 0..20 {
                     let mut player = Named::new(spec, seed, json!({}));
                     let mut action = vec![0; spec.actions.len()];
-                    // The first frame may show the agent a pixel beside its place, as the original's does.
+                    // The first frame may show the agent one pixel off, as in the original.
                     player.step(&action);
                     let (place, heading) = (player.place(), player.heading());
                     action[number] = value as i32;
@@ -108,7 +109,8 @@ fn actions_move_the_agent_as_their_names_say() {
                     let named = format!("{}, {} {value}, seed {seed}", spec.id, branch.name);
                     assert_eq!(player.heading(), if choice.name == "nothing" { heading } else { [x, y] }, "{named}");
                     let [dx, dy] = [player.place()[0] - place[0], player.place()[1] - place[1]];
-                    // The border stops the agent, or it returns on the other side; the screen scrolls along the endless path.
+                    // The border stops the agent or moves it to the other side; on the endless path, the screen
+                    // scrolls.
                     let jumped = dx.abs() > 0.5 || dy.abs() > 0.5;
                     if !(jumped || follows_a_path && choice.name == "right") {
                         assert!(dx * x >= 0.0 && dy * y >= 0.0, "{named}: {dx} {dy}");
@@ -123,7 +125,7 @@ fn actions_move_the_agent_as_their_names_say() {
 }
 
 #[test]
-fn on_a_grid_actions_turn_and_walk() {
+fn grid_actions_turn_and_walk() {
     let mut walked = 0;
     for spec in memory_gym().specs().filter(|spec| spec.id.contains("Grid")) {
         let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
@@ -179,7 +181,7 @@ fn the_ground_truth_of_endless_mortar_mayhem_is_the_tile_that_does_not_burn() {
 }
 
 #[test]
-fn the_ground_truth_of_endless_searing_spotlights_is_where_agent_and_coin_are() {
+fn the_ground_truth_of_endless_searing_spotlights_is_the_position_of_agent_and_coin() {
     let spec = memory_gym().spec("Endless-SearingSpotlights-v0").unwrap();
     let pairs = [("agent_x", "agent_x"), ("agent_y", "agent_y"), ("coin_x", "coin_0_x"), ("coin_y", "coin_0_y")];
     let mut player = Named::new(spec, 3, json!({"agent_visible": true, "coins_visible": true}));
@@ -194,7 +196,7 @@ fn the_ground_truth_of_endless_searing_spotlights_is_where_agent_and_coin_are() 
 }
 
 #[test]
-fn the_ground_truth_of_endless_mystery_path_leads_along_it() {
+fn the_ground_truth_of_endless_mystery_path_is_the_next_action_along_the_path() {
     let spec = memory_gym().spec("Endless-MysteryPath-v0").unwrap();
     let names: Vec<_> = spec.actions[0].choices.iter().map(|choice| choice.name).collect();
     for seed in 0..10 {

@@ -1,10 +1,10 @@
-//! Reset parameters of next episodes, and what running episodes follow from, in a pool.
+//! Reset parameters of next episodes, and seed and options of running episodes, in a pool.
 
 use crate::support::player::Player;
 use endless_gym::pool::{Autoreset, NextOptions, PoolConfig, PoolError, ResetRequest, Seeding};
 use serde_json::{Map, Value as Json, json};
 
-/// An agent that does nothing ends an episode within some dozens of steps.
+/// With an agent that does nothing, an episode ends within a few dozen steps.
 const ID: &str = "MortarMayhem-Grid-v0";
 
 fn options(value: &Json) -> Map<String, Json> {
@@ -15,7 +15,7 @@ fn next(value: &Json, envs: &[usize]) -> NextOptions {
     NextOptions { options: options(value), envs: envs.to_vec() }
 }
 
-/// Steps without moving, and returns the environments whose episodes ended.
+/// Plays one step without moving, and returns the environments whose episodes ended.
 fn step(player: &mut Player) -> Vec<usize> {
     player.step_all(0);
     let ended = player.batch().terminated();
@@ -31,7 +31,7 @@ fn config(num_envs: usize, autoreset: Autoreset) -> PoolConfig {
 }
 
 #[test]
-fn they_apply_from_the_next_episode_on_however_it_begins() {
+fn next_options_apply_from_the_next_episode_on_in_every_autoreset_mode() {
     for autoreset in Autoreset::ALL {
         let mut player = Player::new(&config(3, autoreset));
         let (three, one) = (json!({"command_count": [3]}), json!({"command_count": [1]}));
@@ -76,7 +76,7 @@ fn they_apply_from_the_next_episode_on_however_it_begins() {
 }
 
 #[test]
-fn an_episode_with_them_is_that_of_a_pool_made_with_them() {
+fn an_episode_with_next_options_equals_that_of_a_pool_created_with_them() {
     let wanted = json!({"command_count": [2], "arena_size": 4});
     let mut made = Player::new(&PoolConfig {
         options: endless_gym::pool::ResetOptions::Shared(options(&wanted)),
@@ -95,7 +95,7 @@ fn an_episode_with_them_is_that_of_a_pool_made_with_them() {
 }
 
 #[test]
-fn they_survive_snapshots_and_checkpoints() {
+fn next_options_survive_snapshots_and_checkpoints() {
     let one = json!({"command_count": [1], "arena_size": 6});
     let mut player = Player::new(&config(2, Autoreset::NextStep));
     player.reset(ResetRequest::All);
@@ -127,7 +127,7 @@ fn they_survive_snapshots_and_checkpoints() {
 }
 
 #[test]
-fn errors_change_nothing() {
+fn refused_next_options_change_nothing() {
     let mut player = Player::new(&config(2, Autoreset::NextStep));
     assert!(matches!(player.pool.running_episode(0), Err(PoolError::NotReset)));
     player.reset(ResetRequest::All);
@@ -142,7 +142,7 @@ fn errors_change_nothing() {
 }
 
 #[test]
-fn a_running_episode_names_the_seed_that_it_follows_from() {
+fn a_running_episode_reports_its_seed() {
     let seeds = |seeding: Seeding| {
         let mut player = Player::new(&PoolConfig { seeding, ..config(2, Autoreset::SameStep) });
         player.reset(ResetRequest::All);

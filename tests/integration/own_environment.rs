@@ -1,4 +1,4 @@
-//! An environment of one's own has all that a built-in one has. It is the T-maze of the examples.
+//! Tests that a custom environment, the T-maze of the examples, has all features of a built-in one.
 
 #[path = "../../engine/examples/t_maze.rs"]
 #[allow(dead_code)]
@@ -25,7 +25,7 @@ fn registry() -> Registry {
     Registry::new().with::<TMaze>().unwrap()
 }
 
-/// Short mazes with features, whose frames are compared with frames that are drawn in full.
+/// Short mazes with features; the pool compares frames with frames that are drawn in full.
 fn config(autoreset: Autoreset) -> PoolConfig {
     let options = json!({"length": 3, "max_steps": 8}).as_object().unwrap().clone();
     let options = ResetOptions::Shared(options);
@@ -36,7 +36,8 @@ fn player(config: &PoolConfig, threads: usize) -> Player {
     Player::in_registry(&registry(), config, threads)
 }
 
-/// Walks to the junction and turns to the side of the cue or, without memory, to the other side. Returns the rewards.
+/// Walks to the junction and turns to the side of the cue or, if `remembers` is false, to the other side. Returns the
+/// rewards.
 fn play(autoreset: Autoreset, remembers: bool) -> Vec<f64> {
     let mut player = player(&config(autoreset), 1);
     player.reset(ResetRequest::Seed(1));
@@ -59,7 +60,7 @@ fn every_autoreset_mode_plays_a_task() {
 }
 
 #[test]
-fn truncation_ends_an_episode_and_is_told_from_termination() {
+fn truncation_ends_an_episode_and_differs_from_termination() {
     for autoreset in Autoreset::ALL {
         let mut player = player(&config(autoreset), 1);
         player.reset(ResetRequest::All);
@@ -115,7 +116,7 @@ fn a_snapshot_continues_identically_and_a_forged_one_is_refused() {
     restore(&mut player);
     assert_eq!(play(&mut player), first);
 
-    // At the third cell of a maze that is shorter: the number in the snapshot's reset parameters is another.
+    // Forge a shorter maze in the snapshot's reset parameters, so that the agent is beyond its end.
     restore(&mut player);
     player.step_all(AHEAD);
     let mut forged = player.pool.snapshot(0).unwrap();

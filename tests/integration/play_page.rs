@@ -1,4 +1,4 @@
-//! `endless play`: the page on which the environments are played, served on this machine.
+//! `endless play`: the local page that plays the environments.
 
 use crate::support::page::{BROWSER, Server, given};
 use crate::support::place::Place;
@@ -12,7 +12,7 @@ fn the_page_opens_at_an_episode() {
     let mut command = place.endless(&arguments);
     command.env("BROWSER", &browser);
     if !endless_gym_page::is_built() {
-        // Only release builds have it; `cargo xtask test --only packages` tests them.
+        // Only release builds contain the page; `cargo xtask test --only packages` tests them.
         let output = command.output().unwrap();
         assert!(!output.status.success());
         assert!(text(&output.stderr).contains("run `cargo xtask web`"), "{}", text(&output.stderr));
@@ -29,7 +29,7 @@ fn the_page_opens_at_an_episode() {
 }
 
 #[test]
-fn what_cannot_be_played_is_said_before_the_page_is_served() {
+fn invalid_arguments_are_reported_before_the_page_is_served() {
     let place = Place::new();
     for (arguments, message) in [
         (&["play", "Pong-v0"][..], "no environment `Pong-v0`"),

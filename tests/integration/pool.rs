@@ -1,4 +1,4 @@
-//! Many environments in lockstep: auto-reset, seeding, options, threads, and what is refused.
+//! Many environments in lockstep: autoreset, seeding, options, threads, and refused calls.
 
 use std::collections::HashSet;
 
@@ -20,7 +20,7 @@ fn options(value: Json) -> Map<String, Json> {
     value.as_object().unwrap().clone()
 }
 
-/// Short episodes: an agent that does nothing fails at the first command that asks it to move.
+/// Episodes are short, since an agent that does nothing fails at the first command to move.
 fn config(num_envs: usize) -> PoolConfig {
     PoolConfig { seeding: Seeding::Continue { seed: Some(3) }, ..PoolConfig::new(ID, num_envs) }
 }
@@ -117,7 +117,7 @@ fn same_step_autoreset_keeps_the_end_of_the_old_episode() {
 }
 
 #[test]
-fn the_vector_observation_is_kept_too() {
+fn same_step_autoreset_keeps_the_final_vector_observation() {
     let config = PoolConfig {
         autoreset: Autoreset::SameStep,
         final_observation: true,
@@ -148,7 +148,7 @@ fn disabled_autoreset_leaves_resets_to_the_trainer() {
 }
 
 #[test]
-fn seeds_follow_the_seeding() {
+fn episodes_are_seeded_as_configured() {
     let first_frames = |seeding: Seeding, episodes: usize| -> Vec<Vec<u8>> {
         let mut player = Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 2) });
         let mut frames = vec![frame(&player, 0), frame(&player, 1)];
@@ -169,7 +169,7 @@ fn seeds_follow_the_seeding() {
 }
 
 #[test]
-fn ranges_of_seeds_may_have_a_step() {
+fn seed_ranges_may_have_a_step() {
     let seeding = Seeding::Range { start: 4, end: 12, step: 3, seed: Some(1) };
     let player = Player::started(&PoolConfig { seeding, ..PoolConfig::new(ID, 64) });
     let expected: HashSet<Vec<u8>> = [4, 7, 10].map(first_frame).into();
@@ -177,7 +177,7 @@ fn ranges_of_seeds_may_have_a_step() {
 }
 
 #[test]
-fn all_episodes_after_a_seeded_reset_follow_from_its_seed() {
+fn all_episodes_after_a_seeded_reset_depend_only_on_its_seed() {
     let range = |seed| Seeding::Range { start: 0, end: 100_000, step: 1, seed: Some(seed) };
     let pairs = [
         [Seeding::Continue { seed: Some(3) }, Seeding::Continue { seed: Some(4) }],
@@ -185,7 +185,8 @@ fn all_episodes_after_a_seeded_reset_follow_from_its_seed() {
         [Seeding::List(vec![5, 6, 7]), Seeding::List(vec![5, 6, 7])],
     ];
     for pair in pairs {
-        // One reset by the seed of all, the other one environment at a time and after another number of episodes.
+        // One pool resets with a common seed, the other with a seed for each environment, after a different number of
+        // episodes.
         let each = [ResetRequest::Seed(50), ResetRequest::Each { reset: &[2, 2], seed: &[50, 51] }];
         let shown = pair.clone().into_iter().zip(each).enumerate().map(|(before, (seeding, request))| {
             let mut player = Player::started(&PoolConfig { seeding, ..config(2) });
@@ -254,7 +255,7 @@ fn a_reset_may_change_the_options() {
 }
 
 #[test]
-fn without_frames_nothing_else_changes() {
+fn disabling_frames_changes_nothing_else() {
     let mut with = Player::started(&PoolConfig { features: true, ..config(3) });
     let mut random = SmallRng::seed_from_u64(5);
     let mut without = Player::started(&PoolConfig { features: true, frames: None, ..config(3) });
@@ -322,7 +323,7 @@ fn wrong_calls_are_refused_and_change_nothing() {
 proptest! {
     #![proptest_config(property_cases(64))]
 
-    /// Any options within the limits, any seed, any actions: nothing panics, and two pools agree.
+    /// With any options within the limits, any seed and any actions, nothing panics, and two pools agree.
     #[test]
     fn any_options_within_the_limits_can_be_played(
         (spec, given) in prop::sample::select(memory_gym().specs().collect::<Vec<_>>())

@@ -1,4 +1,4 @@
-//! The `endless` program, as a user runs it: real processes, their output, exit status and what they leave behind.
+//! The `endless` program as a user runs it: real processes, their output, exit status and leftovers.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -33,14 +33,14 @@ fn list_shows_environments_and_parameters() {
     assert_eq!(text(&unknown.stderr).lines().count(), 1);
 }
 
-/// Standard output of a program that runs in a terminal with this number of columns.
+/// Runs a program in a terminal with this number of columns, and returns its standard output.
 fn in_terminal(columns: u16, command: &mut Command) -> String {
     let (mut emulator, program_side) = pseudo_terminal(columns, 24);
     let mut process = Process::spawn(command.stdout(program_side));
-    // The command holds the program's side too; without it, reading ends when the program has ended.
+    // The command holds the program's side, too; drop it, so that reading ends when the program does.
     command.stdout(Stdio::null());
     let mut output = Vec::new();
-    // The end of a terminal's other side is the error EIO.
+    // When the terminal's other side closes, reading fails with EIO.
     let _ = emulator.read_to_end(&mut output);
     assert!(process.wait().success());
     text(&output).to_owned()
@@ -87,7 +87,7 @@ fn frames_are_those_of_an_episode() {
     // The path leads along the sixth of seven rows.
     assert_eq!(pixel(view, 336, 260, 100), [255; 3]);
     assert_ne!(pixel(view, 336, 100, 260), [255; 3]);
-    // The agent is where it is in the view.
+    // The agent is at the same place as in the view.
     let skin: Vec<usize> = (0..84 * 84).filter(|place| observation[place * 3..][..3] == [250, 204, 153]).collect();
     assert!(!skin.is_empty());
     for place in skin {
@@ -96,7 +96,7 @@ fn frames_are_those_of_an_episode() {
 }
 
 #[test]
-fn verify_counts_and_exits_by_differences() {
+fn verify_counts_differences_and_exits_with_1_if_there_are_any() {
     let place = Place::new();
     let files = traces("MortarMayhem-Grid-v0");
     let verify = |files: &[&Path]| {
@@ -171,7 +171,7 @@ fn an_engine_does_not_outlive_a_killed_demo() {
     place.wait_for_engine();
     demo.kill();
     let start = Instant::now();
-    // The engine goes by itself and takes its own segments along; the next process clears up after the killed trainer.
+    // The engine ends on its own and removes its segments; the next process cleans up after the killed trainer.
     while start.elapsed() < Duration::from_secs(10) && !place.segments().is_empty() {
         std::thread::sleep(Duration::from_millis(500));
         place.run(&["demo", "--num-envs", "1", "--seconds", "0.1"]);
@@ -225,7 +225,7 @@ fn serve_reads_its_configuration_as_json_from_a_file_or_standard_input() {
 }
 
 #[test]
-fn wrong_arguments_are_one_clear_line() {
+fn errors_of_arguments_are_one_clear_line() {
     let place = Place::new();
     for (arguments, part) in [
         (vec!["serve", "--env", "Chess-v0"], "no environment `Chess-v0`"),
@@ -271,7 +271,7 @@ fn bench_measures_every_method() {
     }
     assert!(measurements.iter().all(|m| m["steps_per_second"].as_f64().unwrap() > 0.0));
     assert!(measurements.iter().all(|m| m["batch_bytes"].as_u64().unwrap() > 16 * 84 * 84 * 3));
-    // No batch of 16 environments is large enough for huge pages in process.
+    // In process, a batch of 16 environments is too small for huge pages.
     assert!(measurements.iter().all(|m| m["huge_page_bytes"].as_u64().unwrap() <= m["batch_bytes"].as_u64().unwrap()));
 }
 
@@ -313,7 +313,7 @@ fn output_that_cannot_be_written_is_a_failure() {
 }
 
 #[test]
-fn a_closed_pipe_is_no_failure() {
+fn a_closed_pipe_is_not_a_failure() {
     let place = Place::new();
     let trace = &traces("MortarMayhem-Grid-v0")[0];
     let trace = trace.to_str().unwrap();

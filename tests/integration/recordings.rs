@@ -1,4 +1,4 @@
-//! Recordings of this engine in the format of the original's traces, and the progress that a viewer is shown.
+//! Recordings of this engine in the format of the original's traces, and the progress for viewers.
 
 use crate::support::player::{Player, random_actions};
 use endless_gym::batch::Batch;
@@ -9,7 +9,7 @@ use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::{Value as Json, json};
 
-/// JSON without the difference of 1 and 1.0: the original writes some ground truths as integers.
+/// Converts all numbers in JSON to floats, since the original writes some ground truths as integers.
 fn as_floats(json: Json) -> Json {
     match json {
         Json::Number(number) => json!(number.as_f64()),
@@ -19,9 +19,9 @@ fn as_floats(json: Json) -> Json {
     }
 }
 
-/// What the original returned, played here with its actions and recorded, is the original's file.
+/// Recording the original's actions here gives the original's file.
 #[test]
-fn a_recording_equals_the_originals() {
+fn a_recording_equals_the_original_trace() {
     for spec in memory_gym().specs() {
         let expected =
             Trace::open(&crate::support::recorded::reference().join(format!("traces/{}.03.mixed02.json.gz", spec.id)))
@@ -49,7 +49,7 @@ fn a_recording_equals_the_originals() {
     }
 }
 
-/// An episode that has not ended is complete as it was recorded, and not as a part of a longer one.
+/// A recording of an unfinished episode is complete in itself, but not as part of a longer one.
 #[test]
 fn unfinished_recordings_are_replayed() {
     let mut random = SmallRng::seed_from_u64(1);
@@ -81,7 +81,7 @@ fn unfinished_recordings_are_replayed() {
     }
 }
 
-/// The numbers that a viewer is shown during an episode arrive at those of the final info.
+/// The progress numbers during an episode end at those of the final info.
 #[test]
 fn progress_ends_at_the_final_info() {
     for spec in memory_gym().specs() {
@@ -90,7 +90,7 @@ fn progress_ends_at_the_final_info() {
         pool.progress(0).unwrap_err();
         let mut expert = memory_gym().expert(spec.id).unwrap();
         let mut random = SmallRng::seed_from_u64(2);
-        // The expert is interrupted by random actions, so that episodes end in all ways.
+        // Mix in random actions, so that episodes end in all possible ways.
         for seed in 0..4 {
             pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
             expert.reset();
@@ -118,7 +118,8 @@ fn progress_ends_at_the_final_info() {
             let share = |name: &str| shown(name).map(|shown| shown.value / shown.of.unwrap_or(1.0));
             match spec.id {
                 "Endless-MortarMayhem-v0" => assert_eq!(share("commands"), info("commands_completed")),
-                // The original counts a failed last command as executed, and one whose tile the agent left too early as failed.
+                // The original counts a failed last command as executed, and a command as failed if the agent left its
+                // tile too early.
                 id if id.starts_with("Mortar") => {
                     let (shown, of) = shown("commands").map(|shown| (shown.value, shown.of.unwrap())).unwrap();
                     let counted = (info("commands_completed").unwrap() * of).round();

@@ -1,4 +1,4 @@
-//! The service between real processes: engines and trainers that are started, killed and restarted.
+//! The service with real processes: engines and trainers are started, killed and restarted.
 
 use std::fs::File;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -33,7 +33,8 @@ fn groups_are_reset_and_stepped_independently() {
     let second = trainer.receive(1, TIMEOUT).unwrap();
     let first = trainer.receive(0, TIMEOUT).unwrap();
     assert_eq!((first.group(), second.group()), (0, 1));
-    // Seeds are counted over the groups: environment i of group g is seeded with 7 + 4 g + i, as in one pool of all of them.
+    // Seeds are numbered across groups: environment i of group g is seeded with 7 + 4 g + i, as in one pool with all
+    // environments.
     let mut pool = Player::new(&PoolConfig::new(ID, 8));
     pool.reset(ResetRequest::Seed(7));
     let expected = pool.batch().observation();
@@ -91,7 +92,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
 
         trainer.reset(0, ResetRequest::All).unwrap();
         assert_error!(trainer.reset(0, ResetRequest::All), ServiceError::AnswerPending { group: 0 });
-        // The number of actions is checked before the pending answer, and their range after it.
+        // The number of actions is checked before the pending answer, their range after it.
         assert_error!(trainer.send(0, &[0]), ServiceError::Action(ActionError::Count { .. }));
         assert_error!(trainer.send(0, &vec![99; 2 * width]), ServiceError::AnswerPending { group: 0 });
         trainer.receive(0, TIMEOUT).unwrap();
@@ -129,7 +130,7 @@ fn a_second_trainer_and_a_second_engine_are_refused() {
 }
 
 #[test]
-fn an_unknown_engine_is_named_among_those_that_exist() {
+fn the_error_for_an_unknown_engine_lists_the_running_ones() {
     let place = Place::new();
     let alone = place.trainer_now("gym").map(drop).unwrap_err();
     assert!(alone.to_string().contains("running engines: none"), "{alone}");
@@ -154,7 +155,7 @@ fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
     play(&mut trainer, 0, 10);
     let seen = observer.newest().unwrap().unwrap();
     assert_eq!(seen.step(), 11);
-    // An observer that holds its batches reaches its own limit and does not affect the trainer.
+    // An observer that holds batches reaches its own limit and does not affect the trainer.
     let mut held = vec![seen];
     while held.len() < 3 {
         play(&mut trainer, 0, 1);
@@ -170,7 +171,7 @@ fn observers_see_the_newest_batch_and_do_not_slow_the_trainer() {
 }
 
 #[test]
-fn after_a_killed_trainer_the_next_one_plays_on() {
+fn the_next_trainer_plays_after_one_was_killed() {
     let place = Place::new();
     let _engine = place.engine("gym", 2, 2);
     for _ in 0..2 {
@@ -180,7 +181,7 @@ fn after_a_killed_trainer_the_next_one_plays_on() {
         observer.next(TIMEOUT).unwrap();
         killed.kill();
         let mut trainer = place.trainer("gym").unwrap();
-        // The environments are in the episodes of the dead trainer.
+        // The environments are still in the dead trainer's episodes.
         assert_rejected(try_step(&mut trainer, 0), Rejection::NotReset, "");
         play(&mut trainer, 0, 5);
         play(&mut trainer, 1, 5);
@@ -207,7 +208,7 @@ fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
     play(&mut trainer, 0, 3);
     assert_eq!(held.batch().observation(), frame, "a batch of a dead engine remains readable");
 
-    // The engine is replaced before the trainer checks whether it is running.
+    // Replace the engine before the trainer checks whether it is running.
     engine.kill();
     let mut engine = place.engine("gym", 2, 1);
     Observer::connect(&place.connect_config("gym"), 0).unwrap();
@@ -226,7 +227,7 @@ fn a_trainer_reconnects_to_the_successor_of_a_killed_engine() {
     play(&mut place.trainer("gym").unwrap(), 0, 3);
 }
 
-/// Kills processes at any moment, also while they start and connect. `ENDLESS_TEST_ROUNDS=1000` tests rarer moments.
+/// Kills processes at any moment, even while they start and connect. `ENDLESS_TEST_ROUNDS=1000` covers rarer moments.
 #[test]
 #[ignore = "slow"]
 fn deaths_at_any_moment_are_survived() {
@@ -293,7 +294,7 @@ fn a_trainer_reports_a_lost_engine_while_the_namespace_is_locked() {
         scope.spawn(move || {
             report.send(try_step(&mut trainer, 0).map(drop)).unwrap();
         });
-        // Waiting for the lock to the end takes 5 seconds.
+        // Waiting for the lock would take 5 seconds.
         let result = reported.recv_timeout(Duration::from_secs(4));
         lock.unlock().unwrap();
         assert_error!(result.expect("the trainer waits for the lock"), ServiceError::EngineLost { .. });
@@ -441,7 +442,7 @@ fn messages_of_another_type_are_refused() {
     assert_error!(place.trainer_now("other"), ServiceError::IncompatibleTypes { .. });
 }
 
-/// Leaves what a killed engine leaves.
+/// Creates the leftovers of a killed engine.
 fn remains(place: &Place, service: &str) {
     let mut engine = place.engine(service, 1, 1);
     place.trainer(service).unwrap();

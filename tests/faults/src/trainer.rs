@@ -304,7 +304,7 @@ fn retry<T>(mut call: impl FnMut() -> Result<T, ServiceError>) -> Result<T, Serv
     }
 }
 
-/// Starts a child as a data loader would: a fork that keeps all descriptors and memory, and does not execute a program.
+/// Forks a child as a data loader would: it keeps all descriptors and memory, and does not exec another program.
 fn fork() {
     // SAFETY: the child calls only `sleep` and `_exit`, which are async-signal-safe.
     let child = unsafe {

@@ -1,4 +1,4 @@
-//! Actions: any numbers, of any count.
+//! Actions: any numbers, in any quantity.
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::zeroed;

@@ -1,4 +1,4 @@
-//! What a checkpoint of an engine holds for each environment: a snapshot, and the earlier frames of a stack.
+//! The content of a checkpoint for each environment: a snapshot, and the earlier frames of a stack.
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Frames, zeroed};

@@ -1,9 +1,9 @@
-//! Layouts of batches and requests: JSON text.
+//! Layouts of batches and requests, as JSON text.
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{ActionLayout, Batch, Layout, zeroed};
 
-/// A larger batch is not allocated.
+/// Larger batches are not allocated.
 const MAX_BLOCKS: usize = 1 << 14;
 
 pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {

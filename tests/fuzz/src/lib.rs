@@ -1,8 +1,8 @@
-//! Fuzz targets: what a user or another process hands in, made from arbitrary bytes.
+//! Fuzz targets for input from users and other processes, made from arbitrary bytes.
 //!
-//! A target refuses the input by an error of the library, or plays it for a bounded number of steps. It fails by a panic, or where
-//! it takes longer than [`BUDGET`]. `tests/properties.rs` calls the targets with generated and recorded inputs; the package in
-//! `cargo-fuzz` hands them to libFuzzer.
+//! In a target, the library either refuses the input with an error, or plays it for a bounded number of steps. A target
+//! fails if it panics or takes longer than [`BUDGET`]. `tests/properties.rs` calls the targets with generated and
+//! recorded inputs; the package in `cargo-fuzz` runs them with libFuzzer.
 
 mod actions;
 mod checkpoints;
@@ -16,7 +16,7 @@ mod watchdog;
 use arbitrary::Unstructured;
 pub use watchdog::BUDGET;
 
-/// A function of arbitrary bytes. An error means that the input was too short, which ends it early.
+/// A function of arbitrary bytes. An error means that it ended early because the input was too short.
 pub type Target = fn(&mut Unstructured<'_>) -> arbitrary::Result<()>;
 
 /// The targets by name.
@@ -39,7 +39,7 @@ pub fn run(name: &str, data: &[u8]) {
     let _ = watchdog::within_budget(data.to_vec(), || target(&mut Unstructured::new(data)));
 }
 
-/// Runs of a property: `cases`, or as many as the environment variable `PROPTEST_CASES` says.
+/// Number of runs of a property: the environment variable `PROPTEST_CASES`, or else `cases`.
 pub fn property_cases(cases: u32) -> u32 {
     std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(cases)
 }

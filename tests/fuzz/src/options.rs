@@ -1,4 +1,4 @@
-//! Reset options: JSON text, or names of parameters with any values.
+//! Reset options: JSON text, or parameter names with any values.
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::envs::{EnvSpec, ParameterKind};
@@ -33,7 +33,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     Ok(())
 }
 
-/// Some of the parameters, mostly with values within the limits or just outside.
+/// Some of the parameters, mostly with values within or just outside the limits.
 fn structured(spec: &EnvSpec, input: &mut Unstructured<'_>) -> Result<OptionMap> {
     let mut options = OptionMap::new();
     for parameter in spec.parameters {
@@ -64,7 +64,7 @@ fn value(kind: &ParameterKind, input: &mut Unstructured<'_>) -> Result<Json> {
     })
 }
 
-/// An integer from the limits, one beyond them, or a small one.
+/// An integer within the limits, just beyond them, or near the minimum.
 fn integer(min: i64, max: i64, input: &mut Unstructured<'_>) -> Result<i64> {
     let small = i64::from(input.arbitrary::<u8>()?);
     Ok(match input.int_in_range(0..=7_u8)? {

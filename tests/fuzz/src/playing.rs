@@ -15,7 +15,7 @@ pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {
     input.choose(&specs).copied()
 }
 
-/// A pool with everything that a batch can contain, each frame drawn twice and compared.
+/// A pool with everything that a batch can contain, which draws each frame twice and compares the two.
 pub(crate) fn pool(spec: &EnvSpec, options: OptionMap, autoreset: Autoreset) -> std::result::Result<Pool, PoolError> {
     let config = PoolConfig {
         seeding: Seeding::Continue { seed: Some(3) },
@@ -36,7 +36,7 @@ pub(crate) fn reset(pool: &mut Pool) -> Vec<Block> {
     blocks
 }
 
-/// Plays `steps` actions that are drawn from `input`; zeros when it is exhausted.
+/// Plays `steps` actions from `input`, or zeros when it is exhausted.
 pub(crate) fn play(pool: &mut Pool, blocks: &mut [Block], input: &mut Unstructured<'_>, steps: usize) -> Result<()> {
     let branches = pool.spec().action_space.branches().to_vec();
     for _ in 0..steps {

@@ -1,4 +1,4 @@
-//! Snapshots with a valid checksum, in which any number may have any value.
+//! Snapshots with a valid checksum, in which numbers may have any value.
 
 use arbitrary::Unstructured;
 use ciborium::Value;
@@ -21,10 +21,10 @@ use crate::watchdog::within_budget;
 /// Magic, version and checksum.
 const HEAD: usize = 12;
 
-/// Changes of one input.
+/// Maximum number of changes per input.
 const MAX_CHANGES: usize = 12;
 
-/// The content of a snapshot, field for field as the pool encodes it.
+/// The content of a snapshot, with the fields in the pool's encoding.
 #[derive(Serialize, Deserialize)]
 struct Content<S> {
     id: String,
@@ -91,7 +91,7 @@ pub struct Game {
 }
 
 impl Game {
-    /// An environment that has been reset.
+    /// Creates an environment and resets it.
     ///
     /// # Panics
     ///
@@ -129,7 +129,7 @@ impl Game {
     ///
     /// # Panics
     ///
-    /// If the format differs from what this file says.
+    /// If the format differs from this file's description.
     pub fn content(&mut self) -> Value {
         let snapshot = self.pool.snapshot(0).unwrap();
         self.head.copy_from_slice(&snapshot[..HEAD]);
@@ -147,7 +147,7 @@ impl Game {
         Some(self.pool.restore(0, &snapshot))
     }
 
-    /// Restores forged content and, if it is not refused, plays it.
+    /// Restores forged content and plays it unless it is refused.
     pub fn try_to_play(&mut self, content: &Value) -> Outcome {
         within_budget(content.clone(), || self.outcome(content))
     }
@@ -163,7 +163,7 @@ impl Game {
         }
     }
 
-    /// Plays a restored state: to the end of the episode or not, and in another episode.
+    /// Plays a restored state, and then another episode.
     fn play_on(&mut self) {
         self.pool.observe(&mut self.blocks).unwrap();
         self.pool.ground_truth_view(0, &mut [0; VIEW_BYTES]).unwrap();
@@ -209,7 +209,7 @@ pub fn at<'a>(value: &'a mut Value, path: &[usize]) -> &'a mut Value {
     }
 }
 
-/// The paths of all numbers and lists. Of a long list only the first and the last items are walked.
+/// The paths of all numbers and lists. Only the first and the last items of a long list are visited.
 pub fn paths(value: &mut Value) -> Vec<Path> {
     let mut found = match value {
         Value::Integer(_) | Value::Float(_) | Value::Bool(_) | Value::Null | Value::Array(_) | Value::Tag(..) => {
@@ -228,13 +228,13 @@ pub fn paths(value: &mut Value) -> Vec<Path> {
     found
 }
 
-/// Values to put in the place of any number or list.
+/// Values to replace any number or list.
 ///
 /// # Panics
 ///
 /// Never: the numbers are in range.
 pub fn extremes() -> Vec<Value> {
-    // About zero, at the limits of the types, and at limits of coordinates and counters.
+    // Near zero, at the limits of types, and at the limits of coordinates and counters.
     let bounds = [1 << 8, 1 << 13, 1 << 15, 1 << 28, 1 << 31, 1 << 32, 1 << 62, 1 << 63, 1 << 64_i128];
     let integers = bounds.into_iter().flat_map(|bound| [bound - 4, bound - 1, bound, -bound]).chain([-1, 0, 1, 2]);
     let in_range = |value: &i128| (i128::from(i64::MIN)..=i128::from(u64::MAX)).contains(value);
@@ -244,14 +244,14 @@ pub fn extremes() -> Vec<Value> {
     integers.chain(floats.into_iter().map(Value::Float)).chain(others).collect()
 }
 
-/// Gives changed bytes a checksum that matches.
+/// Updates the checksum of changed bytes.
 pub(crate) fn sealed(snapshot: &mut [u8]) {
     if let Some((head, content)) = snapshot.split_at_mut_checked(HEAD) {
         head[8..].copy_from_slice(&crc32fast::hash(content).to_le_bytes());
     }
 }
 
-/// Plays a snapshot of which some numbers, or some bytes behind the checksum, are replaced.
+/// Plays a snapshot in which some numbers, or some bytes, are replaced.
 pub(crate) fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
     let spec = playing::spec(input)?;
     let seeding = match input.int_in_range(0..=2)? {
@@ -285,7 +285,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> arbitrary::Result<()> {
             Some(number) => Value::from(number),
             None => input.choose(&extremes)?.clone(),
         };
-        // Forges further numbers of what can be played.
+        // Keep forging content that can be played.
         if game.try_to_play(&forged) == Outcome::Played {
             content = forged;
         }

@@ -1,4 +1,4 @@
-//! Traces: JSON text. A trace plays no more steps than it has bytes.
+//! Traces, as JSON text. A trace plays no more steps than it has bytes.
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::memory_gym;
@@ -6,7 +6,7 @@ use endless_gym_core::trace::{Trace, replay};
 
 pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     if let Ok(trace) = serde_json::from_slice::<Trace>(input.bytes(input.len())?) {
-        // Any result but a panic.
+        // Any result is fine, except a panic.
         let _ = replay(memory_gym(), &trace);
     }
     Ok(())

@@ -1,10 +1,10 @@
-//! A limit on the time of a target, which also ends a target that never returns.
+//! A time limit for targets, which also catches targets that never return.
 
 use std::fmt::Debug;
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
-/// The longest time that an input may take: some thousand times that of an ordinary one, for a loaded machine.
+/// Maximum time for an input, thousands of times longer than usual to allow for a loaded machine.
 pub const BUDGET: Duration = Duration::from_secs(60);
 
 /// Calls `work`. If it takes longer than [`BUDGET`], prints the input and aborts the process.

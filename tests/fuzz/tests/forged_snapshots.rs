@@ -1,5 +1,5 @@
-//! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot is
-//! refused or can be played; none panics, and none hangs.
+//! Forged snapshots: every number of a snapshot is set to extreme values, with a valid checksum. Each snapshot must be
+//! refused or playable, without a panic or a hang.
 
 use ciborium::Value;
 use endless_gym_core::envs::{EnvSpec, ParameterKind};
@@ -8,11 +8,11 @@ use endless_gym_core::pool::{Seeding, SnapshotError};
 use endless_gym_fuzz::snapshots::{Game, Outcome, at, extremes, paths};
 use serde_json::{Map, Value as Json};
 
-/// Number of items of a forged list: more than any list has by play within a test.
+/// Number of items of a forged list, more than any list gets by playing within a test.
 const MANY: usize = 100_000;
 
 #[test]
-fn every_list_can_be_long() {
+fn long_lists_are_refused_or_played() {
     for spec in memory_gym().specs() {
         let mut game = Game::new(spec, Seeding::Continue { seed: Some(3) }, Map::new());
         game.play(45);
@@ -36,7 +36,7 @@ fn every_list_can_be_long() {
     }
 }
 
-/// Each of the policies, whose place in the sequence of seeds a snapshot holds.
+/// All kinds of seeding, since a snapshot holds the position in the sequence of seeds.
 fn seedings() -> [Seeding; 3] {
     [
         Seeding::Continue { seed: Some(3) },
@@ -52,10 +52,10 @@ fn all_flags(spec: &EnvSpec) -> Map<String, Json> {
 }
 
 #[test]
-fn every_number_can_be_extreme() {
+fn extreme_numbers_are_refused_or_played() {
     for (spec, seeding) in memory_gym().specs().zip(seedings().into_iter().cycle()) {
         let (mut refused, mut played) = (0, 0);
-        // The second time with everything that a flag can turn on.
+        // The second time with every flag turned on.
         for (steps, options) in [(0, Map::new()), (45, all_flags(spec))] {
             let mut game = Game::new(spec, seeding.clone(), options);
             game.play(steps);
@@ -100,7 +100,7 @@ fn an_even_increment_is_refused() {
 }
 
 #[test]
-fn sums_of_the_episode_stay_in_range() {
+fn forged_episode_length_and_return_stay_in_range() {
     let spec = memory_gym().spec("Endless-SearingSpotlights-v0").unwrap();
     let mut game = Game::new(spec, Seeding::Continue { seed: Some(3) }, Map::new());
     let content = game.content();
@@ -114,7 +114,7 @@ fn sums_of_the_episode_stay_in_range() {
         *field(&mut forged, name) = value;
         assert!(matches!(game.restore(&forged), Some(Err(SnapshotError::State(_)))), "{name}");
     }
-    // The largest length is not exceeded.
+    // The length saturates at its maximum.
     let mut forged = content.clone();
     *field(&mut forged, "episode_length") = Value::from(i32::MAX - 1);
     assert_eq!(game.restore(&forged), Some(Ok(())));

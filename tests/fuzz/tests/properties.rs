@@ -1,4 +1,4 @@
-//! The fuzz targets without a fuzzer: each input of the corpus, changes of them, and arbitrary bytes.
+//! Runs the fuzz targets without a fuzzer: on each input of the corpus, on variations of them, and on arbitrary bytes.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ fn corpus(target: &str) -> Vec<Vec<u8>> {
     files.iter().map(|file| std::fs::read(file).unwrap()).collect()
 }
 
-/// What replaces a part of an input: other bytes, numbers that a forger would try, punctuation of JSON.
+/// Replacements for a part of an input: other bytes, numbers that a forger would try, and JSON punctuation.
 fn replacements() -> impl Strategy<Value = Vec<u8>> {
     let words =
         ["0", "-1", "64", "1e400", "18446744073709551615", "4294967296", "null", "[]", "{}", ",", "\"", "[", ""];
@@ -27,7 +27,7 @@ fn replacements() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
-/// Inputs of the corpus, of which parts are replaced.
+/// Inputs of the corpus with some parts replaced.
 fn changed(corpus: Vec<Vec<u8>>) -> impl Strategy<Value = Vec<u8>> {
     let change = (any::<prop::sample::Index>(), 0..6_usize, replacements());
     (prop::sample::select(corpus), prop::collection::vec(change, 0..4)).prop_map(|(mut input, changes)| {
