@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def measure(envs: EndlessVectorEnv, seconds: float) -> float:
-    """Steps per second with random actions, after some steps that are not counted."""
+    """Steps per second with random actions, after a short warm-up."""
     envs.reset(seed=0)
     envs.action_space.seed(0)
     actions = [np.asarray(envs.action_space.sample()) for _ in range(64)]

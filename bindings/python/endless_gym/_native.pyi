@@ -11,7 +11,7 @@ __version__: str
 # Names of the autoreset modes: those of Gymnasium's `AutoresetMode` in lower case.
 AUTORESET_MODES: tuple[str, ...]
 DEFAULT_ENV_ID: str
-# Most environments in a group, groups, threads, and batches of a group that a trainer may hold.
+# Limits: environments in a group, groups, threads, and batches of a group that a trainer may hold.
 MAX_ENVS: int
 MAX_GROUPS: int
 MAX_THREADS: int
@@ -36,9 +36,9 @@ SingleArrays = tuple[
 ]
 
 class Backend:
-    """The groups of environments of a vector environment, in this process or in an engine process; in this file only.
+    """The groups of environments of a vector environment, in this process or in an engine process. Exists only in this stub.
 
-    Both raise the same exceptions with the same messages for the same mistakes. The caller checks group numbers.
+    Both implementations raise the same exceptions with the same messages. The caller checks group numbers.
     """
 
     @property

@@ -16,7 +16,7 @@ def check_adaptable(envs: EndlessVectorEnv, autoreset: AutoresetMode, library: s
         library: Its name, for messages.
 
     Raises:
-        ValueError: Another auto-reset mode, or more than one group.
+        ValueError: The environments have another auto-reset mode, or more than one group.
     """
     mode = AutoresetMode(envs.metadata["autoreset_mode"])
     if mode is not autoreset:

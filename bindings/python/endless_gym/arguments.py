@@ -61,11 +61,11 @@ def timeout(given: float) -> float:
 
 
 def seeding(seed: int | None, seeds: range | Sequence[int] | None) -> dict[str, Any]:
-    """The source of the episodes' seeds, from the arguments `seed` and `seeds`: the JSON object of the engine's `Seeding`.
+    """The arguments `seed` and `seeds` as the JSON object of the engine's `Seeding`.
 
     Raises:
         TypeError: A seed is not an integer.
-        ValueError: A seed is out of range, or there are none in `seeds`.
+        ValueError: A seed is out of range, or `seeds` is empty.
     """
     seed = None if seed is None else integer("seed", seed)
     if seeds is None:

@@ -1,4 +1,4 @@
-"""The entry point of `endless`: Python writes data sets (`endless record` without `--film`), the native module does the rest."""
+"""The entry point of `endless`: Python writes data sets (`endless record` without `--film`), the native module the rest."""
 
 import os
 import shutil
@@ -10,7 +10,7 @@ from endless_gym.program import program
 
 
 def _is_film(arguments: list[str]) -> bool:
-    """Whether these arguments of `record` ask for a film, which the program writes itself."""
+    """Whether these arguments of `record` request a film, which the native program writes."""
     return any(argument.partition("=")[0] == "--film" for argument in arguments)
 
 
@@ -28,7 +28,7 @@ def _find_ffmpeg() -> None:
 def main() -> int:
     """Run the program with this process's arguments, and return its exit status."""
     if sys.argv[1:2] == ["record"] and not _is_film(sys.argv[2:]):
-        # It needs Python's libraries, and so the whole package.
+        # Imported here, since only this command needs the whole package.
         from endless_gym.recording import command
 
         return command.main(sys.argv[2:])

@@ -1,4 +1,4 @@
-"""The arguments of `make_vec` and `serve`, and their checks: the same errors in this process and for an engine process."""
+"""Checks the arguments of `make_vec` and `serve`, so that both raise the same errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ except ImportError as error:
 
 Options = Mapping[str, Any]
 
-#: Largest number of environments of all engines of one trainer together.
+#: Largest total number of environments of all engines of one trainer.
 MAX_TOTAL_ENVS = 2**32 - 1
 
 #: The names of the auto-reset modes.

@@ -1,4 +1,4 @@
-"""Makes vector environments, in this process (`make_vec`) or of a running engine (`connect`)."""
+"""Makes vector environments in this process (`make_vec`), or connects to those of a running engine (`connect`)."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def make_vec(
         num_threads: Threads that step environments; `None` or 0 for one per core.
         seed: Environment `i`, numbered over all groups, is seeded with `seed + i` at its first reset; later episodes continue its
             generator. `None` takes entropy from the operating system.
-        seeds: Seeds of the single episodes: a `range`, with any step, to draw from, as the training in the paper does from
-            `range(100_000)`, with draws seeded by `seed`; or a list, used in order and repeated.
+        seeds: Seeds of the individual episodes. From a `range`, with any step, seeds are drawn at random; `seed` seeds the draws,
+            and the paper trains with `range(100_000)`. A list is used in order and repeated.
         options: Reset parameters by the original's names: one mapping for all environments, or a sequence with one for each
             environment of all groups.
         autoreset: Gymnasium's auto-reset mode: `next_step`, `same_step` or `disabled`.
@@ -55,18 +55,18 @@ def make_vec(
         frames: Format of the frames: grayscale, channels first, row-major, stacked. `None` for the original's format.
         groups: Groups of environments for `send` and `recv`, 1 to 64.
         copy: Return writable copies instead of read-only views.
-        independent_episodes: Start every episode as in a new environment, so that it depends on its seed and its reset parameters
-            alone, and draw a seed for each episode that has none of its own. By default, as in the original, the first frames of
-            an episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with
-            the last one's background, and an episode continues the generator that the one before has drawn from.
+        independent_episodes: Start every episode as in a new environment, so that it depends only on its seed and its reset
+            parameters, and draw a seed for each episode without one. By default, as in the original, the first frames of an
+            episode of Endless-MortarMayhem show the last episode's character, an episode of Searing Spotlights may start with the
+            last one's background, and an episode without a seed continues the generator of the previous one.
         first_env: Number of the first environment, for seeds, if the environments of one trainer are divided among several calls,
             for example one for each rank of a data-parallel run: environment `i` is numbered `first_env + i`.
-        total_envs: Environments of all of these calls together; `None` for `first_env` and those of this call.
+        total_envs: Total number of environments of all these calls; `None` for `first_env` plus those of this call.
         render_mode: What `render` returns: `rgb_array` for frames, `debug_rgb_array` for ground-truth views.
         view: What `rgb_array` shows: `agent` for frames, the default, or `ground_truth` for ground-truth views.
-        episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between two
-            steps, before the one in which the episode may begin: with same-step auto-reset one episode ahead.
-        episode_info: Whether `info` has the seed and the options of each running episode.
+        episode_options: Chooses the options of each episode, see `endless_gym.episodes.EpisodeOptions`. It is called between
+            steps, before the step in which the episode may begin; with same-step auto-reset, that is one episode ahead.
+        episode_info: Whether `info` contains the seed and the options of each running episode.
 
     Raises:
         TypeError: A number is not an integer, or `episode_options` cannot be called.
@@ -122,8 +122,8 @@ def connect(
         view: As for `make_vec`.
         episode_options: As for `make_vec`. It is called in this process; options that differ from the environment's last ones
             are sent to the engine before the next step.
-        episode_info: As for `make_vec`. Each step in which episodes begin asks the engine for them, which needs one of its
-            `batches_held`.
+        episode_info: As for `make_vec`. Each step in which episodes begin requests the information from the engine, which takes
+            one of its `batches_held`.
         engine: Used by `serve`.
 
     Raises:
@@ -140,7 +140,7 @@ def connect(
         episode_options,
         episode_info,
         options=specification["options"],
-        # An earlier trainer may have changed them, or a checkpoint.
+        # An earlier trainer or a checkpoint may have changed them.
         knows_options=False,
         render_mode=render_mode,
         view=view,

@@ -1,4 +1,4 @@
-"""What the numbers of actions, of the ground truth and of the feature observation mean, as the engine's table says."""
+"""The meanings of actions, ground truth and feature observations, from the engine's table."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def metadata(spec: Spec) -> dict[str, Any]:
     """Entries of an environment's `metadata`.
 
     Returns:
-        `actions`: for each branch of an action the names of its numbers, from 0 on; `ground_truth` and `features`: the meaning of
-        each entry by its name, in order. All are strings, lists and dicts.
+        `actions`: for each branch of an action, the names of its numbers, from 0 on; `ground_truth` and `features`: the meaning
+        of each entry by name, in order. All are strings, lists and dicts.
     """
     return {
         "actions": {branch.name: [choice.name for choice in branch.choices] for branch in spec.actions},
@@ -25,7 +25,7 @@ def metadata(spec: Spec) -> dict[str, Any]:
 
 
 def text(specs: Iterable[Spec]) -> str:
-    """What actions and ground truth of these environments mean, for a docstring; ids with the same meanings share an entry."""
+    """The meanings of actions and ground truth, for a docstring; ids with the same meanings share an entry."""
     ids: dict[str, list[str]] = {}
     for spec in specs:
         ids.setdefault("\n".join(f"    {line}" for line in _lines(spec)), []).append(spec.id)

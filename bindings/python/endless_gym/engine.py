@@ -27,13 +27,13 @@ from endless_gym.vector import EndlessVectorEnv
 
 _numbers = count()
 
-#: In a process group of its own, the engine does not receive Ctrl-C. This process does, and then stops the engine. Only
-#: Python 3.10 needs a session for that: Linux schedules sessions as units (autogroup), and a step takes a third longer.
+#: The engine has its own process group, so that only this process receives Ctrl-C, and then stops the engine. Python 3.10 can
+#: only start a session, which makes a step a third slower, since Linux schedules sessions as units (autogroup).
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 
 
 class EngineProcess:
-    """A child process that serves environments. It stops by `end`, when nothing refers to this object, and with this process."""
+    """A child process that serves environments until `end` is called, this object is deleted, or this process ends."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         """Start the process, which reads the JSON object of its `EngineConfig` from its standard input."""
@@ -46,12 +46,12 @@ class EngineProcess:
             **_OWN_GROUP,
         )
         if self._process.stdin is not None:
-            # A process that has ended is reported by `connect`, with its message.
+            # If the process has ended, `connect` reports it with its message.
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.write(json_text(config).encode())
                 self._process.stdin.flush()
         self._log = EngineLog(self._process)
-        # Also called at the exit of the interpreter. It must not refer to this object, which would then never be deleted.
+        # Also called when the interpreter exits. It must not refer to this object, which would then never be deleted.
         self._end = weakref.finalize(self, _end, self._process, self._log, os.getpid())
 
     @property
@@ -79,7 +79,7 @@ class EngineProcess:
 def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
     """Stops an engine that the process `owner` started, and waits for its end."""
     if owner != os.getpid():
-        # So that Popen does not warn of a child that runs.
+        # Keeps Popen from warning about a running child.
         process.returncode = 0
         return
     if process.stdin is not None:
@@ -89,7 +89,7 @@ def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
             process.stdin.flush()
         with contextlib.suppress(BrokenPipeError):
             process.stdin.close()
-    # One that is stopped would not end.
+    # A stopped process would not end.
     process.send_signal(signal.SIGCONT)
     try:
         process.wait(10)
@@ -98,7 +98,7 @@ def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
         process.wait()
     log.close()
     if process.returncode:
-        # A look for engines removes the shared memory that dead ones leave. Here nothing depends on it.
+        # Listing the engines removes the shared memory of dead ones. Nothing here depends on it.
         with contextlib.suppress(OSError, RuntimeError):
             _native.running_engines()
 
@@ -129,8 +129,8 @@ def serve(
     episode_options: EpisodeOptions | None = None,
     episode_info: bool = False,
 ) -> EndlessVectorEnv:
-    """Start an engine in a child process, and connect to it. It stops when the environments are closed, when nothing refers to
-    them, and with this process.
+    """Start an engine in a child process, and connect to it. It stops when the environments are closed or no longer referenced,
+    or when this process ends.
 
     ```python
     import endless_gym
@@ -150,12 +150,12 @@ def serve(
         autoreset: As for `make_vec`.
         observation: As for `make_vec`.
         frames: As for `make_vec`.
-        batches_held: Batches of a group whose arrays may be referenced at a time, 1 to 16.
+        batches_held: Batches of a group whose arrays may be referenced at the same time, 1 to 16.
         checkpoint: File to which the engine saves all environments when it is closed or ended by a signal, and when
             `EndlessVectorEnv.checkpoint` is called.
-        checkpoint_every: Seconds after which it also saves while it runs.
-        resume: Continue from `checkpoint` if it exists; `EndlessVectorEnv.adopt` returns the observations. Otherwise a file that
-            exists is an error.
+        checkpoint_every: Seconds between further saves while the engine runs; `None` for none.
+        resume: Continue from `checkpoint` if it exists; `EndlessVectorEnv.adopt` returns the observations. Without `resume`, an
+            existing file is an error.
         timeout: Seconds to wait for the engine to start, and for each of its answers.
         copy: Return writable copies instead of read-only views of shared memory.
         independent_episodes: As for `make_vec`.
@@ -164,7 +164,7 @@ def serve(
         render_mode: As for `make_vec`.
         view: As for `make_vec`.
         episode_options: As for `connect`.
-        episode_info: As for `connect`; the engine can lend one batch more for it.
+        episode_info: As for `connect`; the engine lends one extra batch for it.
 
     Raises:
         TypeError: A number is not an integer.

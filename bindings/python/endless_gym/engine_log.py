@@ -1,4 +1,4 @@
-"""What an engine in a child process writes to its standard error: logs, which go to `logging`, and the message of its end."""
+"""Reads the standard error of an engine in a child process: log lines, which go to `logging`, and the reason for its end."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _logger = logging.getLogger("endless_gym.engine")
 _LINE = re.compile(r"\S+Z +(ERROR|WARN|INFO|DEBUG|TRACE) (.*)")
 _LEVELS = {"ERROR": 40, "WARN": 30, "INFO": 20, "DEBUG": 10, "TRACE": 5}
 
-#: Number of the latest lines that are kept if they are not log lines.
+#: Number of lines to keep that are not log lines: the most recent ones.
 _KEPT = 100
 
 
 def level() -> list[str]:
-    """Arguments that give the program the current level of the logger, unless `ENDLESS_GYM_LOG` sets one."""
+    """Arguments that pass the logger's current level to the program, unless `ENDLESS_GYM_LOG` sets one."""
     if os.environ.get("ENDLESS_GYM_LOG"):
         return []
     effective = _logger.getEffectiveLevel()
@@ -49,13 +49,13 @@ class EngineLog:
                 self._other.append(line)
 
     def message(self) -> str:
-        """The reason that the engine, which has ended, gave; empty if it gave none."""
+        """The reason that the engine gave for its end; empty if it gave none. The engine must have ended."""
         self._thread.join(10)
         text = "\n" + "\n".join(self._other)
         return text.rpartition("\nendless: ")[2].strip()
 
     def close(self) -> None:
-        """Log why the engine, which has ended, failed, if its status is an error."""
+        """Log why the engine failed, if its exit status is an error. The engine must have ended."""
         if self._process.returncode and (message := self.message()):
             _logger.error("engine %d: %s", self._process.pid, message)
         self._thread.join(10)

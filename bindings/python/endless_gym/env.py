@@ -27,11 +27,11 @@ class Env(gymnasium.Env[Any, Any]):
     Observations are uint8 (84, 84, 3), indexed `[x][y][channel]` as in the original; the ids with `MortarMayhemB` return a dict
     of `visual_observation` and `vector_observation` (float32 (180,)). Every step returns newly allocated arrays.
 
-    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` contain the meanings of the numbers.
 
-    As in the original, an episode can show traces of the one before: the first frames of Endless-MortarMayhem show the last
+    As in the original, an episode can show traces of the previous one: the first frames of Endless-MortarMayhem show the last
     episode's character until the agent may move, so `reset(seed=...)` alone does not determine them. With
-    `independent_episodes`, an episode depends on its seed and its options alone.
+    `independent_episodes`, an episode depends only on its seed and its options.
     `copy.deepcopy` and `pickle` make an independent environment that continues identically: they copy the state of the episode
     and of the generator, but no window.
 
@@ -42,7 +42,7 @@ class Env(gymnasium.Env[Any, Any]):
         options: Reset parameters for every episode. Options of `reset` override them.
         observation: `rgb` for frames, `features` for a vector that describes what the frame shows, or `rgb+features` for a dict
             of both, as for `make_vec`.
-        frames: Format of the frames, as for `make_vec`. `None` for the original's format. Pictures always have the original's.
+        frames: Format of the frames, as for `make_vec`. `None` for the original's format, which `render` always uses.
         view: What `rgb_array` and `human` show instead of the above: `agent` for the frame, `ground_truth` for the ground-truth
             view, for tools that know only Gymnasium's own render modes.
         independent_episodes: Start every episode as in a new environment, and draw a seed for each episode that is given none.
@@ -102,7 +102,7 @@ class Env(gymnasium.Env[Any, Any]):
         """The progress of the episode, such as `{"tiles": (2.0, 9.0), "falls": (1.0, None)}`.
 
         Returns:
-            By name, the current number and the number at which the task is complete; `None` if there is no such number.
+            By name, the current value and the value at which the task is complete, or `None` if there is no such value.
 
         Raises:
             RuntimeError: The environment has not been reset.
@@ -229,7 +229,7 @@ class Env(gymnasium.Env[Any, Any]):
 
     def _picture(self) -> NDArray[np.uint8]:
         if self._view == "ground_truth":
-            # In the original, each picture of this mode advances a clue that is shown. The other modes show the current step's.
+            # In the original, each picture in this mode advances the clue that is shown. The other modes show the current step's.
             return self._native.ground_truth_view(self.render_mode != "debug_rgb_array")
         if self._frames == Frames():
             return self._native.rgb_array()
@@ -238,7 +238,7 @@ class Env(gymnasium.Env[Any, Any]):
         return self._renderer.render([self.snapshot()])[0]
 
     def _show(self) -> None:
-        """Shows the current picture once, in the original's frame rate."""
+        """Shows the current picture once, at the original's frame rate."""
         if self._is_shown:
             return
         if self._window is None:

@@ -1,4 +1,4 @@
-"""Options chosen episode by episode, and the seeds and options of running episodes in `info`."""
+"""Chooses options for each episode, and adds the seeds and options of running episodes to `info`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from endless_gym.vector import EndlessVectorEnv
 
 #: Chooses the options of an environment's next episode. It is called with the number of the environment over all groups, the
 #: number of the episode in this environment, from 0, and the final infos of the environment's last episode: `reward`, `length`,
-#: ..., and as `options` what was returned for it; `None` for the first episode and after one that a reset cut short. It returns
-#: options that override those given at creation, or `None`. With same-step auto-reset an episode begins in the step that ends the
-#: one before, so its options are chosen one episode ahead, with the infos of the last episode that has ended by then.
+#: ..., and `options`, what it returned for that episode; `None` for the first episode and after one that a reset cut short. It
+#: returns options that override those given at creation, or `None`. With same-step auto-reset an episode begins in the step that
+#: ends the previous one, so its options are chosen one episode ahead, with the infos of the last episode that has ended by then.
 EpisodeOptions = Callable[[int, int, dict[str, Any] | None], "Options | None"]
 
 
@@ -39,7 +39,7 @@ def validate_episode_options(given: Any) -> EpisodeOptions | None:
 class EpisodeTracker:
     """Tracks where the episodes of one group begin and end.
 
-    `choose` chooses their options; with `has_info`, `info` has the seeds and options of the running ones.
+    `choose` chooses their options; with `has_info`, `info` contains the seeds and options of the running ones.
     """
 
     def __init__(
@@ -63,14 +63,14 @@ class EpisodeTracker:
         # What `choose` returned for the next episode, and for the running one.
         self._next: dict[int, Options] = {}
         self._running: dict[int, Options] = {}
-        # The final infos of the last episode of each environment, until the options of the next are chosen.
+        # The final infos of the last episode of each environment, until the options of the next one are chosen.
         self._final: dict[int, dict[str, Any]] = {}
         # The environments of a reset whose result has not been received.
         self._reset_envs: Sequence[int] | None = None
         # With next-step auto-reset, the environments whose next episode begins in the next step.
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._copy = results.copy
-        # What `info` has. The arrays are read-only and replaced, not changed, since the caller may keep them.
+        # The entries of `info`. The arrays are read-only and replaced instead of modified, since the caller may keep them.
         self._seeds = np.zeros(num_envs, dtype=np.uint64)
         self._has_seed = np.zeros(num_envs, dtype=np.bool_)
         self._played = np.full(num_envs, None, dtype=object)
@@ -81,7 +81,7 @@ class EpisodeTracker:
         self._choose_for([env for env in envs if env not in self._next])
 
     def after_reset(self, envs: Sequence[int], info: dict[str, Any]) -> None:
-        """Called after it."""
+        """Called after these environments were reset."""
         self._begin(envs)
         for env in envs:
             self._final.pop(env, None)
@@ -91,7 +91,7 @@ class EpisodeTracker:
             self._add(info)
 
     def sent_reset(self, envs: Sequence[int]) -> None:
-        """Called after a reset of these environments was sent, whose result is received as that of a step."""
+        """Called after a reset of these environments was sent; its result is received like that of a step."""
         self._reset_envs = envs
 
     def before_step(self) -> None:
@@ -146,7 +146,7 @@ class EpisodeTracker:
         for env in envs:
             given = self._choose(self._first + env, self._numbers[env], self._final.get(env))
             chosen[env] = mapping("the result of episode_options", given)
-        # After all calls: if one raises, the next attempt repeats all of them.
+        # Only after all calls, so that the next attempt repeats all of them if one raises.
         self._options.set(self._group, chosen)
         self._next.update(chosen)
         for env in envs:

@@ -1,4 +1,4 @@
-"""The scripted experts, for environments in any vector environment."""
+"""The scripted experts, for any vector environment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from endless_gym.specs import Spec, spec
 
 
 class Experts:
-    """One scripted expert for each of n environments: it reads the features and remembers what an agent must remember.
+    """One scripted expert for each of n environments. It reads the features and remembers what an agent must remember.
 
     ```python
     import endless_gym
@@ -26,7 +26,7 @@ class Experts:
     episode_start, ended = np.ones(8, dtype=bool), np.zeros(8, dtype=bool)
     for _ in range(100):
         observation, reward, terminated, truncated, info = envs.step(experts.act(observation, episode_start))
-        # With next-step auto-reset, the observation after the last one of an episode starts another.
+        # With next-step auto-reset, the step after the end of an episode returns the first observation of the next one.
         episode_start, ended = ended, terminated | truncated
     ```
 
@@ -45,7 +45,7 @@ class Experts:
         self._native = _native.Experts(self._spec.id, self.num_envs)
 
     def act(self, observation: Any, episode_start: Any, active: Any = None) -> NDArray[np.int64]:
-        """Choose the actions. Call it once for each observation, also for the first of an episode.
+        """Choose the actions. Call it exactly once for each observation, including the first of an episode.
 
         Args:
             observation: `features`, float32 (n, f); or a dict with `features` and, for the ids with `MortarMayhemB`,

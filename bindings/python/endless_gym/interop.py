@@ -14,21 +14,21 @@ from endless_gym import _native
 if TYPE_CHECKING:
     import torch
 
-#: DLPack's number of the CPU, which is the device of all arrays.
+#: DLPack's device type and number of the CPU, where all arrays are.
 _CPU = (1, 0)
 
-#: Whether numpy can mark read-only arrays, which DLPack supports since its version 1.0.
+#: Whether numpy can mark read-only arrays, which DLPack supports since version 1.0.
 _NUMPY_HAS_FLAG = np.lib.NumpyVersion(np.__version__) >= "2.1.0"
 
 
 class DLPackView:
-    """An array for `from_dlpack` of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
+    """Exports an array to `from_dlpack` of any library: `jax.dlpack.from_dlpack(DLPackView(observation))`.
 
     The tensor shares the array's memory and keeps it alive. A library that supports DLPack 1.0 receives read-only arrays with the
-    read-only flag, which numpy sets from 2.1 on. For other libraries, and PyTorch, which ignores the flag, it is writable if the
-    environments are in this process: the next frames in that memory are then drawn in full, so that writes do no harm, but cost
-    time. Arrays of environments in another process are not exported to such libraries: use `torch_view` for PyTorch, or
-    `DLPackView(array.copy())`.
+    read-only flag, which numpy sets from 2.1 on. For other libraries, and for PyTorch, which ignores the flag, the tensor is
+    writable if the environments are in this process. The next frames in that memory are then drawn in full, so that writes do no
+    harm; this costs time. Arrays of environments in another process are not exported to such libraries: use `torch_view` for
+    PyTorch, or `DLPackView(array.copy())`.
     """
 
     def __init__(self, array: NDArray[Any]) -> None:
@@ -46,7 +46,7 @@ class DLPackView:
 
         Raises:
             BufferError: The array is read-only memory of another process and the library does not support read-only arrays, or
-                another device than the CPU is requested.
+                a device other than the CPU is requested.
         """
         if dl_device is not None and (int(dl_device[0]), int(dl_device[1])) != _CPU:
             raise BufferError(f"dl_device must be the CPU, {_CPU}, got {dl_device}")
@@ -71,7 +71,7 @@ def torch_view(array: NDArray[Any]) -> torch.Tensor:
     """A tensor that shares the array's memory and keeps it alive.
 
     Only read it: PyTorch has no read-only tensors. A write to the memory of environments in this process corrupts later frames;
-    a write to that of environments in another process kills this process. `tensor.clone()` is a copy that may be written to.
+    a write to that of environments in another process kills this process. `tensor.clone()` is a writable copy.
 
     Raises:
         TypeError: PyTorch has no counterpart of the array's dtype.
@@ -130,7 +130,7 @@ def _pin(array: NDArray[Any]) -> str | None:
     if first in _PINNED:
         return None
     runtime = torch.cuda.cudart()
-    # An engine's memory is mapped read-only, which CUDA requires a flag for.
+    # An engine's memory is mapped read-only, for which CUDA requires a flag.
     for flags in (_READ_ONLY, 0):
         status = int(runtime.cudaHostRegister(first, size, flags))
         if status in (0, _ALREADY_REGISTERED):

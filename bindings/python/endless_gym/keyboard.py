@@ -23,7 +23,7 @@ def keys_to_action(spec: Spec) -> dict[tuple[int, ...] | str, Any]:
     """
     keys = sorted(_LEFT | _RIGHT | _UP | (_DOWN if spec.multi_discrete else frozenset()))
     pressed = (set(each) for count in range(len(keys) + 1) for each in combinations(keys, count))
-    # Gymnasium refuses an empty tuple, but not an empty string; without it, it would play its own action for no key, 0.
+    # Gymnasium accepts an empty string but no empty tuple. Without this entry, it would play action 0 when no key is pressed.
     return {tuple(sorted(each)) or "": _action(spec, each) for each in pressed}
 
 

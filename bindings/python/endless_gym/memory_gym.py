@@ -1,4 +1,4 @@
-"""Replacement for `import memory_gym`: registers the original's ids and defines its classes.
+"""Drop-in replacement for `import memory_gym`: registers the original's ids and defines its classes.
 
 ```python
 import endless_gym.memory_gym as memory_gym

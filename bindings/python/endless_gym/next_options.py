@@ -1,4 +1,4 @@
-"""The reset parameters of running episodes and of those that environments play next."""
+"""The reset parameters of running episodes and of the next ones."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _UNKNOWN = ""
 class RunningEpisode(NamedTuple):
     """The seed and the options of an environment's running episode."""
 
-    #: The seed that the episode started with; `None` if it continues the generator of the episode before.
+    #: The seed with which the episode started; `None` if it continues the generator of the previous episode.
     seed: int | None
-    #: The reset parameters that were given for the episode, those given at creation included; the others have their defaults.
+    #: The reset parameters given for the episode, including those given at creation; the others have their defaults.
     options: dict[str, Any]
     #: Whether the last step ended it, so that with next-step auto-reset the next step starts another.
     ended: bool
@@ -37,21 +37,21 @@ def running_episodes(backend: _native.Backend, group: int, envs: Iterable[int]) 
 class NextOptions:
     """The options of each environment's next episode.
 
-    Those given at creation are overridden by those of `set`, and these by those of the last reset. It remembers the
-    options of the backend's environments, and sends only changes.
+    Options of the last reset override those of `set`, which override those given at creation. This class remembers the options
+    that the backend's environments have, and sends only changes.
     """
 
     def __init__(self, backend: _native.Backend, num_envs: int, created: Sequence[Options], is_known: bool) -> None:
         """Prepare for a backend.
 
-        `created` has one mapping for all environments, or one for each of all groups; `is_known` tells whether the backend's
-        environments have these.
+        `created` has one mapping for all environments, or one for each environment of all groups; `is_known` tells whether the
+        backend's environments have these options.
         """
         self._backend = backend
         self._num_envs = num_envs
         self._created = [dict(each) for each in created]
         self._texts = [options_text(each) for each in self._created]
-        # By group and environment, what differs from the options given at creation.
+        # By group and environment, the differences from the options given at creation.
         self._set: list[dict[int, Options]] = [{} for _ in range(backend.groups)]
         self._reset: list[dict[int, Options]] = [{} for _ in range(backend.groups)]
         self._sent: list[dict[int, str]] = [{} for _ in range(backend.groups)]
@@ -66,7 +66,7 @@ class NextOptions:
     def set_all(self, groups: Sequence[int], envs: Sequence[int], options: Any) -> None:
         """Sets the options of these environments of groups, from one mapping or from a sequence, as `set_options` describes."""
         count = self._num_envs * len(groups)
-        # As for seeds: one for each environment of every group, or of all groups.
+        # As for seeds, a sequence has one item for each environment of a group, or of all groups.
         repeats = len(groups) if isinstance(options, Sequence) and len(options) == self._num_envs else 1
         each = _one_for_each(options, count // repeats) * repeats
         for place, group in enumerate(groups):
@@ -74,7 +74,7 @@ class NextOptions:
             self.set(group, {env: given for env in envs if (given := own[env]) is not None})
 
     def set(self, group: int, chosen: Mapping[int, Options]) -> None:
-        """Sets the options of environments' next episodes, over those given at creation."""
+        """Sets the options of the next episodes of environments, which override those given at creation."""
         self._send(group, self._changes(group, {env: (given, _NONE) for env, given in chosen.items()}))
         for env, given in chosen.items():
             self._reset[group].pop(env, None)
@@ -84,7 +84,7 @@ class NextOptions:
                 self._set[group].pop(env, None)
 
     def prepare(self, group: int, envs: Sequence[int], given: Options) -> str | None:
-        """Called before a reset of these environments with these options. Returns the text that the reset must have, if any."""
+        """Called before a reset of these environments with these options. Returns the text that the reset must send, if any."""
         chosen, sent = self._set[group], self._sent[group]
         if not (given or chosen or sent):
             return None
@@ -108,7 +108,7 @@ class NextOptions:
                 self._reset[group].pop(env, None)
 
     def _changes(self, group: int, wanted: Mapping[int, tuple[Options, Options]]) -> dict[str, list[int]]:
-        """The environments whose options differ from what the backend has, by the text of the options."""
+        """The environments whose options differ from those that the backend has, by the text of the options."""
         # Most environments share their mappings.
         texts: dict[tuple[int, int, int], str] = {}
         changes: dict[str, list[int]] = {}

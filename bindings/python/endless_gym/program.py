@@ -4,8 +4,8 @@ import sys
 
 from endless_gym import _native
 
-# Ctrl-C ends the process until the program handles it: Python's handler only makes a note for the next line of Python, which
-# comes after the program's end. A SIGINT that is ignored stays so. `_signal` is compiled into the interpreter.
+# Ctrl-C must end the process until the program handles it: Python's handler would only take effect in the next line of Python,
+# after the program's end. An ignored SIGINT stays ignored. `_signal` is built into the interpreter.
 #
 # Loads the native module from its file, so that neither this package nor numpy and Gymnasium are imported.
 _PROGRAM = """

@@ -50,7 +50,7 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        """Make `num_envs` environments. `buf` and `seed` are passed by PufferLib; `kwargs` are those of `make_vec`.
+        """Make `num_envs` environments. PufferLib passes `buf` and `seed`; `kwargs` are those of `make_vec`.
 
         Raises:
             ValueError: The observation is a dict.
@@ -73,7 +73,7 @@ class EndlessPufferEnv(PufferEnv):  # type: ignore[misc]
     def reset(self, seed: int | None = None) -> tuple[np.ndarray, list[dict[str, Any]]]:
         """Start an episode in every environment; environment `i` is seeded with `seed * num_envs + i`.
 
-        PufferLib gives consecutive seeds to its environments; with this seeding no two of them play the same episodes.
+        PufferLib passes consecutive seeds to its environments; with this seeding no two of them play the same episodes.
 
         Returns:
             The observations, and an empty list of infos.

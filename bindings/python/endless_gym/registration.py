@@ -26,7 +26,7 @@ def register(namespace: str | None = "EndlessGym") -> None:
             id,
             entry_point="endless_gym.registration:single",
             vector_entry_point="endless_gym.registration:vector",
-            # Not `id`, which is a parameter of `gymnasium.make`, to which `gymnasium.make_vec` and RLlib pass these on.
+            # Not `id`: `gymnasium.make_vec` and RLlib pass these on to `gymnasium.make`, which has a parameter of that name.
             kwargs={"env_id": spec.id},
             # The environment checks its arguments itself, and the wrappers cost more than its steps.
             disable_env_checker=True,
@@ -45,7 +45,7 @@ single.metadata = Env.metadata  # type: ignore[attr-defined]
 
 def vector(env_id: str, num_envs: int = 1, **kwargs: Any) -> EndlessVectorEnv:
     """The entry point of `gymnasium.make_vec`; keyword arguments are those of `make_vec`."""
-    # It needs Gymnasium 1.1, single environments do not.
+    # Only vector environments need Gymnasium 1.1.
     from endless_gym.create import make_vec
 
     return make_vec(env_id, num_envs, **kwargs)

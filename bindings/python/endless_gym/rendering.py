@@ -21,7 +21,7 @@ SINGLE_MODES: dict[str, tuple[View, ...]] = {
     "debug_rgb_array": ("ground_truth",),
 }
 
-#: Those of a vector environment.
+#: The render modes of a vector environment.
 VECTOR_MODES = {mode: views for mode, views in SINGLE_MODES.items() if mode != "human"}
 
 
@@ -50,7 +50,7 @@ class SnapshotRenderer:
 
     def __init__(self, id: str, view: View) -> None:
         self._native = _native.Single(json_text({"id": id, "num_envs": 1}))
-        # Only an environment that was reset can be restored.
+        # An environment must be reset before it can be restored.
         self._native.reset(0, "{}")
         self._view = view
 

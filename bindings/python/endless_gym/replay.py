@@ -12,7 +12,7 @@ from endless_gym.env import Env, Observation
 
 
 class ReplayStep(NamedTuple):
-    """One step of an episode that is played again; the first item is the reset."""
+    """One step of a replayed episode; the first item is the reset."""
 
     #: The observation: uint8 (84, 84, 3), or a dict for the ids with a vector observation.
     observation: Observation
@@ -46,10 +46,10 @@ def replay(
 
     Args:
         id: Environment id.
-        seed: The seed that the episode started with. Or a snapshot, taken at the start of the episode or later, from which it is
-            continued. An episode that continues the generator of the one before has no seed, so it needs a snapshot.
+        seed: The seed with which the episode started. Or a snapshot, taken at the start of the episode or later, from which the
+            replay continues. An episode that continues the generator of the previous one has no seed, so it needs a snapshot.
         options: The reset parameters of the episode; `None` for the defaults, and with a snapshot, which contains its own.
-        actions: The actions in the order of the steps, each an element of the action space. They must not go beyond the end.
+        actions: The actions in the order of the steps, each an element of the action space, up to the end of the episode.
         render_mode: As for `endless_gym.Env`; its pictures are `ReplayStep.frame`.
 
     Returns:

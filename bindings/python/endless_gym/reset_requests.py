@@ -1,4 +1,4 @@
-"""Which environments of a vector environment a reset starts, and with which seeds."""
+"""Resets of a vector environment: which environments start an episode, and with which seeds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ResetRequests:
         self._num_envs, self._num_groups, self._first_env = num_envs, num_groups, first_env
 
     def envs(self, mask: Any, name: str = "reset_mask") -> Sequence[int]:
-        """The numbers of the environments of a mask; all for `None`."""
+        """The numbers of the environments in a mask; all for `None`."""
         return range(self._num_envs) if mask is None else np.flatnonzero(self._mask(mask, name)).tolist()
 
     def request(self, seed: Seeds, mask: Any, group: int) -> _native.Reset | None:

@@ -50,14 +50,14 @@ class EndlessVecEnv(VecEnv):
 
     `info` is the info of the last step as the vector environment returned it, in arrays.
 
-    `step` and `reset` raise what those of `EndlessVectorEnv` raise.
+    `step` and `reset` raise the same exceptions as those of `EndlessVectorEnv`.
     """
 
     def __init__(self, envs: EndlessVectorEnv) -> None:
         """Wrap `envs`, made by `make_vec`, `serve` or `connect` with same-step auto-reset and one group.
 
         Raises:
-            ValueError: Another auto-reset mode, several groups, or an engine without final observations.
+            ValueError: The environments have another auto-reset mode, several groups, or no final observations.
         """
         check_adaptable(envs, gymnasium.vector.AutoresetMode.SAME_STEP, "Stable-Baselines3")
         if not envs.has_final_observation:
@@ -122,9 +122,9 @@ class EndlessVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), dones, infos
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return the picture of each environment, uint8 (height, width, 3), as the render mode of the environments says.
+        """Return the picture of each environment, uint8 (height, width, 3), in the render mode of the environments.
 
-        Stable-Baselines3 records and shows only those of the render mode `rgb_array`. They are the ground-truth views if the
+        Stable-Baselines3 records and shows only pictures of the render mode `rgb_array`. They are the ground-truth views if the
         environments were made with `view="ground_truth"`.
         """
         return self.envs.render() or [None] * self.num_envs

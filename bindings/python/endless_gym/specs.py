@@ -22,7 +22,7 @@ DEFAULT_ENV_ID = _native.DEFAULT_ENV_ID
 #: The kinds of observations.
 ObservationName = Literal["rgb", "features", "rgb+features"]
 
-#: Values of the argument `observation`, with whether the batch has frames and whether it has features.
+#: For each value of the argument `observation`, whether the batch has frames and whether it has features.
 OBSERVATIONS: dict[ObservationName, tuple[bool, bool]] = {
     "rgb": (True, False),
     "features": (False, True),
@@ -37,14 +37,14 @@ class Frames:
     The engine writes this format directly, without a conversion, and only the pixels that change.
     """
 
-    #: Grayscale without a channel axis, as Gymnasium's `GrayscaleObservation`.
+    #: Grayscale without a channel axis, like Gymnasium's `GrayscaleObservation`.
     grayscale: bool = False
     #: The channel is the first axis of a frame, as in PyTorch's convolutions.
     channels_first: bool = False
     #: Indexed `[row][column]` instead of `[x][y]`.
     row_major: bool = False
     #: Number of stacked frames, 1 to 64: the last frames of the episode, oldest first, padded with the episode's first frame.
-    #: More than 1 add a leading axis, as Gymnasium's `FrameStackObservation`.
+    #: A stack of more than 1 adds a leading axis, like Gymnasium's `FrameStackObservation`.
     stack: int = 1
 
     def shape(self) -> tuple[int, ...]:
@@ -102,7 +102,7 @@ class Spec:
     ground_truth: int
     #: What its numbers mean.
     ground_truth_columns: tuple[Meaning, ...]
-    #: Whether the original's `info["ground_truth"]` is an int array, of a single environment.
+    #: Whether a single environment of the original returns `info["ground_truth"]` as an int array.
     ground_truth_is_integer: bool
     #: Names of the final infos besides `reward` and `length`, and whether the original's value is an int.
     info: tuple[tuple[str, bool], ...]
@@ -145,7 +145,7 @@ class Spec:
         try:
             if "max_steps" in parameters:
                 return int(parameters["max_steps"])
-            # Mortar Mayhem: the most commands with the longest durations.
+            # Mortar Mayhem: the largest number of commands with the longest durations.
             longest = {name: max(value) for name, value in parameters.items() if isinstance(value, (list, tuple))}
             clue = longest.get("command_show_duration", 0) + longest.get("command_show_delay", 0)
             execution = longest["explosion_duration"] + longest["explosion_delay"]

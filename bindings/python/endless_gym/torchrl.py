@@ -43,21 +43,21 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
     * `action`: int64 () for Discrete, (branches,) for MultiDiscrete spaces,
     * `reward`: float32 (1,); `done`, `terminated`, `truncated`: bool (1,),
     * `ground_truth`: float64 (k,), if the original has it,
-    * `("final_info", NAME)`: the original's final infos, such as `success` or `commands_completed`: float64 (1,), or int64 (1,)
-      for those that are integers, with `reward` float64 (1,) and `length` int64 (1,) of the episode. Zeros where no episode ends.
+    * `("final_info", NAME)`: the original's final infos, such as `success` or `commands_completed`, float64 (1,), or int64 (1,)
+      for integers; also `reward`, float64 (1,), and `length`, int64 (1,), of the episode. Zeros where no episode ends.
 
     At the end of an episode, `next` holds its last observation. `rollout` and collectors then reset the environment. On the CPU,
     observations are copied, since TorchRL stores them and transforms may modify them in place; to other devices they are
     transferred without an intermediate copy.
 
-    `step` and `reset` raise what those of `EndlessVectorEnv` raise.
+    `step` and `reset` raise the same exceptions as those of `EndlessVectorEnv`.
     """
 
     def __init__(self, envs: EndlessVectorEnv, device: torch.device | str = "cpu") -> None:
         """Wrap `envs`, made by `make_vec`, `serve` or `connect` with disabled auto-reset and one group.
 
         Raises:
-            ValueError: Another auto-reset mode, or several groups.
+            ValueError: The environments have another auto-reset mode, or several groups.
         """
         check_adaptable(envs, gymnasium.vector.AutoresetMode.DISABLED, "TorchRL")
         super().__init__(device=device, batch_size=[envs.num_envs])
@@ -102,12 +102,12 @@ class EndlessEnv(EnvBase):  # type: ignore[misc]
     ) -> list[Callable[[], EndlessEnv]]:
         """Functions for the processes of a `MultiCollector`, each of which starts an engine with its share of the environments.
 
-        The environments are numbered over all workers: with `seed`, they play the episodes that they play in one process. Do not
-        call the collector's `set_seed`, which seeds each worker by itself.
+        The environments are numbered over all workers, so with `seed` they play the same episodes as in one process. Do not call
+        the collector's `set_seed`, which seeds each worker independently.
 
         Args:
             env_id: The environment id.
-            num_envs: Number of environments of all workers.
+            num_envs: Total number of environments of all workers.
             num_workers: Number of workers.
             device: Device of the tensors.
             **kwargs: Those of `endless_gym.serve`.

@@ -26,8 +26,8 @@ from endless_gym.specs import all_specs
 class GroupReconnection(NamedTuple):
     """What `reconnect` found out about a group."""
 
-    #: Batches that the group has returned in the engine that is connected now, counted on from the checkpoint that it resumed
-    #: from; `None` if its status cannot be read.
+    #: Batches that the group has returned in the current engine, including those before the checkpoint that it resumed from;
+    #: `None` if its status cannot be read.
     step: int | None
     #: Batches that it had returned in the engine that ended; `None` if the engine is the same, or if its status cannot be read.
     lost_step: int | None
@@ -39,11 +39,11 @@ class GroupReconnection(NamedTuple):
 class Reconnection(NamedTuple):
     """What `reconnect` found."""
 
-    #: Whether the engine is another run than before. Otherwise the connection and the results that were not received are kept.
+    #: Whether this is another run of the engine. Otherwise the connection and the results that were not received are kept.
     restarted: bool
-    #: A number that identifies the run of the engine that is connected now.
+    #: A number that identifies the current run of the engine.
     incarnation: int
-    #: By group.
+    #: One entry for each group.
     groups: list[GroupReconnection]
 
 
@@ -51,7 +51,7 @@ class Reconnection(NamedTuple):
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
 
-    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` say what the numbers mean.
+    `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` contain the meanings of the numbers.
 
     `make_vec`, `serve` and `connect` create it. `step` returns arrays of n = `num_envs` rows: observation uint8 (n, 84, 84, 3) or
     of `single_observation_space`, reward float64 (n,), terminated and truncated bool (n,), and `info`. Observations and
@@ -59,12 +59,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     exist. With `copy=True` they are writable copies, as rewards and flags always are. `endless_gym.torch_view` returns tensors
     that share their memory.
 
-    `info` has an array for each key, and for the key with a leading underscore a mask, as in Gymnasium: `ground_truth` float64
-    (n, k) if the original has it; in steps that end episodes the original's final infos: `reward`, the episode's return, float64
-    (n,), `length`, its steps, int32 (n,), and the numbers of the task. With same-step auto-reset the final infos are in
-    `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was started without
-    `--final-observation`. With `episode_info`, `info` and `final_info` also have: `seed` uint64
-    (n,), whose mask is false for episodes that continue a generator, and `options`, an array of n dicts.
+    As in Gymnasium, `info` has an array for each key, and a mask for the key with a leading underscore. `ground_truth`, float64
+    (n, k), is present if the original has it. Steps that end episodes add the original's final infos: `reward`, the episode's
+    return, float64 (n,), `length`, its number of steps, int32 (n,), and the metrics of the task. With same-step auto-reset the
+    final infos are in `final_info`, and `final_obs` has the last observation of each episode that ended, unless an engine was
+    started without `--final-observation`. With `episode_info`, `info` and `final_info` also have `seed`, uint64 (n,), whose mask
+    is false for episodes that continue a generator, and `options`, an array of n dicts.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
         Args:
             seed: Environment `i` of group `g` is seeded with `seed + first_env + g * num_envs + i`. Or a list or an array with a
-                seed or `None` for each environment of a group, or of all groups. Later episodes follow from this seed alone.
+                seed or `None` for each environment of a group, or of all groups. This seed alone determines later episodes.
                 `None` uses the seeds given at creation for the first reset, and continues the generators afterwards.
             options: Reset parameters of the environments that are reset, until their next `reset` or `set_options`; they
-                override those given at creation and by `set_options`. And `reset_mask`, bool (n,), the environments that start
-                an episode. The others go on, and keep their options.
+                override those given at creation and by `set_options`. The entry `reset_mask`, bool (n,), selects the
+                environments that start an episode; the others continue, and keep their options.
             group: The group to reset. `None` resets all groups and returns the arrays of group 0.
 
         Returns:
@@ -157,7 +157,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             observation: (n, ...) with the shape and dtype of `observation_space`; uint8 (n, 84, 84, 3) by default, or a dict of
                 such arrays.
             reward: float64 (n,).
-            terminated: bool (n,). As in the original, it is set at every end of an episode, also at the step limit.
+            terminated: bool (n,). As in the original, it is set at every end of an episode, including the step limit.
             truncated: bool (n,).
             info: Arrays with their masks, as the class describes.
 
@@ -232,14 +232,14 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         mask: NDArray[np.bool_] | None = None,
         group: int | None = None,
     ) -> None:
-        """Set the reset parameters of the next episodes, however these begin: by auto-reset or by a reset.
+        """Set the reset parameters of the next episodes, whether they begin by auto-reset or by a reset.
 
         They override those given at creation, and replace those of earlier calls and of the last `reset`. Running episodes do not
         change. With same-step auto-reset the next episode begins in the step that ends the running one.
 
         Args:
             options: One mapping for all environments, or a sequence with one for each environment of a group, or of all groups;
-                `None` in a sequence leaves an environment as it is. An empty mapping returns to the options of creation.
+                `None` in a sequence leaves an environment as it is. An empty mapping restores the options given at creation.
             mask: bool (n,), the environments of a group whose options are set; `None` for all.
             group: The group; `None` for all groups.
 
@@ -275,7 +275,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Set the states of environments of a group, all of which must have been reset once, to those of snapshots.
 
         Args:
-            snapshots: Snapshots by the number of the environment, also of other environments of the same id.
+            snapshots: Snapshots by environment number. They may come from other environments of the same id.
             group: The group of the environments.
 
         Returns:
@@ -290,15 +290,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         for env, snapshot in snapshots.items():
             self._backend.restore(group, self._env(env), snapshot)
             self._options.forget(group, [env])
-        # A reset of no environment returns the current observations.
+        # Resetting no environments returns the current observations.
         return self._results.start(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
 
     def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
         """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
 
-        With `rgb_array` the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
-        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process from a
-        snapshot, which does not change the environments. With same-step auto-reset, it shows the new episode, as Gymnasium does.
+        With `rgb_array` it is the frame, uint8 (84, 84, 3), whatever the observation; with `debug_rgb_array`, or the view
+        `ground_truth`, the original's ground-truth view, uint8 (336, 336, 3). Each is drawn in this process from a snapshot,
+        which does not change the environments. With same-step auto-reset, it shows the new episode, as in Gymnasium.
 
         Raises:
             ValueError: There is no such group.
@@ -323,7 +323,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def adopt(self, group: int = 0) -> tuple[Any, dict[str, Any]]:
         """The current observations and info of a group, without starting an episode.
 
-        It continues the episodes of an engine that resumed from a checkpoint, or that another trainer left.
+        Use it to continue the episodes of an engine that resumed from a checkpoint, or of another trainer that has gone.
 
         Raises:
             ValueError: There is no such group.
@@ -335,7 +335,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Save all environments of a served engine to its checkpoint file, and wait until it is on the disk.
 
         Returns:
-            For each group the number of batches that it had returned; an engine that resumes counts on from there.
+            For each group, the number of batches that it had returned; an engine that resumes continues counting from there.
 
         Raises:
             RuntimeError: The engine has no checkpoint file or cannot write it, the environments are in this process or have no
@@ -347,17 +347,17 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self._backend.checkpoint()
 
     def reconnect(self, timeout: float = 30.0) -> Reconnection:
-        """Connect to an engine that replaces an engine that has ended. Its environments must then be reset, or
-        adopted (`adopt`) if the engine resumed from a checkpoint.
+        """Connect to the engine that replaced one that has ended. Its environments must then be reset, or adopted (`adopt`) if
+        the engine resumed from a checkpoint.
 
-        If the engine is running, the connection is kept, and so are results that were not received: nothing is played twice, and
-        `recv` returns what was sent.
+        If the engine is still running, the connection is kept, and so are results that were not received: nothing is played
+        twice, and `recv` returns the results of what was sent.
 
         Args:
             timeout: Seconds to wait for the engine to start.
 
         Returns:
-            Whether the engine is another run, and for each group its step and what became of the last request.
+            Whether this is another run of the engine, and for each group its step and what became of the last request.
 
         Raises:
             ConnectionError: There is no such engine, or it already has a trainer.

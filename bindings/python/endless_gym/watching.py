@@ -1,4 +1,4 @@
-"""An observer of the batches of an engine that another process trains with."""
+"""Observes the batches of an engine that another process trains with."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class WatchedBatch(NamedTuple):
     truncated: NDArray[np.bool_]
     #: As `EndlessVectorEnv.step` returns it.
     info: dict[str, Any]
-    #: Number of the batch: those that the group has returned since the engine started, this one included.
+    #: Number of the batch: how many the group has returned since the engine started, including this one.
     step: int
     #: Number of the group.
     group: int
-    #: Batches of the group between the one that was watched before and this one.
+    #: Batches of the group that were missed between the previous watched batch and this one.
     missed: int
 
 
@@ -54,7 +54,7 @@ class Watch:
         """Called by `watch`."""
         self._timeout = None if timeout is None else checked_timeout(timeout)
         group = None if group is None else integer("group", group)
-        # A year stands for no limit.
+        # A year, which stands for no limit.
         observer = _native.Observer(service, group, 3e7 if self._timeout is None else self._timeout)
         specification = json.loads(observer.specification())
         self._observer: _native.Observer | None = observer
@@ -73,7 +73,7 @@ class Watch:
 
         Raises:
             StopIteration: The engine has ended, or `close` was called.
-            TimeoutError: There was no batch in time. The next call waits again.
+            TimeoutError: No batch arrived in time. The next call waits again.
             TooManyBatchesHeld: Arrays of as many batches as the engine lends are referenced; delete them, or use `copy=True`.
         """
         if self._observer is None:
@@ -99,7 +99,7 @@ class Watch:
 
 
 def watch(service: str, *, group: int | None = None, timeout: float | None = 30.0, copy: bool = False) -> Watch:
-    """Watch the batches of a running engine, beside its trainer and without slowing it.
+    """Watch the batches of a running engine alongside its trainer, which never waits for the watch.
 
     ```python
     import endless_gym
@@ -109,8 +109,8 @@ def watch(service: str, *, group: int | None = None, timeout: float | None = 30.
             print(batch.step, batch.reward.mean(), batch.missed)
     ```
 
-    The arrays are read-only views of the memory that the engine wrote. It does not write to it again while an array of the batch
-    exists; it lends as many batches of a group to an observer as to its trainer (`batches_held`). A loop holds up to two.
+    The arrays are read-only views of the memory that the engine wrote, which it does not overwrite while an array of the batch
+    exists. It lends as many batches of a group to an observer as to its trainer (`batches_held`). A loop holds up to two.
 
     Args:
         service: The engine's name.

@@ -1,4 +1,4 @@
-"""A window that shows pictures, by pygame, which is imported when the first window opens."""
+"""A window that shows pictures with pygame, which is imported when the first window opens."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 #: Width and height of the window in pixels: those of the ground-truth view. Frames are magnified.
 _SIZE = 336
 
-#: SDL's drivers that show nothing. It chooses one if there is no display.
+#: SDL drivers that show nothing. SDL chooses one of them if there is no display.
 _INVISIBLE = ("dummy", "offscreen")
 
 
 class WindowClosed(RuntimeError):
     """The user has closed the window of `render_mode="human"`.
 
-    `reset` and `step` raise it before they play, and go on raising it until `close` is called.
+    `reset` and `step` raise it before they play, and keep raising it until `close` is called.
     """
 
 

@@ -11,11 +11,11 @@ Actors never wait for the learner's update, nor the learner for an actor that is
 
 * An actor copies the newest weights, plays one trajectory with them into a free slot, and sends the number of the slot.
 * The learner copies trajectories into a batch, which frees their slots, learns from the batch and publishes new weights.
-* A trajectory is of an older policy than the one that learns from it. Its *policy lag* is the number of versions between them. A
-  trajectory with a larger lag than `--max-policy-lag` is dropped; V-trace (Espeholt et al., 2018) corrects the value targets of
-  the others, and the clipped probability ratio to the stored log-probabilities bounds the step of the policy.
+* A trajectory may come from an older policy than the one that learns from it. Its *policy lag* is the number of versions between
+  them. A trajectory with a lag above `--max-policy-lag` is dropped; V-trace (Espeholt et al., 2018) corrects the value targets of
+  the others, and the clipped probability ratio to the stored log-probabilities bounds the policy update.
 
-The task is one command of Mortar Mayhem: an agent without memory gets 0.025 of at most 0.1.
+The task is one command of Mortar Mayhem: an agent without memory earns 0.025 of at most 0.1.
 """
 
 import json
@@ -61,7 +61,7 @@ class Args:
     num_steps: int = 64
     """length of a trajectory"""
     service: bool = False
-    """step the environments of each actor in an engine process of its own, over shared memory, instead of in the actor"""
+    """step the environments of each actor in a separate engine process, over shared memory, instead of in the actor"""
     batch_trajectories: int = 4
     """trajectories of one update"""
     max_policy_lag: int = 4
@@ -111,7 +111,7 @@ class Agent(nn.Module):
                 nn.init.orthogonal_(parameter, 1.0 if name.startswith("gru") else 2**0.5)
             else:
                 nn.init.zeros_(parameter)
-        # Rewards are small: large initial values would take updates to forget.
+        # Rewards are small: it would take updates to unlearn large initial values.
         for head, gain in ((self.actor, 0.01), (self.critic, 0.05)):
             nn.init.orthogonal_(head[-1].weight, gain)
 
@@ -136,11 +136,11 @@ def log_prob_of(heads: list[Categorical], action: torch.Tensor) -> torch.Tensor:
 
 
 class Shared:
-    """What the processes share. PyTorch removes the names of its shared memory at once, so that no process can leave any."""
+    """The memory that the processes share. PyTorch removes its names at once, so that no process can leave any behind."""
 
     def __init__(self, args: Args, features: int, branches: int, weights: torch.Tensor) -> None:
         slots, steps, envs = args.actors * SLOTS_PER_ACTOR, args.num_steps, args.num_envs
-        # Observations have one step more: the last one is only for the value estimate after the last step.
+        # One more observation than steps: the last one is used only for the value estimate after the last step.
         self.slots = {
             "obs": torch.zeros(slots, steps + 1, envs, features),
             "first": torch.zeros(slots, steps + 1, envs),
@@ -165,8 +165,8 @@ def publish(shared: Shared, agent: Agent, version: int) -> None:
 def newest(shared: Shared) -> tuple[torch.Tensor, int]:
     """A copy of the newest weights, and their version.
 
-    There is no lock, which an actor that is killed could hold. Stored log-probabilities are those of the weights that acted,
-    whatever they are, so that even a copy of two versions would be a valid policy.
+    There is no lock, since a killed actor could hold it. The stored log-probabilities are always those of the weights that acted,
+    so even a mixture of two versions would be a valid policy.
     """
     while True:
         before, weights, after = int(shared.version), shared.weights.clone(), int(shared.version)
@@ -185,7 +185,7 @@ def act(number: int, args: Args, action_sizes: list[int], shared: Shared, pipe: 
         args.num_envs,
         num_threads=1,
         seed=args.seed,
-        # All actors together have the seeds of one call with all environments.
+        # All actors together use the same seeds as one call with all environments.
         first_env=number * args.num_envs,
         total_envs=args.actors * args.num_envs,
         options=json.loads(args.options),
@@ -229,14 +229,14 @@ def actors_of(
 ) -> Iterator[tuple[list[Any], list[Connection]]]:
     """The processes of the actors, and the pipes to them."""
     pipes, processes = [], []
-    # Ctrl-C reaches all processes of a terminal. The learner ends the actors, which ignore it from their start.
+    # Ctrl-C reaches all processes of a terminal. The actors ignore it from their start; the learner ends them.
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         for number in range(args.actors):
             here, there = context.Pipe()
             process = context.Process(target=act, args=(number, args, action_sizes, shared, there), daemon=True)
             process.start()
-            # An actor has the only other end, so that the pipe ends with the actor.
+            # Only the actor has the other end, so that the pipe closes when the actor ends.
             there.close()
             pipes.append(here)
             processes.append(process)
@@ -255,13 +255,13 @@ def actors_of(
 
 
 def free(pipe: Connection, slot: int) -> None:
-    # If the actor has ended, `receive` says so.
+    # If the actor has ended, `receive` reports it.
     with suppress(BrokenPipeError, ConnectionResetError):
         pipe.send(slot)
 
 
 def receive(processes: list[Any], pipes: list[Connection]) -> list[tuple[Connection, int, list[float]]]:
-    """The trajectories that are complete, at least one: the pipe of the actor, the slot, and the returns of ended episodes.
+    """At least one complete trajectory: for each, the actor's pipe, the slot, and the returns of ended episodes.
 
     Raises:
         ActorLost: An actor has ended.
@@ -358,7 +358,7 @@ def main() -> None:
                     trajectories.append({name: tensor[slot].clone() for name, tensor in shared.slots.items()})
                     free(pipe, slot)
                     returns_of_episodes.extend(returns)
-                # The lag is that at the update, for which a trajectory may have waited.
+                # The lag is measured at the update, for which a trajectory may have waited.
                 fresh = [each for each in trajectories if version - int(each["version"]) <= args.max_policy_lag]
                 dropped += len(trajectories) - len(fresh)
                 batch, trajectories = fresh[: args.batch_trajectories], fresh[args.batch_trajectories :]

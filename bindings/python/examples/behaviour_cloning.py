@@ -1,4 +1,4 @@
-"""Behaviour cloning: a recurrent network learns to act as the episodes of a Minari data set do.
+"""Behaviour cloning: a recurrent network learns to imitate the episodes of a Minari data set.
 
 pip install "./bindings/python[minari]" torch tyro
 endless record MortarMayhem-Grid-v0 --episodes 2000 --error-rate 0 0.1 --option "command_count=[3]" \\
@@ -60,7 +60,7 @@ class Policy(nn.Module):
 
 @torch.no_grad()
 def evaluate(policy: Policy | None, id: str, options: dict[str, Any], episodes: int) -> tuple[float, int]:
-    """Mean return and number of steps of episodes with unseen seeds, with the most likely actions, or with random ones."""
+    """Mean return and number of steps of episodes with unseen seeds, with the most likely actions; random without a policy."""
     envs = endless_gym.make_vec(id, episodes, observation="features", options=options, autoreset="disabled")
     envs.action_space.seed(0)
     observation, _ = envs.reset(seed=200_000)

@@ -1,16 +1,16 @@
-"""A curriculum: the task grows with what the agent can do.
+"""A curriculum: the task grows with the agent's skill.
 
     python curriculum.py                  # one command at first, then one more whenever nearly all episodes succeed
     python curriculum.py --no-curriculum  # all commands from the start
     python curriculum.py --compare 10     # both, with the seeds 1 to 10
 
 Mortar Mayhem shows commands, which the agent must remember and execute in order. Here only a whole sequence without a mistake is
-rewarded, so that an agent that knows nothing rarely sees a reward: with each command the chance falls to about a quarter. With
+rewarded, so an untrained agent rarely sees a reward: each further command reduces the chance to about a quarter. With
 `episode_options` the number of commands of each episode depends on the results of the last ones.
 
-The agent is as small as the task allows, so that a run takes seconds: it is told how to remember (it counts the fires, and keeps
-the list of the commands that were shown), and learns which moves execute a command, as a table of action preferences, by
-REINFORCE with a baseline (Williams, 1992). Both ways of training use the same agent and the same settings.
+The agent is as small as the task allows, so that a run takes seconds. Its memory is hand-written (it counts the fires and keeps
+the list of the commands shown); it learns which moves execute a command, as a table of action preferences, by REINFORCE with a
+baseline (Williams, 1992). Both ways of training use the same agent and the same settings.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Agent:
         self._rate, self._baseline = learning_rate, 0.0
 
     def act(self, rows: NDArray[np.int64], executes: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Actions for the rows of the table, which count for the episode's reward where it executes a command."""
+        """Actions for the rows of the table. Where the agent executes a command, the episode's reward reinforces them."""
         weights = np.exp(self._preferences[rows])
         policy = weights / weights.sum(1, keepdims=True)
         actions = (policy.cumsum(1) < self._random.random((len(rows), 1))).sum(1).clip(0, ACTIONS - 1)
@@ -145,7 +145,7 @@ def train(seed: int, given: argparse.Namespace, has_curriculum: bool) -> tuple[i
             rows, executes = memory.observe(features)
             features, reward, terminated, _, info = envs.step(agent.act(rows, executes))
             steps += given.num_envs
-            # With next-step auto-reset, this step has started another episode where the last one ended it.
+            # With next-step auto-reset, this step started another episode where the last step ended one.
             memory.begin(ended, features)
             ended = terminated.copy()
             finished = np.flatnonzero(ended)

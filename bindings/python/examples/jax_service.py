@@ -3,8 +3,8 @@
 pip install ./bindings/python jax
 python jax_service.py --env-id Endless-MortarMayhem-v0 --num-envs 256 --total-timesteps 100000
 
-On the CPU, `jax.device_put(observation, may_alias=True)` is an array of the memory that the engine wrote. `jax.numpy.asarray`
-would copy the batch. On a GPU or TPU the same call makes the one copy to the device.
+On the CPU, `jax.device_put(observation, may_alias=True)` returns an array over the memory that the engine wrote, whereas
+`jax.numpy.asarray` would copy the batch. On a GPU or TPU the same call makes the only copy to the device.
 """
 
 import argparse
@@ -22,9 +22,9 @@ FILTERS = [(16, 8, 4), (32, 4, 2)]  # output channels, size and stride of the co
 
 
 def as_jax(observation: Any) -> Any:
-    """The observation, an array or a dict of arrays, as read-only JAX arrays of the same memory where the device can read it.
+    """The observation, an array or a dict of arrays, as read-only JAX arrays over the same memory if the device can read it.
 
-    A JAX array keeps the engine's memory in use: an engine lends `batches_held` batches at a time, so keep none for longer.
+    A JAX array keeps its batch alive, and an engine lends only `batches_held` batches at a time, so do not keep the arrays.
     """
     return jax.device_put(observation, may_alias=True)
 

@@ -5,9 +5,9 @@ pip install --no-deps gym==0.26.2 pettingzoo shimmy
 pip install --no-deps --no-build-isolation pufferlib==3.0.0
 python pufferlib_rollout.py --env-id MysteryPath-Grid-v0 --num-envs 1024
 
---no-deps is needed since PufferLib 3.0.0 requires NumPy 1 and Gymnasium 0.29, although it works with the current versions. Its
-setup compiles its own games from sources that it downloads from GitHub. To skip them, set NO_OCEAN=1 NO_TRAIN=1 for its
-installation, with a folder on the PYTHONPATH that contains a file `sitecustomize.py` with the line:
+--no-deps is needed because PufferLib 3.0.0 requires NumPy 1 and Gymnasium 0.29, although it works with the current versions. Its
+setup compiles its own games from sources that it downloads from GitHub. To skip them, install it with NO_OCEAN=1 NO_TRAIN=1 and
+with a folder on the PYTHONPATH that contains a file `sitecustomize.py` with the line:
 import builtins; builtins.c_extension_paths = []
 """
 
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="seed of the environments and the actions")
     args = parser.parse_args()
 
-    # The native backend has one batch in this process. The other backends have two, each with half of the environments.
+    # The native backend uses one batch in this process. The other backends use two, each with half of the environments.
     batches = 1 if args.backend == "PufferEnv" else 2
     vecenv = pufferlib.vector.make(
         EndlessPufferEnv,
@@ -39,7 +39,7 @@ def main() -> None:
         backend=args.backend,
     )
     rng = np.random.default_rng(args.seed)
-    # Numbers of choices, of each branch for MultiDiscrete.
+    # Number of choices, for each branch of MultiDiscrete.
     space = vecenv.single_action_space
     choices = np.broadcast_to(space.nvec if hasattr(space, "nvec") else space.n, vecenv.action_space.shape)
 

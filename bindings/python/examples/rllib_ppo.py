@@ -2,12 +2,12 @@
 
 pip install ./bindings/python ./agents 'ray[rllib]'
 python rllib_ppo.py                   # feature observations: learns the command in a few minutes on one core
-python rllib_ppo.py --memory gru      # a module of its own, with the GRU of endless_gym_agents, in place of RLlib's LSTM
-python rllib_ppo.py --memory none     # the baseline without memory, which cannot
+python rllib_ppo.py --memory gru      # a custom module with the GRU of endless_gym_agents, in place of RLlib's LSTM
+python rllib_ppo.py --memory none     # the baseline without memory, which cannot learn it
 python rllib_ppo.py --env-id Endless-MortarMayhem-v0 --options '{}' --observation rgb --total-timesteps 10000000
 
-All environments of an env runner are one vector environment, stepped by one call. RLlib's own loop over their episodes, in
-Python, takes most of the time.
+All environments of an env runner form one vector environment, stepped by one call. RLlib's own Python loop over their episodes
+takes most of the time.
 """
 
 import argparse
@@ -75,7 +75,7 @@ class GRUModule(TorchRLModule, ValueFunctionAPI):
         """The outputs of the GRU, float32 (B, T, hidden size), for observations (B, T, ...)."""
         observed, hidden = batch[Columns.OBS], batch[Columns.STATE_IN]["hidden"]
         sequences, steps = observed.shape[:2]
-        # In the order of packed sequences: first step 0 of all, then step 1, ...
+        # In the order of packed sequences: step 0 of all sequences, then step 1, ...
         flat = observed.transpose(0, 1).flatten(0, 1)
         encoded = self.memory.embedding(self.encoder({self.key: flat}))
         outputs = packed_layers(encoded, self.memory.recurrent.all_weights, hidden[None, None], [sequences] * steps)
@@ -85,7 +85,7 @@ class GRUModule(TorchRLModule, ValueFunctionAPI):
 class ScaleFrames(ConnectorV2):
     """Convert frames uint8 (84, 84, 3) in a batch to float32 in [0, 1]. The episodes keep them as uint8, a quarter of the memory.
 
-    RLlib's convolutions take no uint8; those of `GRUModule` do. Feature observations, which are float32, are left as they are.
+    RLlib's convolutions do not accept uint8; those of `GRUModule` do. Feature observations, which are float32, are unchanged.
     """
 
     def recompute_output_observation_space(self, input_observation_space: Any, input_action_space: Any) -> gym.Space:
@@ -129,7 +129,7 @@ def make_config(args: argparse.Namespace) -> PPOConfig:
             num_envs_per_env_runner=args.num_envs,
             gym_env_vectorize_mode="vector_entry_point",
             rollout_fragment_length=args.num_steps,
-            # RLlib adds its own pieces after these, except the observations, which are in the batch already.
+            # RLlib adds its own connectors after these, except for observations, which are already in the batch.
             env_to_module_connector=lambda env, spaces, device: [AddObservationsFromEpisodesToBatch(), *scale],
         )
         .learners(
@@ -174,7 +174,7 @@ def main() -> None:
     if "MortarMayhemB" in args.env_id:
         parser.error(f"{args.env_id} has dict observations, which the network here does not support; choose another id")
 
-    # Never a cluster that happens to run on this machine.
+    # Do not join a cluster that happens to run on this machine.
     ray.init("local", num_cpus=args.num_env_runners + 1, include_dashboard=False, log_to_driver=False)
     algorithm = make_config(args).build_algo()
     steps, mean = 0, "none yet"

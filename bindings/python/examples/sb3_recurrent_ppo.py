@@ -24,7 +24,7 @@ def main() -> None:
     args = parser.parse_args()
 
     venv = EndlessVecEnv.make(args.env_id, num_envs=args.num_envs)
-    # The observations of the MortarMayhemB ids are a dict of a frame and a vector.
+    # The observations of the MortarMayhemB ids are dicts of a frame and a vector.
     policy = "MultiInputLstmPolicy" if hasattr(venv.observation_space, "spaces") else "CnnLstmPolicy"
     model = RecurrentPPO(
         policy,

@@ -24,7 +24,7 @@ from endless_gym.torchrl import EndlessEnv
 
 
 class Pixels(nn.Module):
-    """Convert frames uint8 (..., 84, 84, 3) to float32 (..., 3, 84, 84). In the policy, so that the stored frames stay uint8."""
+    """Convert frames uint8 (..., 84, 84, 3) to float32 (..., 3, 84, 84) in the policy, so that stored frames stay uint8."""
 
     def forward(self, frames: torch.Tensor) -> torch.Tensor:
         return frames.movedim(-1, -3) / 255.0
@@ -58,7 +58,7 @@ def make_policy(env: EndlessEnv) -> ProbabilisticActor:
 
 
 def make_collector(args: argparse.Namespace) -> BaseCollector:
-    """A collector in this process, or in several that each collect the frames of their share of the environments."""
+    """A collector in this process, or in several processes that each collect from their share of the environments."""
     sizes = {"frames_per_batch": args.num_envs * args.num_steps, "total_frames": args.total_timesteps}
     sizes["auto_register_policy_transforms"] = False  # the policy has no recurrent state to reset
     if not args.num_workers:
@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--env-id", default="Endless-MortarMayhem-v0", help="environment id")
     parser.add_argument("--num-envs", type=int, default=64, help="number of environments of all workers")
     parser.add_argument(
-        "--num-workers", type=int, default=0, help="processes, each with an engine; 0 for this one, without"
+        "--num-workers", type=int, default=0, help="processes, each with an engine; 0 to use this process without one"
     )
     parser.add_argument("--num-steps", type=int, default=32, help="rollout length: steps per environment and batch")
     parser.add_argument("--total-timesteps", type=int, default=100_000, help="environment steps in total")

@@ -17,7 +17,7 @@ use serde_json::Value as Json;
 
 use crate::errors;
 
-/// The shape that actions must have: that of the action space, with the environments as the first axis of a group's actions.
+/// The required shape of actions: that of the action space, for a group with the environments as the first axis.
 pub struct ActionShape {
     shape: Vec<usize>,
     meaning: &'static str,
@@ -62,11 +62,11 @@ impl ActionShape {
             let shown: String = given.repr()?.to_string().chars().take(80).collect();
             Ok::<_, PyErr>(PyTypeError::new_err(format!("actions must be integers, got {shown}")))
         };
-        // numpy takes it for a list of small integers.
+        // numpy would treat it as a list of small integers.
         if given.is_instance_of::<PyByteArray>() {
             return Err(no_integers()?);
         }
-        // It refuses lists whose items have different lengths.
+        // numpy refuses lists whose items have different lengths.
         let Ok(array) = given.py().import("numpy")?.call_method1("asarray", (given,)) else {
             return Err(self.error("a list of items with different shapes"));
         };

@@ -15,14 +15,14 @@ use pyo3::types::PyTuple;
 ///
 /// # Safety
 ///
-/// The memory stays mapped while the owner lives. The engine or pool does not write to it in that time.
+/// The memory stays mapped while the owner lives. The engine or pool does not write to it during that time.
 pub unsafe trait Owner {
     /// Address of the batch and its number of blocks.
     fn memory(&self) -> (*const Block, usize);
 }
 
-/// Whether Python gets a copy of a section, which it may write to: a few bytes for each environment, which Gymnasium's wrappers and
-/// trainers change in place.
+/// Whether Python gets a writable copy of a section: one with a few bytes per environment, which Gymnasium's wrappers and trainers
+/// modify in place.
 fn is_copied(section: BatchSection) -> bool {
     matches!(section, BatchSection::Reward | BatchSection::Terminated | BatchSection::Truncated)
 }

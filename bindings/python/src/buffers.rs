@@ -88,7 +88,7 @@ pub fn note_export(array: &Bound<'_, PyUntypedArray>) -> bool {
     }
 }
 
-/// A view of an array, for libraries that take writable arrays only. Whoever writes to it must own the memory, or have noted the
+/// A writable view of an array, for libraries that accept no others. Whoever writes to it must own the memory, or have noted the
 /// export.
 #[pyfunction]
 pub fn writable_view<'py>(array: &Bound<'py, PyUntypedArray>) -> PyResult<Bound<'py, PyUntypedArray>> {

@@ -1,6 +1,6 @@
 //! Environments in another process, through shared memory.
 //!
-//! [`Connection`] has the methods of the groups in this process ([`Pools`](crate::pool::Pools)).
+//! [`Connection`] has the same methods as the groups in this process ([`Pools`](crate::pool::Pools)).
 
 use std::time::{Duration, Instant};
 
@@ -17,10 +17,10 @@ use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::arrays::{self, Owner};
 use crate::{errors, logs};
 
-/// Longest time between two runs of Python's signal handlers, among them that of Ctrl-C.
+/// Longest time between two runs of Python's signal handlers, including that of Ctrl-C.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// The steps of a group in the engine that is connected and in the one that was lost, and what became of the last request.
+/// The steps of a group in the current engine and in the lost one, and what became of the last request.
 type GroupFound = (Option<u64>, Option<u64>, &'static str);
 
 /// The owner of the arrays of one batch in shared memory. The engine writes to the memory again once all arrays are gone.
@@ -112,7 +112,7 @@ impl Connection {
         self.trainer()?.reset_with(group, request, options.as_ref()).map_err(errors::service)
     }
 
-    /// The number and the arrays of a group that has answered: of `group`, or of the first to answer for `None`.
+    /// Waits for the answer of `group`, or of any group for `None`. Returns the group's number and arrays.
     fn receive<'py>(&mut self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
         let received = self.wait(py, |trainer, slice| match group {
             Some(group) => trainer.receive(group, slice),
@@ -152,8 +152,8 @@ impl Connection {
         self.wait(py, Trainer::checkpoint)
     }
 
-    /// Connects to an engine of the same name that replaces a lost engine. Returns whether the engine is another one, its
-    /// incarnation, and for each group `(step, lost_step, last_request)`.
+    /// Connects to the engine of the same name that replaced a lost one. Returns whether it is another engine, its incarnation,
+    /// and for each group `(step, lost_step, last_request)`.
     fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<(bool, u64, Vec<GroupFound>)> {
         let trainer = self.trainer()?;
         logs::start(py)?;
@@ -172,8 +172,8 @@ impl Connection {
         Ok((found.restarted, found.incarnation, found.groups.into_iter().map(group).collect()))
     }
 
-    /// Disconnects. Arrays remain valid. While another call waits, such as one that a signal handler interrupted, that call and its
-    /// connection remain.
+    /// Disconnects. Arrays remain valid. If another call is waiting, for example when a signal handler calls this, the connection
+    /// stays open.
     fn close(slf: &Bound<'_, Self>) {
         if let Ok(mut connection) = slf.try_borrow_mut() {
             connection.trainer = None;
@@ -205,7 +205,7 @@ impl Connection {
     }
 }
 
-/// Calls `answer` with parts of the timeout until it returns something else than a timeout, without the interpreter's lock, and runs
+/// Calls `answer` with slices of the timeout, without the interpreter's lock, until it returns anything but a timeout. Runs
 /// Python's signal handlers between the calls.
 pub fn wait<T: Send>(
     py: Python<'_>,
@@ -231,7 +231,7 @@ pub fn wait<T: Send>(
     }
 }
 
-/// Calls `connect` with parts of the timeout until there is an engine, without the interpreter's lock, and runs Python's signal
+/// Calls `connect` with slices of the timeout, without the interpreter's lock, until there is an engine. Runs Python's signal
 /// handlers between the calls.
 pub fn wait_for_engine<T: Send>(
     py: Python<'_>,

@@ -10,8 +10,8 @@ use pyo3::prelude::*;
 
 type Column<'py> = Bound<'py, PyAny>;
 
-/// Of a step that ended episodes: which environments' episodes ended, their returns and lengths, and the columns of `info`, as
-/// int64 where `integers` says so. `None` if no episode ended.
+/// For a step that ended episodes: which environments' episodes ended, their returns and lengths, and the columns of `info`, as
+/// int64 where `integers` is true. `None` if no episode ended.
 ///
 /// `ended` may lie in shared memory. Each byte is read once; any nonzero byte is true.
 #[pyfunction]

@@ -19,7 +19,7 @@ create_exception!(
     "Arrays of this process hold all batches that the engine can lend."
 );
 
-/// The message for environments without a state, of a pool and of an engine.
+/// The message for environments that have not been reset, in a pool or in an engine.
 const NOT_RESET: &str = "the environments have no episodes yet; reset all of them first";
 
 /// The exception for an error of a pool.
@@ -45,10 +45,10 @@ pub fn snapshot(error: SnapshotError) -> PyErr {
 pub fn service(error: ServiceError) -> PyErr {
     use ServiceError as E;
     let text = match &error {
-        // The messages of a pool in this process.
+        // The same messages as for a pool in this process.
         E::Rejected { reason: Rejection::NotReset, .. } => NOT_RESET.to_owned(),
         E::Rejected { message, .. } => message.clone(),
-        // The names of Python's methods.
+        // With the names of the Python methods.
         E::AnswerPending { group } => {
             format!("group {group} has a pending answer; call `recv` before the next request")
         }
@@ -83,7 +83,7 @@ pub fn service(error: ServiceError) -> PyErr {
     }
 }
 
-/// The error of every method after `close`.
+/// The error that every method returns after `close`.
 pub fn closed() -> PyErr {
     PyRuntimeError::new_err("the environments are closed")
 }

@@ -11,7 +11,7 @@ use pyo3::prelude::*;
 /// One scripted expert for each of `num_envs` environments.
 #[pyclass(module = "endless_gym._native")]
 pub struct Experts {
-    // Python's classes must be `Sync`, which experts need not be.
+    // Python classes must be `Sync`, which experts need not be.
     experts: Mutex<Vec<Box<dyn Expert>>>,
     features: usize,
     vector_observation: usize,
@@ -32,8 +32,8 @@ impl Experts {
         })
     }
 
-    /// The actions, int64 (n, branches), for features float32 (n, f) and, where the environment has it, the vector observation
-    /// float32 (n, v). `turn` has a number for each environment: 0 leaves its expert out and returns zeros, 1 acts, 2 starts an
+    /// The actions, int64 (n, branches), for features float32 (n, f) and, if the environment has it, the vector observation
+    /// float32 (n, v). `turn` has a number for each environment: 0 skips its expert and returns zeros, 1 acts, 2 starts an
     /// episode and acts.
     #[pyo3(signature = (features, vector_observation, turn))]
     fn act<'py>(

@@ -1,7 +1,7 @@
 //! Logs of the native module through Python's `logging`, under the logger `endless_gym`.
 //!
-//! Events may come from any thread, while another one holds the interpreter's lock and waits for it. They are therefore kept, and
-//! handed to Python by the next call that holds the lock.
+//! An event may come from a thread for which another thread waits while it holds the interpreter's lock. Events are therefore
+//! buffered, and the next call that holds the lock passes them to Python.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};
@@ -17,29 +17,29 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::layer::{Context, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
-/// Levels of `logging`, with the level of `tracing` that each stands for.
+/// Levels of `logging`, and the corresponding levels of `tracing`.
 const LEVELS: [(u8, Level); 4] = [(40, Level::ERROR), (30, Level::WARN), (20, Level::INFO), (10, Level::DEBUG)];
 
-/// Most events that are kept. Python takes them often; beyond this number, newer ones are dropped.
+/// Maximum number of buffered events. Python fetches them often; newer ones beyond this number are dropped.
 const CAPACITY: usize = 1000;
 
-/// The level of Python's logger when it was last asked. Events below it cost one comparison.
+/// The level of Python's logger when it was last read. Events below it cost one comparison.
 static LOWEST: AtomicU8 = AtomicU8::new(u8::MAX);
 
 static WAITING: AtomicBool = AtomicBool::new(false);
 static EVENTS: Mutex<VecDeque<(u8, String)>> = Mutex::new(VecDeque::new());
 
-/// Adopts the level of Python's logger, and starts to keep events. Called by the calls that connect.
+/// Adopts the level of Python's logger, and starts buffering events. Called when connecting.
 pub fn start(py: Python<'_>) -> PyResult<()> {
     static START: Once = Once::new();
-    // An error means that the process logs otherwise already.
+    // An error means that the process already has another subscriber.
     START.call_once(|| drop(tracing_subscriber::registry().with(Forward).try_init()));
     let level: u64 = logger(py)?.call_method0("getEffectiveLevel")?.extract()?;
     LOWEST.store(u8::try_from(level).unwrap_or(u8::MAX), Ordering::Relaxed);
     Ok(())
 }
 
-/// Hands the events that were kept to Python.
+/// Passes the buffered events to Python.
 pub fn flush(py: Python<'_>) -> PyResult<()> {
     if !WAITING.swap(false, Ordering::Relaxed) {
         return Ok(());
@@ -56,12 +56,12 @@ fn logger(py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
     py.import("logging")?.call_method1("getLogger", ("endless_gym",))
 }
 
-/// Keeps events for Python.
+/// Buffers events for Python.
 struct Forward;
 
 impl<S: Subscriber> Layer<S> for Forward {
     fn register_callsite(&self, _metadata: &'static Metadata<'static>) -> Interest {
-        // The level of Python's logger changes.
+        // The level of Python's logger may change.
         Interest::sometimes()
     }
 

@@ -40,7 +40,7 @@ impl Observer {
         text.map_err(|error| PyRuntimeError::new_err(error.to_string()))
     }
 
-    /// The next batch, for which it waits up to `timeout` seconds, or without a limit for `None`.
+    /// Waits for the next batch, up to `timeout` seconds, or without a limit for `None`.
     #[pyo3(signature = (timeout))]
     fn next<'py>(&mut self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Watched<'py>> {
         if self.process != std::process::id() {

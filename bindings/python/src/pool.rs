@@ -1,6 +1,6 @@
 //! The groups of environments in this process.
 //!
-//! [`Pools`] has the methods of a connection to an engine, and raises the same errors for the same mistakes.
+//! [`Pools`] has the same methods as a connection to an engine, and raises the same errors.
 
 use endless_gym::batch::Block;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
@@ -26,7 +26,7 @@ pub fn check_pool_config(config: &str) -> PyResult<()> {
 
 /// The environments of one group, and the buffers of its batches.
 ///
-/// A buffer is not written to while arrays of it exist. A new one is allocated if arrays of all buffers exist.
+/// A buffer is not written to while arrays of it exist. A new one is allocated if all are in use.
 struct Group {
     pool: Pool,
     buffers: Buffers,
@@ -47,18 +47,18 @@ enum Message {
 pub struct Pools {
     /// Empty after `close`.
     pools: Vec<Group>,
-    /// What was sent and not received, in that order; at most one message for each group.
+    /// Messages that were sent but not yet received, in order; at most one for each group.
     pending: Vec<(usize, Message)>,
     action_shape: ActionShape,
-    /// Memory for actions that are not checked yet.
+    /// Actions that have not been checked yet.
     unchecked: Vec<i32>,
     process: u32,
 }
 
 #[pymethods]
 impl Pools {
-    /// One group for each configuration, which is JSON text; at least one. All have the same id and number of environments. They
-    /// share `num_threads` threads, one per core for 0.
+    /// Makes one group for each configuration, which is JSON text. There must be at least one, and all must have the same id and
+    /// number of environments. They share `num_threads` threads, one per core for 0.
     #[new]
     fn new(configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
         let threads = Threads::new(num_threads).map_err(errors::pool)?;
@@ -133,7 +133,7 @@ impl Pools {
         Ok(())
     }
 
-    /// Executes what was sent to a group, or what was sent first for `None`. Returns the group's number and its arrays.
+    /// Executes the message sent to a group, or for `None` the first one sent. Returns the group's number and its arrays.
     fn receive<'py>(&mut self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
         self.check(group.unwrap_or(0))?;
         let place = self.pending.iter().position(|(number, _)| group.is_none_or(|group| group == *number));
@@ -179,7 +179,7 @@ impl Pools {
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
     }
 
-    /// Releases the environments, unless another thread steps them. Arrays remain valid.
+    /// Releases the environments, unless another thread is stepping them. Arrays remain valid.
     fn close(slf: &Bound<'_, Self>) {
         if let Ok(mut pools) = slf.try_borrow_mut() {
             pools.pools.clear();
@@ -210,7 +210,7 @@ impl Pools {
         self.pending.iter().any(|(number, _)| *number == group)
     }
 
-    /// The group, or an error if a message to it is pending: the error of an engine.
+    /// The group, or the same error as for an engine if a message to it is pending.
     fn idle(&mut self, group: usize) -> PyResult<&mut Group> {
         self.check(group)?;
         if self.is_pending(group) {

@@ -72,8 +72,8 @@ impl Single {
         Ok(PyArray1::from_vec(py, picture).reshape([SCREEN, SCREEN, 3])?.into_any())
     }
 
-    /// The ground-truth view, indexed \[row\]\[column\]\[channel\]: the one that follows the last view, as in the original, or that of
-    /// the current step.
+    /// The ground-truth view, indexed \[row\]\[column\]\[channel\]: the one after the last view, as in the original, or that of the
+    /// current step.
     fn ground_truth_view<'py>(&mut self, py: Python<'py>, of_current_step: bool) -> PyResult<Bound<'py, PyAny>> {
         if of_current_step {
             self.pool.align_ground_truth_view(0).map_err(errors::pool)?;
@@ -83,7 +83,7 @@ impl Single {
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
     }
 
-    /// Names of the numbers that say how far the episode is, with the numbers and those at which nothing is missing.
+    /// The progress of the episode: for each quantity its name, its value, and the value at which the task is complete.
     fn progress(&self) -> PyResult<Vec<(&'static str, f64, Option<f64>)>> {
         let progress = self.pool.progress(0).map_err(errors::pool)?;
         Ok(progress.iter().map(|shown| (shown.name, shown.value, shown.of)).collect())

@@ -1,12 +1,12 @@
-"""Episodes of scripted experts, of random play or of an agent, as a Minari data set.
+"""Records episodes of scripted experts, random play or an agent as a Minari data set.
 
 | module | content |
 | --- | --- |
 | `chunks` | arrays that are compressed while they grow |
-| `players` | what chooses the actions |
+| `players` | the policies that choose the actions |
 | `episodes` | plays episodes, many at a time |
 | `dataset` | writes a Minari data set |
-| `recorder` | `record`: all of it |
+| `recorder` | `record`, which combines them |
 | `command` | `endless record` |
 """
 

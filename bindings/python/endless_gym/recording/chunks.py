@@ -1,4 +1,4 @@
-"""Arrays that grow by one row a step and are compressed in chunks as they grow."""
+"""Arrays that grow by one row per step and are compressed in chunks as they grow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 #: The fastest level: frames are mostly areas of one colour, which higher levels hardly compress further.
 LEVEL = 1
 
-#: Largest size of a chunk in bytes. HDF5 caches 1 MB of an array, so that reading frame after frame decompresses each chunk once.
+#: Largest size of a chunk in bytes. HDF5 caches 1 MB of an array, so reading frames in order decompresses each chunk only once.
 CHUNK_BYTES = 2**20
 
 

@@ -29,9 +29,9 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def run(name: str, work: Callable[[], object]) -> int:
-    """Run a command that records, and report errors of the user in one line on standard error; return the exit status.
+    """Run a command that records, and report user errors in one line on standard error; return the exit status.
 
-    SIGTERM and SIGHUP stop it as Ctrl-C does, so that nothing half-written is left.
+    SIGTERM and SIGHUP stop it like Ctrl-C, so that nothing half-written is left.
     """
     signals = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, _interrupt) for number in signals]
@@ -68,7 +68,7 @@ def show(recording: Recording, as_json: bool) -> None:
 
 @contextmanager
 def progress(episodes: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error, hidden if that is no terminal."""
+    """A progress bar on standard error, hidden if that is not a terminal."""
     try:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -153,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[0.0],
         metavar="P",
-        help="probability that a step takes a random action, not the expert's; the episodes take several in turn [default: 0]",
+        help="probability that a step takes a random action instead of the expert's; episodes cycle through several [default: 0]",
     )
     add("--seed", type=int, default=0, help="episode i has the seed SEED + i [default: 0]")
     add("--action-seed", type=int, default=0, metavar="SEED", help="seed of the random actions [default: 0]")
@@ -169,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="JSON",
-        help="reset parameters as a JSON object; if repeated, the episodes take them in turn",
+        help="reset parameters as a JSON object; if repeated, episodes cycle through them",
     )
     add(
         "--max-steps",

@@ -1,7 +1,7 @@
 """Writes episodes as a Minari data set, in the format HDF5.
 
-Minari's own writer stores frames as JPEG, which changes them, or without compression. This one compresses them without
-loss, in chunks compressed while the episodes are played. Minari reads both formats.
+Minari's own writer stores frames as JPEG, which is lossy, or without compression. This one compresses them losslessly, in chunks,
+while the episodes are played. Minari reads both formats.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class DatasetWriter:
         root: Folder of the data sets; `None` for Minari's: `MINARI_DATASETS_PATH`, or `~/.minari/datasets`.
         observation_space: Space of a recorded observation.
         action_space: Space of an action.
-        env_spec: What `recover_environment` makes.
+        env_spec: The environment that `recover_environment` makes.
         metadata: Further metadata of the data set.
         overwrite: Replace a data set of that id.
 
@@ -116,7 +116,7 @@ class DatasetWriter:
                 data_format="hdf5",
                 jpeg_encoding=False,
             )
-            # The layout of HDF5 1.10, whose chunks have less administration than those of 1.0.
+            # The layout of HDF5 1.10 has less overhead per chunk than that of 1.0.
             self._file = h5py.File(self._folder / "data" / _FILE, "w", libver=("v110", "v110"), track_order=True)
         except BaseException:
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -164,7 +164,7 @@ class DatasetWriter:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _finish(self) -> None:
-        """Writes the metadata, and moves the data set to its place."""
+        """Writes the metadata, and moves the data set into place."""
         self._storage.update_metadata(
             {
                 **self._metadata,
@@ -183,7 +183,7 @@ class DatasetWriter:
                 described.write_text(json.dumps({}))
         if self.path.exists():
             os.rename(self.path, self._folder / "replaced")
-        # `mkdtemp` makes a folder for its owner alone.
+        # Only the owner can access a folder made by `mkdtemp`.
         finished = self._folder / "finished"
         finished.mkdir()
         os.rename(self._folder / "data", finished / "data")

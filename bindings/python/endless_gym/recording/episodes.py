@@ -1,4 +1,4 @@
-"""Plays episodes, many at a time, each from a seed and reset parameters of its own."""
+"""Plays episodes, many at a time, each with its own seed and reset parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Plan:
         seed: Seed of the environment.
         options: Reset parameters.
         error_rate: Probability that a step takes a random action.
-        max_steps: Steps after which the episode is truncated; `None` for the environment's own end only.
+        max_steps: Steps after which the episode is truncated; `None` to play until it terminates.
     """
 
     number: int
@@ -40,7 +40,7 @@ class Episode:
     """A played episode of T steps.
 
     Attributes:
-        plan: What determined it.
+        plan: The plan that was played.
         observations: T + 1 observations by their keys.
         arrays: `actions` int64, `rewards` float64, `terminations` and `truncations` bool, with T rows.
         ground_truth: T + 1 rows of `info["ground_truth"]`, float64; `None` if the environment has none.
@@ -72,7 +72,7 @@ def play(
     action_seed: int,
     stop: threading.Event,
 ) -> list[Episode]:
-    """Play these episodes, whose numbers are consecutive, at the same time. None depends on the others.
+    """Play these episodes, whose numbers are consecutive, at the same time. They do not depend on each other.
 
     Args:
         spec: The environment.
@@ -80,8 +80,8 @@ def play(
         plans: The episodes.
         observation: What is recorded: `rgb`, `features` or `rgb+features`.
         frames: Format of the frames, as for `make_vec`.
-        action_seed: Seed of the random actions; each episode draws from a stream of its own.
-        stop: Ends the playing.
+        action_seed: Seed of the random actions; each episode has its own stream.
+        stop: Stops playing when set.
 
     Raises:
         Stopped: `stop` is set.
@@ -92,7 +92,7 @@ def play(
     errors = Errors(spec, action_seed, range(plans[0].number, plans[0].number + num_envs), rates)
     actor = player.actor(num_envs, plans[0].number)
     shown = _union(observation, player.observation)
-    # New environments for every episode, since some show traces of the episode before, as in the original.
+    # New environments for every episode, since some show traces of the previous episode, as in the original.
     with make_vec(
         spec.id,
         num_envs,
@@ -142,12 +142,12 @@ def play(
 
 
 def _copied(info: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """The ground truth. A view would keep the memory of its whole batch."""
+    """A copy of the ground truth. A view would keep the memory of its whole batch alive."""
     return info["ground_truth"].copy() if "ground_truth" in info else None
 
 
 def _union(recorded: ObservationName, needed: ObservationName | None) -> ObservationName:
-    """The observation that has all of what is recorded and needed."""
+    """The kind of observation that contains both what is recorded and what the player needs."""
     contents = np.array(OBSERVATIONS[recorded]) | np.array(OBSERVATIONS[needed] if needed else (False, False))
     return next(name for name, given in OBSERVATIONS.items() if given == tuple(contents))
 

@@ -1,4 +1,4 @@
-"""What chooses the actions of the episodes that are recorded."""
+"""The policies that choose the actions of recorded episodes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from endless_gym.experts import Experts
 from endless_gym.specs import ObservationName, Spec
 
-#: Chooses actions for observations of n environments by their keys, given which are the first of an episode, bool (n,), and which
-#: environments need an action, bool (n,). Returns actions in the shape of a vector environment.
+#: Chooses actions. The arguments are the observations of n environments by key, whether each is the first of an episode, bool
+#: (n,), and whether each environment needs an action, bool (n,). Returns actions in the shape of a vector environment.
 Actor: TypeAlias = Callable[[Mapping[str, NDArray[Any]], NDArray[np.bool_], NDArray[np.bool_]], NDArray[np.int64]]
 
 
@@ -28,7 +28,7 @@ class Player(Protocol):
         """The observation that it needs, `rgb`, `features` or `rgb+features`; `None` if it needs none."""
 
     def actor(self, num_envs: int, first_episode: int) -> Actor:
-        """The policy of `num_envs` environments, which play the episodes from that number on."""
+        """The policy of `num_envs` environments, which play consecutive episodes from number `first_episode` on."""
 
 
 class ExpertPlayer:
@@ -66,7 +66,7 @@ class RandomPlayer:
 class Errors:
     """Random actions that replace some of a policy's, with a generator for each episode."""
 
-    #: Steps whose numbers are drawn together.
+    #: Steps whose random numbers are drawn together.
     STEPS = 256
 
     def __init__(self, spec: Spec, seed: int, episodes: range, rates: NDArray[np.float64]) -> None:

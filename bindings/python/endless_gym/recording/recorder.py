@@ -23,10 +23,10 @@ from endless_gym.recording.episodes import Episode, Plan, play
 from endless_gym.recording.players import ExpertPlayer, Player, RandomPlayer
 from endless_gym.specs import Frames, ObservationName, Spec, contents, spec
 
-#: Steps after which episodes are truncated in environments without a step limit, in which an expert may never stop.
+#: Steps after which episodes are truncated in environments without a step limit, which an expert may play forever.
 DEFAULT_MAX_STEPS = 1000
 
-#: Episodes that a thread plays at the same time. A fixed number, so that an agent's actions do not depend on that of threads.
+#: Episodes that a thread plays at the same time. It is fixed, so that an agent's actions do not depend on the number of threads.
 EPISODES_AT_A_TIME = 32
 
 
@@ -85,18 +85,18 @@ def record(
         id: Environment id, such as `MortarMayhem-v0`.
         episodes: Number of episodes.
         policy: `expert` for the scripted expert, `random` for random actions, or a `Player`.
-        error_rates: Probability, 0 to 1, that a step takes a random action, not the policy's; or several, which the episodes take
-            in turn.
+        error_rates: Probability, 0 to 1, that a step takes a random action instead of the policy's; episodes cycle through
+            several.
         seed: Episode `i` has the seed `seed + i`.
         action_seed: Seed of the random actions, and of an agent's.
-        options: Reset parameters by the original's names: one mapping, or several, which the episodes take in turn.
+        options: Reset parameters by the original's names: one mapping, or several, through which episodes cycle.
         max_steps: Truncate episodes after this number of steps. `None`: after 1,000 if the environment has no step limit.
         observation: `rgb`, `features` or `rgb+features`, as for `make_vec`.
         frames: Format of the frames, as for `make_vec`.
         dataset: Id of the data set; `None` for `endless-gym/ID/expert-v0`, or with `random` in its place.
         root: Folder of the data sets; `None` for Minari's.
         overwrite: Replace an existing data set of that id, once the new one is complete.
-        author: Who is named as the author.
+        author: Author in the metadata.
         description: Text in the metadata.
         num_threads: Threads that play; `None` for one per core.
         progress: Called with the number of episodes written so far.
@@ -119,7 +119,7 @@ def record(
     each = [mapping("options", given) for given in several]
     if not each:
         raise ValueError("options must be a mapping or a sequence with at least one, got an empty sequence")
-    # Wrong reset parameters are an error before anything is written.
+    # Reports wrong reset parameters before anything is written.
     make_vec(described.id, len(each), 1, options=each, observation="features").close()
     limits = [_limit(described, given, max_steps) for given in each]
     plans = [
@@ -167,7 +167,7 @@ def record(
 def _waves(
     plans: Sequence[Plan], threads: int, work: Callable[[Sequence[Plan], threading.Event], list[Episode]]
 ) -> Iterator[Iterator[list[Episode]]]:
-    """Episodes in order; some are played ahead."""
+    """Episodes in order; some are played in advance."""
     size = EPISODES_AT_A_TIME
     parts = iter([plans[at : at + size] for at in range(0, len(plans), size)])
     stop, pending = threading.Event(), deque[Future[list[Episode]]]()
@@ -216,8 +216,8 @@ def _limit(described: Spec, options: Mapping[str, Any], max_steps: int | None) -
 def _env_spec(
     described: Spec, options: Sequence[Mapping[str, Any]], observation: ObservationName
 ) -> gymnasium.envs.registration.EnvSpec:
-    """What makes the environment again, with frames in the original's format: a specification is kept as JSON."""
-    # Not the registry's own.
+    """The specification that recreates the environment, with frames in the original's format, since Minari stores it as JSON."""
+    # A copy, since the registry's own must not change.
     env_spec = copy.deepcopy(gymnasium.spec(f"EndlessGym/{described.id}"))
     if len(options) == 1 and options[0]:
         env_spec.kwargs["options"] = dict(options[0])
