@@ -1,4 +1,5 @@
-//! Reset parameters of next episodes, and what running episodes follow from, through the service: as in a pool.
+//! Tests that reset parameters of next episodes, and seed and options of running episodes, are the same through the
+//! service as in a pool.
 
 use crate::support::foreign::{Foreign, RequestHeader};
 use crate::support::place::Place;
@@ -16,7 +17,7 @@ fn next(value: &serde_json::Value, envs: &[usize]) -> NextOptions {
 }
 
 #[test]
-fn options_of_next_episodes_are_those_of_a_pool() {
+fn next_options_and_running_episodes_equal_those_of_a_pool() {
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -75,7 +76,7 @@ fn mistakes_are_typed_errors() {
     assert_error!(pending, ServiceError::AnswerPending { group: 0 });
     trainer.receive(0, TIMEOUT).unwrap();
 
-    // Texts that are no lists of options, and lengths beyond the payload.
+    // Texts that are not lists of options, and lengths beyond the payload.
     let specification = trainer.specification().clone();
     drop(trainer);
     let foreign = Foreign::new(place.namespace(), &specification);

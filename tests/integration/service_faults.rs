@@ -1,7 +1,8 @@
-//! Faults around a service: full and small shared memory, removed directories, stopped processes, other users, few descriptors.
+//! Faults outside the service: full and small shared memory, removed directories, stopped processes, other users, few
+//! descriptors.
 //!
-//! Tests that need a mount namespace or the rights of root are ignored; `cargo xtask test` runs them where the system permits it.
-//! They start this test program again inside such a namespace.
+//! Tests that need a mount namespace or root are ignored; `cargo xtask test --all` runs them where the system permits
+//! it. They start this test program again inside such a namespace.
 
 use std::fs::{self, File, Permissions};
 use std::io::Write;
@@ -23,7 +24,7 @@ use rustix::process::Signal;
 
 const SEGMENTS: &str = "/dev/shm";
 
-/// The program `endless serve`.
+/// The command `endless serve`.
 fn serve(place: &Place, service: &str) -> Command {
     let mut command = place.endless(&["serve", "--env", ID, "--num-envs", "2", "--service", service]);
     command.stdout(Stdio::null());
@@ -45,7 +46,7 @@ fn inside_full_shared_memory_an_engine_reports_it_and_leaves_nothing() {
     assert_eq!((output.status.code(), output.status.signal()), (Some(1), None), "{text}");
     assert!(text.contains("/dev/shm has 0 MB free"), "{text}");
     assert_eq!(place.segments(), [] as [PathBuf; 0]);
-    // As soon as there is room, an engine starts.
+    // An engine starts as soon as there is room.
     fs::remove_file(filler).unwrap();
     let _engine = place.engine("gym", 2, 1);
     play(&mut place.trainer("gym").unwrap(), 0, 3);
@@ -62,7 +63,7 @@ fn inside_memory_that_dead_processes_fill_an_engine_starts() {
     let mut engine = place.engine("gym", 2, 1);
     play(&mut place.trainer("gym").unwrap(), 0, 1);
     engine.kill();
-    // A segment of the dead engine takes what is left.
+    // A segment of the dead engine takes the rest of the memory.
     let segment = place.segments().into_iter().find(|path| path.extension().unwrap() == "data").unwrap();
     let mut file = File::options().append(true).open(segment).unwrap();
     file.write_all(&vec![1; 9 << 20]).unwrap_err();
@@ -74,7 +75,8 @@ fn inside_memory_that_dead_processes_fill_an_engine_starts() {
 #[test]
 fn an_unusable_counter_of_a_dead_process_is_replaced() {
     let place = Place::new();
-    // A process of iceoryx2 itself leaves its counter; one that dies on it leaves it like this.
+    // A plain iceoryx2 process leaves its counter behind; one that dies while it creates the counter leaves it in this
+    // state.
     let _foreign = foreign::engine_of_version(place.namespace(), "old", 999);
     let counters = || place.segments().into_iter().filter(|path| path.extension().unwrap() == "global_mgmt");
     let left: Vec<_> = counters().collect();
@@ -125,7 +127,7 @@ fn two_directories_of_one_path_share_nothing() {
     let _engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
     play(&mut trainer, 0, 1);
-    // Older than anything that a clock could call fresh.
+    // Make the segments look old by any clock.
     for segment in place.segments() {
         File::open(segment).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
     }
@@ -145,14 +147,14 @@ fn two_directories_of_one_path_share_nothing() {
 }
 
 #[test]
-fn an_engine_whose_directory_is_removed_comes_back() {
+fn serve_restarts_an_engine_whose_directory_is_removed() {
     let place = Place::new();
     let mut engine = Process::spawn(serve(&place, "gym").stderr(Stdio::null()));
     let mut trainer = place.trainer("gym").unwrap();
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
     play(&mut trainer, 0, 1);
     fs::remove_dir_all(place.root()).unwrap();
-    // A visitor creates the directory again.
+    // Another process creates the directory again.
     running_engines(place.namespace()).unwrap();
     let start = Instant::now();
     let error = loop {
@@ -184,7 +186,7 @@ fn an_engine_ends_with_an_error_when_its_directory_is_removed() {
     assert!(start.elapsed() < Duration::from_secs(2));
 }
 
-/// Engines that are stopped for a second at any moment of their start, with visitors around.
+/// Stops engines for a second at various moments of their start, while other processes list engines.
 #[test]
 fn an_engine_that_is_stopped_while_it_starts_can_be_found() {
     let place = Place::new();
@@ -222,7 +224,7 @@ fn an_engine_that_is_stopped_while_it_starts_can_be_found() {
 }
 
 #[test]
-fn a_stopped_holder_of_the_lock_is_waited_for_and_named() {
+fn waiters_name_a_stopped_holder_of_the_lock_and_continue_after_it() {
     let place = Place::new();
     let _engine = place.engine("gym", 1, 1);
     drop(place.trainer("gym").unwrap());
@@ -236,7 +238,7 @@ fn a_stopped_holder_of_the_lock_is_waited_for_and_named() {
         let (found, expected) = (running_engines(place.namespace()), LockHolder { pid: holder.id(), stopped: true });
         let error = assert_error!(found, ServiceError::NamespaceLocked { holder: Some(it), .. } if *it == expected);
         assert!(error.to_string().contains("kill -CONT"), "{error}");
-        // A caller with more patience continues as soon as the lock is free.
+        // A caller with a longer timeout continues as soon as the lock is free.
         holder.kill();
         waiting.join().unwrap().unwrap();
     });
@@ -250,13 +252,13 @@ fn inside_small_shared_memory_observers_get_what_is_left() {
         return;
     }
     let place = Place::new();
-    // A batch has 1.36 MB: five for the engine and its trainer, four for each observer.
+    // A batch has 1.36 MB; the engine and its trainer need five, each observer four.
     let mut engine = place.engine("gym", 64, 1);
     let mut trainer = place.trainer("gym").unwrap();
     let config = place.connect_config("gym");
     let mut observer = Observer::connect(&config, 0).unwrap();
     assert_error!(Observer::connect(&config, 0), ServiceError::SharedMemoryTooSmall { .. });
-    // Something else takes the rest.
+    // Another file takes the rest.
     fs::write(Path::new(SEGMENTS).join("filler"), vec![1; 14 << 20]).unwrap_err();
     let (mut seen, mut held) = (Vec::new(), Vec::new());
     held.push(reset(&mut trainer, 0));
@@ -276,7 +278,7 @@ fn inside_small_shared_memory_observers_get_what_is_left() {
 #[test]
 fn few_descriptors_are_an_error_or_enough() {
     let place = Place::new();
-    // Without the descriptors that this process has opened for other tests.
+    // Close the descriptors that this process has opened for other tests.
     let closed = "for fd in /proc/$$/fd/*; do fd=${fd##*/}; if ((fd > 2)); then eval \"exec $fd>&-\"; fi; done";
     let limited = |limit: u64| {
         let mut command = place.command("bash");
@@ -292,7 +294,7 @@ fn few_descriptors_are_an_error_or_enough() {
         assert!(text.contains(&format!("the limit of this process is {limit}")), "{text}");
         needed = text.split_whitespace().nth(1).unwrap().parse().unwrap();
     }
-    // The number in the message is enough for a trainer and all observers.
+    // The number in the message suffices for a trainer and all observers.
     let _engine = limited(needed);
     let mut trainer = place.trainer("gym").unwrap();
     let config = place.connect_config("gym");
@@ -304,7 +306,7 @@ fn few_descriptors_are_an_error_or_enough() {
 }
 
 #[test]
-fn a_shared_directory_is_refused_without_advice_to_lock_others_out() {
+fn a_shared_directory_is_refused_without_advising_chmod() {
     let error = running_engines(&Namespace::at("/tmp")).unwrap_err().to_string();
     assert!(error.contains("shared with other users") && !error.contains("chmod"), "{error}");
 }

@@ -1,5 +1,5 @@
-//! Peers that write anything: forged specifications, requests and responses, and memory that changes while it is read. None makes
-//! the other side panic, hang or read beyond its memory.
+//! Malicious peers: forged specifications, requests and responses, and memory that changes while it is read. None may
+//! make the other side panic, hang or read out of bounds.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -25,7 +25,7 @@ fn numbers() -> impl Strategy<Value = u64> {
 }
 
 #[test]
-fn any_text_can_be_a_specification() {
+fn no_specification_text_makes_a_client_panic() {
     let place = Place::new();
     let _engine = place.engine("gym", 1, 1);
     let valid = serde_json::to_vec(place.trainer("gym").unwrap().specification()).unwrap();
@@ -35,7 +35,7 @@ fn any_text_can_be_a_specification() {
         1 => prop::sample::select(vec!["null", "[]", "{}", "-1", "0.5", "\"x\"", ",", ""]).prop_map(|part| part.as_bytes().to_vec()),
         1 => prop::collection::vec(any::<u8>(), 0..9),
     ];
-    // Any place, or the first number behind it.
+    // Replaces a byte at any place, or the first number after it.
     let change = (any::<prop::sample::Index>(), any::<bool>(), parts);
     let mut runner = TestRunner::new(ProptestConfig { failure_persistence: None, ..property_cases(60) });
     runner
@@ -52,7 +52,7 @@ fn any_text_can_be_a_specification() {
             }
             let _published = foreign::specification_text(place.namespace(), "forged", &text);
             let config = ConnectConfig { timeout: Duration::ZERO, ..place.connect_config("forged") };
-            // Valid or not, there is nothing behind it.
+            // Even a valid specification has no services.
             prop_assert!(place.trainer_now("forged").is_err());
             prop_assert!(Observer::connect(&config, 0).is_err());
             Ok(())
@@ -91,7 +91,7 @@ fn any_request_is_answered() {
 }
 
 #[test]
-fn requests_may_change_while_the_engine_reads_them() {
+fn an_engine_survives_requests_that_change_while_it_reads_them() {
     let place = Place::new();
     let _engine = place.engine("gym", 4, 1);
     let specification = place.trainer("gym").unwrap().specification().clone();
@@ -108,7 +108,7 @@ fn requests_may_change_while_the_engine_reads_them() {
 }
 
 #[test]
-fn batches_may_change_while_an_observer_reads_them() {
+fn an_observer_survives_batches_that_change_while_it_reads_them() {
     let place = Place::new();
     let engine = place.engine("model", 2, 1);
     let specification = place.trainer("model").unwrap().specification().clone();
@@ -138,7 +138,7 @@ fn batches_may_change_while_an_observer_reads_them() {
         let start = Instant::now();
         let both = || received.load(Ordering::Relaxed) > 0 && refused.load(Ordering::Relaxed) > 0;
         for step in 0.. {
-            // What the reader meets depends on the scheduler.
+            // What the reader sees depends on the scheduler.
             if step >= 2_000 && (both() || start.elapsed() > Duration::from_secs(60)) {
                 break;
             }
@@ -155,7 +155,7 @@ fn batches_may_change_while_an_observer_reads_them() {
 }
 
 #[test]
-fn a_forged_length_is_cut() {
+fn a_forged_payload_length_is_limited() {
     let place = Place::new();
     let engine = place.engine("model", 1, 1);
     let specification = place.trainer("model").unwrap().specification().clone();

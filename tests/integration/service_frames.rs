@@ -1,4 +1,4 @@
-//! Frames received through the service, while batches are held for random times and processes are killed.
+//! Tests frames received through the service while batches are held for random times and processes are killed.
 //!
 //! The engines check their incremental drawing; the received frames are compared with those of a pool that draws in full.
 
@@ -14,7 +14,7 @@ use rand::{RngExt, SeedableRng};
 
 const NUM_ENVS: usize = 4;
 
-/// Batches that are held, with a copy of their frames from when they were received.
+/// Held batches, with copies of their frames made on receipt.
 #[derive(Default)]
 struct Held(Vec<(BatchLease, Vec<u8>)>);
 
@@ -24,7 +24,7 @@ impl Held {
         self.0.push((received, frames));
     }
 
-    /// Checks all batches and drops some at random, so that at most two are left.
+    /// Checks all batches and drops random ones, so that at most two are left.
     fn release(&mut self, random: &mut SmallRng) {
         for (received, frames) in &self.0 {
             assert!(received.batch().observation() == frames, "a held batch changed");
@@ -79,7 +79,7 @@ fn frames_are_correct_while_batches_are_held_and_processes_restart() {
             engine.kill();
             engine = place.engine("gym", NUM_ENVS, 1);
         }
-        // The next trainer receives chunks that the last one returned.
+        // The next trainer receives chunks that the previous one returned.
         drop(trainer);
         trainer = place.trainer("gym").unwrap();
     }

@@ -1,4 +1,4 @@
-//! An observer that is paused costs the engine nothing, keeps its place, and gets the newest batch when it resumes.
+//! Tests that a paused observer costs the engine nothing, keeps its slot, and gets the newest batch when it resumes.
 
 use std::collections::HashSet;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,7 +14,7 @@ use endless_gym::service::{Engine, EngineConfig, EngineStatus, Observer, Service
 
 const NUM_ENVS: usize = 4;
 
-/// The addresses at which this many batches arrive, of which the trainer holds none.
+/// The addresses of this many batches, none of which the trainer holds.
 fn buffers(trainer: &mut Trainer, batches: usize) -> HashSet<usize> {
     (0..batches).map(|_| step(trainer, 0).blocks().as_ptr().addr()).collect()
 }
@@ -37,7 +37,7 @@ fn the_engine_writes_to_one_buffer_while_observers_are_paused() {
     for round in 0..5 {
         observers.iter_mut().for_each(Observer::pause);
         assert!(observers.iter().all(Observer::is_paused));
-        // The engine learns of it when it sends the next batch.
+        // The engine notices the pause when it sends the next batch.
         step(&mut trainer, 0);
         assert_eq!(buffers(&mut trainer, 20).len(), 1, "round {round}");
         for observer in &mut observers {
@@ -75,7 +75,7 @@ fn a_lease_is_valid_while_its_observer_is_paused() {
 }
 
 #[test]
-fn a_paused_observer_keeps_its_place() {
+fn a_paused_observer_keeps_its_slot() {
     let place = Place::new();
     let config = EngineConfig { observers: 2, ..place.engine_config("gym", NUM_ENVS, 1) };
     let mut engine = Engine::new(memory_gym(), &config).unwrap();
@@ -109,7 +109,7 @@ fn a_paused_observer_keeps_its_place() {
 }
 
 #[test]
-fn the_last_batch_is_sent_again_for_an_observer_that_resumes_while_the_trainer_pauses() {
+fn an_idle_engine_resends_the_last_batch_to_a_resumed_observer() {
     let place = Place::new();
     let _engine = place.engine("gym", NUM_ENVS, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -127,7 +127,7 @@ fn the_last_batch_is_sent_again_for_an_observer_that_resumes_while_the_trainer_p
         }
         let sent = last.as_ref().unwrap().step();
         assert_eq!(other.newest().unwrap().map(|lease| lease.step()), Some(sent));
-        // The same chunk is sent again, unless the trainer holds it.
+        // The engine sends the same chunk again, unless the trainer holds it.
         let held = last.filter(|_| round % 2 == 0);
         let begin = Instant::now();
         let seen = observer.next(TIMEOUT).unwrap();
@@ -138,7 +138,7 @@ fn the_last_batch_is_sent_again_for_an_observer_that_resumes_while_the_trainer_p
         drop(seen);
         assert!(observer.newest().unwrap().is_none());
     }
-    // The trainer goes on, whatever its queue has.
+    // The trainer continues, whatever its queue holds.
     for _ in 0..5 {
         let last = step(&mut trainer, 0);
         expected.step_all(1);

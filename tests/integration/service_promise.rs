@@ -1,5 +1,5 @@
-//! Whether a request was executed never, once, or cannot be known: each row of the table in the documentation of
-//! `endless-gym-service`, with real processes.
+//! Tests how often a request was executed with real processes: each row of the table in the documentation of
+//! `endless-gym-service`.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ fn status(place: &Place) -> EngineStatus {
     EngineStatus::of(place.namespace(), "gym").unwrap()
 }
 
-/// Resets group 0 of an engine, which then has returned one batch.
+/// Resets group 0 of an engine and receives its first batch.
 fn start(trainer: &mut Trainer) {
     trainer.reset(0, ResetRequest::Seed(1)).unwrap();
     assert_eq!(trainer.receive(0, TIMEOUT).unwrap().step(), 1);
@@ -54,7 +54,7 @@ fn after_a_timeout_and_a_reconnection_a_step_is_played_once() {
 }
 
 #[test]
-fn a_step_that_takes_long_is_named_with_its_duration() {
+fn a_timeout_names_a_long_request_with_its_duration() {
     let place = Place::new();
     let engine = place.engine("gym", 1024, 2);
     let mut trainer = place.trainer("gym").unwrap();
@@ -64,7 +64,7 @@ fn a_step_that_takes_long_is_named_with_its_duration() {
         other => panic!("{other:?}"),
     };
     assert_eq!(activity(), EngineActivity::Idle { group: 1, since: None, process: engine.id() });
-    // The engine draws every frame twice, which takes some tens of milliseconds.
+    // The engine draws every frame twice, which takes tens of milliseconds.
     trainer.reset(1, ResetRequest::All).unwrap();
     wait_until("the reset runs", || status(&place).groups[1].busy.is_some());
     engine.stop();
@@ -90,7 +90,8 @@ fn a_step_that_takes_long_is_named_with_its_duration() {
     assert!(error.to_string().contains("the trainer has requested nothing of group 1 for "), "{error}");
 }
 
-/// Starts an engine of the same kind, connects the trainer to it, and returns what became of its last request.
+/// Starts a new engine of the same kind, connects the trainer to it, and returns the fate of the trainer's last
+/// request.
 fn replaced(place: &Place, trainer: &mut Trainer, num_envs: usize) -> (Process, LastRequest, Option<u64>) {
     let successor = place.engine("gym", num_envs, 1);
     let found = trainer.reconnect(TIMEOUT).unwrap();
@@ -100,12 +101,12 @@ fn replaced(place: &Place, trainer: &mut Trainer, num_envs: usize) -> (Process, 
 }
 
 #[test]
-fn a_dead_engine_tells_what_became_of_the_last_request() {
+fn reconnecting_after_an_engines_death_reports_the_fate_of_the_last_request() {
     let place = Place::new();
     let mut engine = place.engine("gym", 2, 1);
     let mut trainer = place.trainer("gym").unwrap();
 
-    // It dies before it takes the request.
+    // The engine dies before it takes the request.
     start(&mut trainer);
     engine.stop();
     send(&mut trainer, 0);
@@ -114,7 +115,7 @@ fn a_dead_engine_tells_what_became_of_the_last_request() {
     let (mut engine, last, lost_step) = replaced(&place, &mut trainer, 2);
     assert_eq!((last, lost_step), (LastRequest::NotPlayed, Some(1)));
 
-    // It dies after it has answered, and the answer has not been received.
+    // The engine dies after it has answered, before the answer is received.
     start(&mut trainer);
     send(&mut trainer, 0);
     wait_until("the engine answers", || status(&place).groups[0].step == 2);
@@ -122,13 +123,14 @@ fn a_dead_engine_tells_what_became_of_the_last_request() {
     let (mut engine, last, lost_step) = replaced(&place, &mut trainer, 2);
     assert_eq!((last, lost_step), (LastRequest::Played, Some(2)));
 
-    // It dies when all is received.
+    // The engine dies after everything is received.
     start(&mut trainer);
     engine.kill();
     let (mut engine, last, lost_step) = replaced(&place, &mut trainer, 2);
     assert_eq!((last, lost_step), (LastRequest::Played, Some(1)));
 
-    // An answer that arrived before its death can still be received. An observer receives it after the trainer.
+    // An answer that arrived before the engine's death can still be received. Once the observer has it, so does the
+    // trainer's queue.
     start(&mut trainer);
     let mut observer = Observer::connect(&place.connect_config("gym"), 0).unwrap();
     send(&mut trainer, 0);
@@ -138,7 +140,7 @@ fn a_dead_engine_tells_what_became_of_the_last_request() {
 }
 
 #[test]
-fn an_engine_that_dies_during_a_request_leaves_it_unknown() {
+fn the_fate_of_a_request_is_unknown_if_the_engine_dies_during_it() {
     let place = Place::new();
     let mut engine = place.engine("gym", 1024, 1);
     let mut trainer = place.trainer("gym").unwrap();
@@ -190,7 +192,7 @@ fn a_rejected_request_changes_nothing_and_its_whole_explanation_arrives() {
     assert_error!(trainer.receive(0, TIMEOUT), ServiceError::Rejected { message, .. } if message.contains(&name));
     let found = trainer.reconnect(TIMEOUT).unwrap().groups[0];
     assert_eq!((found.step, found.last_request), (Some(1), LastRequest::NotPlayed));
-    // The batch that was overwritten by the explanation is drawn in full; the engine checks every frame.
+    // The batch that the explanation overwrote must be drawn in full; the engine checks every frame.
     for number in 2..8 {
         assert_eq!(step(&mut trainer, 0).step(), number);
     }

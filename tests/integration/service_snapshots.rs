@@ -1,4 +1,4 @@
-//! Snapshots through the service: they equal those of a pool in this process and can be restored in both.
+//! Tests that snapshots through the service equal those of a pool in this process and can be restored in both.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -49,7 +49,7 @@ fn restored_environments_continue_identically_in_both_directions() {
     }
     play_both(&mut trainer, &mut player, 40..200);
 
-    // Both are restored, with the environments in reverse order.
+    // Restore both, with the environments in reverse order.
     for (env, snapshot) in taken.iter().rev().enumerate() {
         trainer.restore(0, env, snapshot, TIMEOUT).unwrap();
         player.pool.restore(env, snapshot).unwrap();
@@ -89,7 +89,7 @@ fn mistakes_are_typed_errors() {
     let specification = next.specification().clone();
     drop(next);
 
-    // Lengths beyond the payload.
+    // Lengths beyond the payload are rejected.
     let foreign = Foreign::new(place.namespace(), &specification);
     let good = RequestHeader::reset_all(&specification);
     assert_eq!(foreign.ask(good, foreign.blocks(), |_| {}).unwrap().0, 0);
@@ -114,7 +114,7 @@ fn a_late_snapshot_is_returned_by_the_same_call() {
     assert_error!(trainer.receive_any(TIMEOUT), ServiceError::NothingPending);
     assert_eq!(trainer.snapshot(0, 1, TIMEOUT).unwrap(), expected);
 
-    // Another request replaces it: another environment, another snapshot, a step.
+    // Another request replaces it: for another environment, with another snapshot, or a step.
     let other = trainer.snapshot(0, 2, TIMEOUT).unwrap();
     engine.stop();
     assert_error!(trainer.snapshot(0, 1, short), ServiceError::TimedOut { .. });
@@ -133,7 +133,7 @@ fn a_late_snapshot_is_returned_by_the_same_call() {
 }
 
 #[test]
-fn a_thousand_spotlights_fit() {
+fn a_snapshot_with_a_thousand_spotlights_fits_into_a_message() {
     let place = Place::new();
     let options = serde_json::json!({"initial_spawns": 1000, "num_spawns": 1000, "spot_damage": 0.0});
     let options = ResetOptions::Shared(options.as_object().unwrap().clone());

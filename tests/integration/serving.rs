@@ -1,4 +1,4 @@
-//! What an operator of `endless serve` relies on: checkpoints, status, metrics, logs, and its end. Real processes.
+//! What operators of `endless serve` rely on, with real processes: checkpoints, status, metrics, logs, and its end.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -18,7 +18,7 @@ use serde_json::Value as Json;
 const NUM_ENVS: usize = 3;
 const GROUPS: usize = 2;
 
-/// Environments of which the engine has a twin in this process.
+/// The arguments for environments that have a twin in this process.
 const ENVIRONMENTS: [&str; 7] = [
     "--env=Endless-MysteryPath-v0",
     "--num-envs=3",
@@ -34,14 +34,14 @@ fn serve(place: &Place, more: &[&str]) -> Process {
     Process::spawn(place.endless(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()))
 }
 
-/// Ends an engine by a signal, and returns what it printed.
+/// Ends an engine with a signal, and returns what it printed.
 fn ended(mut engine: Process, by: Signal) -> String {
     engine.signal(by);
     assert!(engine.wait().success());
     engine.output()
 }
 
-/// The engine's environments in this process.
+/// The same environments as the engine's, in this process.
 struct Twin {
     groups: Vec<Player>,
 }
@@ -80,7 +80,7 @@ impl Twin {
         }
     }
 
-    /// Plays steps whose actions depend on their numbers.
+    /// Plays steps with actions derived from step, environment and group.
     fn play(&mut self, trainer: &mut Trainer, steps: std::ops::Range<usize>) {
         for step in steps {
             for (group, twin) in self.groups.iter_mut().enumerate() {
@@ -95,13 +95,13 @@ impl Twin {
 }
 
 #[test]
-fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
+fn a_resumed_engine_continues_identically() {
     let place = Place::new();
     let file = place.root().join("state");
     let checkpoint = format!("--checkpoint={}", file.display());
     let mut twin = Twin::new();
 
-    // On request; then the engine is killed, and everything after the checkpoint is lost.
+    // Checkpoint on request; then the engine is killed, and everything after the checkpoint is lost.
     let mut engine = serve(&place, &[&checkpoint]);
     let mut trainer = place.trainer("gym").unwrap();
     assert_rejected(trainer.checkpoint(TIMEOUT), Rejection::NotReset, "");
@@ -113,7 +113,7 @@ fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
     }
     engine.kill();
 
-    // Two engines do not save to one file, whatever their names are.
+    // Two engines cannot save to one file, even with different names.
     let first = serve(&place, &[&checkpoint, "--resume"]);
     drop(place.trainer("gym").unwrap());
     let named = ENVIRONMENTS.map(|argument| if argument == "--service=gym" { "--service=second" } else { argument });
@@ -142,7 +142,7 @@ fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
     twin.adopt(&mut trainer);
     twin.play(&mut trainer, 70..140);
 
-    // On SIGTERM; a new trainer adopts the episodes.
+    // Checkpoint on SIGTERM; a new trainer adopts the episodes.
     drop(trainer);
     let output = ended(engine, Signal::TERM);
     assert!(output.contains("resumed from") && output.contains("after 71, 71 batches"), "{output}");
@@ -151,7 +151,7 @@ fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
     twin.adopt(&mut trainer);
     twin.play(&mut trainer, 140..160);
 
-    // Periodically, until nothing changes.
+    // Checkpoint periodically, until nothing changes.
     let saved = || place.status("gym")["checkpoints"].as_u64().unwrap();
     wait_until("nothing is saved any more", || {
         let before = saved();
@@ -167,7 +167,7 @@ fn an_engine_that_resumes_continues_as_one_that_never_stopped() {
 }
 
 #[test]
-fn a_checkpoint_that_is_missing_or_damaged_is_told_apart() {
+fn missing_and_damaged_checkpoints_are_told_apart() {
     let place = Place::new();
     let file = place.root().join("state");
     let checkpoint = format!("--checkpoint={}", file.display());
@@ -243,7 +243,7 @@ fn status_shows_engines_and_their_processes() {
     drop((seen, observer));
     assert_eq!(place.status("gym")["groups"][1]["observers"], Json::Array(vec![]));
 
-    // An engine that is stopped does not answer, and its status can still be read.
+    // A stopped engine does not answer, but its status can still be read.
     engine.stop();
     send(&mut trainer, 0);
     assert_eq!(place.status("gym")["groups"][0]["step"], 53);
@@ -258,7 +258,7 @@ fn status_shows_engines_and_their_processes() {
     watch.wait();
 }
 
-/// The answer to a request, head and body.
+/// Sends a request and returns the answer, head and body.
 fn http(address: &str, request: &str) -> String {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.write_all(request.as_bytes()).unwrap();
@@ -274,7 +274,7 @@ fn metrics_are_served_for_prometheus() {
     let mut lines = BufReader::new(engine.0.stdout.take().unwrap()).lines();
     let printed = lines.by_ref().map(Result::unwrap).find(|line| line.starts_with("metrics at ")).unwrap();
     let address = printed.strip_prefix("metrics at http://").unwrap().strip_suffix("/metrics").unwrap().to_owned();
-    // Clients that send half a request, and one that never reads.
+    // Clients that send half a request and never read.
     let _stuck: Vec<_> = (0..20)
         .map(|_| {
             let mut stream = TcpStream::connect(&address).unwrap();
@@ -299,7 +299,7 @@ fn metrics_are_served_for_prometheus() {
         assert!(body.lines().any(|found| found == line), "{line}: {body}");
     }
     assert!(body.contains("endless_gym_engine_info{service=\"gym\",id=\"Endless-MysteryPath-v0\",num_envs=\"3\""));
-    // Every sample has its HELP and TYPE before it.
+    // HELP and TYPE precede every sample.
     let mut described = (String::new(), String::new());
     for line in body.lines() {
         match line.split(' ').collect::<Vec<_>>()[..] {
@@ -320,7 +320,7 @@ fn metrics_are_served_for_prometheus() {
     );
     let taken = place.run(&["serve", "--service=other", &format!("--metrics={address}")]);
     assert!(text(&taken.stderr).starts_with(&format!("endless: --metrics {address}: ")), "{}", text(&taken.stderr));
-    // The stuck clients do not delay the end.
+    // The stuck clients do not delay the engine's end.
     let start = Instant::now();
     engine.signal(Signal::TERM);
     assert!(engine.wait().success());
@@ -328,7 +328,7 @@ fn metrics_are_served_for_prometheus() {
 }
 
 #[test]
-fn logs_follow_the_option_and_the_variable() {
+fn the_log_option_overrides_the_variable() {
     let place = Place::new();
     let errors = |arguments: &[&str], variable: Option<&str>| {
         let mut command = place.endless(&[&["serve", "--num-envs=1"], arguments].concat());
@@ -356,7 +356,7 @@ fn logs_follow_the_option_and_the_variable() {
 #[test]
 fn a_second_signal_ends_the_program_at_once() {
     let place = Place::new();
-    // A fifo without a reader: the last checkpoint cannot be written, and the engine never ends by itself.
+    // A FIFO without a reader blocks the last checkpoint, so the engine never ends on its own.
     let fifo: PathBuf = place.root().join("state.new");
     let mut engine = serve(&place, &[&format!("--checkpoint={}", place.root().join("state").display())]);
     Twin::new().reset(&mut place.trainer("gym").unwrap());

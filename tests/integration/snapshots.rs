@@ -1,4 +1,4 @@
-//! Snapshots: a restored environment continues identically in any pool.
+//! Tests that an environment restored from a snapshot continues identically in any pool.
 
 use crate::support::player::{Player, random_actions};
 use endless_gym::memory_gym;
@@ -25,7 +25,7 @@ fn a_restored_environment_continues_identically() {
             original.observe();
             restored.observe();
             assert!(original.bytes() == restored.bytes(), "{} after {played}", spec.id);
-            // Over the ends of episodes, so that the generator counts.
+            // Long enough for episodes to end, so that the generator matters.
             for step in 0..400 {
                 let actions = random_actions(spec, 1, &mut random);
                 original.step(&actions);

@@ -1,4 +1,4 @@
-//! `endless play --terminal` and `endless view --terminal` in a pseudo-terminal, whose screen a terminal emulator keeps.
+//! `endless play --terminal` and `endless view --terminal` in a pseudo-terminal with a terminal emulator.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -48,13 +48,13 @@ impl Session {
         self.screen.lock().unwrap().screen().contents()
     }
 
-    /// Waits until the screen has that text.
+    /// Waits until the screen shows that text.
     #[track_caller]
     fn wait_for(&self, text: &str) {
         wait_until(text, || self.contents().contains(text));
     }
 
-    /// The picture of a frame's size in the upper left corner, in rows.
+    /// The frame-sized picture in the upper left corner, in rows.
     fn picture(&self) -> Vec<[u8; 3]> {
         let parser = self.screen.lock().unwrap();
         let pixel = |place: u16| {
@@ -67,7 +67,7 @@ impl Session {
         (0..84 * 84).map(pixel).collect()
     }
 
-    /// Whether the terminal reads lines and shows what is typed, as a shell needs it, outside the alternate screen.
+    /// Whether the terminal is restored for a shell: line mode with echo, outside the alternate screen.
     fn is_left(&self) -> bool {
         let modes = tcgetattr(&self.terminal).unwrap().local_modes;
         let has_lines = modes.contains(LocalModes::ICANON | LocalModes::ECHO);
@@ -78,7 +78,7 @@ impl Session {
 
     fn end(&mut self) -> Option<i32> {
         let status = self.process.wait();
-        // What it wrote last may not have been read yet.
+        // Its last output may not have been read yet.
         std::thread::sleep(Duration::from_millis(300));
         assert!(self.is_left(), "{}", self.contents());
         status.code()
@@ -106,7 +106,7 @@ fn a_game_is_played_with_keys() {
     session.press("r");
     session.wait_for("step 0 ");
     assert!(session.picture() == frame(id, 3, &[]));
-    // Up, and left by the other key.
+    // Up with an arrow key, left with the letter key.
     session.press("\x1b[A");
     session.wait_for("step 1 ");
     session.press("a");
@@ -127,7 +127,7 @@ fn a_game_is_played_with_keys() {
 }
 
 #[test]
-fn the_terminal_is_left_after_signals() {
+fn the_terminal_is_restored_after_signals() {
     let place = Place::new();
     for (given, name) in [(Signal::TERM, "TERM"), (Signal::HUP, "HUP")] {
         let mut session = Session::start(&mut place.endless(&["play", "--terminal"]));
@@ -143,7 +143,7 @@ fn the_terminal_is_left_after_signals() {
 }
 
 #[test]
-fn what_cannot_be_played_is_an_error() {
+fn a_missing_terminal_and_invalid_arguments_are_errors() {
     let place = Place::new();
     let run = |arguments: &[&str]| {
         let output = place.endless(arguments).stdin(Stdio::null()).output().unwrap();

@@ -1,4 +1,4 @@
-//! Recorded episodes of the original replay without a difference.
+//! Tests that recorded episodes of the original replay without a difference.
 
 use std::io::Read;
 
@@ -45,7 +45,7 @@ traces! {
     endless_searing_spotlights: "Endless-SearingSpotlights-v0",
 }
 
-/// A replay that finds nothing wrong with a wrong trace would prove nothing.
+/// Shows that a replay finds the differences in a wrong trace.
 #[test]
 fn every_kind_of_difference_is_found() {
     let open = |id: &str, file: usize| {
@@ -77,7 +77,7 @@ fn every_kind_of_difference_is_found() {
     }
 }
 
-/// A checksum tells that a frame differs; the recorded frames tell where.
+/// Checksums show that a frame differs, the recorded frames where.
 #[test]
 fn the_first_frames_are_the_same_byte_by_byte() {
     for spec in memory_gym().specs() {
@@ -97,7 +97,8 @@ fn the_first_frames_are_the_same_byte_by_byte() {
     }
 }
 
-/// The traces alone cover these reset parameters: the published original, with which `tests/integration/live.rs` compares, lacks them.
+/// Only the traces cover these reset parameters, since the published original, with which `tests/integration/live.rs`
+/// compares, lacks them.
 #[test]
 fn traces_have_the_newest_reset_parameters() {
     for (trace, parameter) in [
@@ -111,7 +112,7 @@ fn traces_have_the_newest_reset_parameters() {
 }
 
 #[test]
-fn a_byte_that_differs_is_found() {
+fn the_first_differing_byte_is_found() {
     let frame = recorded_frames("MysteryPath-v0").remove(0);
     let mut other = frame.clone();
     other[(7 * 84 + 30) * 3 + 2] ^= 4;
@@ -120,7 +121,7 @@ fn a_byte_that_differs_is_found() {
     assert_eq!((place, expected ^ found), ([7, 30, 2], 4));
 }
 
-/// The raw frames that were recorded of an id.
+/// The recorded raw frames of an id.
 fn recorded_frames(id: &str) -> Vec<Vec<u8>> {
     let file = std::fs::File::open(reference().join(format!("frames/{id}.gz"))).unwrap();
     let mut bytes = Vec::new();
@@ -130,7 +131,7 @@ fn recorded_frames(id: &str) -> Vec<Vec<u8>> {
     frames.map(<[u8]>::to_vec).collect()
 }
 
-/// The first `count` frames of the engine when it plays a trace, with the checksums of the trace.
+/// The engine's first `count` frames when it plays a trace, with the trace's checksums.
 fn frames(trace: &Trace, count: usize) -> Vec<(Vec<u8>, u32)> {
     let config = PoolConfig {
         options: ResetOptions::Shared(trace.options.clone()),
@@ -180,7 +181,7 @@ fn a_trace_without_its_last_steps_is_an_error() {
                 assert!(matches!(error, TraceError::Truncated { episode, .. } if episode == last), "{error}");
             }
             assert!(matches!(truncated(|trace| trace.episodes.clear()), Err(TraceError::Empty)));
-            // A recording with another limit states it.
+            // A recording with another step limit states it.
             let limited = truncated(|trace| {
                 trace.max_steps = Some(10);
                 trace.episodes.iter_mut().for_each(|episode| episode.steps.truncate(10));

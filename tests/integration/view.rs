@@ -1,4 +1,4 @@
-//! `endless view`: what a browser receives of a running engine, and who is refused.
+//! `endless view`: what a browser receives from a running engine, and which requests are refused.
 
 use std::io::{BufRead, BufReader, Read};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -38,7 +38,7 @@ fn the_token_the_host_and_the_origin_are_required() {
         "{headers}"
     );
     let body = String::from_utf8(body).unwrap();
-    // Every file that the page names is there.
+    // The server has every file that the page uses.
     assert!(body.contains(&format!("<base href=\"/{token}/\">")), "{body}");
     for name in ["style.css", "view.css", "icon.svg", "view.js", "frames.js", "curves.js", "engines.js", "numbers.js"] {
         let (status, headers, body) = server.get(&format!("/{token}/{name}"), &[]);
@@ -63,13 +63,13 @@ fn the_token_the_host_and_the_origin_are_required() {
     {
         assert_eq!(server.status(&format!("/{token}/{path}"), &[]), 404, "{path}");
     }
-    // No other interface of the machine is bound.
+    // The server binds no other interface.
     assert!(server.address().ip().is_loopback());
     server.process.interrupt();
 }
 
 #[test]
-fn frames_are_the_batchs_bytes_in_every_layout() {
+fn frames_equal_the_bytes_of_the_batch_in_every_format() {
     for (number, format) in pixel_formats().enumerate() {
         let stack = [1, 3][number % 2];
         let place = Place::new();
@@ -85,10 +85,10 @@ fn frames_are_the_batchs_bytes_in_every_layout() {
         let mut socket = server.show("endless");
         let envs = [3, 0, 4];
         socket.select(0, &envs);
-        // A page shows what is sent after its server has connected.
+        // A page shows only batches sent after its server has connected.
         socket.wait(|about| about["state"] == "live");
         let config = PoolConfig { frames: Some(Frames { format, stack }), ..PoolConfig::new(id, 5) };
-        // The same episode as [x][y][channel].
+        // The second twin plays the same episode with frames as [x][y][channel].
         let mut twins = [Player::new(&config), Player::new(&PoolConfig::new(id, 5))];
         reset(&mut trainer, 0);
         twins.iter_mut().for_each(|twin| twin.reset(ResetRequest::Seed(3)));
@@ -108,7 +108,7 @@ fn frames_are_the_batchs_bytes_in_every_layout() {
         assert_eq!(about["batch"]["envs"][2]["return"], batch.episode_return()[4]);
         assert_eq!(about["batch"]["envs"][1]["length"], batch.episode_length()[0]);
 
-        // The strides lead to the pixels.
+        // The strides give the pixels.
         let frame = &about["batch"]["frame"];
         let number = |name: &str| frame[name].as_u64().unwrap() as usize;
         assert_eq!((number("width"), number("height"), number("stack")), (84, 84, stack));
@@ -125,7 +125,7 @@ fn frames_are_the_batchs_bytes_in_every_layout() {
 }
 
 #[test]
-fn without_frames_there_are_numbers() {
+fn a_page_shows_numbers_if_there_are_no_frames() {
     let place = Place::new();
     let arguments = ["--env", "MortarMayhem-v0", "--num-envs", "3", "--groups", "2", "--no-frames", "--features"];
     let _engine = place.serve(&arguments);
@@ -146,7 +146,7 @@ fn without_frames_there_are_numbers() {
 }
 
 #[test]
-fn an_engine_is_lost_and_found_and_not_observed_without_a_browser() {
+fn a_lost_engine_is_found_again_and_is_observed_only_for_a_browser() {
     let place = Place::new();
     let server = Server::start(place.endless(&["view", "endless"]));
     let mut socket = server.show("endless");
@@ -176,7 +176,7 @@ fn an_engine_is_lost_and_found_and_not_observed_without_a_browser() {
     step(&mut trainer, 0);
     assert_eq!(observers(&place), 0);
 
-    // Curves go on, with the points from before.
+    // The curves continue after their earlier points.
     let mut socket = server.show("endless");
     wait_for_observers(&place, 1);
     let first = socket.points();
@@ -220,7 +220,7 @@ fn the_page_is_opened_in_a_browser() {
 }
 
 #[test]
-fn without_a_browser_the_page_is_served_and_one_line_says_why() {
+fn the_page_is_served_without_a_browser_and_one_line_reports_it() {
     let place = Place::new();
     std::fs::create_dir(place.root().join("empty")).unwrap();
     place.script("failing/xdg-open", "echo > \"$0.ran\"; exit 3");
@@ -249,7 +249,7 @@ fn without_a_browser_the_page_is_served_and_one_line_says_why() {
     }
 }
 
-/// Steps without a pause until it is told to stop.
+/// Steps without pause while `work` runs.
 fn train_while<R>(trainer: &mut Trainer, work: impl FnOnce() -> R) -> R {
     let done = AtomicBool::new(false);
     std::thread::scope(|scope| {
@@ -266,13 +266,13 @@ fn train_while<R>(trainer: &mut Trainer, work: impl FnOnce() -> R) -> R {
 }
 
 #[test]
-fn without_a_page_no_batch_is_taken() {
+fn no_batch_is_taken_without_a_page() {
     let place = Place::new();
     let _engine = place.serve(&["--env", "MortarMayhem-Grid-v0", "--num-envs", "4"]);
     let server = Server::start(place.endless(&["view", "endless"]));
     let mut trainer = place.trainer("endless").unwrap();
     reset(&mut trainer, 0);
-    // Reading the page and the list of engines is not looking at one.
+    // Loading the page and the list of engines observes no engine.
     let token = server.token().to_owned();
     for path in [format!("/?token={token}"), format!("/{token}/view.js"), format!("/{token}/engines")] {
         assert_eq!(server.status(&path, &[]), 200);
@@ -302,10 +302,10 @@ fn a_batch_is_taken_only_for_a_message() {
     reset(&mut trainer, 0);
     let mut socket = server.show("endless");
     wait_for_observers(&place, 1);
-    // One that shows environments, and one in the background, which gets one message with each status.
+    // A page that shows environments, and one in the background, which gets one message per status.
     for (shown, least) in [(&[0, 1][..], 20), (&[], 3)] {
         socket.select(0, shown);
-        // Until the selection is in effect, messages are those of the one before.
+        // Skip messages for the previous selection.
         let (begin, messages) = train_while(&mut trainer, || {
             socket.wait(|about| about["batch"]["envs"].as_array().is_some_and(|envs| envs.len() == shown.len()));
             let begin = taken(&place);
@@ -314,7 +314,7 @@ fn a_batch_is_taken_only_for_a_message() {
             }
             (begin, least)
         });
-        // What is on its way, up to the answer to a selection that no other message has.
+        // Count the messages still on their way, up to the answer to a new, distinct selection.
         socket.select(0, &[1]);
         let mut messages = messages + 1;
         while socket.next().0["batch"]["envs"].as_array().is_none_or(|envs| envs.len() != 1) {
@@ -339,7 +339,7 @@ fn a_busy_engine_writes_to_one_buffer_while_a_page_shows_it() {
         let messages = AtomicUsize::new(0);
         let last = std::thread::scope(|scope| {
             let training = scope.spawn(|| {
-                // Batches in a row that have come in the same memory. With an observer that can receive there are no two.
+                // Successive batches in the same memory. With an active observer, there are never two.
                 let (mut address, mut in_a_row, start) = (0, 0, Instant::now());
                 loop {
                     assert!(start.elapsed() < TIMEOUT, "{in_a_row} batches in one buffer, {shown:?}");
@@ -357,7 +357,7 @@ fn a_busy_engine_writes_to_one_buffer_while_a_page_shows_it() {
             }
             training.join().unwrap()
         });
-        // The last batch is shown, also of other environments than before.
+        // The page shows the last batch, even of environments not shown before.
         socket.wait(|about| about["batch"]["step"] == last);
         socket.select(0, &[7, 50, 98]);
         socket.wait(|about| {

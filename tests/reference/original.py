@@ -1,4 +1,4 @@
-"""The original environments, and how an episode in them is recorded. Needs memory-gym 1.0.2 or 1.0.3 on Python 3.11."""
+"""The original environments, and the recording of their episodes. Needs memory-gym 1.0.2 or 1.0.3 on Python 3.11."""
 
 import os
 import warnings
@@ -16,7 +16,7 @@ import numpy  # noqa: E402
 
 
 class Original:
-    """One environment object of the original, with which several episodes can be played in a row."""
+    """One environment object of the original, which can play several episodes in a row."""
 
     def __init__(self, env_id: str, options: dict[str, Any]) -> None:
         self.env: Any = gymnasium.make(env_id, disable_env_checker=True, render_mode="debug_rgb_array").unwrapped
@@ -35,9 +35,9 @@ class Original:
 
         Args:
             seed: Seed of the reset; None continues the object's random generator.
-            actions: Integers or lists of integers. Each is taken when the environment is ready for it.
-            views: Whether each step also has the checksum of the ground-truth view.
-            frames: The observations, uint8 (84, 84, 3), are appended to this list.
+            actions: Integers or lists of integers, each requested when the environment is ready for it.
+            views: Whether to record the checksum of the ground-truth view with each step.
+            frames: A list to which the observations, uint8 (84, 84, 3), are appended.
         """
         observation, info = self.env.reset(seed=seed, options=dict(self.options))
         if self._is_endless_path:
@@ -64,8 +64,8 @@ class Original:
 class _Start(tuple[int, int]):
     """The first tile of an endless path, which equals its coordinates.
 
-    Version 1.0.2 compares the node itself with a pair of numbers, so that the first tile counts as progress; 1.0.3 compares
-    its coordinates. This makes 1.0.2 do as 1.0.3 does.
+    Version 1.0.2 compares the node itself with a pair of numbers, so that the first tile counts as progress; 1.0.3
+    compares its coordinates. This makes 1.0.2 behave like 1.0.3.
     """
 
     x = property(lambda self: self[0])

@@ -1,7 +1,7 @@
 """Plays given actions in the original and prints the trace; `tests/integration/live.rs` runs it.
 
-Reads one request a line: {"env", "options", "views", "episodes": [{"seed", "actions"}]}. Answers each with one line: a trace as
-README.md describes it, or {"error": text} if the original raises.
+Reads one request per line: {"env", "options", "views", "episodes": [{"seed", "actions"}]}. Answers each with one line:
+a trace in the format of README.md, or {"error": text} if the original raises.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Policies that choose the recorded actions.
 
-A policy maps an environment of the original and a generator to an action. The generator is Python's, so that the choice of
-actions draws nothing from the environment's.
+A policy maps an environment of the original and a generator to an action. The generator is Python's, so that
+choosing actions draws nothing from the environment's.
 """
 
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def mixed(error_rate: float) -> Policy:
     return lambda env, rng: uniform(env, rng) if rng.random() < error_rate else oracle(env, rng)
 
 
-#: By the name in a trace.
+#: Policies by their name in a trace.
 POLICIES: dict[str, Policy] = {
     "random": uniform,
     "constant": constant,

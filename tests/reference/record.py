@@ -3,8 +3,8 @@
     python record.py OUT                                      # all of them, to compare them with those of this folder
     python record.py OUT --salt more --only MysteryPath-v0    # others: the salt varies seeds and actions
 
-Writes OUT/traces, OUT/views and OUT/frames in the format that README.md describes. Recordings whose options the installed version
-of memory-gym does not have are left out, and named on standard error.
+Writes OUT/traces, OUT/views and OUT/frames in the format that README.md describes. Recordings with options that the
+installed version of memory-gym lacks are skipped, and listed on standard error.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from policies import POLICIES
 
 Options = dict[str, Any]
 
-#: Options beside the defaults.
+#: Sets of options besides the defaults.
 VARIANTS: dict[str, list[Options]] = {
     "MortarMayhem-v0": [
         {
@@ -163,7 +163,7 @@ VARIANTS: dict[str, list[Options]] = {
     ],
 }
 
-#: Frames that are kept of an id, and the policy of the trace that they belong to.
+#: Number of frames kept for each id, and the policy of the trace that they come from.
 FRAMES = 40
 FRAMES_OF = "mixed20"
 
@@ -174,9 +174,9 @@ class Kind(NamedTuple):
     folder: str
     salt: str
     episodes: int
-    #: At most, of an episode.
+    #: Maximum number of steps of an episode.
     steps: int
-    #: Whether the ground-truth view is recorded too.
+    #: Whether the ground-truth view is recorded, too.
     views: bool
 
 
@@ -196,7 +196,7 @@ class Plan(NamedTuple):
         return f"{self.env_id}.{self.number:02d}.{self.policy}"
 
     def kinds(self) -> list[Kind]:
-        """What is recorded of it."""
+        """The kinds of recordings made of it."""
         return [TRACES] if self.options or self.policy == "constant" else [TRACES, VIEWS]
 
     def record(self, kind: Kind) -> tuple[dict[str, Any], list[Any]]:
@@ -207,7 +207,7 @@ class Plan(NamedTuple):
         episodes: list[Any] = []
         frames: list[Any] = []
         for episode in range(kind.episodes):
-            # Every second episode continues the generator.
+            # Every second episode has no seed and continues the generator.
             seed = first_seed + episode if episode % 2 == 0 else None
             actions = (POLICIES[self.policy](original.env, rng) for _ in range(kind.steps))
             episodes.append(original.episode(seed, actions, kind.views, frames))
@@ -223,13 +223,13 @@ def plans(env_id: str) -> Iterator[Plan]:
 
 
 def write(path: Path, data: bytes) -> None:
-    """Write a gzip file without a time, so that equal recordings are equal files."""
+    """Write a gzip file without a timestamp, so that equal recordings give equal files."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(gzip.compress(data, 9, mtime=0))
 
 
 def main() -> None:
-    """Record what the command line asks for."""
+    """Record what the command line requests."""
     parser = argparse.ArgumentParser(description="Record episodes in the original environments.")
     parser.add_argument("out", type=Path, help="folder to write to")
     parser.add_argument("--salt", help="text that varies seeds and actions (default: that of the recordings)")

@@ -1,5 +1,5 @@
-//! A headless Chromium, driven over pipes by the DevTools protocol.
-#![allow(dead_code)] // The tests of the page that plays use it too.
+//! A headless Chromium, controlled over pipes with the DevTools protocol.
+#![allow(dead_code)] // Some functions are only used by the tests of bindings/web.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
@@ -11,10 +11,10 @@ use serde_json::{Value as Json, json};
 /// How long a condition may take; the machine may be busy with other tests.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// The programs that may be Chromium, beside the one that the environment variable CHROMIUM names. `cargo xtask` looks for the same.
+/// Names of Chromium's program, unless the environment variable CHROMIUM names one. `cargo xtask` looks for the same.
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
-/// The name of a site that resolves to this machine, as an attacker's would after a change of its address.
+/// A host name that resolves to this machine, as in a DNS rebinding attack.
 pub const REBOUND: &str = "rebound.test";
 
 /// A browser with one tab.
@@ -24,9 +24,9 @@ pub struct Chromium {
     from: BufReader<ChildStdout>,
     calls: u64,
     session: Option<String>,
-    /// What the page complained about: exceptions, errors of the console, files that could not be loaded.
+    /// The page's errors: exceptions, console errors, and files that could not be loaded.
     pub complaints: Vec<String>,
-    /// The profile, with the folder of downloads.
+    /// The folder with the profile and the downloads.
     folder: PathBuf,
 }
 
@@ -35,10 +35,10 @@ impl Chromium {
     pub fn start(folder: &Path, (width, height): (u32, u32)) -> Self {
         let _ = std::fs::remove_dir_all(folder);
         std::fs::create_dir_all(folder.join("downloads")).unwrap();
-        // Commands come from descriptor 3, and answers go to descriptor 4.
+        // Chromium reads commands from descriptor 3 and writes answers to descriptor 4.
         let mut command = Command::new("sh");
         command.args(["-c", r#"exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null"#, &program()]);
-        // It only loads the page of this test, and not every container permits its sandbox.
+        // No sandbox: it loads only the page under test, and not every container permits a sandbox.
         command.args(["--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu", "--no-first-run"]);
         command.args(["--disable-background-networking", "--disable-dev-shm-usage", "--disable-extensions"]);
         command.arg(format!("--host-resolver-rules=MAP {REBOUND} 127.0.0.1"));
@@ -61,7 +61,7 @@ impl Chromium {
         chromium
     }
 
-    /// Another size of the window; a phone has a touch screen.
+    /// Resizes the window. A phone has a touch screen.
     pub fn resize(&mut self, width: u32, height: u32, phone: bool) {
         let metrics = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": phone});
         self.call("Emulation.setDeviceMetricsOverride", &metrics);
@@ -74,7 +74,7 @@ impl Chromium {
         assert!(answer["errorText"].is_null(), "{url}: {}", answer["errorText"]);
     }
 
-    /// The value of an expression in the page, once it is settled.
+    /// The value of an expression in the page. Waits if it is a promise.
     pub fn value(&mut self, expression: &str) -> Json {
         let arguments = json!({"expression": expression, "awaitPromise": true, "returnByValue": true});
         let answer = self.call("Runtime.evaluate", &arguments);
@@ -82,7 +82,7 @@ impl Chromium {
         answer["result"]["value"].clone()
     }
 
-    /// Waits until an expression is true; until then it may fail, as while a page is loading.
+    /// Waits until an expression is true. Until then it may fail, for example while a page is loading.
     pub fn wait(&mut self, expression: &str) {
         let start = Instant::now();
         loop {
@@ -106,12 +106,12 @@ impl Chromium {
         self.key("keyUp", code);
     }
 
-    /// `rawKeyDown` or `keyUp`.
+    /// Sends a `rawKeyDown` or `keyUp`.
     pub fn key(&mut self, kind: &str, code: &str) {
         self.call("Input.dispatchKeyEvent", &json!({"type": kind, "code": code, "key": code}));
     }
 
-    /// `touchStart` or `touchEnd` in the middle of an element.
+    /// Sends a `touchStart` or `touchEnd` in the middle of an element.
     pub fn touch(&mut self, kind: &str, selector: &str) {
         let middle = format!(
             "(() => {{ const e = document.querySelector({}); e.scrollIntoView({{block: 'center', behavior: 'instant'}}); \
@@ -123,14 +123,14 @@ impl Chromium {
         self.call("Input.dispatchTouchEvent", &json!({"type": kind, "touchPoints": points}));
     }
 
-    /// Chooses a file in the page's field for files.
+    /// Chooses a file in a file input of the page.
     pub fn choose(&mut self, selector: &str, file: &Path) {
         let root = self.call("DOM.getDocument", &json!({}))["root"]["nodeId"].clone();
         let field = self.call("DOM.querySelector", &json!({"nodeId": root, "selector": selector}))["nodeId"].clone();
         self.call("DOM.setFileInputFiles", &json!({"nodeId": field, "files": [file]}));
     }
 
-    /// The file that the page has saved, once it is complete.
+    /// Waits for the file that the page saves.
     pub fn download(&mut self) -> PathBuf {
         let start = Instant::now();
         loop {

@@ -1,4 +1,4 @@
-//! Engines and trainers that are written against the protocol and do not use the library. They can send invalid messages.
+//! Engines and trainers that implement the protocol without the library, so that they can send invalid messages.
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -122,8 +122,8 @@ impl Foreign {
         self.answer()
     }
 
-    /// Sends a request with any header, and changes header and payload by `words` until the engine has answered or for 20
-    /// milliseconds, which is long enough for it to read them several times.
+    /// Sends a request, and overwrites its header and payload with `words` until the engine answers or 20 milliseconds
+    /// have passed, long enough for the engine to read them several times.
     pub fn ask_while_changing(&self, header: RequestHeader, mut words: impl FnMut() -> u64) {
         let mut message = self.loan(header, self.blocks);
         let mut memory = SharedWords::of(message.user_header_mut());
@@ -131,7 +131,7 @@ impl Foreign {
         message.send().unwrap();
         let start = Instant::now();
         while start.elapsed() < Duration::from_millis(20) && self.subscriber.receive().unwrap().is_none() {
-            // The incarnation is kept: a request for another one is dropped.
+            // Keep the incarnation, since requests for another one are dropped.
             memory.change([0, 2, 3, 4, 5, 6, 7, 8][words() as usize % 8], words());
             for _ in 0..64 {
                 payload.change(words() as usize, words());
@@ -168,10 +168,10 @@ impl SharedWords {
         SharedWords { count: size_of_val(value) / size_of::<u64>(), first: std::ptr::from_mut(value).cast() }
     }
 
-    /// Writes one of the words.
+    /// Overwrites one of the words.
     pub fn change(&mut self, index: usize, word: u64) {
-        // SAFETY: a header or a payload is aligned to words, and mapped for writing as long as its publisher exists, which the tests
-        // guarantee.
+        // SAFETY: a header or payload is aligned to words, and mapped for writing as long as its publisher exists,
+        // which the tests ensure.
         unsafe { self.first.add(index % self.count).write_volatile(word) };
     }
 }
@@ -183,21 +183,21 @@ pub struct Engine {
     _parts: Box<dyn std::any::Any>,
 }
 
-/// The headers in shared memory of a message that was sent.
+/// A sent message in shared memory.
 pub struct SentHeader {
-    /// All of the user header.
+    /// The whole user header.
     pub words: SharedWords,
     pub payload: SharedWords,
     header: *mut ResponseHeader,
-    /// The number of blocks of the payload in iceoryx2's header.
+    /// The payload's number of blocks in iceoryx2's header.
     length: *mut u64,
 }
 
 impl SentHeader {
     /// Changes group, step and number of blocks after the message was received.
     pub fn overwrite(&mut self, group: u32, step: u64, blocks: u64) {
-        // SAFETY: the chunk is mapped as long as the publisher exists, which the tests guarantee. Its receiver holds it, so the
-        // publisher does not reuse it.
+        // SAFETY: the chunk is mapped as long as the publisher exists, which the tests ensure. Its receiver holds it,
+        // so the publisher does not reuse it.
         unsafe {
             (&raw mut (*self.header).group).write_volatile(group);
             (&raw mut (*self.header).step).write_volatile(step);
@@ -206,7 +206,8 @@ impl SentHeader {
     }
 }
 
-/// The address of the number of elements in iceoryx2's header, whose fields are private: it is the last word of that value.
+/// The address of the number of elements in iceoryx2's header, whose fields are private: the last word with the value
+/// `value`.
 fn number_of_elements(header: &Header, value: usize) -> *mut u64 {
     let first = std::ptr::from_ref(header).cast::<u64>().cast_mut();
     let words = size_of::<Header>() / size_of::<u64>();
@@ -256,7 +257,7 @@ impl Engine {
     }
 }
 
-/// A specification that is published like an engine's, until this is dropped.
+/// A specification, published like an engine's until this is dropped.
 struct Published {
     path: PathBuf,
     /// Holds the lock.
@@ -279,7 +280,7 @@ fn publish(namespace: &Namespace, service: &str, layout_version: u32, text: &[u8
     let head = [&b"EGYMSTAT"[..], &layout_version.to_ne_bytes(), &7_u32.to_ne_bytes(), &package, &length.to_ne_bytes()];
     let head = head.concat();
     bytes[8..][..head.len()].copy_from_slice(&head);
-    // After incarnation and time of the start.
+    // The number of groups, after incarnation and start time.
     bytes[8 + head.len() + 16..][..4].copy_from_slice(&1_u32.to_ne_bytes());
     bytes.extend_from_slice(text);
     let prefix = std::fs::read_to_string(namespace.root().join("prefix")).unwrap();
@@ -290,7 +291,7 @@ fn publish(namespace: &Namespace, service: &str, layout_version: u32, text: &[u8
     Published { path, _file: file }
 }
 
-/// An engine of another layout version.
+/// An engine with another layout version.
 pub fn engine_of_version(namespace: &Namespace, service: &str, layout_version: u32) -> impl Sized + use<> {
     let node = node(namespace);
     (publish(namespace, service, layout_version, b"not JSON"), node)
@@ -307,7 +308,7 @@ pub fn specification(namespace: &Namespace, service: &str, specification: &Servi
     specification_text(namespace, service, &serde_json::to_vec(specification).unwrap())
 }
 
-/// An engine of the right version whose requests have another type.
+/// An engine with the right version whose requests have another type.
 pub fn engine_of_other_type(namespace: &Namespace, service: &str, model: &ServiceSpecification) -> impl Sized + use<> {
     let renamed = ServiceSpecification { service: service.to_owned(), ..model.clone() };
     let published = specification(namespace, service, &renamed);

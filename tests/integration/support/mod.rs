@@ -1,4 +1,4 @@
-//! What several modules of tests share.
+//! Helpers for the tests.
 
 pub mod chromium;
 pub mod foreign;

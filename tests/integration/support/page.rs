@@ -1,4 +1,4 @@
-//! The web servers of the program `endless` as real processes, and what asks them.
+//! The web servers of the program `endless` as real processes, and clients for them.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -15,10 +15,10 @@ use super::process::{Process, wait_until};
 /// How long anything may take; the machine may be busy with other tests.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A script in place of a browser: it writes down its arguments, in a file that is complete when it has its name.
+/// A script that stands in for a browser: it writes its arguments to a file, which appears complete.
 pub const BROWSER: &str = "echo \"$@\" > \"$0.part\"; mv \"$0.part\" \"$0.given\"";
 
-/// What such a browser was given, once it was started; it may be started again.
+/// Waits until such a browser is started, and returns its arguments. It can be called again for the next start.
 pub fn given(browser: &Path) -> String {
     let file = PathBuf::from(format!("{}.given", browser.display()));
     wait_until("the browser is started", || file.exists());
@@ -41,7 +41,7 @@ impl Server {
         let mut stdout = BufReader::new(process.0.stdout.take().unwrap());
         stdout.read_line(&mut line).unwrap();
         let url = line.trim().split(' ').find(|word| word.starts_with("http://")).map(str::to_owned);
-        // What it prints later is not needed, but must have a reader.
+        // Drain later output, so that the process does not block.
         std::thread::spawn(move || drop(stdout.read_to_end(&mut Vec::new())));
         let url = url.unwrap_or_else(|| panic!("no address: `{line}` {}", process.errors()));
         Server { process, url }
@@ -56,7 +56,7 @@ impl Server {
         self.url.split("token=").nth(1).unwrap()
     }
 
-    /// Asks for a path as a browser would, with further headers, and returns the status, the headers and the body.
+    /// Requests a path as a browser would, with additional headers, and returns status, headers and body.
     pub fn get(&self, path: &str, headers: &[(&str, &str)]) -> (u16, String, Vec<u8>) {
         let host = self.address().to_string();
         let mut all = vec![("Host", &*host), ("Connection", "close")];
@@ -90,13 +90,13 @@ impl Server {
     }
 }
 
-/// What a browser receives.
+/// A browser's connection.
 pub struct Socket {
     socket: WebSocket<TcpStream>,
 }
 
 impl Socket {
-    /// The next message with frames: what it says, and the pixels.
+    /// The next message with frames: its JSON and the pixels.
     pub fn next(&mut self) -> (Json, Vec<u8>) {
         loop {
             if let Message::Binary(bytes) = self.socket.read().unwrap() {

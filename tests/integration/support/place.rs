@@ -1,4 +1,4 @@
-//! A namespace for one test alone, and the processes that use it.
+//! A separate namespace for a test, and the processes that use it.
 
 use std::fs::{self, DirBuilder, Permissions};
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
@@ -17,7 +17,7 @@ pub struct Place {
 
 impl Place {
     pub fn new() -> Self {
-        // At random, since another test run may have the same process ids in a container of its own.
+        // A random name, since a test run in another container may have the same process ids.
         let namespace = Namespace::at(format!("/tmp/endless-{:016x}", rand::random::<u64>()));
         DirBuilder::new().mode(0o700).create(namespace.root()).unwrap();
         Place { namespace }
@@ -31,7 +31,7 @@ impl Place {
         self.namespace.root()
     }
 
-    /// A program that uses the namespace.
+    /// A command that uses the namespace.
     pub fn command(&self, program: impl AsRef<Path>) -> Command {
         let mut command = Command::new(program.as_ref());
         command.env(ROOT_VARIABLE, self.root()).stdin(Stdio::null());
@@ -69,7 +69,7 @@ impl Place {
         serde_json::from_slice::<Json>(&output.stdout).unwrap()[0].take()
     }
 
-    /// An executable script.
+    /// Writes an executable script.
     pub fn script(&self, name: &str, script: &str) -> PathBuf {
         let path = self.root().join(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -115,7 +115,7 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        // Segments of processes that were killed.
+        // Killed processes leave their segments.
         self.segments().iter().for_each(|segment| drop(fs::remove_file(segment)));
         let _ = fs::remove_dir_all(self.root());
     }

@@ -7,7 +7,7 @@ use endless_gym::pool::{Pool, PoolConfig, Registry, ResetRequest, Threads};
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
-/// A pool with the memory of its batch.
+/// A pool with the memory for its batch.
 pub struct Player {
     pub pool: Pool,
     pub blocks: Vec<Block>,
@@ -29,7 +29,7 @@ impl Player {
         Player { pool, blocks }
     }
 
-    /// A pool of which all environments have been reset.
+    /// A pool whose environments have been reset.
     pub fn started(config: &PoolConfig) -> Self {
         let mut player = Player::new(config);
         player.reset(ResetRequest::All);

@@ -9,7 +9,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Winsize, tcsetwinsize};
 
-/// How long one call of the service may take.
+/// How long a call of the service may take.
 pub const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// How long a process may take for anything; the machine may be busy with other tests.
@@ -58,7 +58,7 @@ impl Process {
         self.signal(Signal::CONT);
     }
 
-    /// Kills the process, which cannot clean up.
+    /// Kills the process without letting it clean up.
     pub fn kill(&mut self) {
         self.0.kill().unwrap();
         self.0.wait().unwrap();
@@ -108,7 +108,7 @@ fn read(pipe: Option<impl Read>) -> String {
     text
 }
 
-/// Both ends of a pseudo-terminal: that of the terminal emulator, and that of the program in it.
+/// Both ends of a pseudo-terminal: the terminal emulator's, and that of the program in it.
 pub fn pseudo_terminal(columns: u16, rows: u16) -> (File, File) {
     let emulator = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
     grantpt(&emulator).unwrap();
@@ -121,13 +121,13 @@ pub fn pseudo_terminal(columns: u16, rows: u16) -> (File, File) {
 /// Marks the process in which [`again`] runs a test.
 const AGAIN: &str = "ENDLESS_TEST_AGAIN";
 
-/// Runs the test `name` of this program in a process of its own, and fails as it does. Returns true there.
+/// Runs the test `name` of this program in a separate process, where it returns true, and fails if the test does.
 #[track_caller]
 pub fn alone(name: &str) -> bool {
     again(Command::new(std::env::current_exe().unwrap()), name)
 }
 
-/// As [`alone`], in a mount namespace of its own, after the shell commands `mounts`.
+/// Like [`alone`], in a new mount namespace, after the shell commands `mounts`.
 #[track_caller]
 pub fn inside_namespace(name: &str, mounts: &str) -> bool {
     let mut command = unshare(mounts);
@@ -135,7 +135,7 @@ pub fn inside_namespace(name: &str, mounts: &str) -> bool {
     again(command, name)
 }
 
-/// A command that runs its further arguments in a mount namespace of its own, after the shell commands `mounts`.
+/// A command that runs its further arguments in a new mount namespace, after the shell commands `mounts`.
 pub fn unshare(mounts: &str) -> Command {
     let mut command = Command::new("unshare");
     command.args(["--mount", "--map-root-user", "sh", "-c", &format!("{mounts} && exec \"$0\" \"$@\"")]);

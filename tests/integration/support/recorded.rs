@@ -1,4 +1,4 @@
-//! What several test programs need.
+//! Recorded traces, random options and formats.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ pub fn traces(id: &str) -> Vec<PathBuf> {
     traces_in("traces", id)
 }
 
-/// Those that have the checksums of ground-truth views.
+/// The recorded traces of an id with checksums of ground-truth views.
 pub fn traces_with_views(id: &str) -> Vec<PathBuf> {
     traces_in("views", id)
 }
@@ -37,7 +37,7 @@ fn traces_in(folder: &str, id: &str) -> Vec<PathBuf> {
     files
 }
 
-/// Any value within the parameter's limits, more often one that is not far from the default.
+/// Any value within the parameter's limits, mostly not far from the default.
 fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
     match parameter.kind {
         ParameterKind::Bool { .. } => any::<bool>().prop_map(Json::from).boxed(),
@@ -57,7 +57,7 @@ fn value(parameter: &Parameter) -> BoxedStrategy<Json> {
     }
 }
 
-/// Any set of options within the limits: some of the parameters, each with any value.
+/// Any set of options within the limits.
 pub fn options(spec: &'static EnvSpec) -> impl Strategy<Value = Map<String, Json>> {
     let options: Vec<_> = spec
         .parameters
@@ -70,17 +70,17 @@ pub fn options(spec: &'static EnvSpec) -> impl Strategy<Value = Map<String, Json
     options.prop_map(|options| options.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect())
 }
 
-/// All formats of the pixels.
+/// All pixel formats.
 pub fn pixel_formats() -> impl Iterator<Item = PixelFormat> {
     (0..8).map(|bits| PixelFormat { grayscale: bits & 1 != 0, channels_first: bits & 2 != 0, row_major: bits & 4 != 0 })
 }
 
-/// Any format of the pixels.
+/// Any pixel format.
 pub fn pixel_format() -> impl Strategy<Value = PixelFormat> {
     prop::sample::select(pixel_formats().collect::<Vec<_>>())
 }
 
-/// `cases` runs of a property, or as many as the environment variable `PROPTEST_CASES` says.
+/// The number of runs of a property: the environment variable `PROPTEST_CASES`, or else `cases`.
 pub fn property_cases(cases: u32) -> ProptestConfig {
     let given = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok());
     ProptestConfig::with_cases(given.unwrap_or(cases))

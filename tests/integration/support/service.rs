@@ -1,6 +1,6 @@
-//! Engines and trainers in child processes of the tests of the service.
+//! Engines and trainers in child processes of the service's tests.
 //!
-//! The test program starts itself: the ignored test `role` plays the role that the environment names.
+//! The test program starts itself: the ignored test `role` plays the role that an environment variable names.
 
 use std::io::Read;
 use std::process::{Command, Stdio};
@@ -19,7 +19,7 @@ use super::process::{Process, TIMEOUT};
 pub const ID: &str = "MortarMayhem-Grid-v0";
 const ROLE: &str = "ENDLESS_TEST_ROLE";
 
-/// Arguments with which a test program runs its ignored test `role`, and no other.
+/// Arguments with which a test program runs only its ignored test `role`.
 pub const ROLE_ARGUMENTS: [&str; 4] = ["role", "--exact", "--ignored", "--nocapture"];
 
 impl Place {
@@ -40,7 +40,7 @@ impl Place {
     }
 }
 
-/// Lets a command that starts this test program play a role.
+/// Sets the role of a command that starts this test program.
 pub fn set_role(command: &mut Command, role: &str) {
     command.args(ROLE_ARGUMENTS).env(ROLE, role);
 }
@@ -81,7 +81,7 @@ pub fn play(trainer: &mut Trainer, group: usize, steps: u64) {
     }
 }
 
-/// Checks that a call failed with an error of that pattern, and returns the error.
+/// Asserts that a call failed with an error that matches the pattern, and returns the error.
 macro_rules! assert_error {
     ($result:expr, $pattern:pat $(if $guard:expr)?) => {{
         let error = $result.map(drop).unwrap_err();
@@ -91,7 +91,7 @@ macro_rules! assert_error {
 }
 pub(crate) use assert_error;
 
-/// Checks that an engine rejected a request for that reason, with a text that contains `part`.
+/// Asserts that an engine rejected a request for that reason, with a message that contains `part`.
 #[track_caller]
 pub fn assert_rejected<T>(result: Result<T, ServiceError>, expected: Rejection, part: &str) {
     let error = result.map(drop).unwrap_err();
@@ -99,7 +99,7 @@ pub fn assert_rejected<T>(result: Result<T, ServiceError>, expected: Rejection, 
     assert!(error.to_string().contains(part), "{error}");
 }
 
-/// Plays the role that the environment names; does nothing if there is none.
+/// Plays the role that the environment variable names, if any.
 pub fn play_role() {
     let Ok(role) = std::env::var(ROLE) else { return };
     let connect =
@@ -118,7 +118,7 @@ pub fn play_role() {
             }
             loop {
                 match trainer.receive_any(TIMEOUT) {
-                    // An engine that is stopped answers when it is killed or continued.
+                    // A stopped engine has not answered yet; keep waiting until it is continued or killed.
                     Err(ServiceError::TimedOut { .. }) => {}
                     received => {
                         let group = received.unwrap().group();
