@@ -392,7 +392,7 @@ pub enum EngineActivity {
     Busy {
         /// The group of the request.
         group: usize,
-        /// The kind of the request: `step`, `reset`, `snapshot`, `restore` or `checkpoint`.
+        /// The kind of the request: `step`, `reset`, `snapshot`, `restore`, `checkpoint`, `options` or `episodes`.
         kind: &'static str,
         /// How long it has been executing it.
         since: Duration,

@@ -71,7 +71,8 @@ pub struct GroupStatus {
     pub last_taken: u64,
     /// Number of the last request that the engine has answered.
     pub last_answered: u64,
-    /// Kind of the last request: `step`, `reset`, `snapshot`, `restore` or `checkpoint`; `None` before the first.
+    /// Kind of the last request: `step`, `reset`, `snapshot`, `restore`, `checkpoint`, `options` or `episodes`; `None`
+    /// before the first.
     pub kind: Option<&'static str>,
     /// How long the engine has been executing the current request; `None` if there is none.
     #[serde(rename = "busy_seconds", serialize_with = "optional_seconds")]
