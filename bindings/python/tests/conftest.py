@@ -1,4 +1,4 @@
-"""Fixtures and markers of all tests."""
+"""Fixtures and markers for all tests."""
 
 import os
 import shutil
@@ -25,19 +25,19 @@ def _python(variable: str, contents: str) -> str:
 
 @pytest.fixture(scope="session")
 def original_python() -> str:
-    """A Python that has the original, memory-gym 1.0.2."""
+    """A Python with the original, memory-gym 1.0.2."""
     return _python("ENDLESS_ORIGINAL_PYTHON", "memory-gym 1.0.2")
 
 
 @pytest.fixture(scope="session")
 def libraries_python() -> str:
-    """A Python with the dependency group `rllib`: Ray, JAX and Jupyter's kernel, and with the agents."""
+    """A Python with the agents and the dependency group `rllib`: Ray, JAX and Jupyter's kernel."""
     return _python("ENDLESS_LIBRARIES_PYTHON", "the group `rllib`")
 
 
 @pytest.fixture
 def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A folder for Ray's logs and sockets, whose paths must be short, with nothing sent or written elsewhere."""
+    """A folder for Ray's logs and sockets, whose paths must be short. Nothing is sent or written elsewhere."""
     with tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp", ignore_cleanup_errors=True) as folder:
         monkeypatch.setenv("RAY_TMPDIR", folder)
         monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # otherwise it writes a token to the home directory
@@ -48,13 +48,13 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 @pytest.fixture(autouse=True, scope="session")
 def sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The folder for the logs of Stable-Baselines3, in this process and its children; by default it makes new ones in /tmp."""
+    """Sets the log folder of Stable-Baselines3 for this process and its children; by default it makes new ones in /tmp."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
 
 
 @pytest.fixture(autouse=True, scope="session")
 def own_namespace() -> Iterator[Path]:
-    """A namespace root of this test run, so that runs at the same time do not see each other's engines and segments."""
+    """The namespace root of this test run, so that concurrent runs do not see each other's engines and segments."""
     # A short path, since it is part of the path of Unix sockets.
     root = tempfile.mkdtemp(prefix="endless-", dir="/tmp")
     os.environ["ENDLESS_GYM_ROOT"] = root

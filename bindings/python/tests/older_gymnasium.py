@@ -1,7 +1,7 @@
-"""Plays as programs written for Gymnasium 0.29 do, CleanRL's ppo_trxl among them. Runs in the original's Python, and prints all
-that the environments return, as digests.
+"""Plays like programs written for Gymnasium 0.29, such as CleanRL's ppo_trxl. Runs in the original's Python, and prints digests of
+everything that the environments return.
 
-Usage: older_gymnasium.py MODULE, which registers the original's ids
+Usage: older_gymnasium.py MODULE, where MODULE registers the original's ids
 """
 
 import hashlib
@@ -22,15 +22,15 @@ IDS = [
 
 
 def digest(value):
-    """What can be compared between processes."""
+    """A digest that can be compared between processes."""
     if isinstance(value, dict):
-        # The seconds that an episode took.
+        # "t" is the duration of an episode.
         return {key: digest(item) for key, item in value.items() if key != "t"}
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
         return [digest(item) for item in value]
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
-    # 0 and 0.0 are the same reward, and so are a float and numpy's.
+    # 0 and 0.0 are the same reward, and so are Python's and numpy's floats.
     return float(value) if isinstance(value, (int, float, np.number)) else repr(value)
 
 

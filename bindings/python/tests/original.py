@@ -1,4 +1,4 @@
-"""Plays the original: actions from a file, everything that it returns to another. Runs in the original's Python.
+"""Plays actions from a file in the original, and writes everything that it returns to another. Runs in the original's Python.
 
 Usage: original.py ID ACTIONS.npy OPTIONS OUT.pickle
 """

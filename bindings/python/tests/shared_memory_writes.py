@@ -1,6 +1,6 @@
-"""Ways to write to the memory of a batch. As a program: tries all of them on a served batch, and prints how many raised.
+"""Ways to write to the memory of a batch. As a program, tries all of them on a served batch and prints how many raised.
 
-A write that is not refused kills the process, since the memory of another process is mapped read-only.
+A write that is not refused kills the process, since the memory of an engine process is mapped read-only.
 """
 
 import warnings
@@ -16,14 +16,14 @@ ID = "MortarMayhemB-v0"
 
 
 class Legacy:
-    """What a consumer of DLPack's unversioned protocol passes on."""
+    """An array as a consumer of DLPack's unversioned protocol receives it."""
 
     def __init__(self, array: np.ndarray) -> None:
         self.capsule = endless_gym.DLPackView(array).__dlpack__()
 
 
 def imported(array: np.ndarray) -> torch.Tensor:
-    """By a consumer of the unversioned protocol."""
+    """The array, imported by a consumer of the unversioned protocol."""
     return torch.utils.dlpack.from_dlpack(Legacy(array).capsule)
 
 

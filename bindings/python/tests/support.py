@@ -1,4 +1,4 @@
-"""What several tests use: comparisons of what environments return, and engines of the program."""
+"""Helpers for several tests: comparisons of what environments return, and engines started by the program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WHERE = [endless_gym.make_vec, endless_gym.serve]
 
 
 def exact(value: Any) -> Any:
-    """A value that is equal to that of another if every byte is: arrays by dtype, shape and contents; without times."""
+    """A value that compares equal only if every byte is: arrays by dtype, shape and contents. Times are left out."""
     if isinstance(value, np.ndarray) and value.dtype != object:
         return ("array", str(value.dtype), value.shape, value.tobytes())
     if isinstance(value, dict):
@@ -57,7 +57,7 @@ def engine_of_program(service: str, id: str, *arguments: str) -> Iterator[subpro
 
 
 def await_end_of_engines(seconds: float = 10.0) -> None:
-    """Assert that all engines end within some seconds."""
+    """Assert that all engines end within this time."""
     end = time.monotonic() + seconds
     while endless_gym.running_engines() and time.monotonic() < end:
         time.sleep(0.02)
@@ -71,9 +71,9 @@ def segments() -> set[str]:
 
 
 def rest_of_terminal(leader: int) -> bytes:
-    """What a program still writes to a terminal, until it closes it."""
+    """Everything that a program writes to a terminal before it closes it."""
     shown = b""
-    # The end of a terminal is an error.
+    # Reading at the end of a terminal is an error.
     with contextlib.suppress(OSError):
         while part := os.read(leader, 4096):
             shown += part

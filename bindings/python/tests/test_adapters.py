@@ -1,4 +1,4 @@
-"""The adapters to Stable-Baselines3, TorchRL and PufferLib keep the tools' contracts."""
+"""The adapters fulfil the contracts of Stable-Baselines3, TorchRL and PufferLib."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def random_actions(envs, rng: np.random.Generator, num_envs: int) -> np.ndarray:
 
 
 def reference(env_id: str, num_envs: int, autoreset: str, seed: int, **kwargs):
-    """The package's own vector environment, which an adapter is compared with."""
+    """The package's own vector environment, with which an adapter is compared."""
     envs = endless_gym.make_vec(env_id, num_envs=num_envs, autoreset=autoreset, **kwargs)
     return envs, envs.reset(seed=seed)[0]
 
@@ -74,7 +74,7 @@ class TestStableBaselines3:
         rewards += 1  # on-policy algorithms add to the rewards of episodes that were cut off
         venv.close()
 
-    def test_episodes_end_as_monitor_would_say(self):
+    def test_infos_of_ended_episodes_match_those_of_monitor(self):
         num_envs, rng = 8, np.random.default_rng(1)
         envs, obs = reference(SHORT, num_envs, "disabled", seed=11)
         venv = self.make(SHORT, num_envs=num_envs)
@@ -113,14 +113,14 @@ class TestStableBaselines3:
                     assert infos[index] is previous_infos[index], "the dict of a running episode is made once"
             previous_infos, previous_done = infos, done
             if done.any():
-                # The next episodes' seeds are the environments' own, so that both play the same.
+                # The next episodes continue the environments' own generators, so both play the same.
                 np.testing.assert_array_equal(obs, following)
             total[done], length[done] = 0, 0
         assert ended >= num_envs
         venv.close()
         envs.close()
 
-    def test_the_ground_truth_at_an_end_is_the_ended_episodes(self):
+    def test_final_ground_truth_is_that_of_the_ended_episode(self):
         venv = self.make("Endless-SearingSpotlights-v0", num_envs=2)
         venv.seed(0)
         venv.reset()
@@ -149,7 +149,7 @@ class TestStableBaselines3:
                 return
         pytest.fail("no episode ended")
 
-    def test_seeds_and_options_are_for_the_next_reset(self):
+    def test_seeds_and_options_apply_to_the_next_reset(self):
         venv = self.make(SHORT, num_envs=2)
         venv.seed(5)
         venv.set_options({"command_show_duration": [2]})
@@ -180,8 +180,8 @@ class TestStableBaselines3:
         assert venv.env_is_wrapped(object, [0, 2]) == [False, False]
         venv.close()
 
-    def test_only_stable_baselines3_is_spared_torchs_warning(self):
-        # In a process of its own, since PyTorch warns once.
+    def test_torch_warning_is_suppressed_only_for_stable_baselines3(self):
+        # In a separate process, since PyTorch warns only once.
         program = f"""
 import numpy as np, torch, warnings
 from endless_gym.sb3 import EndlessVecEnv
@@ -198,7 +198,7 @@ for read in (lambda: obs_as_tensor(observation, "cpu"), lambda: torch.as_tensor(
         printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
         assert printed.split() == ["0", "1"]
 
-    def test_steps_run_no_more_python_for_more_environments(self):
+    def test_a_step_runs_the_same_number_of_python_lines_for_any_number_of_environments(self):
         def lines_of_a_step(num_envs: int) -> int:
             venv = self.make(SHORT, num_envs=num_envs)
             venv.reset()
@@ -256,7 +256,7 @@ class TestTorchRL:
         env.close()
 
     @pytest.mark.parametrize("env_id", [SHORT, "MysteryPath-Grid-v0", "Endless-SearingSpotlights-v0"])
-    def test_rollout_is_what_the_environments_return(self, env_id):
+    def test_rollout_equals_what_the_environments_return(self, env_id):
         import torch
 
         num_envs, steps, rng = 4, 120, np.random.default_rng(5)

@@ -124,7 +124,7 @@ def test_actions_have_the_shape_of_the_action_space(where, id: str, shape: tuple
         for actions in (flat, bytearray(flat), right * 0.5, right.astype(bool), right.astype(str), None):
             with pytest.raises(TypeError, match=r"^actions must be integers, got "):
                 envs.step(actions)
-        # Everything that is right, and nothing that was wrong has been played.
+        # All valid actions are played, and none of the invalid ones were.
         layouts = [right, right.tolist(), np.asfortranarray(right), np.repeat(right, 2, 0)[::2]]
         for actions in layouts + [
             right.astype(dtype) for dtype in ("int8", "uint8", "int16", "int32", "uint64", ">i4")
@@ -189,7 +189,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_the_same_in_an_engine_process(mistake: str) -> None:
+def test_mistakes_raise_the_same_errors_in_an_engine_process(mistake: str) -> None:
     errors = []
     for where in WHERE:
         with pytest.raises(ValueError) as refused:
@@ -225,7 +225,7 @@ def test_the_native_module_checks_shapes() -> None:
             _native.ended_episodes(*arguments)
 
 
-def test_flags_may_be_any_byte() -> None:
+def test_any_nonzero_byte_of_a_flag_is_true() -> None:
     raw = np.array([0, 1, 2, 255, 0, 128], np.uint8)
     infos = np.arange(12.0).reshape(6, 2)
     ends = _native.ended_episodes(

@@ -1,4 +1,4 @@
-"""`compose.yaml` and `docs/operate/pod.yaml`: what they start works in IPC namespaces that have only /dev/shm in common."""
+"""The containers of `compose.yaml` and `docs/operate/pod.yaml` work in IPC namespaces that have only /dev/shm in common."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ ROOT = Path(__file__).parents[3]
 
 @dataclass(frozen=True)
 class Container:
-    """What a container starts."""
+    """The command of a container, and its surroundings."""
 
     command: list[str]
     environment: dict[str, str]
     user: Any
     #: Bytes of /dev/shm.
     shm: int
-    #: The command that tells whether it is ready.
+    #: The health check command.
     health: list[str]
 
 
@@ -66,7 +66,7 @@ def pod() -> tuple[Container, Container]:
     assert volume["emptyDir"]["medium"] == "Memory"
     for each in (engine, trainer):
         assert each["volumeMounts"] == [{"name": volume["name"], "mountPath": "/dev/shm"}]
-        # Memory in /dev/shm counts for the container that writes it.
+        # Memory in /dev/shm counts towards the limit of the container that writes to it.
         assert size(each["resources"]["limits"]["memory"]) > size(volume["emptyDir"]["sizeLimit"])
     return tuple(
         Container(
@@ -92,12 +92,12 @@ def test_both_containers_have_one_user_and_one_root(containers: Any) -> None:
     assert engine.health == ["endless", "status", "mortar"]
     arguments = dict(zip(engine.command[2::2], engine.command[3::2], strict=True))
     assert engine.command[:2] == ["endless", "serve"]
-    # `--batches-held` + 2 batches of each group, with 84 x 84 x 3 bytes for an environment and some numbers.
+    # Each group has `--batches-held` + 2 batches, with 84 x 84 x 3 bytes and some numbers for each environment.
     needed = int(arguments["--num-envs"]) * int(arguments["--groups"]) * 5 * 22_000
     assert needed < engine.shm / 2
 
 
-def test_the_compose_file_builds_the_image_that_it_runs() -> None:
+def test_compose_file_builds_the_image_that_it_runs() -> None:
     services = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]
     assert (ROOT / services["engine"]["build"] / "Dockerfile").exists()
     assert {service["image"] for service in services.values()} == {"endless-gym"}
@@ -115,7 +115,7 @@ def shared() -> Iterator[Path]:
 
 
 def namespaces() -> list[str]:
-    """The command before another that gives it mount and IPC namespaces of its own; empty if that is not permitted."""
+    """A prefix for commands that gives them their own mount and IPC namespaces; empty if that is not permitted."""
     for unshare in (["unshare", "--mount", "--ipc"], ["unshare", "--mount", "--ipc", "--map-root-user"]):
         try:
             if (
@@ -172,7 +172,7 @@ def test_the_trainer_uses_the_engine(containers: Any, shared: Path, tmp_path: Pa
             assert trained.returncode == 0, trained.stderr
             assert trained.stdout == "51200 environment steps\n"
         finally:
-            # As `docker stop` and the end of a pod do.
+            # Like `docker stop` and the end of a pod.
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(serving.pid, signal.SIGTERM)
             try:
@@ -181,7 +181,7 @@ def test_the_trainer_uses_the_engine(containers: Any, shared: Path, tmp_path: Pa
                 os.killpg(serving.pid, signal.SIGKILL)
                 raise
     assert serving.returncode == 0, (tmp_path / "log").read_text()
-    # The folder of the root stays, and nothing else.
+    # Only the root directory remains.
     assert sorted(path.name for path in shared.iterdir()) == ["endless"]
     # An engine that has ended is not healthy.
     assert subprocess.run(command(engine.health), env=environment(engine), capture_output=True).returncode == 1

@@ -1,4 +1,4 @@
-"""What the numbers of actions, ground truth and features mean: the same table wherever a user looks."""
+"""The meanings of actions, ground truth and features are the same wherever a user looks."""
 
 import json
 import pydoc

@@ -1,4 +1,4 @@
-"""Engines that `serve` started and no call closed end when nothing refers to them, and with their process."""
+"""Engines that `serve` started end without a call of `close` when nothing refers to them, and with their process."""
 
 import contextlib
 import gc
@@ -23,7 +23,7 @@ ACTIONS = np.zeros((4, 2), dtype=np.int64)
 
 @pytest.fixture
 def no_collector() -> Iterator[None]:
-    """Without Python's cyclic garbage collector, so that an engine in a reference cycle runs on."""
+    """Disables Python's cyclic garbage collector, so that an engine in a reference cycle would keep running."""
     gc.collect()
     gc.disable()
     yield
@@ -38,7 +38,7 @@ def play(envs: endless_gym.EndlessVectorEnv) -> np.ndarray:
     return envs.step(ACTIONS)[0]
 
 
-def test_an_engine_ends_when_its_name_is_assigned_again(no_collector: None) -> None:
+def test_an_engine_ends_when_its_variable_is_reassigned(no_collector: None) -> None:
     observations = []
     for _ in range(3):
         envs = endless_gym.serve(ID, 4)
@@ -58,7 +58,7 @@ def test_an_engine_ends_with_the_wrappers_around_it(no_collector: None) -> None:
     assert endless_gym.running_engines() == []
 
 
-def test_an_engine_ends_with_an_exception_that_nobody_keeps(no_collector: None) -> None:
+def test_an_engine_ends_when_an_exception_leaves_its_function(no_collector: None) -> None:
     def fails() -> None:
         envs = endless_gym.serve(ID, 4)
         envs.step(ACTIONS)
@@ -91,7 +91,7 @@ def test_an_engine_ends_before_its_interpreter_does(end: str) -> None:
 
 
 def test_engines_end_with_the_kernel_of_a_notebook() -> None:
-    """An interactive interpreter, as a kernel is one, runs three cells and is killed."""
+    """An interactive interpreter, like a kernel, runs three cells and is killed."""
     kernel = subprocess.Popen([sys.executable, "-i", "-q"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         kernel.stdin.write("import endless_gym\n")
@@ -117,7 +117,7 @@ def test_close_ends_the_engine_while_a_forked_child_lives() -> None:
     try:
         process = envs._engine._process
         envs.close()
-        # Not killed after the time that an engine gets to end.
+        # The engine ended by itself; it was not killed after a timeout.
         assert process.returncode == 0
         envs.close()
     finally:

@@ -93,7 +93,7 @@ def test_a_window_shows_the_ground_truth_view(id: str, monkeypatch: pytest.Monke
     for _ in range(3):
         shown.step(np.array([1, 2]))
         silent.step(np.array([1, 2]))
-        assert shown.render() is None  # it is shown already
+        assert shown.render() is None  # `step` has shown the picture
         picture = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
         np.testing.assert_array_equal(picture, silent.render())
         assert pygame.display.get_caption()[0] == f"{id}, seed 3"
@@ -149,7 +149,7 @@ def test_the_originals_ids_and_classes_make_equal_environments() -> None:
     np.testing.assert_array_equal(env.reset(seed=2)[0], other.reset(seed=2)[0])
 
 
-#: How a second environment is made from one.
+#: Ways to copy an environment.
 COPIES = {"deepcopy": copy.deepcopy, "copy": copy.copy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
@@ -174,7 +174,7 @@ def test_copies_continue_identically_and_independently(how: Any, id: str) -> Non
 
 
 def play(env: endless_gym.Env, actions: list[Any]) -> Any:
-    """Plays over the ends of episodes."""
+    """Plays, and resets at the ends of episodes."""
     for action in actions:
         *step, info = env.step(action)
         yield (*step, info, env.render())
@@ -228,10 +228,10 @@ def test_async_vector_env_plays_as_sync_vector_env(where: str, context: str) -> 
         asynchronous.close()
 
 
-def test_an_environment_travels_to_a_spawned_worker() -> None:
+def test_an_environment_can_be_sent_to_a_spawned_worker() -> None:
     env = endless_gym.Env("MysteryPath-v0")
     env.reset(seed=1)
-    # The environment itself is pickled, not only what makes it.
+    # The environment itself is pickled, not only its arguments.
     asynchronous = gymnasium.vector.AsyncVectorEnv([lambda: env] * 2, context="spawn")
     try:
         observation, _ = asynchronous.reset(seed=[3, 4])

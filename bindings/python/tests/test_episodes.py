@@ -12,7 +12,7 @@ from support import WHERE, exact
 
 import endless_gym
 
-#: An agent that does nothing ends an episode within some dozens of steps.
+#: The episode of an agent that does nothing ends within a few dozen steps.
 ID = "MortarMayhem-Grid-v0"
 MODES = ["next_step", "same_step", "disabled"]
 ONE, TWO, THREE = ({"command_count": [count]} for count in (1, 2, 3))
@@ -44,13 +44,13 @@ def until_all_began(envs: Envs, group: int = 0) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_options_of_a_reset_are_those_of_its_group_and_its_environments(where: Callable[..., Envs]) -> None:
+def test_options_of_a_reset_apply_only_to_its_group_and_environments(where: Callable[..., Envs]) -> None:
     with where(ID, 3, groups=2, seed=0, options={"arena_size": 4}) as envs:
         four = {"arena_size": 4}
         envs.reset(options=TWO, group=0)
         envs.reset(group=1)
         assert (played(envs, 0), played(envs, 1)) == ([four | TWO] * 3, [four] * 3)
-        # A reset of another group has not made the first forget that its options are others.
+        # The reset of the other group does not affect what is known about the options of the first.
         envs.reset(group=0)
         assert played(envs, 0) == [four] * 3
         envs.reset(options=TWO)
@@ -96,7 +96,7 @@ def test_set_options_apply_to_the_next_episodes(where: Callable[..., Envs], mode
             until_all_began(envs)
         expected = [THREE, ONE, {}]
         assert played(envs) == expected
-        # They stay below the options of a reset, and return after it.
+        # The options of a reset override them until the next reset.
         envs.reset(options={"arena_size": 4})
         assert played(envs) == [own | {"arena_size": 4} for own in expected]
         envs.reset()
@@ -126,7 +126,7 @@ def test_wrong_options_change_nothing(where: Callable[..., Envs]) -> None:
             envs.set_options(ONE, group=2)
         envs.reset()
         assert played(envs, 0) == played(envs, 1) == [{}] * 2
-        # One for each environment of every group, and one for each of all groups.
+        # One item for each environment of a group, or of all groups.
         envs.set_options([ONE, None])
         envs.reset()
         assert played(envs, 0) == played(envs, 1) == [ONE, {}]
@@ -150,7 +150,7 @@ def test_options_survive_snapshots(where: Callable[..., Envs]) -> None:
         assert played(others) == [{}, TWO]
         until_all_began(others)
         assert played(others) == [{}, ONE]
-        # Until the next reset.
+        # The restored options last until the next reset.
         others.reset()
         assert played(others) == [{}, {}]
 
@@ -165,13 +165,13 @@ def test_options_survive_checkpoints(tmp_path) -> None:
         assert played(envs) == [TWO, TWO]
         until_all_began(envs)
         assert played(envs) == [ONE, TWO]
-        # This object knows only the options given at creation.
+        # The new trainer knows only the options given at creation.
         envs.reset()
         assert played(envs) == [{}, {}]
 
 
 class Choices:
-    """Chooses one, two, three, one, ... commands, and keeps how it was called."""
+    """Chooses one, two, three or the default number of commands in turn, and records its calls."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[int, int, dict[str, Any] | None]] = []
@@ -215,7 +215,7 @@ def test_a_function_chooses_the_options_of_each_episode(where: Callable[..., Env
             for env in range(num_envs):
                 assert info["options"][env] == choices.options(group * num_envs + env, number[group, env])
         assert number.min() >= 2
-        # Each episode is chosen once and in turn, with the infos of the last episode that has ended by then.
+        # The function is called once for each episode, in order, with the infos of the last episode that had ended by then.
         ahead = 2 if mode == "same_step" else 1
         for env in range(groups * num_envs):
             own = [(episode, final) for number, episode, final in choices.calls if number == env]
@@ -254,7 +254,7 @@ def test_reset_asks_the_function_for_options(where: Callable[..., Envs]) -> None
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_an_exception_of_the_function_loses_no_step(where: Callable[..., Envs]) -> None:
+def test_an_exception_in_the_function_loses_no_step(where: Callable[..., Envs]) -> None:
     is_wrong = False
 
     def choose(env: int, episode: int, final: dict[str, Any] | None) -> dict[str, Any]:
@@ -331,13 +331,13 @@ def test_info_has_seeds_and_options_of_running_episodes(where: Callable[..., Env
         assert not {"seed", "options"} & set(envs.reset()[1])
 
 
-#: Their first frames show the character of the episode before, as in the original.
+#: Their first frames show the character of the previous episode, as in the original.
 SHOWS_THE_LAST = ("Endless-MortarMayhem-v0",)
 
 
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("id", endless_gym.all_specs())
-def test_episodes_are_played_again(id: str, where: Callable[..., Envs]) -> None:
+def test_replay_repeats_episodes(id: str, where: Callable[..., Envs]) -> None:
     short = {} if "Mortar" in id else {"max_steps": 25}
     short |= {"command_count": [2]} if id.startswith("Mortar") else {}
     num_envs, steps = 2, 150
@@ -385,7 +385,7 @@ def row(observation: Any, env: int) -> Any:
 
 
 def compare(shown: list[Any], rewards: list[float], steps: Any) -> bool:
-    """Whether the observations are equal. Asserts that rewards and the end are."""
+    """Whether the observations are equal. Asserts that the rewards and the end of the episode are."""
     steps = list(steps)
     assert [step.reward for step in steps[1:]] == rewards
     assert [step.terminated for step in steps] == [False] * (len(steps) - 1) + [True]

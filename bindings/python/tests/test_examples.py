@@ -1,4 +1,4 @@
-"""Every example runs as a user would run it, and ends with numbers that make sense."""
+"""Every example runs as a user would run it, and prints plausible numbers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SUMMARY = re.compile(r"steps=(\d+) steps_per_second=(\d+) .*mean_return=(-?\d+\.
 def run(
     script: str, cwd: Path, *arguments: str, python: str = sys.executable, **variables: str
 ) -> tuple[str, re.Match[str]]:
-    """Run the example with `arguments`, and return what it printed, and the last line's numbers."""
+    """Run the example with `arguments`, and return its output and the numbers in its last line."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""} | variables
     ran = subprocess.run(
         [python, EXAMPLES / script, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
@@ -50,7 +50,7 @@ def test_every_example_has_a_test():
 
 SHORT_ID, GRID_ID, DICT_ID = "Endless-MortarMayhem-v0", "MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"
 ROLLOUT, BATCHES = "--num-steps 32", r"(?s)(batch=\(8, 32\) observation=\(8, 32, 84, 84, 3\).*){2}"
-#: Arguments of an example, the environments, and what it prints; random actions end episodes of `SHORT_ID`.
+#: Arguments of an example, the environments, and its expected output. Random actions end episodes of `SHORT_ID`.
 RUNS = [
     (f"sb3_recurrent_ppo.py {ROLLOUT} --hidden-size 32", [SHORT_ID, GRID_ID, DICT_ID], "train/"),
     (f"torchrl_rollout.py {ROLLOUT}", [SHORT_ID, GRID_ID], BATCHES),
@@ -99,8 +99,8 @@ def test_cleanrl_ppo_needs_steps_for_one_update(tmp_path):
 @pytest.mark.parametrize(
     "script", ["cleanrl_ppo.py", "jax_service.py", "pufferlib_rollout.py", "sb3_recurrent_ppo.py", "torchrl_rollout.py"]
 )
-def test_command_lines_are_right_as_written(tmp_path, libraries_python, script):
-    """Those of the docstring, with fewer steps. The other examples have tests with shorter command lines."""
+def test_command_lines_in_docstrings_work(tmp_path, libraries_python, script):
+    """The commands run with fewer steps. The other examples have their own tests."""
     text = (EXAMPLES / script).read_text()
     lines = re.findall(rf"^python {script} ?(.*)$", text, re.M)
     assert lines, "the docstring shows no command"
@@ -146,7 +146,7 @@ def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, 
     }
     flat = (str(part) for pair in arguments.items() for part in pair)
     output, summary = run("rllib_ppo.py", tmp_path, *flat, python=libraries_python)
-    # A step that resets an environment is not counted, and RLlib samples whole steps of all environments.
+    # RLlib does not count steps that reset an environment, and samples whole steps of all environments.
     assert 256 <= int(summary[1]) < 256 + 2 * 8
     assert output.count("steps=") >= 2
     if env_id.startswith("Endless"):
@@ -154,7 +154,7 @@ def test_rllib_ppo(tmp_path, ray_folder, libraries_python, env_id, observation, 
 
 
 def test_rllib_ppo_remembers_a_command(tmp_path, ray_folder, libraries_python):
-    """In episodes that are as short as the task permits, with the module's GRU and without a memory."""
+    """The module's GRU learns more than an agent without memory, in episodes as short as the task permits."""
     options = {"command_count": [1], "command_show_duration": [1], "command_show_delay": [0]}
     options |= {"explosion_delay": [5], "explosion_duration": [1]}
     sizes = ("--num-envs", "32", "--num-steps", "32", "--total-timesteps", "24000", "--learning-rate", "0.003")
@@ -220,19 +220,19 @@ def test_asynchronous_actors_limit_the_policy_lag(tmp_path):
     output, summary = run("asynchronous_actors.py", tmp_path, *ACTORS, *sizes)
     assert summary[1] == "2048"
     assert set(re.findall(r"largest_lag=(\d+)", output)) == {"0"}
-    # While the learner learns, every actor completes or begins a trajectory of the policy before.
+    # While the learner updates, every actor completes or begins a trajectory of the previous policy.
     assert int(re.findall(r"dropped=(\d+)", output)[-1]) > 0
 
 
 def test_asynchronous_actors_learn_one_command(tmp_path):
     _, summary = run("asynchronous_actors.py", tmp_path, "--total-timesteps", "250000")
-    # By chance, and without memory, 0.025 of 0.1.
+    # By chance, or without memory, the return is 0.025 of 0.1.
     assert float(summary[3]) > 0.04
 
 
 @pytest.mark.parametrize("ended", ["actor", "learner", "ctrl-c"])
 def test_asynchronous_actors_end_together(tmp_path, ended):
-    """Within seconds, with a message, and nothing is left in /dev/shm."""
+    """If one process ends, all end within seconds, with a message, and nothing is left in /dev/shm."""
     process = subprocess.Popen(
         [sys.executable, EXAMPLES / "asynchronous_actors.py", *ACTORS, "--total-timesteps", "100000000", "--service"],
         cwd=tmp_path,
@@ -273,7 +273,7 @@ def test_asynchronous_actors_end_together(tmp_path, ended):
 
 
 def is_running(pid):
-    # Nothing may wait for an actor whose learner was killed: it then stays in the process table.
+    # If the learner was killed, nobody waits for its actors, which may stay in the process table.
     try:
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:

@@ -1,4 +1,4 @@
-"""`endless record --film`: what another decoder reads, against the frames of an environment."""
+"""`endless record --film`: compares films, read by another decoder, with the frames of an environment."""
 
 import subprocess
 from collections.abc import Iterator
@@ -49,7 +49,7 @@ def episode(id: str, seed: int, max_steps: int) -> Iterator[NDArray[np.uint8]]:
         ("SearingSpotlights-v0", 25, "png"),
     ],
 )
-def test_films_have_every_pixel(id: str, steps: int, suffix: str, tmp_path: Path) -> None:
+def test_films_contain_every_pixel(id: str, steps: int, suffix: str, tmp_path: Path) -> None:
     file = tmp_path / f"film.{suffix}"
     command = [*program(), "record", id, "--film", str(file), "--seed", "3", "--scale", "1"]
     subprocess.run([*command, "--max-steps", str(steps)], check=True, timeout=200)
@@ -64,5 +64,5 @@ def test_films_have_every_pixel(id: str, steps: int, suffix: str, tmp_path: Path
             film.load()
             assert np.array_equal(np.asarray(film.convert("RGB")), picture), place
             duration += film.info["duration"]
-    # The last picture is shown for one second longer.
+    # The last picture is shown for an extra second.
     assert duration == pytest.approx(1000 * (len(pictures) / spec(id).render_fps + 1), abs=1)

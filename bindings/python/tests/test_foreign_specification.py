@@ -1,4 +1,4 @@
-"""An engine's environment need not be one that this build has."""
+"""A client can use an environment that its own build does not have."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""With `independent_episodes`, an episode depends on its seed and options alone, in new and in used environments."""
+"""With `independent_episodes`, an episode depends only on its seed and options, in new and in used environments."""
 
 import gymnasium
 import numpy as np
@@ -8,7 +8,7 @@ from support import WHERE, engine_of_program, exact
 import endless_gym
 
 IDS = list(endless_gym.all_specs())
-#: Options of earlier episodes that leave something behind.
+#: Options of an episode that affect later episodes.
 LEFT = {
     "Endless-MortarMayhem-v0": {"agent_scale": 0.4},
     "SearingSpotlights-v0": {"hide_chessboard": True, "light_dim_off_duration": 0},
@@ -17,7 +17,7 @@ LEFT = {
 
 
 def played(envs, seed: int, options: dict, steps: int) -> list[object]:
-    """All that an environment or a vector environment returns for the seed and the same actions, as `exact` values."""
+    """Everything that an environment or a vector environment returns for a seed and the same actions, as `exact` values."""
     envs.action_space.seed(seed)
     out = [exact(envs.reset(seed=seed, options=options))]
     for _ in range(steps):
@@ -29,7 +29,7 @@ def played(envs, seed: int, options: dict, steps: int) -> list[object]:
 
 
 @pytest.mark.parametrize("id", IDS)
-def test_used_environments_play_what_new_ones_do(id: str) -> None:
+def test_used_environments_play_like_new_ones(id: str) -> None:
     def make(independent: bool) -> gymnasium.Env:
         return gymnasium.make(f"EndlessGym/{id}", independent_episodes=independent)
 
@@ -46,7 +46,7 @@ def test_used_environments_play_what_new_ones_do(id: str) -> None:
 @pytest.mark.parametrize(
     ("where", "id"), [*((endless_gym.make_vec, id) for id in IDS), *((endless_gym.serve, id) for id in LEFT)]
 )
-def test_used_vector_environments_play_what_new_ones_do(id: str, autoreset: str, where) -> None:
+def test_used_vector_environments_play_like_new_ones(id: str, autoreset: str, where) -> None:
     arguments = {"num_envs": 3, "autoreset": autoreset, "observation": "rgb+features"}
     with where(id, **arguments, independent_episodes=True) as envs:
         played(envs, 3, LEFT.get(id, {}), 70)
@@ -58,7 +58,7 @@ def test_used_vector_environments_play_what_new_ones_do(id: str, autoreset: str,
 
 @pytest.mark.parametrize("where", WHERE)
 def test_later_episodes_do_not_depend_on_the_actions(where) -> None:
-    """Searing Spotlights draws from the generator in every episode, for each new spotlight."""
+    """Searing Spotlights draws from the generator during the episode, for each new spotlight."""
 
     def starts(action: int) -> list[bytes]:
         found = []

@@ -1,4 +1,4 @@
-"""Tensors of other libraries on the engine's memory."""
+"""Tensors of other libraries that share the engine's memory."""
 
 import subprocess
 import sys
@@ -103,7 +103,7 @@ for make in (endless_gym.make_vec, endless_gym.serve):
         for _ in range(3):
             observation, *_ = envs.step(np.ones(3, dtype=np.int64))
         np.testing.assert_array_equal(frames, kept["visual_observation"])
-        # XLA cannot use this memory for the result; if it did, it would crash on a served batch.
+        # XLA must not use this memory for the result: it would crash on a served batch.
         np.testing.assert_array_equal(add_one(frames), kept["visual_observation"] + np.uint8(1))
         frames = observation["visual_observation"]
         before = frames.copy()

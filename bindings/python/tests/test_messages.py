@@ -1,4 +1,4 @@
-"""`send` and `recv`, and the calls that are refused between them, behave equally in this process and in an engine process."""
+"""`send`, `recv` and the calls that are refused between them behave the same in this process and in an engine process."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ def both() -> Iterator[list[endless_gym.EndlessVectorEnv]]:
 
 
 def outcome(call: Callable[..., object], *arguments: object) -> object:
-    """What a call returns, or the type and message of its exception."""
+    """The result of a call, or the type and message of its exception."""
     try:
         returned = call(*arguments)
     except Exception as error:
@@ -92,7 +92,7 @@ def test_a_pending_answer_is_an_error_in_every_call() -> None:
                 if " " not in name or name.startswith(("reset", "restore")):
                     assert inside[0] is RuntimeError, name
                     assert inside[1] == ("group 0 has a pending answer; call `recv` before the next request"), name
-            # No refused call has replaced the message, and the other group answers.
+            # No refused call has replaced the pending message, and the other group still answers.
             for envs in places:
                 envs.send(ACTIONS, 1)
             inside, outside = (outcome(envs.recv, 0) for envs in places)

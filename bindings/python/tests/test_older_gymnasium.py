@@ -1,4 +1,4 @@
-"""Programs that need Gymnasium 0.29 and numpy 1, as the original does, run with the package in its place."""
+"""Programs that need Gymnasium 0.29 and numpy 1, like the original, run with this package in its place."""
 
 import json
 import os
@@ -12,7 +12,7 @@ import endless_gym
 
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
-    """Variables with which the original's Python finds the package that is tested here, too."""
+    """Variables with which the original's Python also finds the package under test."""
     (tmp_path / "endless_gym").symlink_to(Path(endless_gym.__file__).parent)
     return {**os.environ, "PYTHONPATH": str(tmp_path), "SDL_VIDEODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
 
@@ -24,7 +24,7 @@ def test_env_plays_as_the_original_under_gymnasium_029(original_python: str, env
         command = [original_python, "-W", "ignore", program, module]
         ran = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert ran.returncode == 0, ran.stderr
-        # The original's libraries print lines of their own first.
+        # The original's libraries print other lines first.
         records.append(json.loads(ran.stdout.splitlines()[-1]))
     original, ours = records
     assert original.keys() == ours.keys()

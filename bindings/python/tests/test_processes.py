@@ -50,7 +50,7 @@ def test_an_engine_has_one_trainer_and_ends_with_its_environments() -> None:
 def test_ctrl_c_reaches_python_while_it_waits() -> None:
     program = f"""
 import endless_gym, os, signal
-# What a shell starts in the background ignores Ctrl-C, and so does what is started there.
+# Processes that a shell starts in the background ignore Ctrl-C, and so do their children.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 with endless_gym.serve({ID!r}, 4) as envs:
     envs.reset()
@@ -100,7 +100,7 @@ def test_a_forked_child_does_no_harm() -> None:
                 those.step(actions)
             except RuntimeError:
                 refused += 1
-        # The engine does not end with the environments of the child.
+        # The engine does not end when the child deletes its copy of the environments.
         del envs, inside, those
         gc.collect()
         os._exit(refused)
@@ -111,7 +111,7 @@ def test_a_forked_child_does_no_harm() -> None:
     envs.close()
 
 
-def test_reconnecting_to_an_engine_that_was_started_again() -> None:
+def test_reconnecting_to_a_restarted_engine() -> None:
     with engine_of_program("again", ID, "--num-envs=4") as first:
         envs = endless_gym.connect("again")
         envs.reset()
@@ -164,7 +164,7 @@ def test_package_includes_the_program() -> None:
 
 
 def test_a_running_engine_without_final_observations() -> None:
-    """As `endless serve --autoreset same-step` starts it."""
+    """`endless serve --autoreset same-step` starts such an engine."""
     with (
         engine_of_program("without-final", ID, "--num-envs=4", "--seed=1", "--autoreset=same-step"),
         endless_gym.connect("without-final") as envs,
@@ -185,7 +185,7 @@ def test_a_running_engine_without_final_observations() -> None:
         assert ends > 4
 
 
-#: Starts an engine or connects to one, forks a worker that lives on, and prints its process id.
+#: Starts an engine or connects to one, forks a worker that outlives it, and prints the worker's process id.
 FORKING = """
 import os, sys, time, endless_gym
 envs = endless_gym.connect("forking") if sys.argv[1] == "connect" else endless_gym.serve("Endless-MortarMayhem-v0", 4)
@@ -320,7 +320,7 @@ def test_the_errors_of_an_engine_are_logged(caplog: pytest.LogCaptureFixture, tm
         while not caplog.records and time.monotonic() < end:
             envs.reset()
         assert "cannot save a checkpoint" in caplog.text
-    # The last one fails as well, and with it the engine.
+    # The last save, at the end of the engine, fails too, so the engine reports an error.
     last = caplog.records[-1]
     assert (last.name, last.levelno) == ("endless_gym.engine", logging.ERROR)
     assert last.message.startswith(f"engine {envs._engine.pid}: checkpoint {folder}/state cannot be written"), last

@@ -1,4 +1,4 @@
-"""Data sets of demonstrations, as Minari reads them."""
+"""Data sets of demonstrations, read by Minari."""
 
 import json
 import os
@@ -49,7 +49,7 @@ def parts(observation: Any) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("id", IDS)
-def test_recorded_episodes_follow_from_seed_and_actions(id: str) -> None:
+def test_seed_and_actions_reproduce_recorded_episodes(id: str) -> None:
     recorded = endless_gym.record(id, 3, error_rates=[0.0, 0.2], seed=40, options=short(id), max_steps=40)
     dataset = load(recorded.dataset)
     assert (dataset.total_episodes, dataset.total_steps) == (3, recorded.steps)
@@ -64,7 +64,7 @@ def test_recorded_episodes_follow_from_seed_and_actions(id: str) -> None:
         assert metadata[number]["total_steps"] == len(episode) <= 40
         options = metadata[number].get("options", {})
         assert {name: np.asarray(value).tolist() for name, value in options.items()} == short(id)
-        # A new environment, since some of the original's show traces of the episode before.
+        # A new environment, since some of the original's show traces of the previous episode.
         fresh = gymnasium.make(f"EndlessGym/{id}")
         observation, info = fresh.reset(seed=metadata[number]["seed"], options=options)
         for step in range(len(episode) + 1):
@@ -146,7 +146,7 @@ def test_errors_have_their_rate_and_differ_between_episodes() -> None:
         np.testing.assert_allclose(shares, 1 / 3, atol=0.05)
 
 
-def test_a_recording_depends_neither_on_threads_nor_on_what_is_played_at_the_same_time(
+def test_a_recording_does_not_depend_on_threads_or_on_episodes_played_at_the_same_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from endless_gym.recording import recorder
@@ -157,7 +157,7 @@ def test_a_recording_depends_neither_on_threads_nor_on_what_is_played_at_the_sam
             error_rates=0.8,
             dataset=dataset,
             num_threads=threads,
-            # Episode 0 has these options, episode 1 the others, and so on.
+            # Even episodes have the first options, odd ones the second.
             options=[{}, {"initial_command_count": 2}],
             max_steps=70,
         )
@@ -289,7 +289,7 @@ def test_ctrl_c_leaves_no_data_set(root: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=follower, text=True)
     os.close(follower)
     shown = b""
-    # The progress bar is shown before the first episode, and counts those that were written.
+    # The progress bar appears before the first episode is written.
     while b"/100000" not in shown or not any(root.glob(".recording-*")):
         shown += os.read(leader, 4096)
     process.send_signal(number)
@@ -300,7 +300,7 @@ def test_ctrl_c_leaves_no_data_set(root: Path, number: signal.Signals) -> None:
     assert os.listdir(root) == []
 
 
-def test_other_commands_are_those_of_the_engine(
+def test_other_commands_run_in_the_native_program(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["endless", "--log", "off", "record", "MysteryPath-v0"])
@@ -328,7 +328,7 @@ def test_experts_check_their_arguments() -> None:
         endless_gym.Experts("MortarMayhem-v0", 0)
 
 
-def test_experts_play_beside_auto_reset() -> None:
+def test_experts_play_with_next_step_auto_reset() -> None:
     with endless_gym.make_vec("MysteryPath-Grid-v0", 6, observation="features", seed=0) as envs:
         experts = endless_gym.Experts("MysteryPath-Grid-v0", 6)
         observation, _ = envs.reset()
@@ -336,7 +336,7 @@ def test_experts_play_beside_auto_reset() -> None:
         ended = np.zeros(6, dtype=bool)
         while ends < 20:
             observation, _, terminated, _, info = envs.step(experts.act(observation, episode_start))
-            # The step after the last one of an episode only starts the next.
+            # The step after the end of an episode only starts the next one.
             episode_start, ended = ended, terminated.copy()
             ends += int(terminated.sum())
             successes += int(info.get("success", np.zeros(1)).sum())

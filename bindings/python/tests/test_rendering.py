@@ -23,7 +23,7 @@ IDS = list(endless_gym.all_specs())
 
 @pytest.fixture
 def invisible(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows that are not shown and do not wait."""
+    """Windows are not shown and do not wait."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setattr(Window, "wait", lambda self, fps: None)
     monkeypatch.setattr(pygame.time, "Clock", lambda: type("Clock", (), {"tick": lambda self, fps: None})())
@@ -32,7 +32,7 @@ def invisible(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("mode", ["rgb_array", "debug_rgb_array"])
 def test_a_batch_is_rendered_as_its_environments(where: Any, mode: str) -> None:
-    # The clues of Endless-MortarMayhem are long, and a new one follows each that was obeyed.
+    # The clues of Endless-MortarMayhem are long, and a new one follows each executed command.
     options = {
         "Endless-MortarMayhem-v0": {"max_steps": 60, "initial_command_count": 2, "allowed_commands": 9},
         "MortarMayhem-v0": {"command_count": [3], "command_show_delay": [2], "explosion_delay": [3]},
@@ -67,8 +67,8 @@ def compare(pictures: Any, singles: list[endless_gym.Env], id: str) -> None:
     same(pictures, [env.render() for env in singles], id)
 
 
-def test_a_clue_that_follows_an_obeyed_one_is_rendered_in_its_time() -> None:
-    # With one direction on an arena that wraps around, the agent obeys the only command by standing still or walking on.
+def test_a_clue_after_an_executed_command_is_rendered_at_the_right_step() -> None:
+    # Over many seeds, an agent that stands still executes some commands.
     id, options = (
         "Endless-MortarMayhem-v0",
         {"explosion_delay": [2], "explosion_duration": [1], "command_show_delay": [2]},
@@ -126,7 +126,7 @@ def test_pictures_do_not_depend_on_the_observation() -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_a_picture_is_the_observation_at_ends_of_episodes_too(where: Any) -> None:
+def test_pictures_equal_observations_also_when_episodes_end(where: Any) -> None:
     kwargs = {"options": {"max_steps": 6}, "autoreset": "same_step", "independent_episodes": True}
     with where("Endless-MortarMayhem-v0", 2, seed=1, render_mode="rgb_array", **kwargs) as envs:
         observation, _ = envs.reset()
@@ -136,7 +136,7 @@ def test_a_picture_is_the_observation_at_ends_of_episodes_too(where: Any) -> Non
             observation, *_ = envs.step(envs.action_space.sample())
 
 
-def test_the_ground_truth_view_is_an_rgb_array_for_tools_that_know_no_other() -> None:
+def test_rgb_array_can_show_the_ground_truth_view() -> None:
     id = "MortarMayhem-v0"
     debug = endless_gym.Env(id, "debug_rgb_array")
     single = gymnasium.make(f"EndlessGym/{id}", render_mode="rgb_array", view="ground_truth")
@@ -235,7 +235,7 @@ def test_gymnasiums_play_takes_the_keys(id: str, view: str, invisible: None) -> 
     env = gymnasium.make(f"EndlessGym/{id}", render_mode="rgb_array", view=view)
     free = endless_gym.spec(id).multi_discrete
     up, left, right, down = pygame.K_UP, pygame.K_LEFT, pygame.K_d, pygame.K_s
-    # What is pressed or released before each step, and the action that follows.
+    # The keys pressed or released before each step, and the resulting action.
     steps = [
         ([], [0, 0], 0),
         ([(True, left)], [1, 0], 1),

@@ -12,20 +12,20 @@ GROUPS, NUM_ENVS = 2, 2
 
 
 def episodes(envs: endless_gym.EndlessVectorEnv, group: int = 0, number: int = 3) -> list[list[bytes]]:
-    """The first frames of the next episodes of each environment of a group, which start in the same step as others end."""
+    """The first frames of the next episodes of each environment of a group, with same-step auto-reset."""
     firsts: list[list[bytes]] = [[] for _ in range(envs.num_envs)]
     while min(map(len, firsts)) < number:
         envs.send(np.zeros((envs.num_envs, 2), np.int64), group)
         observation, _, terminated, *_ = envs.recv(group)
         for env in np.flatnonzero(terminated):
-            # The character of the last episode is not shown in the first frame.
+            # The first frame does not yet show the character of the last episode.
             firsts[env].append(observation[env].tobytes())
     return [each[:number] for each in firsts]
 
 
 @pytest.mark.parametrize("seeds", [None, range(100_000), range(0, 90_000, 3), [5, 6, 7, 8, 9]])
-def test_episodes_depend_on_the_seed_of_the_reset_alone(seeds) -> None:
-    """In every place, for every policy, whatever the seed of creation and whatever was played before."""
+def test_episodes_depend_only_on_the_seed_of_the_reset(seeds) -> None:
+    """In process and served, for every seeding policy, whatever the seed at creation and the episodes played before."""
     played = []
     for where in WHERE:
         for seed in (0, 1):
@@ -35,7 +35,7 @@ def test_episodes_depend_on_the_seed_of_the_reset_alone(seeds) -> None:
                 for group in range(GROUPS):
                     episodes(envs, group, 1 + seed)
                 shown = []
-                # The same seeds, given in all ways.
+                # The same seeds, in every form.
                 for given in (40, every, np.array(every)):
                     envs.reset(seed=given)
                     shown.append([episodes(envs, group) for group in range(GROUPS)])
@@ -60,7 +60,7 @@ def test_episodes_depend_on_the_seed_of_the_reset_alone(seeds) -> None:
     assert all(each == played[0] for each in played)
 
 
-def test_seeds_of_a_reset_are_those_of_sync_vector_env() -> None:
+def test_a_reset_uses_the_same_seeds_as_sync_vector_env() -> None:
     sync = SyncVectorEnv([lambda: endless_gym.Env(ID)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
     with endless_gym.make_vec(ID, 3, seed=0, autoreset="same_step") as envs:
         for seed in (7, [3, 1, 2]):
@@ -96,7 +96,7 @@ def test_ranges_keep_their_step(where) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_lists_longer_than_a_command_line_are_used_in_order(where) -> None:
-    """The list is longer than an argument of a command may be."""
+    """The list is longer than the longest permitted command-line argument."""
     seeds = [(number * 7_919) % 2**64 + 10**15 for number in range(100_000)]
     with where(ID, 3, seeds=seeds) as envs:
         for episode in range(2):

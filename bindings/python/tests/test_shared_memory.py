@@ -1,4 +1,4 @@
-"""Nothing that a user does with the arrays of a step changes later steps, or kills the process."""
+"""Nothing that a user does with the arrays of a step changes later steps or kills the process."""
 
 import gc
 import subprocess
@@ -20,7 +20,7 @@ FRAMES = [None, endless_gym.Frames(grayscale=True, stack=2), endless_gym.Frames(
 
 
 def arrays_of(returned: object) -> list[np.ndarray]:
-    """All arrays in what `step` or `reset` returned, but for the time."""
+    """All arrays in what `step` or `reset` returned, except times."""
     if isinstance(returned, dict):
         return [array for key, value in returned.items() if key != "t" for array in arrays_of(value)]
     if isinstance(returned, tuple):
@@ -31,7 +31,7 @@ def arrays_of(returned: object) -> list[np.ndarray]:
 @pytest.mark.parametrize("export", EXPORTS)
 @pytest.mark.parametrize("frames", FRAMES)
 @pytest.mark.parametrize("id", ["MortarMayhemB-v0", "Endless-MysteryPath-v0", "SearingSpotlights-v0"])
-def test_writes_to_exported_memory_are_drawn_over(
+def test_later_frames_overwrite_writes_to_exported_memory(
     export: Callable[[np.ndarray], torch.Tensor], frames: endless_gym.Frames | None, id: str
 ) -> None:
     def make() -> endless_gym.EndlessVectorEnv:
@@ -64,7 +64,7 @@ def test_an_exported_tensor_keeps_its_memory() -> None:
 
 
 def test_reading_without_an_export_causes_no_full_redraw() -> None:
-    """Reading, by all means that do not export a writable tensor, causes no full redraw: a pixel that is changed stays so."""
+    """Ways to read that do not export a writable tensor cause no full redraw, so a pixel changed behind the engine stays."""
     with endless_gym.make_vec("MortarMayhem-Grid-v0", 1, seed=5, autoreset="disabled") as envs:
         envs.reset()
         for _ in range(3):
@@ -110,7 +110,7 @@ def test_refused_exports_say_how_to_export() -> None:
         del observation, array, shared, copied
 
 
-def test_a_capsule_that_nobody_takes_releases_the_array() -> None:
+def test_an_unconsumed_capsule_releases_the_array() -> None:
     with endless_gym.make_vec("MortarMayhem-v0", 2) as envs:
         observation, _ = envs.reset()
         address = observation.ctypes.data

@@ -1,6 +1,6 @@
-"""Every fenced code block of the documentation runs as it is shown.
+"""Every fenced code block of the documentation runs as shown.
 
-A comment before a block says how to treat it; readers of the page do not see it:
+A comment before a block, which readers of the page do not see, says how to treat it:
 
     <!-- not run: REASON -->    the block is not run, for that reason
     <!-- continues -->          the block is run after the one before it, in the same folder; Python blocks share their names
@@ -65,7 +65,7 @@ def blocks(file: Path) -> Iterator[Block]:
 
 
 def programs(file: Path) -> list[list[Block]]:
-    """The blocks that run, each with those that continue it."""
+    """The blocks that run, each with the blocks that continue it."""
     runs: list[list[Block]] = []
     for block in blocks(file):
         if block.reason or block.language not in ("python", *SHELL):
@@ -78,7 +78,7 @@ def programs(file: Path) -> list[list[Block]]:
 
 
 TIMEOUT = 280
-#: Engines remove their segments. Not SIGINT, which Python's start would swallow.
+#: Ends engines so that they remove their segments. SIGINT could get lost while Python starts.
 END_JOBS = "kill -TERM $(jobs -p) 2>/dev/null || true; wait"
 ALL_PROGRAMS = [program for page in pages() for program in programs(page)]
 PROGRAMS = [program for program in ALL_PROGRAMS if not program[0].libraries]
@@ -143,7 +143,7 @@ def test_snippets_of_docstrings_define_their_names() -> None:
         assert checked.returncode == 0, f"{snippet.name}: {checked.stdout}"
 
 
-#: What may show a command that a reader copies.
+#: Files that may show a command that a reader copies.
 SOURCES = (
     "*.md",
     "bindings/python/endless_gym/**/*.py",
@@ -151,7 +151,7 @@ SOURCES = (
     "engine/cli/src/*.rs",
     "docs/**/*.md",
 )
-#: A word with brackets outside of quotes, after a program or in an argument: zsh takes it for a pattern of file names.
+#: A word with unquoted brackets, after a program or in an argument, which zsh would treat as a file name pattern.
 GLOB = re.compile(r"""(?:pip install|--option|--environment\.option)[ =](?:[^'"`\s]+ )*[^'"`\s]*\[""")
 
 

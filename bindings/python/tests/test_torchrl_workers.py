@@ -1,4 +1,4 @@
-"""TorchRL's collector in several processes, each with an engine of its own."""
+"""TorchRL's collector in several processes, each with its own engine."""
 
 import os
 
@@ -25,8 +25,8 @@ def test_environments_must_be_divisible_among_the_workers() -> None:
 
 
 @pytest.mark.slow
-def test_workers_play_the_episodes_of_one_process() -> None:
-    """Each plays its share of what one process plays with the same actions: no seed is used twice, and none is left out."""
+def test_workers_play_the_same_episodes_as_one_process() -> None:
+    """Each worker plays its share of the episodes of one process: no seed is used twice, and none is left out."""
     makers = EndlessEnv.workers(ID, ENVS, WORKERS, seed=40, options={"max_steps": 5})
     collector = MultiCollector(
         makers, None, sync=True, cat_results=0, frames_per_batch=ENVS * STEPS, total_frames=2 * ENVS * STEPS

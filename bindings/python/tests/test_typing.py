@@ -1,4 +1,4 @@
-"""Scripts of users are type-checked strictly."""
+"""User scripts pass strict type checking."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def marked() -> set[int]:
 @pytest.mark.slow
 @pytest.mark.libraries
 def test_mypy_accepts_right_calls_and_reports_wrong_ones(tmp_path: Path) -> None:
-    # In a folder without the package's own settings, as a user runs it. PyTorch, which is left to pyright, takes it minutes.
+    # In a folder without the package's own settings, as a user runs it. mypy takes minutes for PyTorch, which pyright checks.
     (tmp_path / "mypy.ini").write_text("[mypy]\nstrict = True\n[mypy-torch.*]\nfollow_imports = skip\n")
     command = [sys.executable, "-m", "mypy", "--no-error-summary", "--cache-dir", tmp_path / "cache"]
     checked = subprocess.run([*command, *RIGHT, WRONG], cwd=tmp_path, capture_output=True, text=True)

@@ -70,7 +70,7 @@ def test_arrays_are_views_that_do_not_change(where) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_copies_are_the_users_own(where) -> None:
+def test_copies_are_writable_and_independent(where) -> None:
     with where(ID, 2, seed=1, copy=True) as envs:
         observation, info = envs.reset()
         # More steps than a served engine lends.
@@ -154,7 +154,7 @@ def test_reset_takes_options_and_a_mask(where) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_environments_may_have_options_of_their_own(where) -> None:
+def test_each_environment_can_have_its_own_options(where) -> None:
     each = [{"arena_size": size} for size in (2, 3, 4, 5)]
     with where("MortarMayhem-v0", 2, groups=2, seed=1, options=each) as envs:
         for group in range(2):
@@ -165,7 +165,7 @@ def test_environments_may_have_options_of_their_own(where) -> None:
                 np.testing.assert_array_equal(observation[env], alone.reset(seed=1 + number)[0])
 
 
-def test_features_come_alone_or_beside_frames() -> None:
+def test_features_are_observed_with_or_without_frames() -> None:
     envs = endless_gym.make_vec(ID, 2, seed=1, observation="features")
     observation, _ = envs.reset()
     assert observation.dtype == np.float32
@@ -214,7 +214,7 @@ def stacked(number: int):
         (endless_gym.Frames(channels_first=True, row_major=True, stack=2), [transposed((2, 1, 0)), stacked(2)]),
     ],
 )
-def test_frames_are_as_gymnasiums_wrappers_make_them(where, mode: AutoresetMode, frames, wrappers) -> None:
+def test_frames_equal_those_of_gymnasiums_wrappers(where, mode: AutoresetMode, frames, wrappers) -> None:
     def wrapped() -> gymnasium.Env:
         env: gymnasium.Env = endless_gym.Env("Endless-SearingSpotlights-v0")
         for wrapper in wrappers:

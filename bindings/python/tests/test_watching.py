@@ -1,4 +1,4 @@
-"""Observers beside a trainer: `endless_gym.watch` and `endless watch`."""
+"""Observers that watch a trainer: `endless_gym.watch` and `endless watch`."""
 
 import gc
 import json
@@ -21,7 +21,7 @@ from endless_gym.program import program
 ID = "Endless-MortarMayhem-v0"
 NUM_ENVS = 4
 
-# A trainer in a process of its own. It plays in time with its standard input, or on its own until that closes.
+# A trainer in a separate process. It plays one step per line of its standard input, or continuously until that closes.
 TRAINER = f"""
 import sys, threading, endless_gym
 envs = endless_gym.serve({ID!r}, {NUM_ENVS}, groups=int(sys.argv[1]), seed=0)
@@ -61,7 +61,7 @@ class Trainer:
         assert self.process.stdout.readline() == "played\n"
 
     def end(self) -> str:
-        """Ends it, and returns what it printed."""
+        """Ends the trainer, and returns what it printed."""
         return self.process.communicate(timeout=60)[0]
 
 
@@ -80,7 +80,7 @@ def watch_command(*arguments: str) -> list[str]:
     return [*program(), "watch", *arguments]
 
 
-def test_a_watched_batch_is_the_trainers(trainer: Trainer) -> None:
+def test_watched_batches_equal_those_of_the_trainer(trainer: Trainer) -> None:
     with endless_gym.make_vec(ID, NUM_ENVS, seed=0) as envs, endless_gym.watch(trainer.service) as batches:
         assert (batches.id, batches.num_envs, batches.num_groups) == (ID, NUM_ENVS, 1)
         assert batches.observation_space == envs.observation_space
@@ -91,7 +91,7 @@ def test_a_watched_batch_is_the_trainers(trainer: Trainer) -> None:
             trainer.step()
             batch = next(batches)
             observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
-            # The reset was the first.
+            # The first batch was that of the reset.
             assert (batch.step, batch.group, batch.missed) == (step, 0, 0)
             np.testing.assert_array_equal(batch.observation, observation)
             np.testing.assert_array_equal(batch.reward, reward)
@@ -120,7 +120,7 @@ def test_missed_batches_are_counted(trainer: Trainer) -> None:
 
 
 @pytest.mark.parametrize("trainer", [(3, "steps")], indirect=True)
-def test_all_groups_are_watched_or_one(trainer: Trainer) -> None:
+def test_one_group_or_all_can_be_watched(trainer: Trainer) -> None:
     with endless_gym.watch(trainer.service) as batches, endless_gym.watch(trainer.service, group=1, copy=True) as one:
         for _ in range(3):
             trainer.step()
@@ -167,7 +167,7 @@ def test_a_closed_watch_yields_nothing(trainer: Trainer) -> None:
 
 
 @pytest.mark.parametrize("trainer", [(1, "alone")], indirect=True)
-def test_a_watch_that_hoards_harms_only_itself(trainer: Trainer) -> None:
+def test_a_watch_that_holds_too_many_batches_affects_no_other(trainer: Trainer) -> None:
     with endless_gym.watch(trainer.service) as batches:
         held = []
         with pytest.raises(endless_gym.TooManyBatchesHeld):

@@ -1,4 +1,4 @@
-"""Every wrapper of Gymnasium over single and vector environments, in this process and served, at the ends of episodes."""
+"""Every wrapper of Gymnasium works with single and vector environments, in process and served, also when episodes end."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -14,9 +14,9 @@ import endless_gym
 
 __all__ = ["recorded"]
 
-#: Has a dict as observation.
+#: An id with dict observations.
 DICT_ID = "MortarMayhemB-v0"
-#: The wrappers that convert to tensors, with the packages of the group `libraries`.
+#: The wrappers that convert to tensors, which need the packages of the group `libraries`.
 TENSORS = ("ArrayConversion", "NumpyToTorch")
 WHERE = {"in process": endless_gym.make_vec, "served": endless_gym.serve}
 NUM_ENVS = 3
@@ -76,7 +76,7 @@ def test_wrappers_work_with_single_environments(name: str, id: str, recorded: li
         assert len(recorded) > 0
 
 
-#: Observations in a dict, and frames with two branches of actions and with one, in all modes; served, each of these in one mode.
+#: Dict observations, and frames with two action branches and with one: in process in all modes, served in one mode each.
 KINDS = (DICT_ID, "SearingSpotlights-v0", "Endless-MysteryPath-v0")
 PAIRS = [
     *(("in process", mode, id) for mode in AutoresetMode for id in KINDS),
@@ -86,8 +86,8 @@ PAIRS = [
 
 @pytest.fixture(scope="module", params=PAIRS, ids=lambda each: f"{each[0]}, {each[1].name}, {each[2]}")
 def pair(request: pytest.FixtureRequest) -> Iterator[tuple[VectorEnv, VectorEnv]]:
-    """Our environments and Gymnasium's of the same id. Both always play the same, so the frames that an episode takes over from
-    an earlier one are the same, too."""
+    """Our vector environments and Gymnasium's. Both always play the same, so that an episode shows the same traces of earlier
+    ones."""
     where, mode, id = request.param
     with WHERE[where](id, NUM_ENVS, autoreset=mode, options=SHORT[id], render_mode="rgb_array") as envs:
         yield envs, synchronous(id, mode)
@@ -100,7 +100,7 @@ def synchronous(id: str, mode: AutoresetMode) -> VectorEnv:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", marked(VECTOR))
-def test_wrappers_return_what_they_return_over_sync_vector_env(
+def test_wrappers_return_the_same_as_over_sync_vector_env(
     name: str, pair: tuple[Any, Any], recorded: list[Any]
 ) -> None:
     case, (envs, sync) = VECTOR[name], pair
@@ -127,7 +127,7 @@ def test_wrappers_return_what_they_return_over_sync_vector_env(
 
 
 def play(case: Case, envs: VectorEnv, name: str) -> Any:
-    """What a wrapper returns over environments, which are not closed."""
+    """Everything that a wrapper returns; the environments are not closed."""
     wrapped = case.wrap(envs)
     envs.action_space.seed(1)
     disabled = envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED
@@ -139,7 +139,7 @@ def play(case: Case, envs: VectorEnv, name: str) -> Any:
         done = np.asarray(step[2]) | np.asarray(step[3])
         ends += int(done.sum())
         if disabled and done.any():
-            # Converters of arrays have no reset of single environments.
+            # Wrappers that convert arrays cannot reset single environments.
             returned.append(plain(envs.reset(options={"reset_mask": done})))
     assert ends > NUM_ENVS
     if getattr(wrapped, "recording", False):

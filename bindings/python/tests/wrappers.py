@@ -1,4 +1,4 @@
-"""Each wrapper of Gymnasium, with the arguments that it is tested with, or why it is not."""
+"""Each wrapper of Gymnasium, with the arguments for its test or the reason why it is not tested."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ try:
 except ImportError:
     torch = None  # the tests that need it are marked
 
-#: Reset parameters with which episodes end within some steps.
+#: Reset parameters with which episodes end within a few steps.
 SHORT: dict[str, dict[str, Any]] = {
     id: {"command_count": [1], "explosion_duration": [1], "explosion_delay": [2]}
     if id.startswith("MortarMayhem")
@@ -40,11 +40,11 @@ class Case(NamedTuple):
     """A wrapper that applies."""
 
     wrap: Wrap
-    #: Arguments of the environments beside the id and the options.
+    #: Arguments of the environments besides the id and the options.
     kwargs: Mapping[str, Any] = MappingProxyType({})
-    #: Whether the wrapper works with observations that are a dict, with others, or both.
+    #: Whether the wrapper works with dict observations (true), with others (false), or both.
     dicts: tuple[bool, ...] = (False, True)
-    #: The auto-reset modes that a vector wrapper works with, over any environments.
+    #: The auto-reset modes with which a vector wrapper works.
     modes: tuple[AutoresetMode, ...] = tuple(AutoresetMode)
 
 
@@ -57,9 +57,9 @@ class Refuses(NamedTuple):
 
 
 RGB = {"render_mode": "rgb_array"}
-#: Gymnasium's wrappers of observations do not change `final_obs`, and its converters take no arrays of objects.
+#: Gymnasium's observation wrappers do not change `final_obs`, and its converters do not accept object arrays.
 NOT_SAME_STEP = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
-NOT_JAX = "it is for environments that return arrays of JAX"
+NOT_JAX = "it is for environments that return JAX arrays"
 FRAMES = (False,)
 
 
@@ -68,13 +68,13 @@ def unchanged(given: Any) -> Any:
 
 
 def doubled(reward: Any) -> Any:
-    """Writes to the rewards."""
+    """Modifies the rewards in place."""
     reward *= 2
     return reward
 
 
 def scaled(env: Any, wrapper: Wrap, *args: Any) -> Any:
-    """`wrapper` over frames as floating-point numbers."""
+    """`wrapper` over frames converted to float32."""
     dtype = (
         vectors.DtypeObservation if isinstance(env, gymnasium.vector.VectorEnv) else gymnasium.wrappers.DtypeObservation
     )
@@ -209,7 +209,7 @@ def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[l
 
 
 def plain(value: Any) -> Any:
-    """A comparable copy of a value, without times and with arrays instead of tensors: engines lend few batches."""
+    """A comparable copy of a value, without times and with arrays instead of tensors. It holds no batch of an engine."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items() if key != "t"}
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):

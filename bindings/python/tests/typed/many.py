@@ -1,4 +1,4 @@
-"""Environments in this process, by each of the two functions that make them."""
+"""Environments in this process, made by each of the two functions."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Environments in an engine process: one of its own, and one that runs."""
+"""Environments in an engine process: one that the script starts, and a running one."""
 
 import endless_gym
 

@@ -1,4 +1,4 @@
-"""What type checkers must refuse; each line with a mark is an error."""
+"""Calls that type checkers must refuse: each marked line is an error."""
 
 import endless_gym
 
