@@ -1,9 +1,9 @@
-"""Write what follows from the sources into the pages: the tables of the environments, and the messages of errors.
+"""Write the generated parts of the pages: the tables of the environments, and the messages of errors.
 
     endless list --json | python docs/generate.py            # writes into the pages
     endless list --json | python docs/generate.py --check    # fails if a page is stale
 
-A page names its parts by comments, `<!-- generated: PART ARGUMENT -->`; what follows, up to `<!-- end -->`, is replaced.
+A comment in a page, `<!-- generated: PART ARGUMENT -->`, names a part; the text after it, up to `<!-- end -->`, is replaced.
 """
 
 import json
@@ -32,7 +32,7 @@ def family(name: str) -> list[Spec]:
 
 
 def merged(specs: list[Spec], rows: Callable[[Spec], Iterable[tuple[str, ...]]]) -> list[tuple[str, ...]]:
-    """The rows of all environments, each once, with a first column of the ids that have it."""
+    """The distinct rows of all environments, with a first column for the ids that have each."""
     ids: dict[tuple[str, ...], list[str]] = {}
     for spec in specs:
         for row in rows(spec):
@@ -60,7 +60,7 @@ def overview(_: str) -> str:
 
 
 def actions(_: str) -> str:
-    """What the numbers of an action mean, with a row for each branch."""
+    """The meanings of an action's numbers, with a row for each branch."""
 
     def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
         for branch, described in enumerate(spec["actions"]):
@@ -77,7 +77,7 @@ def actions(_: str) -> str:
 
 
 def parameters(name: str) -> str:
-    """Reset parameters with limits, the default of each id, and meaning."""
+    """Reset parameters with their limits, the default of each id, and their meaning."""
     specs = family(name)
     found: dict[tuple[str, str, str], dict[str, str]] = {}
     for spec in specs:
@@ -118,7 +118,7 @@ def ground_truth(name: str) -> str:
 
 
 def features(name: str) -> str:
-    """Columns of the feature observation; those of the same meaning share a row."""
+    """Columns of the feature observation; columns with the same meaning share a row."""
 
     def rows(spec: Spec) -> Iterable[tuple[str, ...]]:
         names: dict[tuple[str, str], list[str]] = {}
@@ -184,7 +184,7 @@ def error_types() -> dict[str, dict[str, tuple[str, str]]]:
 
 
 def cause(doc: str) -> str:
-    """The text of documentation comments, without the links of Rust's documentation, which lead nowhere here."""
+    """The text of documentation comments, without rustdoc links, which do not work here."""
     text = " ".join(re.findall(r"/// ?(.*)", doc))
     return " ".join(re.sub(r"\[(`.+?`)\](\(.+?\))?", r"\1", text).split())
 
@@ -192,7 +192,7 @@ def cause(doc: str) -> str:
 def message(text: str, arguments: str, fields: str) -> str:
     """The text of a format string, with names in angle brackets in place of values."""
     names = set(re.findall(r"(\w+):", fields))
-    # Commas inside of parentheses do not separate arguments.
+    # Commas inside parentheses do not separate arguments.
     values = iter(part for part in re.split(r",(?![^(]*\))", arguments) if part.strip())
 
     def placeholder(found: re.Match[str]) -> str:

@@ -11,14 +11,14 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
 
-#: Documents of the repository that are pages of the site, too.
+#: Documents elsewhere in the repository that are also pages of the site.
 PAGES = {
     "design/comparison.md": "benches/comparison.md",
     "reference/changes.md": "CHANGELOG.md",
     "train/learning.md": "agents/benches/learning/README.md",
 }
 
-#: What a page must not have: scripts, pictures and style sheets from other hosts.
+#: Scripts, pictures and style sheets from other hosts, which a page must not load.
 EXTERNAL = re.compile(
     r"""<(?:script|img|iframe|source)\b[^>]*\ssrc=["']?(?:https?:)?//"""
     r"""|<link\b[^>]*rel=["']?(?:stylesheet|preconnect|icon)[^>]*href=["']?(?:https?:)?//"""
@@ -26,7 +26,7 @@ EXTERNAL = re.compile(
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are written elsewhere in the repository, with their pictures."""
+    """Add the pages from elsewhere in the repository, with their pictures."""
     for page, source in PAGES.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text()))
         for picture in (ROOT / source).parent.glob("*.png"):
@@ -56,7 +56,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     def contents(found: re.Match[str]) -> str:
         return f"```{Path(found[1]).suffix[1:]}\n{(ROOT / found[1]).read_text()}```"
 
-    # A link that is a paragraph of its own shows the file.
+    # A link that forms a paragraph by itself is replaced by the file's contents.
     markdown = re.sub(r"^\[([\w/.-]+\.(?:rs|yaml|sh))\]\([^)]*\)$", contents, markdown, flags=re.M)
     markdown = re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)", link, markdown)
     if os.environ.get("ENDLESS_DOCS_PAGE"):
@@ -65,7 +65,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """Check that no page loads anything from elsewhere when it is viewed."""
+    """Check that no page loads anything from other hosts."""
     for file in Path(config.site_dir).rglob("*.html"):
         if found := EXTERNAL.search(file.read_text()):
             raise PluginError(f"{file} loads something from elsewhere: {found[0]}")

@@ -1,5 +1,5 @@
 #!/bin/bash
-# A run for each of five seeds.
+# One run for each of five seeds.
 #SBATCH --job-name=mortar
 #SBATCH --array=1-5 --ntasks=1 --cpus-per-task=16 --gpus=1
 #SBATCH --time=24:00:00 --signal=INT@300 --requeue
@@ -7,7 +7,7 @@
 
 run="runs/mortar-$SLURM_ARRAY_TASK_ID"
 arguments=(--env Endless-MortarMayhem-v0 --agent gru --seed "$SLURM_ARRAY_TASK_ID" --run "$run")
-# A job that was requeued, or submitted again, resumes.
+# A job that was requeued or submitted again resumes its run.
 if [[ -e $run/checkpoints/last.pt ]]; then
     arguments=(--resume "$run")
 fi

@@ -6,7 +6,7 @@
 #SBATCH --output=%x-%j.log
 
 head=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
-# Jobs that share a node have ports of their own.
+# Jobs that share a node need different ports.
 port=$((20000 + SLURM_JOB_ID % 10000))
 srun --cpus-per-task="$SLURM_CPUS_PER_TASK" torchrun --nnodes="$SLURM_NNODES" --nproc-per-node=4 --max-restarts=3 \
     --rdzv-backend=c10d --rdzv-endpoint="$head:$port" --rdzv-id="$SLURM_JOB_ID" \

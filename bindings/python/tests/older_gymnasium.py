@@ -1,5 +1,5 @@
-"""Plays like programs written for Gymnasium 0.29, such as CleanRL's ppo_trxl. Runs in the original's Python, and prints digests of
-everything that the environments return.
+"""Plays like programs written for Gymnasium 0.29, such as CleanRL's ppo_trxl. Runs in the original's Python, and prints digests
+of everything that the environments return.
 
 Usage: older_gymnasium.py MODULE, where MODULE registers the original's ids
 """
