@@ -5,11 +5,11 @@ mod actions;
 use std::sync::Arc;
 
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main, measurement::WallTime};
-use endless_gym_core::envs::mortar_mayhem::{self, MortarMayhem};
-use endless_gym_core::envs::mystery_path::{self, MysteryPath};
-use endless_gym_core::envs::searing_spotlights::{self, SearingSpotlights};
 use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters};
 use endless_gym_core::random::Generator;
+use endless_gym_memory_gym::mortar_mayhem::{self, MortarMayhem};
+use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
+use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};
 use serde_json::Map;
 
 use actions::Actions;

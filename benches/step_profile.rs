@@ -13,14 +13,14 @@ use std::hint::black_box;
 use std::sync::Arc;
 
 use endless_gym_core::batch::Block;
-use endless_gym_core::envs::mortar_mayhem::{self, MortarMayhem};
-use endless_gym_core::envs::mystery_path::{self, MysteryPath};
-use endless_gym_core::envs::searing_spotlights::{self, SearingSpotlights};
 use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters, SCREEN};
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
+use endless_gym_memory_gym::memory_gym;
+use endless_gym_memory_gym::mortar_mayhem::{self, MortarMayhem};
+use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
+use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};
 use memmap2::{Advice, MmapMut};
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::Map;

@@ -70,9 +70,9 @@ impl Toolchain {
     }
 }
 
-/// Builds the core without threads and without the system's entropy.
+/// Builds the environments and the core, without threads and without the system's entropy.
 pub fn build_core() -> Result<(), String> {
-    Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-core", "--no-default-features"]).map(drop)
+    Toolchain::find().ok_or(MISSING)?.build(&["--package", "endless-gym-memory-gym"]).map(drop)
 }
 
 /// Whether there is a Chromium for the tests.

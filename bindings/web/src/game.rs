@@ -5,9 +5,9 @@ use std::rc::Rc;
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs::view::VIEW_BYTES;
 use endless_gym_core::envs::{self, Expert};
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::trace::{Recorder, Trace};
+use endless_gym_memory_gym::memory_gym;
 use serde_json::{Map, Value as Json, json};
 
 use crate::agent::{Agent, Memory};

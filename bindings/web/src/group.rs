@@ -2,9 +2,9 @@
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
 use endless_gym_core::envs;
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Experts, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
+use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;

@@ -4,9 +4,9 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{OptionMap, PoolConfig, ResetOptions};
 use endless_gym_core::trace::{Trace, replay};
+use endless_gym_memory_gym::memory_gym;
 use serde::Deserialize;
 use serde_json::{Map, Value as Json, json};
 

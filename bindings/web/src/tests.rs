@@ -2,7 +2,7 @@
 
 use super::*;
 use endless_gym_core::envs::SCREEN;
-use endless_gym_core::memory_gym;
+use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
 fn put(bytes: &[u8]) {

@@ -4,7 +4,6 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_core::DEFAULT_ENV_ID;
 use endless_gym_core::batch::{BLOCK_BYTES, Batch, BatchBuffer};
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{Pool, Registry, ResetRequest, Threads};
@@ -29,7 +28,7 @@ const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id, or `all`.
-    #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
+    #[arg(long = "env", value_name = "ID")]
     id: String,
     /// Number of environments.
     #[arg(long, default_value_t = 1024)]

@@ -3,7 +3,6 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use clap::Parser;
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{Autoreset, Experts, PoolConfig, Registry, ResetRequest};
 use endless_gym_service::EngineConfig;
@@ -21,7 +20,7 @@ use super::view::Beside;
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id; `endless list` lists them.
-    #[arg(long = "env", value_name = "ID", default_value = "MortarMayhem-v0")]
+    #[arg(long = "env", value_name = "ID")]
     id: String,
     /// Policy that chooses the actions.
     #[arg(long, value_enum, default_value = "expert")]
@@ -49,19 +48,6 @@ pub struct Args {
     /// Print JSON [default: text].
     #[arg(long)]
     json: bool,
-}
-
-/// Parses an empty command line, for the defaults.
-#[derive(Parser)]
-struct Defaults {
-    #[command(flatten)]
-    args: Args,
-}
-
-impl Default for Args {
-    fn default() -> Self {
-        Defaults::parse_from([""]).args
-    }
 }
 
 /// Duration without `--seconds`.

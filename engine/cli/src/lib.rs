@@ -30,7 +30,7 @@ mod watch;
 
 use std::ffi::OsString;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use endless_gym_core::pool::Registry;
 
 use failure::Failure;
@@ -103,12 +103,32 @@ const FAILURE: u8 = 1;
 /// command clears.
 pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, executable: &[OsString]) -> u8 {
     engine_process::set_executable(executable);
-    let arguments = std::iter::once("endless".into()).chain(arguments);
-    match Cli::try_parse_from(arguments).map_err(Failure::from).and_then(|cli| run(registry, cli)) {
+    let mut arguments: Vec<_> = std::iter::once("endless".into()).chain(arguments).collect();
+    let parse = |arguments: &[OsString]| {
+        Cli::from_arg_matches(&command(registry).try_get_matches_from(arguments)?).map_err(Failure::from)
+    };
+    let cli = parse(&arguments).and_then(|cli| match cli.command {
+        Some(_) => Ok(cli),
+        None => {
+            arguments.push("demo".into());
+            parse(&arguments)
+        }
+    });
+    match cli.and_then(|cli| run(registry, cli)) {
         Ok(true) => 0,
         Ok(false) => FAILURE,
         Err(error) => report(&*error),
     }
+}
+
+/// The command line, in which the first environment of the registry is the default.
+fn command(registry: &Registry) -> clap::Command {
+    let Some(id) = registry.specs().next().map(|spec| spec.id) else { return Cli::command() };
+    ["demo", "serve", "play", "bench"].into_iter().fold(Cli::command(), |command, name| {
+        command.mut_subcommand(name, |command| {
+            command.mut_arg("id", |argument| argument.required(false).default_value(id))
+        })
+    })
 }
 
 /// Prints an error, a usage or a help, and returns the exit status.
@@ -130,7 +150,8 @@ fn report(error: &(dyn std::error::Error + 'static)) -> u8 {
 /// Runs one command. Returns false if `verify` found a difference.
 fn run(registry: &Registry, cli: Cli) -> Result<bool, Failure> {
     logs::start(cli.log.as_deref())?;
-    match cli.command.unwrap_or_else(|| Command::Demo(demo::Args::default())) {
+    let Some(command) = cli.command else { return Ok(true) };
+    match command {
         Command::List(args) => list::run(registry, &args)?,
         Command::Demo(args) => demo::run(registry, &args)?,
         Command::Serve(args) => serve::run(registry, &args)?,

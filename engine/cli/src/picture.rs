@@ -101,7 +101,7 @@ fn half_block_line(rows: &[[u8; 3]]) -> String {
 mod tests {
 
     use super::*;
-    use endless_gym_core::memory_gym;
+    use endless_gym_memory_gym::memory_gym;
 
     #[test]
     fn colours_need_a_capable_terminal_and_no_no_color() {

@@ -22,7 +22,7 @@ use super::{open, stop, terminal};
 #[derive(clap::Args)]
 pub struct Args {
     /// Environment id; `endless list` lists them.
-    #[arg(value_name = "ID", default_value = "MortarMayhem-v0")]
+    #[arg(value_name = "ID")]
     id: String,
     /// Seed of the first episode [default: random, 0 to 99,999, on the page; 0 in the terminal].
     #[arg(long)]

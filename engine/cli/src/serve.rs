@@ -4,7 +4,6 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use endless_gym_core::DEFAULT_ENV_ID;
 use endless_gym_core::pool::{Autoreset, PoolConfig, Registry};
 use endless_gym_service::{CheckpointConfig, Engine, EngineConfig, ServiceError};
 use serde::Deserialize;
@@ -53,7 +52,7 @@ pub struct Args {
 #[derive(clap::Args)]
 struct EngineArgs {
     /// Environment id; `endless list` lists them.
-    #[arg(long = "env", value_name = "ID", default_value = DEFAULT_ENV_ID)]
+    #[arg(long = "env", value_name = "ID")]
     id: String,
     /// Environments in each group.
     #[arg(long, default_value_t = 1024)]

@@ -1,20 +1,19 @@
-//! The Memory Gym environments, bit-exact and fast.
+//! An engine that steps many environments in lockstep, and what environments are made of.
 //!
-//! The modules follow the data: [`random`] and [`raster`] serve [`envs`], the rules and pictures of the environments; [`batch`]
-//! describes the memory layout of one step of many environments; [`pool`] steps them in lockstep; [`trace`] replays recorded
-//! episodes of the original.
+//! The modules follow the data: environments, which implement a trait of [`envs`], draw random numbers with [`random`] and frames with
+//! [`raster`]; [`batch`] describes the memory layout of one step of many environments; [`pool`] steps them; [`trace`] records and
+//! replays episodes. The environments themselves are crates of their own, such as `endless-gym-memory-gym`.
 
 #![deny(unsafe_code)]
 
 pub mod batch;
 pub mod envs;
-mod memory_gym;
 pub mod pool;
 pub mod random;
 pub mod raster;
 pub mod trace;
 
-pub use memory_gym::{DEFAULT_ENV_ID, memory_gym};
-
 #[cfg(test)]
 mod property_cases;
+#[cfg(test)]
+mod toy;

@@ -4,9 +4,9 @@ use std::collections::VecDeque;
 
 use endless_gym_core::batch::{BatchSection, Block, Layout, Section, zeroed};
 use endless_gym_core::envs::ActionSpace;
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{OptionMap, Pool, PoolError, ResetRequest, SnapshotError, Threads};
 use endless_gym_core::random::Generator;
+use endless_gym_memory_gym::memory_gym;
 use endless_gym_service::{BatchLease, ServiceError, ServiceSpecification, Trainer};
 
 use crate::options;

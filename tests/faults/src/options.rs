@@ -1,9 +1,9 @@
 //! Random reset parameters within the limits of the parameter tables.
 
 use endless_gym_core::envs::ParameterKind;
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::OptionMap;
 use endless_gym_core::random::Generator;
+use endless_gym_memory_gym::memory_gym;
 use serde_json::Value as Json;
 
 /// Some of an id's parameters with random values, usually not far from the defaults.

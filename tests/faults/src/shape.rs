@@ -1,10 +1,10 @@
 //! What an engine serves: the arguments of `endless serve`, and the matching pools.
 
 use endless_gym_core::batch::Frames;
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, Seeding};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::PixelFormat;
+use endless_gym_memory_gym::memory_gym;
 use serde::{Deserialize, Serialize};
 
 use crate::options;

@@ -6,8 +6,8 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use endless_gym_core::memory_gym;
 use endless_gym_core::random::Generator;
+use endless_gym_memory_gym::memory_gym;
 use endless_gym_service::Namespace;
 use serde::Serialize;
 

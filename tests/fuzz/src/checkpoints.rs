@@ -2,8 +2,8 @@
 
 use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Frames, zeroed};
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use endless_gym_memory_gym::memory_gym;
 
 use crate::playing;
 use crate::snapshots::sealed;

@@ -4,10 +4,10 @@ use arbitrary::{Result, Unstructured};
 use endless_gym_core::batch::{Block, zeroed};
 use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{
     Autoreset, OptionMap, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
+use endless_gym_memory_gym::memory_gym;
 
 /// Any of the ids.
 pub(crate) fn spec(input: &mut Unstructured<'_>) -> Result<&'static EnvSpec> {

@@ -3,12 +3,12 @@
 use arbitrary::Unstructured;
 use ciborium::Value;
 use endless_gym_core::batch::{Block, zeroed};
+use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::envs::{EnvSpec, mortar_mayhem, mystery_path, searing_spotlights};
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{
     Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads,
 };
+use endless_gym_memory_gym::{memory_gym, mortar_mayhem, mystery_path, searing_spotlights};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use serde::de::DeserializeOwned;

@@ -3,9 +3,9 @@
 
 use ciborium::Value;
 use endless_gym_core::envs::{EnvSpec, ParameterKind};
-use endless_gym_core::memory_gym;
 use endless_gym_core::pool::{Seeding, SnapshotError};
 use endless_gym_fuzz::snapshots::{Game, Outcome, at, extremes, paths};
+use endless_gym_memory_gym::memory_gym;
 use serde_json::{Map, Value as Json};
 
 /// Number of items of a forged list, more than any list gets by playing within a test.

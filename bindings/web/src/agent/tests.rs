@@ -1,6 +1,6 @@
 //! Compares the page's agent with outputs recorded from PyTorch, and reads broken files.
 
-use endless_gym_core::memory_gym;
+use endless_gym_memory_gym::memory_gym;
 use serde::Deserialize;
 
 use super::*;

@@ -1,6 +1,6 @@
 //! Tests trained agents on the page, and the flash.
 
-use endless_gym_core::memory_gym;
+use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 
 use crate::chromium::Chromium;

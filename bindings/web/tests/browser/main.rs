@@ -8,8 +8,8 @@ mod server;
 use std::path::{Path, PathBuf};
 
 use chromium::Chromium;
-use endless_gym_core::memory_gym;
 use endless_gym_core::trace::{Trace, replay};
+use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 use server::PageServer;
 

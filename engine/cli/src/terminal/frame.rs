@@ -26,9 +26,9 @@ pub fn newest(observation: &[u8], frames: Frames) -> Pixels {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::{Batch, zeroed};
-    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     use endless_gym_core::raster::PixelFormat;
+    use endless_gym_memory_gym::memory_gym;
 
     use super::*;
 

@@ -164,7 +164,7 @@ fn action(spec: &EnvSpec, directions: &[Direction]) -> Vec<i32> {
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::memory_gym;
+    use endless_gym_memory_gym::memory_gym;
 
     use super::*;
 

@@ -54,8 +54,8 @@ pub fn fitting(columns: u16, lines: u16) -> usize {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::{Batch, Frames, zeroed};
-    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    use endless_gym_memory_gym::memory_gym;
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 

@@ -169,7 +169,7 @@ mod tests {
     use ratatui::backend::TestBackend;
     use ratatui::style::Color;
 
-    use endless_gym_core::memory_gym;
+    use endless_gym_memory_gym::memory_gym;
 
     use super::super::keys::Direction;
     use super::*;

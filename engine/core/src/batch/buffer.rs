@@ -12,7 +12,7 @@ use super::block::{Block, zeroed};
 ///
 /// ```
 /// use endless_gym_core::batch::BatchBuffer;
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
 ///
 /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 256), &Threads::new(1)?)?;
@@ -112,8 +112,8 @@ mod tests {
     use super::super::block::{BLOCK_BYTES, blocks_for};
     use super::super::view::Batch;
     use super::*;
-    use crate::memory_gym;
     use crate::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    use crate::toy::toys;
 
     /// Sizes around 4 MiB and around a multiple of a huge page.
     const SIZES: [usize; 8] = [0, 64, 4096, (4 << 20) - 64, 4 << 20, (4 << 20) + 64, (6 << 20) - 64, 21_700_000];
@@ -149,8 +149,8 @@ mod tests {
     #[test]
     fn a_pool_writes_the_same_batch_into_buffers_and_vecs() {
         for num_envs in [2, 256] {
-            let config = PoolConfig::new("MortarMayhem-Grid-v0", num_envs);
-            let mut pools = [(); 2].map(|()| Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap());
+            let config = PoolConfig::new("Toy-v0", num_envs);
+            let mut pools = [(); 2].map(|()| Pool::new(toys(), &config, &Threads::new(1).unwrap()).unwrap());
             let layout = pools[0].layout().clone();
             let (mut buffer, mut vec) = (BatchBuffer::new(layout.blocks()), zeroed(layout.blocks()));
             pools[0].reset(ResetRequest::Seed(5), &mut buffer).unwrap();

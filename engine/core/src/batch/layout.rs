@@ -62,7 +62,7 @@ impl<S: SectionTable> Section<S> {
 ///
 /// ```
 /// use endless_gym_core::batch::{BatchSection, Contents, Frames, Layout, batch_layout, zeroed};
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 ///
 /// let contents = Contents { frames: Some(Frames::default()), ..Contents::default() };
 /// let layout = batch_layout(memory_gym().spec("MysteryPath-v0")?, 16, contents)?;
@@ -403,19 +403,19 @@ mod tests {
     use super::super::block::zeroed;
     use super::super::frames::Frames;
     use super::*;
-    use crate::memory_gym;
+    use crate::toy::toys;
 
     fn everything() -> Contents {
         Contents { frames: Some(Frames::default()), features: true, final_observation: true }
     }
 
     fn layout(num_envs: usize) -> Layout {
-        batch_layout(memory_gym().spec("Endless-MortarMayhem-v0").unwrap(), num_envs, everything()).unwrap()
+        batch_layout(toys().spec("Toy-v0").unwrap(), num_envs, everything()).unwrap()
     }
 
     #[test]
     fn sections_are_aligned_and_do_not_overlap() {
-        for (spec, num_envs) in memory_gym().specs().zip([1, 3, 64, 1000].into_iter().cycle()) {
+        for (spec, num_envs) in toys().specs().zip([1, 3, 64, 1000].into_iter().cycle()) {
             let layout = batch_layout(spec, num_envs, everything()).unwrap();
             let mut end = 0;
             for section in layout.sections() {
@@ -442,7 +442,7 @@ mod tests {
 
     #[test]
     fn a_missing_section_wrong_type_or_short_batch_reads_as_empty() {
-        let layout = batch_layout(memory_gym().spec("MysteryPath-v0").unwrap(), 4, Contents::default());
+        let layout = batch_layout(toys().spec("Toy-Plain-v0").unwrap(), 4, Contents::default());
         let layout = layout.unwrap();
         let batch = zeroed(layout.blocks());
         assert_eq!(layout.read::<f64>(&batch, BatchSection::Reward).len(), 4);
@@ -464,7 +464,7 @@ mod tests {
 
     #[test]
     fn too_many_and_too_few_environments_are_refused() {
-        let spec = memory_gym().specs().next().unwrap();
+        let spec = toys().specs().next().unwrap();
         for given in [0, MAX_ENVS + 1, usize::MAX] {
             assert_eq!(batch_layout(spec, given, everything()), Err(LayoutError::NumEnvs { given }));
             assert_eq!(action_layout(&spec.action_space, given), Err(LayoutError::NumEnvs { given }));
@@ -476,7 +476,7 @@ mod tests {
 
     #[test]
     fn a_message_takes_the_longest_options_and_snapshots() {
-        let spec = memory_gym().specs().next().unwrap();
+        let spec = toys().specs().next().unwrap();
         for num_envs in [1, 7, 1024, MAX_ENVS] {
             let layout = action_layout(&spec.action_space, num_envs).unwrap();
             for (section, bytes) in ActionSection::ALL.iter().filter_map(|section| match section.row() {

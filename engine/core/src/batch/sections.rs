@@ -293,7 +293,7 @@ impl ActionSection {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::memory_gym;
+    use crate::toy::toys;
 
     #[test]
     fn a_name_finds_its_section() {
@@ -311,7 +311,7 @@ mod tests {
     /// Each `final_*` section has the number type and the shape of its original.
     #[test]
     fn final_sections_equal_their_originals() {
-        for spec in memory_gym().specs() {
+        for spec in toys().specs() {
             let contents = Contents { frames: Some(Frames::default()), features: true, final_observation: true };
             for section in BatchSection::ALL {
                 let Some(original) = section.name().strip_prefix("final_") else { continue };
@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn shapes_fit_the_table() {
-        for spec in memory_gym().specs() {
+        for spec in toys().specs() {
             for stack in [1, 4] {
                 let frames = Some(Frames { stack, ..Frames::default() });
                 let contents = Contents { frames, features: true, final_observation: true };

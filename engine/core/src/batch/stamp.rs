@@ -51,12 +51,12 @@ mod tests {
     use super::super::layout::batch_layout;
     use super::super::sections::{BatchSection, Contents};
     use super::*;
-    use crate::memory_gym;
+    use crate::toy::toys;
 
     #[test]
     fn the_stamp_lies_behind_the_sections() {
         let contents = Contents { features: true, ..Contents::default() };
-        let layout = batch_layout(memory_gym().specs().next().unwrap(), 3, contents).unwrap();
+        let layout = batch_layout(toys().specs().next().unwrap(), 3, contents).unwrap();
         let mut batch = zeroed(layout.blocks());
         let stamp = Stamp { pool: 7, buffer: 1, generation: 2 };
         stamp.write(&layout, &mut batch);

@@ -101,14 +101,20 @@ batch_sections! { batch_view! }
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, BatchSection, zeroed};
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
 ///
 /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 4), &Threads::new(1)?)?;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(7), &mut blocks)?;
 ///
-/// Read as the wrong number type, a section is empty.
+/// let batch = Batch::new(pool.layout(), &blocks);
+/// assert_eq!(batch.observation().len(), 4 * 84 * 84 * 3);
+/// assert_eq!(batch.reward(), [0.0; 4]);
+/// assert!(batch.features().is_empty());
+/// // Read as the wrong number type, a section is empty.
+/// assert_eq!(batch.section::<u8>(BatchSection::Terminated), [0; 4]);
+/// assert!(batch.section::<f32>(BatchSection::Terminated).is_empty());
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Copy, Debug)]

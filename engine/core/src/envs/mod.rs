@@ -1,20 +1,13 @@
-//! The environments: the trait that every family implements, specifications, and reset parameters.
+//! What an environment is: the traits that it implements, its specification, and its reset parameters.
 
 mod action_space;
-mod character;
-mod character_sprites;
-mod controls;
 mod environment;
 mod expert;
-pub mod mortar_mayhem;
-pub mod mystery_path;
 mod parameters;
 mod progress;
 mod screen;
-pub mod searing_spotlights;
 mod spec;
 mod task;
-mod vector;
 pub mod view;
 
 pub use action_space::{ActionError, ActionSpace, InvalidActionSpace};

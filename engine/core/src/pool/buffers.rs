@@ -82,7 +82,7 @@ mod model_tests;
 mod tests {
     use super::*;
     use crate::batch::{Contents, Frames, batch_layout, zeroed};
-    use crate::memory_gym;
+    use crate::toy::toys;
 
     fn write(buffers: &mut Buffers, layout: &Layout, batch: &mut [Block]) -> Buffer {
         let buffer = buffers.begin(layout, batch);
@@ -92,7 +92,7 @@ mod tests {
 
     fn layout() -> Layout {
         let contents = Contents { frames: Some(Frames::default()), ..Contents::default() };
-        batch_layout(memory_gym().specs().next().unwrap(), 1, contents).unwrap()
+        batch_layout(toys().specs().next().unwrap(), 1, contents).unwrap()
     }
 
     #[test]

@@ -12,7 +12,7 @@ use crate::envs::{Expert, UnknownEnvironment};
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{Experts, Pool, PoolConfig, ResetRequest, Threads};
 ///
 /// let config = PoolConfig { features: true, ..PoolConfig::new("MortarMayhem-Grid-v0", 4) };
@@ -114,107 +114,4 @@ pub enum ExpertsError {
         /// Numbers that the experts write.
         needed: usize,
     },
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::batch::zeroed;
-    use crate::memory_gym;
-    use crate::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
-
-    const NUM_ENVS: usize = 3;
-    const EPISODES: usize = 3;
-
-    /// Returns and lengths of the first episodes of each environment.
-    type Episodes = [Vec<(f64, i32)>; NUM_ENVS];
-
-    fn config(id: &str, autoreset: Autoreset) -> PoolConfig {
-        let seeding = Seeding::List(vec![5, 6, 7, 8, 9, 10]);
-        PoolConfig { features: true, frames: None, autoreset, seeding, ..PoolConfig::new(id, NUM_ENVS) }
-    }
-
-    /// Plays until every environment has finished [`EPISODES`] episodes.
-    fn play(id: &str, autoreset: Autoreset) -> Episodes {
-        let mut pool = Pool::new(memory_gym(), &config(id, autoreset), &Threads::new(1).unwrap()).unwrap();
-        let mut blocks = zeroed(pool.layout().blocks());
-        pool.reset(ResetRequest::All, &mut blocks).unwrap();
-        let mut experts = Experts::new(memory_gym(), id, NUM_ENVS, autoreset).unwrap();
-        let mut actions = vec![0; NUM_ENVS * pool.spec().action_space.branches().len()];
-        let mut episodes = Episodes::default();
-        for _ in 0..5000 {
-            experts.act(&Batch::new(pool.layout(), &blocks), &mut actions).unwrap();
-            pool.step(&actions, &mut blocks).unwrap();
-            let batch = Batch::new(pool.layout(), &blocks);
-            let ended: Vec<u8> = batch.terminated().to_vec();
-            for env in (0..NUM_ENVS).filter(|env| ended[*env] == 1) {
-                episodes[env].push((batch.episode_return()[env], batch.episode_length()[env]));
-            }
-            if autoreset == Autoreset::Disabled && ended.contains(&1) {
-                pool.reset(ResetRequest::Each { reset: &ended, seed: &[0; NUM_ENVS] }, &mut blocks).unwrap();
-            }
-            if episodes.iter().all(|episodes| episodes.len() >= EPISODES) {
-                break;
-            }
-        }
-        episodes.iter_mut().for_each(|episodes| episodes.truncate(EPISODES));
-        episodes
-    }
-
-    /// The same episodes, each played by a new expert in a new environment.
-    fn alone(id: &str) -> Episodes {
-        let spec = memory_gym().spec(id).unwrap();
-        std::array::from_fn(|env| {
-            let episode = |number: usize| {
-                let config = PoolConfig { num_envs: 1, total_envs: 1, ..config(id, Autoreset::Disabled) };
-                let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).unwrap();
-                let mut blocks = zeroed(pool.layout().blocks());
-                let seed = 5 + (number * NUM_ENVS + env) as u64 % 6;
-                pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-                let (mut expert, mut action) =
-                    (memory_gym().expert(id).unwrap(), vec![0; spec.action_space.branches().len()]);
-                loop {
-                    let batch = Batch::new(pool.layout(), &blocks);
-                    if batch.terminated()[0] == 1 {
-                        return (batch.episode_return()[0], batch.episode_length()[0]);
-                    }
-                    expert.act(batch.features(), batch.vector_observation(), &mut action);
-                    pool.step(&action, &mut blocks).unwrap();
-                }
-            };
-            (0..EPISODES).map(episode).collect()
-        })
-    }
-
-    #[test]
-    fn experts_act_like_new_ones_in_every_episode_and_autoreset_mode() {
-        for id in ["MortarMayhem-Grid-v0", "MortarMayhemB-Grid-v0", "MysteryPath-Grid-v0"] {
-            let expected = alone(id);
-            assert!(expected.iter().flatten().all(|(total, length)| *total > 0.0 && *length > 5), "{id}: {expected:?}");
-            for mode in Autoreset::ALL {
-                assert_eq!(play(id, mode), expected, "{id}, {mode}");
-            }
-        }
-    }
-
-    #[test]
-    fn batches_and_actions_of_the_wrong_size_are_rejected() {
-        let id = "MortarMayhemB-Grid-v0";
-        let pool = |config: &PoolConfig| Pool::new(memory_gym(), config, &Threads::new(1).unwrap()).unwrap();
-        let act = |pool: &Pool, actions: &mut [i32]| {
-            let blocks = zeroed(pool.layout().blocks());
-            Experts::new(memory_gym(), id, NUM_ENVS, Autoreset::NextStep)?
-                .act(&Batch::new(pool.layout(), &blocks), actions)
-        };
-        let good = config(id, Autoreset::NextStep);
-        let needed = NUM_ENVS * memory_gym().spec(id).unwrap().features.len();
-        assert_eq!(act(&pool(&good), &mut [0; NUM_ENVS]), Ok(()));
-        assert_eq!(act(&pool(&good), &mut [0; 2]), Err(ExpertsError::Actions { given: 2, needed: NUM_ENVS }));
-        let plain = PoolConfig { features: false, ..good.clone() };
-        let error = ExpertsError::Features { given: 0, needed, num_envs: NUM_ENVS };
-        assert_eq!(act(&pool(&plain), &mut [0; NUM_ENVS]), Err(error));
-        let fewer = PoolConfig { num_envs: 2, total_envs: 2, ..good };
-        let error = ExpertsError::Features { given: needed / 3 * 2, needed, num_envs: NUM_ENVS };
-        assert_eq!(act(&pool(&fewer), &mut [0; NUM_ENVS]), Err(error));
-    }
 }

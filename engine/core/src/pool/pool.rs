@@ -25,7 +25,7 @@ use crate::raster::PixelFormat;
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
 ///
 /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-Grid-v0", 8), &Threads::new(1)?)?;
@@ -184,7 +184,7 @@ impl Pool {
     ///
     /// ```
     /// use endless_gym_core::batch::zeroed;
-    /// use endless_gym_core::memory_gym;
+    /// use endless_gym_memory_gym::memory_gym;
     /// use endless_gym_core::pool::{NextOptions, Pool, PoolConfig, ResetRequest, Threads};
     ///
     /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MortarMayhem-Grid-v0", 4), &Threads::new(1)?)?;
@@ -233,7 +233,7 @@ impl Pool {
     ///
     /// ```
     /// # use endless_gym_core::batch::{Batch, zeroed};
-    /// # use endless_gym_core::memory_gym;
+    /// # use endless_gym_memory_gym::memory_gym;
     /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     /// let mut pool = Pool::new(memory_gym(), &PoolConfig::new("MysteryPath-v0", 2), &Threads::new(1)?)?;
     /// let mut blocks = zeroed(pool.layout().blocks());
@@ -277,7 +277,7 @@ impl Pool {
     ///
     /// ```
     /// # use endless_gym_core::batch::zeroed;
-    /// # use endless_gym_core::memory_gym;
+    /// # use endless_gym_memory_gym::memory_gym;
     /// # use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     /// let config = PoolConfig::new("MysteryPath-v0", 2);
     /// let mut pool = Pool::new(memory_gym(), &config, &Threads::new(1)?)?;

@@ -36,15 +36,15 @@ mod transform;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use blit::blend_keyed;
+pub use blit::blend_keyed;
 pub use canvas::Canvas;
-pub(crate) use circle::circle_outline;
+pub use circle::circle_outline;
 pub use circle::{Disc, DiscColumn};
 pub use damage::Damage;
 pub use dirty_surface::DirtySurface;
 pub use format::PixelFormat;
 pub use rect::{CornerRadii, Rect};
 pub use runs::Rgb;
-pub(crate) use runs::copy_run;
+pub use runs::copy_run;
 pub use sprite::Sprite;
 pub use surface::Surface;

@@ -15,7 +15,7 @@ use crate::pool::{OptionMap, Pool};
 ///
 /// ```
 /// use endless_gym_core::batch::zeroed;
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{Autoreset, Pool, PoolConfig, ResetRequest, Threads};
 /// use endless_gym_core::trace::{Recorder, Trace, replay};
 ///
@@ -62,7 +62,7 @@ impl Recorder {
     pub fn step(&mut self, action: &[i32], pool: &Pool, blocks: &[Block]) {
         let Some(episode) = self.trace.episodes.last_mut() else { return };
         let batch = Batch::new(pool.layout(), blocks);
-        let done = batch.terminated()[0] == 1;
+        let done = batch.terminated()[0] | batch.truncated()[0] == 1;
         episode.steps.push(Step {
             action: action.to_vec(),
             reward: batch.reward()[0],

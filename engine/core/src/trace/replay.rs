@@ -69,7 +69,7 @@ impl Replay {
 /// [`TraceError::Pool`] if the trace's environment, reset parameters or actions are invalid.
 ///
 /// ```
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::trace::{Trace, replay};
 ///
 /// let text = r#"{"env": "MysteryPath-Grid-v0", "options": {}, "episodes": [
@@ -109,7 +109,7 @@ pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> 
             let batch = Batch::new(pool.layout(), &blocks);
             replay.compare(step, "observation checksum", expected.crc, crc32fast::hash(batch.observation()));
             replay.compare(step, "reward", expected.reward, batch.reward()[0]);
-            replay.compare(step, "done", expected.done, batch.terminated()[0] == 1);
+            replay.compare(step, "done", expected.done, batch.terminated()[0] | batch.truncated()[0] == 1);
             compare_info(&mut replay, step, &expected.info, &info(&pool, &blocks, expected.done));
             if let Some(crc) = expected.render_crc {
                 pool.ground_truth_view(0, &mut view)?;

@@ -138,8 +138,8 @@ fn create<T>(
 mod tests {
     use std::sync::mpsc::channel;
 
-    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::PoolConfig;
+    use endless_gym_memory_gym::memory_gym;
 
     use super::*;
     use crate::engine::config::EngineConfig;

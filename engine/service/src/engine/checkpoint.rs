@@ -377,8 +377,8 @@ impl Drop for CheckpointLock {
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::zeroed;
-    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
+    use endless_gym_memory_gym::memory_gym;
     use proptest::prelude::*;
 
     use super::*;

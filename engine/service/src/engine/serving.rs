@@ -51,7 +51,7 @@ const START_ATTEMPTS: usize = 3;
 /// use std::sync::atomic::{AtomicBool, Ordering};
 /// use std::time::Duration;
 ///
-/// use endless_gym_core::memory_gym;
+/// use endless_gym_memory_gym::memory_gym;
 /// use endless_gym_core::pool::{PoolConfig, ResetRequest};
 /// use endless_gym_service::{ConnectConfig, Engine, EngineConfig, Namespace, Trainer};
 ///
@@ -388,8 +388,8 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
 
 #[cfg(test)]
 mod tests {
-    use endless_gym_core::memory_gym;
     use endless_gym_core::pool::PoolConfig;
+    use endless_gym_memory_gym::memory_gym;
 
     use super::*;
     use crate::namespace::directory::Namespace;

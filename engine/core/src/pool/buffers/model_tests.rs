@@ -5,8 +5,8 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::batch::{Contents, batch_layout, zeroed};
-use crate::memory_gym;
 use crate::property_cases::property_cases;
+use crate::toy::toys;
 
 /// What happens to the buffers of two pools.
 #[derive(Clone, Copy, Debug)]
@@ -75,7 +75,7 @@ impl Model {
 
 fn layout() -> Layout {
     let contents = Contents::default();
-    batch_layout(memory_gym().specs().next().unwrap(), 1, contents).unwrap()
+    batch_layout(toys().specs().next().unwrap(), 1, contents).unwrap()
 }
 
 #[test]

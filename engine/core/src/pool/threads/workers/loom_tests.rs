@@ -9,10 +9,10 @@ use loom::model::Builder;
 
 use super::*;
 use crate::batch::zeroed;
-use crate::memory_gym;
 use crate::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use crate::toy::toys;
 
-const ID: &str = "MysteryPath-Grid-v0";
+const ID: &str = "Toy-v0";
 
 /// Pieces of work. An unsynchronised mutable access fails the model.
 struct Pieces {
@@ -141,7 +141,7 @@ fn loom_a_pool_steps_every_environment_once() {
     fn play(threads: &Threads) -> Vec<u8> {
         let config =
             PoolConfig { frames: None, seeding: Seeding::Continue { seed: Some(1) }, ..PoolConfig::new(ID, 64) };
-        let mut pool = Pool::new(memory_gym(), &config, threads).unwrap();
+        let mut pool = Pool::new(toys(), &config, threads).unwrap();
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
         pool.step(&[1; 64], &mut blocks).unwrap();

@@ -1,0 +1,71 @@
+//! The meaning of actions that several ids share.
+
+use endless_gym_core::envs::{ActionBranch, Choice};
+
+const fn choice(name: &'static str, description: &'static str) -> Choice {
+    Choice { name, description }
+}
+
+/// Free movement: a branch for each axis. Both together move diagonally, by the same distance.
+pub(crate) const MOVE: &[ActionBranch] = &[
+    ActionBranch {
+        name: "horizontal",
+        choices: &[
+            choice("nothing", "no horizontal movement"),
+            choice("left", "faces left and moves left"),
+            choice("right", "faces right and moves right"),
+        ],
+    },
+    ActionBranch {
+        name: "vertical",
+        choices: &[
+            choice("nothing", "no vertical movement"),
+            choice("up", "faces up and moves up"),
+            choice("down", "faces down and moves down"),
+        ],
+    },
+];
+
+/// Turning and walking on a grid.
+pub(crate) const TURN_AND_WALK: &[ActionBranch] = &[ActionBranch {
+    name: "move",
+    choices: &[
+        choice("nothing", "no movement"),
+        choice("left", "turns left by 90 degrees, and stays on its tile"),
+        choice("right", "turns right by 90 degrees, and stays on its tile"),
+        choice("ahead", "walks one tile ahead, except over the border"),
+    ],
+}];
+
+/// Movement along a path that leads to the right.
+pub(crate) const FOLLOW: &[ActionBranch] = &[ActionBranch {
+    name: "move",
+    choices: &[
+        choice("nothing", "no movement"),
+        choice("right", "faces right and moves right"),
+        choice("up", "faces up and moves up"),
+        choice("down", "faces down and moves down"),
+    ],
+}];
+
+/// Actions on a grid.
+const NOTHING: i32 = 0;
+const LEFT: i32 = 1;
+const RIGHT: i32 = 2;
+const AHEAD: i32 = 3;
+
+/// The grid action for a movement by `(x, y)` cells of an agent with that heading, a unit vector: horizontally first.
+pub(crate) fn turn_or_walk([heading_x, heading_y]: [f32; 2], (x, y): (i32, i32)) -> i32 {
+    let (wanted_x, wanted_y) = match (x, y) {
+        (0, 0) => return NOTHING,
+        (0, y) => (0.0, y.signum() as f32),
+        (x, _) => (x.signum() as f32, 0.0),
+    };
+    let ahead = heading_x * wanted_x + heading_y * wanted_y;
+    let clockwise = heading_x * wanted_y - heading_y * wanted_x;
+    match () {
+        _ if ahead > 0.5 => AHEAD,
+        _ if clockwise > 0.5 => RIGHT,
+        _ => LEFT,
+    }
+}

@@ -1,0 +1,136 @@
+//! Mortar Mayhem: memorise a sequence of commands, then execute it in an arena whose other tiles burn.
+
+mod commands;
+mod config;
+mod display_schedule;
+mod drawing;
+pub mod expert;
+mod features;
+mod parameters;
+mod registry;
+mod rules;
+mod state;
+
+use std::sync::Arc;
+
+pub use commands::{COMMANDS, Command, MAX_VECTOR_COMMANDS};
+pub use config::Config;
+pub use drawing::{Assets, Scene};
+pub use parameters::{Locomotion, Parameters, Variant};
+pub use registry::IDS;
+pub use state::State;
+
+use crate::character_sprites::CharacterSprites;
+use endless_gym_core::envs::Expert;
+use endless_gym_core::envs::Progress;
+use endless_gym_core::envs::ResetParameters;
+use endless_gym_core::envs::{Environment, InvalidState, Transition};
+use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
+use state::DisplayedCharacter;
+
+/// One environment of the family.
+#[derive(Clone, Debug)]
+pub struct MortarMayhem {
+    assets: Arc<Assets>,
+    state: State,
+    /// Pictures of [`DisplayedCharacter::Earlier`].
+    earlier_sprites: Arc<CharacterSprites>,
+}
+
+impl Environment for MortarMayhem {
+    type Variant = Variant;
+    type Assets = Assets;
+    type State = State;
+    type Scene = Scene;
+
+    fn assets(variant: Variant, parameters: &ResetParameters) -> Assets {
+        Assets::new(variant, Parameters::new(variant, parameters))
+    }
+
+    fn new(assets: &Arc<Assets>) -> Self {
+        MortarMayhem { assets: Arc::clone(assets), state: State::new(), earlier_sprites: Arc::clone(&assets.character) }
+    }
+
+    fn reset(&mut self, assets: &Arc<Assets>, random: &mut Generator) {
+        if self.state.displayed == DisplayedCharacter::Current {
+            self.earlier_sprites = Arc::clone(&self.assets.character);
+        }
+        let last_scale = self.assets.config.parameters.agent_scale;
+        if !Arc::ptr_eq(&self.assets, assets) {
+            self.assets = Arc::clone(assets);
+        }
+        self.state.reset(&assets.config, last_scale, random);
+    }
+
+    fn step(&mut self, action: &[i32], random: &mut Generator) -> Transition {
+        self.state.step(&self.assets.config, action, random)
+    }
+
+    fn shared(&self) -> &Arc<Assets> {
+        &self.assets
+    }
+
+    fn scene(&self) -> Scene {
+        Scene::new(&self.state, &self.assets.config, &self.assets.character, &self.earlier_sprites)
+    }
+
+    fn paint(assets: &Assets, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.paint(assets, canvas);
+    }
+
+    fn repaint(assets: &Assets, shown: &Scene, scene: &Scene, canvas: &mut Canvas<'_>) {
+        scene.damage_since(shown, assets, canvas.tracks_dirty()).repair(canvas, |canvas| scene.paint(assets, canvas));
+    }
+
+    fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {
+        self.assets.draw_ground_truth(&mut self.state, &self.earlier_sprites, canvas);
+    }
+
+    fn align_ground_truth(&mut self) {
+        self.state.align_view_display();
+    }
+
+    fn vector_observation(&self, out: &mut [f32]) {
+        out.fill(0.0);
+        for (one_hot, command) in out.chunks_exact_mut(COMMANDS).zip(&self.state.commands) {
+            one_hot[command.one_hot()] = 1.0;
+        }
+    }
+
+    fn features(&self, out: &mut [f32]) {
+        self.state.write_features(&self.assets.config, out);
+    }
+
+    fn ground_truth(&self, out: &mut [f64]) {
+        let (x, y) = self.state.target;
+        out.copy_from_slice(&[f64::from(x) / 5.0, f64::from(y) / 5.0]);
+    }
+
+    fn state(&self) -> &State {
+        &self.state
+    }
+
+    fn restore(&mut self, assets: &Arc<Assets>, state: State) -> Result<(), InvalidState> {
+        if !state.is_valid(&assets.config) {
+            return Err(InvalidState);
+        }
+        self.assets = Arc::clone(assets);
+        self.earlier_sprites = assets.displayed_sprites(&state);
+        self.state = state;
+        Ok(())
+    }
+
+    fn progress(&self) -> Vec<Progress> {
+        self.state.progress(&self.assets.config)
+    }
+
+    fn info(&self, out: &mut [f64]) {
+        let endless = self.assets.config.variant.endless;
+        out.copy_from_slice(&if endless { self.state.endless_info() } else { self.state.finite_info() });
+    }
+
+    fn expert(variant: Variant) -> Option<Box<dyn Expert>> {
+        Some(Box::new(expert::MortarExpert::new(variant)))
+    }
+}

@@ -1,0 +1,142 @@
+//! The feature observation of Mystery Path: the content of a frame as numbers. It does not contain the path, which the agent
+//! must remember.
+
+use super::config::{Config, TILE};
+use super::parameters::Variant;
+use super::path::GRID;
+use super::state::State;
+use endless_gym_core::envs::Column;
+use endless_gym_core::envs::SCREEN;
+
+/// Indices of the columns that all ids have.
+pub(super) const AGENT: usize = 0;
+pub(super) const HEADING: usize = 2;
+pub(super) const FALLEN: usize = 4;
+const SHARED: usize = FALLEN + 1;
+/// Indices in [`FINITE_FEATURES`].
+const ORIGIN: usize = SHARED;
+const GOAL: usize = ORIGIN + 3;
+/// Indices in [`ENDLESS_FEATURES`].
+pub(super) const STAMINA: usize = SHARED;
+pub(super) const BACKGROUND: usize = STAMINA + 2;
+pub(super) const PAST_SHIFT: usize = BACKGROUND + 1;
+pub(super) const PAST_PATH: usize = PAST_SHIFT + 1;
+
+/// Columns of tiles that are on the screen in whole or in part.
+const SCREEN_COLUMNS: usize = GRID as usize + 1;
+const SCREEN_TILES: usize = SCREEN_COLUMNS * GRID as usize;
+
+/// Divisor of a tile's column and row.
+const LAST_TILE: f32 = GRID as f32 - 1.0;
+
+const fn column(name: &'static str, description: &'static str) -> Column {
+    Column { name, description }
+}
+
+const SHARED_COLUMNS: [Column; SHARED] = [
+    column("agent_x", "horizontal centre of the agent on the screen, divided by 84"),
+    column("agent_y", "vertical centre of the agent on the screen, divided by 84"),
+    column("heading_x", "direction of the agent: horizontal part of a unit vector"),
+    column("heading_y", "direction of the agent: vertical part of a unit vector, down is positive"),
+    column("fallen", "1 while the red cross is seen: the agent fell off the path"),
+];
+
+/// The columns of the finite ids.
+pub const FINITE_FEATURES: &[Column] = &FINITE;
+
+/// The columns of the endless id.
+pub const ENDLESS_FEATURES: &[Column] = &ENDLESS;
+
+const FINITE: [Column; GOAL + 3] = with_shared([
+    column("origin_shown", "1 if the path's first tile is seen"),
+    column("origin_x", "column of the path's first tile, divided by 6; 0 if it is not seen"),
+    column("origin_y", "row of the path's first tile, divided by 6; 0 if it is not seen"),
+    column("goal_shown", "1 if the goal is seen"),
+    column("goal_x", "column of the goal, divided by 6; 0 if it is not seen"),
+    column("goal_y", "row of the goal, divided by 6; 0 if it is not seen"),
+]);
+
+/// The shared columns, followed by an id's own columns and empty ones.
+const fn with_shared<const OWN: usize, const ALL: usize>(own: [Column; OWN]) -> [Column; ALL] {
+    let mut all = [column("", ""); ALL];
+    let mut place = 0;
+    while place < SHARED + OWN {
+        all[place] = if place < SHARED { SHARED_COLUMNS[place] } else { own[place - SHARED] };
+        place += 1;
+    }
+    all
+}
+
+const ENDLESS: [Column; PAST_PATH + SCREEN_TILES] = {
+    let mut columns = with_shared([
+        column("stamina_shown", "1 if the stamina bar is seen"),
+        column("stamina", "green share of the stamina bar; 0 if it is not seen"),
+        column("background_shift", "tiles that the background has scrolled to the left; 0 if it is not seen"),
+        column(
+            "past_shift",
+            "offset in tiles of column 0 of the past path to the left of the screen; 0 if none is seen",
+        ),
+    ]);
+    let mut tile = 0;
+    while tile < SCREEN_TILES {
+        let name = PAST_NAMES[tile / GRID as usize][tile % GRID as usize];
+        columns[PAST_PATH + tile] =
+            column(name, "1 if the past path's tile in this column and row of the screen is seen");
+        tile += 1;
+    }
+    columns
+};
+
+macro_rules! past_names {
+    ($($column:literal)*) => {
+        [$([
+            concat!("past_", $column, "_0"), concat!("past_", $column, "_1"), concat!("past_", $column, "_2"),
+            concat!("past_", $column, "_3"), concat!("past_", $column, "_4"), concat!("past_", $column, "_5"),
+            concat!("past_", $column, "_6"),
+        ]),*]
+    };
+}
+
+/// Names of the past path's feature columns, by column and row on the screen.
+const PAST_NAMES: [[&str; GRID as usize]; SCREEN_COLUMNS] = past_names!(0 1 2 3 4 5 6 7);
+
+impl State {
+    /// Writes the feature observation.
+    pub(super) fn write_features(&self, config: &Config, out: &mut [f32]) {
+        out.fill(0.0);
+        let character = self.shown_agent(config);
+        out[AGENT] = character.position.0 as f32 / SCREEN as f32;
+        out[AGENT + 1] = character.position.1 as f32 / SCREEN as f32;
+        out[HEADING..HEADING + 2].copy_from_slice(&character.heading());
+        out[FALLEN] = f32::from(u8::from(self.cross.is_some()));
+        if config.variant == Variant::Endless {
+            self.write_endless(config, out);
+            return;
+        }
+        let parameters = &config.parameters;
+        let tiles =
+            [(ORIGIN, parameters.show_origin, self.route.start()), (GOAL, parameters.show_goal, self.route.end())];
+        for (place, _, (x, y)) in tiles.into_iter().filter(|(_, shown, _)| *shown) {
+            out[place..place + 3].copy_from_slice(&[1.0, x as f32 / LAST_TILE, y as f32 / LAST_TILE]);
+        }
+    }
+
+    fn write_endless(&self, config: &Config, out: &mut [f32]) {
+        let parameters = &config.parameters;
+        if parameters.show_stamina {
+            out[STAMINA] = 1.0;
+            out[STAMINA + 1] = self.endless.stamina_share(parameters.stamina_level).max(0.0) as f32;
+        }
+        if parameters.show_background {
+            out[BACKGROUND] = self.endless.background() as f32 / TILE as f32;
+        }
+        if parameters.show_past_path {
+            let camera = self.endless.camera() / f64::from(TILE);
+            for (_, (x, row)) in self.past_tiles(config) {
+                let column = (x - camera.floor() as i32).clamp(0, GRID);
+                out[PAST_SHIFT] = (camera - camera.floor()) as f32;
+                out[PAST_PATH + (column * GRID + row) as usize] = 1.0;
+            }
+        }
+    }
+}

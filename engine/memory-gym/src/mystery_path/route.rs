@@ -1,0 +1,189 @@
+//! The route of an episode: one generated path, or a growing row of joined paths.
+//!
+//! Source: `EndlessMysteryPath` of the original's `pygame_assets.py`, and the visits that its nodes record.
+
+use serde::{Deserialize, Serialize};
+
+use super::path::{GRID, Path, Tile, TileSet};
+use endless_gym_core::random::Generator;
+
+/// Columns of a segment of the endless route: a grid, and a column with the one tile that leads to the next grid.
+pub const SEGMENT: i32 = GRID + 1;
+
+/// One path and its visited tiles.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Segment {
+    tiles: TileSet,
+    walls: TileSet,
+    /// Index of the first tile in the whole route.
+    first: usize,
+    /// Tiles that the agent has visited in the episode. The route's first tile always counts as visited.
+    seen: TileSet,
+    /// Tiles that the agent has visited since its last fall. The route's first tile always counts as visited.
+    seen_since_fall: TileSet,
+}
+
+/// The tiles of the route, and which of them the agent has visited.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Route {
+    segments: Vec<Segment>,
+    /// All tiles in order.
+    tiles: Vec<Tile>,
+}
+
+/// The result of a visit to a tile of the route.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Visit {
+    /// Whether it is the first visit in the episode.
+    pub first: bool,
+    /// Whether it is the first visit since the last fall.
+    pub first_since_fall: bool,
+}
+
+impl Route {
+    /// Whether every index and every tile is in range. A forged snapshot may hold any numbers.
+    pub fn is_valid(&self) -> bool {
+        let columns = self.segments.len() as i64 * i64::from(SEGMENT);
+        self.segments.len() < 1 << 24
+            && !self.tiles.is_empty()
+            && self.tiles.iter().all(|(x, y)| (0..columns).contains(&i64::from(*x)) && (0..GRID).contains(y))
+            && self.segments.iter().all(|segment| segment.first < self.tiles.len())
+    }
+
+    /// Removes all paths but keeps the allocated memory.
+    pub fn clear(&mut self) {
+        self.segments.clear();
+        self.tiles.clear();
+    }
+
+    /// Replaces the route with one path from `start` to `end`.
+    pub fn set_path(&mut self, start: Tile, end: Tile, random: &mut Generator) {
+        self.clear();
+        self.add(Path::generate(start, end, random), None);
+    }
+
+    /// Adds a path from left to right that starts in the row where the last one ended; the first one starts in a random row.
+    pub fn extend(&mut self, random: &mut Generator) {
+        let mut row = || random.integers(0, i64::from(GRID)) as i32;
+        let start = self.tiles.last().map_or_else(&mut row, |(_, y)| *y);
+        let end = row();
+        self.add(Path::generate((0, start), (GRID - 1, end), random), Some((GRID, end)));
+    }
+
+    fn add(&mut self, path: Path, joint: Option<Tile>) {
+        let left = self.segments.len() as i32 * SEGMENT;
+        let mut segment = Segment {
+            tiles: TileSet::default(),
+            walls: path.walls,
+            first: self.tiles.len(),
+            seen: TileSet::default(),
+            seen_since_fall: TileSet::default(),
+        };
+        for (x, y) in path.tiles().chain(joint) {
+            segment.tiles.insert((x, y));
+            self.tiles.push((left + x, y));
+        }
+        self.segments.push(segment);
+        if left == 0 {
+            self.mark_start();
+        }
+    }
+
+    fn mark_start(&mut self) {
+        if let (Some(segment), Some(start)) = (self.segments.first_mut(), self.tiles.first()) {
+            segment.seen.insert(*start);
+            segment.seen_since_fall.insert(*start);
+        }
+    }
+
+    /// Number of joined paths.
+    pub fn segments(&self) -> usize {
+        self.segments.len()
+    }
+
+    /// The tiles in order.
+    pub fn tiles(&self) -> &[Tile] {
+        &self.tiles
+    }
+
+    /// The first tile.
+    pub fn start(&self) -> Tile {
+        self.tiles.first().copied().unwrap_or_default()
+    }
+
+    /// The last tile.
+    pub fn end(&self) -> Tile {
+        self.tiles.last().copied().unwrap_or_default()
+    }
+
+    /// Walls of the first path.
+    pub fn walls(&self) -> impl Iterator<Item = Tile> {
+        self.segments.first().into_iter().flat_map(|segment| segment.walls.iter())
+    }
+
+    /// Visits a tile. Returns `None` if it is not on the route.
+    pub fn visit(&mut self, (x, y): Tile) -> Option<Visit> {
+        let segment = self.segments.get_mut(usize::try_from(x / SEGMENT).ok()?)?;
+        let tile = (x % SEGMENT, y);
+        if !segment.tiles.contains(tile) {
+            return None;
+        }
+        let visit =
+            Visit { first: !segment.seen.contains(tile), first_since_fall: !segment.seen_since_fall.contains(tile) };
+        segment.seen.insert(tile);
+        segment.seen_since_fall.insert(tile);
+        Some(visit)
+    }
+
+    /// Records a fall: no tile except the first has been visited since.
+    pub fn fall(&mut self) {
+        self.segments.iter_mut().for_each(|segment| segment.seen_since_fall = TileSet::default());
+        self.mark_start();
+    }
+
+    /// The index of a tile in the route; `None` if it is not on the route.
+    pub fn index(&self, tile: Tile) -> Option<usize> {
+        let first = self.segments.get(usize::try_from(tile.0 / SEGMENT).ok()?)?.first;
+        self.tiles[first..].iter().position(|other| *other == tile).map(|place| first + place)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn endless(segments: usize) -> Route {
+        let mut route = Route::default();
+        let mut random = Generator::from_seed(1);
+        (0..segments).for_each(|_| route.extend(&mut random));
+        route
+    }
+
+    #[test]
+    fn segments_join_into_one_way() {
+        let route = endless(50);
+        assert!(route.tiles().windows(2).all(|w| (w[0].0 - w[1].0).abs() + (w[0].1 - w[1].1).abs() == 1));
+        assert_eq!(route.end().0, 50 * SEGMENT - 1);
+        for (index, tile) in route.tiles().iter().enumerate() {
+            assert_eq!(route.index(*tile), Some(index));
+        }
+        assert_eq!(route.index((-1, 0)), None);
+        assert_eq!(route.index((50 * SEGMENT, 0)), None);
+    }
+
+    #[test]
+    fn visits_are_remembered_until_the_fall_or_the_end() {
+        let mut route = endless(2);
+        let (start, next) = (route.tiles()[0], route.tiles()[1]);
+        let nothing_new = Some(Visit { first: false, first_since_fall: false });
+        assert_eq!(route.visit(start), nothing_new);
+        assert_eq!(route.visit(next), Some(Visit { first: true, first_since_fall: true }));
+        assert_eq!(route.visit(next), nothing_new);
+        route.fall();
+        assert_eq!(route.visit(start), nothing_new);
+        assert_eq!(route.visit(next), Some(Visit { first: false, first_since_fall: true }));
+        for beside in [(0, -1), (0, 7), (-1, start.1), (-9, start.1), (100, start.1)] {
+            assert_eq!(route.visit(beside), None, "{beside:?}");
+        }
+    }
+}

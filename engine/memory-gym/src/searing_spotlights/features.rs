@@ -1,0 +1,175 @@
+//! The feature observation of Searing Spotlights: the content of a frame as numbers.
+
+use super::config::{Config, HEALTH_WIDTH};
+use super::state::{Background, Exit, State};
+use endless_gym_core::envs::Column;
+use endless_gym_core::envs::SCREEN;
+
+/// Maximum number of coins and spotlights in the features. A frame may show more.
+pub(super) const COINS: usize = 8;
+pub(super) const SPOTLIGHTS: usize = 16;
+
+/// Indices of the columns in [`FEATURES`].
+pub(super) const AGENT: usize = 0;
+pub(super) const HEALTH: usize = 5;
+pub(super) const HIT: usize = 6;
+pub(super) const LAST_ACTION: usize = 7;
+pub(super) const LAST_REWARD: usize = 9;
+pub(super) const LIGHT: usize = 10;
+pub(super) const EXIT: usize = 11;
+pub(super) const COIN: usize = 15;
+pub(super) const SPOTLIGHT: usize = COIN + 3 * COINS;
+
+macro_rules! coin {
+    ($number:literal) => {
+        [
+            Column {
+                name: concat!("coin_", $number, "_seen"),
+                description: "1 if this coin's centre is seen; only coins that are seen are numbered",
+            },
+            Column { name: concat!("coin_", $number, "_x"), description: "x of its centre, as a share of the width" },
+            Column { name: concat!("coin_", $number, "_y"), description: "y of its centre, as a share of the height" },
+        ]
+    };
+}
+
+macro_rules! spotlight {
+    ($number:literal) => {
+        [
+            Column {
+                name: concat!("spotlight_", $number, "_radius"),
+                description: "radius of a lit circle that overlaps the screen, as a share of the width; 0 for none",
+            },
+            Column {
+                name: concat!("spotlight_", $number, "_x"),
+                description: "x of its centre, as a share of the width; may lie off the screen",
+            },
+            Column {
+                name: concat!("spotlight_", $number, "_y"),
+                description: "y of its centre, as a share of the height; may lie off the screen",
+            },
+        ]
+    };
+}
+
+const FIRST: [Column; COIN] = [
+    Column { name: "agent_seen", description: "1 if the agent's centre is seen" },
+    Column { name: "agent_x", description: "x of its centre as a share of the screen's width; 0 if not seen" },
+    Column { name: "agent_y", description: "y of its centre as a share of the screen's height; 0 if not seen" },
+    Column { name: "heading_x", description: "x of its heading, a unit vector; 0 if not seen" },
+    Column { name: "heading_y", description: "y of its heading, a unit vector; 0 if not seen" },
+    Column { name: "health", description: "green share of the health bar" },
+    Column { name: "hit", description: "1 if red tiles are seen" },
+    Column { name: "last_action_x", description: "the previous action as the bar shows it: -1 left, 1 right" },
+    Column { name: "last_action_y", description: "the previous action as the bar shows it: -1 up, 1 down" },
+    Column {
+        name: "last_reward_positive",
+        description: "1 if the bar shows that the previous step gave a positive reward",
+    },
+    Column { name: "light", description: "brightness outside the lit circles: 1 at first, 0 in the dark" },
+    Column { name: "exit_seen", description: "1 if the exit's centre is seen" },
+    Column { name: "exit_x", description: "x of its centre as a share of the screen's width; 0 if not seen" },
+    Column { name: "exit_y", description: "y of its centre as a share of the screen's height; 0 if not seen" },
+    Column { name: "exit_open", description: "1 if the exit is seen and open" },
+];
+
+const COIN_COLUMNS: [[Column; 3]; COINS] =
+    [coin!(0), coin!(1), coin!(2), coin!(3), coin!(4), coin!(5), coin!(6), coin!(7)];
+
+const SPOTLIGHT_COLUMNS: [[Column; 3]; SPOTLIGHTS] = [
+    spotlight!(0),
+    spotlight!(1),
+    spotlight!(2),
+    spotlight!(3),
+    spotlight!(4),
+    spotlight!(5),
+    spotlight!(6),
+    spotlight!(7),
+    spotlight!(8),
+    spotlight!(9),
+    spotlight!(10),
+    spotlight!(11),
+    spotlight!(12),
+    spotlight!(13),
+    spotlight!(14),
+    spotlight!(15),
+];
+
+const COUNT: usize = SPOTLIGHT + 3 * SPOTLIGHTS;
+
+/// The columns. An object counts as seen if its centre is on the screen and either not in the dark or within a lit circle.
+pub const FEATURES: &[Column] = &{
+    let mut columns = [FIRST[0]; COUNT];
+    let mut at = 0;
+    while at < COUNT {
+        columns[at] = if at < COIN {
+            FIRST[at]
+        } else if at < SPOTLIGHT {
+            COIN_COLUMNS.as_flattened()[at - COIN]
+        } else {
+            SPOTLIGHT_COLUMNS.as_flattened()[at - SPOTLIGHT]
+        };
+        at += 1;
+    }
+    columns
+};
+
+impl State {
+    /// Writes the feature observation.
+    pub(super) fn write_features(&self, config: &Config, out: &mut [f32]) {
+        out.fill(0.0);
+        let parameters = &config.parameters;
+        let coins_visible = self.coins_visible(parameters);
+        // In the endless id without a coin, the coin's surface hides everything that is not visible in the dark.
+        let blacked_out = config.variant.endless && self.coins.is_empty() && coins_visible;
+        let share = |(x, y): (i32, i32)| [x as f32 / SCREEN as f32, y as f32 / SCREEN as f32];
+
+        let agent = self.shown_agent();
+        if self.is_seen(agent.position, parameters.agent_visible, blacked_out) {
+            out[AGENT] = 1.0;
+            out[AGENT + 1..AGENT + 3].copy_from_slice(&share(agent.position));
+            out[AGENT + 3..AGENT + 5].copy_from_slice(&agent.heading());
+        }
+        out[HEALTH] = 1.0 - f32::from(self.red_columns.min(HEALTH_WIDTH as u8)) / HEALTH_WIDTH as f32;
+        if parameters.show_last_action {
+            let direction = |branch: i32| [0.0, -1.0, 1.0][branch as usize];
+            out[LAST_ACTION..LAST_ACTION + 2].copy_from_slice(&self.shown_action.map(direction));
+        }
+        let shows_reward = parameters.show_last_positive_reward && self.shown_reward_positive;
+        out[LAST_REWARD] = f32::from(u8::from(shows_reward));
+        if let Some(Exit { location, open }) = self.exit
+            && self.is_seen(location, parameters.exit_visible, blacked_out)
+        {
+            out[EXIT] = 1.0;
+            out[EXIT + 1..EXIT + 3].copy_from_slice(&share(location));
+            out[EXIT + 3] = f32::from(u8::from(open));
+        }
+        let seen_coins = self.coins.iter().filter(|coin| self.is_seen(**coin, coins_visible, blacked_out));
+        for (coin, out) in seen_coins.zip(out[COIN..SPOTLIGHT].chunks_exact_mut(3)) {
+            let [x, y] = share(*coin);
+            out.copy_from_slice(&[1.0, x, y]);
+        }
+        if blacked_out {
+            return;
+        }
+        out[LIGHT] = 1.0 - f32::from(self.darkness) / 255.0;
+        let mut lit = 0;
+        if self.darkness > 0 {
+            let circles = self.lit.iter().filter(|circle| circle.is_on_screen());
+            for (circle, out) in circles.zip(out[SPOTLIGHT..].chunks_exact_mut(3)) {
+                let [x, y] = share(circle.centre());
+                out.copy_from_slice(&[f32::from(circle.radius) / SCREEN as f32, x, y]);
+                lit += 1;
+            }
+        }
+        let red = self.background == Background::Red && (lit > 0 || self.darkness < 255);
+        out[HIT] = f32::from(u8::from(red));
+    }
+
+    /// Whether the frame shows the centre of an object at `place`, which may be visible in the dark.
+    fn is_seen(&self, place: (i32, i32), visible_in_dark: bool, blacked_out: bool) -> bool {
+        let on_screen = |coordinate: i32| (0..SCREEN as i32).contains(&coordinate);
+        let lit = || self.darkness < 255 || self.lit.iter().any(|circle| circle.contains(place));
+        on_screen(place.0) && on_screen(place.1) && (visible_in_dark || (!blacked_out && lit()))
+    }
+}

@@ -1,0 +1,173 @@
+//! The state of a Searing Spotlights environment.
+
+use serde::{Deserialize, Serialize};
+
+use super::circles::Circle;
+use super::config::{Config, MAX_COORDINATE};
+use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
+use super::spotlight::Spotlight;
+use crate::character::Character;
+use endless_gym_core::envs::Progress;
+use endless_gym_core::envs::SCREEN;
+
+/// The background of the screen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum Background {
+    /// White and blue tiles.
+    Blue,
+    /// White and red tiles.
+    Red,
+    /// Plain white.
+    White,
+    /// Plain black.
+    Black,
+}
+
+/// Everything that changes during play.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct State {
+    pub(super) agent: Character,
+    /// The previous episode's agent, which the ground-truth view shows until the first step of an episode.
+    pub(super) former_agent: Option<Character>,
+    /// Whether the frame is the first of its episode.
+    pub(super) first_frame: bool,
+    pub(super) health: f64,
+    /// Red columns of the health bar; more than [`HEALTH_WIDTH`](super::config::HEALTH_WIDTH) for negative health.
+    pub(super) red_columns: u8,
+    pub(super) spotlights: Vec<Spotlight>,
+    pub(super) spawn_timer: i64,
+    pub(super) spawns_left: i64,
+    /// The circles that the spotlights lit in the last step, in drawing order. An episode starts with those of the previous
+    /// one.
+    pub(super) lit: Vec<Circle>,
+    /// Whether the lit circles have outlines.
+    pub(super) outlined: bool,
+    /// Darkness outside the lit circles, 0 to 255.
+    pub(super) darkness: u8,
+    /// Centres of the coins that are left.
+    pub(super) coins: Vec<(i32, i32)>,
+    /// Number of coins at the start of the episode.
+    pub(super) num_coins: usize,
+    pub(super) coins_collected: u32,
+    pub(super) exit: Option<Exit>,
+    pub(super) last_action: [i32; 2],
+    /// The action of the last step but one, which the bar shows.
+    pub(super) shown_action: [i32; 2],
+    pub(super) last_reward_positive: bool,
+    /// Whether the last step but one gave a positive reward, which the bar shows.
+    pub(super) shown_reward_positive: bool,
+    /// Whether a spotlight touched the agent in the last step.
+    pub(super) hit: bool,
+    /// The backgrounds without and with a hit. As in the original, a replaced background stays replaced in later episodes.
+    pub(super) backgrounds: [Background; 2],
+    /// The current background.
+    pub(super) background: Background,
+    pub(super) steps: i64,
+    /// Steps since the endless id's coin appeared.
+    pub(super) coin_steps: i64,
+    pub(super) success: bool,
+}
+
+/// The exit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Exit {
+    /// Centre in pixels.
+    pub location: (i32, i32),
+    /// Whether the agent can leave by it.
+    pub open: bool,
+}
+
+impl State {
+    /// The state before the first reset.
+    pub(super) fn new() -> Self {
+        State {
+            agent: Character::default(),
+            former_agent: None,
+            first_frame: true,
+            health: 0.0,
+            red_columns: 0,
+            spotlights: Vec::new(),
+            spawn_timer: 0,
+            spawns_left: 0,
+            lit: Vec::new(),
+            outlined: false,
+            darkness: 0,
+            coins: Vec::new(),
+            num_coins: 0,
+            coins_collected: 0,
+            exit: None,
+            last_action: [0, 0],
+            shown_action: [0, 0],
+            last_reward_positive: false,
+            shown_reward_positive: false,
+            hit: false,
+            backgrounds: [Background::Blue, Background::Red],
+            background: Background::Blue,
+            steps: 0,
+            coin_steps: 0,
+            success: false,
+        }
+    }
+
+    /// Whether the rules can continue from this state. A forged snapshot may hold any numbers.
+    pub(super) fn is_valid(&self) -> bool {
+        let near = |(x, y): (i32, i32)| x.unsigned_abs() < MAX_COORDINATE && y.unsigned_abs() < MAX_COORDINATE;
+        self.agent.is_valid()
+            && self.former_agent.is_none_or(|agent| agent.is_valid())
+            && self.health.is_finite()
+            && usize::from(self.red_columns) <= SCREEN
+            && self.spotlights.len() <= MAX_SPOTLIGHTS
+            && self.spotlights.iter().all(Spotlight::is_valid)
+            && self.lit.len() <= MAX_SPOTLIGHTS
+            && self
+                .lit
+                .iter()
+                .all(|circle| near(circle.centre()) && (0..=MAX_SPOT_RADIUS).contains(&circle.radius.into()))
+            && self.coins.len() <= MAX_COINS
+            && self.coins.iter().copied().chain(self.exit.map(|exit| exit.location)).all(near)
+            && self.last_action.iter().chain(&self.shown_action).all(|branch| (0..3).contains(branch))
+            && self.coins_collected < u32::MAX / 2
+            // `i64::MAX` without a limit.
+            && self.spawns_left >= 0
+            && [self.spawn_timer, self.steps, self.coin_steps].iter().all(|count| (0..i64::MAX / 2).contains(count))
+    }
+
+    /// Whether coins are visible in the dark.
+    pub(super) fn coins_visible(&self, parameters: &Parameters) -> bool {
+        parameters.coins_visible || self.coin_steps < parameters.coin_show_duration
+    }
+
+    /// The share of health points that is left.
+    pub(super) fn health_share(&self, parameters: &Parameters) -> f64 {
+        self.health / parameters.agent_health
+    }
+
+    /// Number of coins, and health points.
+    pub(super) fn progress(&self, config: &Config) -> Vec<Progress> {
+        let coins = self.coins_collected;
+        let coins = match config.variant.endless {
+            true => Progress::count("coins", coins),
+            false => Progress::share("coins", coins, self.num_coins as f64),
+        };
+        vec![coins, Progress::share("health", self.health, config.parameters.agent_health)]
+    }
+
+    /// The final info of the finite id: share of health, share of coins, success. The share of coins is NaN without
+    /// coins, as in the original.
+    pub(super) fn finite_info(&self, parameters: &Parameters) -> [f64; 3] {
+        let coins = f64::from(self.coins_collected) / self.num_coins as f64;
+        [self.health_share(parameters), coins, f64::from(u8::from(self.success))]
+    }
+
+    /// The final info of the endless id: share of health, number of coins.
+    pub(super) fn endless_info(&self, parameters: &Parameters) -> [f64; 2] {
+        [self.health_share(parameters), f64::from(self.coins_collected)]
+    }
+
+    /// Positions of agent and coin, as shares of the screen's size; (0, 0) without a coin.
+    pub(super) fn ground_truth(&self) -> [f64; 4] {
+        let (x, y) = self.agent.position;
+        let (coin_x, coin_y) = self.coins.first().copied().unwrap_or_default();
+        [x, y, coin_x, coin_y].map(|pixels| f64::from(pixels) / SCREEN as f64)
+    }
+}
