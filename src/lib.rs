@@ -50,8 +50,8 @@ pub mod batch {
 pub mod envs {
     pub use endless_gym_core::envs::{
         ActionBranch, ActionError, ActionSpace, Choice, Column, EnvSpec, Expert, FRAME_BYTES, InfoColumn,
-        InvalidActionSpace, InvalidState, Parameter, ParameterError, ParameterKind, Progress, ResetParameters, SCREEN,
-        Task, Transition, UnknownEnvironment, view,
+        InvalidActionSpace, InvalidState, ObservationSpace, Parameter, ParameterError, ParameterKind, Progress,
+        ResetParameters, SCREEN, Task, Transition, UnknownEnvironment, box_action, view,
     };
 }
 

@@ -18,7 +18,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let service = std::env::args().nth(1).unwrap_or_else(|| "endless".to_owned());
     let mut trainer = Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(&service) })?;
     let num_envs = trainer.specification().num_envs;
-    let branches = trainer.specification().action_space.branches().len();
+    let branches = trainer.specification().action_space.width();
 
     trainer.reset(0, ResetRequest::Seed(0))?;
     let mut reward = 0.0;

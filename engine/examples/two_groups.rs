@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 /// Plays both groups and returns how long it took.
 fn play() -> Result<Duration, ServiceError> {
     let mut trainer = Trainer::connect(&ConnectConfig { timeout: TIMEOUT, ..ConnectConfig::new(SERVICE) })?;
-    let actions = vec![0; NUM_ENVS * trainer.specification().action_space.branches().len()];
+    let actions = vec![0; NUM_ENVS * trainer.specification().action_space.width()];
     for group in 0..2 {
         trainer.reset(group, ResetRequest::Seed(0))?;
     }

@@ -13,7 +13,7 @@ fn play(id: &str, num_envs: usize, steps: usize) -> Vec<Option<Vec<f64>>> {
     let mut player = Player::started(&config);
     let mut experts = Experts::new(memory_gym(), spec.id, num_envs, config.autoreset).unwrap();
     let mut ended = vec![None; num_envs];
-    let mut actions = vec![0; num_envs * spec.action_space.branches().len()];
+    let mut actions = vec![0; num_envs * spec.action_space.width()];
     for _ in 0..steps {
         experts.act(&player.batch(), &mut actions).unwrap();
         player.step(&actions);
@@ -109,7 +109,7 @@ mod pools {
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks).unwrap();
         let mut experts = Experts::new(memory_gym(), id, NUM_ENVS, autoreset).unwrap();
-        let mut actions = vec![0; NUM_ENVS * pool.spec().action_space.branches().len()];
+        let mut actions = vec![0; NUM_ENVS * pool.spec().action_space.width()];
         let mut episodes = Episodes::default();
         for _ in 0..5000 {
             experts.act(&Batch::new(pool.layout(), &blocks), &mut actions).unwrap();
@@ -140,8 +140,7 @@ mod pools {
                 let mut blocks = zeroed(pool.layout().blocks());
                 let seed = 5 + (number * NUM_ENVS + env) as u64 % 6;
                 pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
-                let (mut expert, mut action) =
-                    (memory_gym().expert(id).unwrap(), vec![0; spec.action_space.branches().len()]);
+                let (mut expert, mut action) = (memory_gym().expert(id).unwrap(), vec![0; spec.action_space.width()]);
                 loop {
                     let batch = Batch::new(pool.layout(), &blocks);
                     if batch.terminated()[0] == 1 {

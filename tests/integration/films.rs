@@ -30,7 +30,7 @@ fn frames(id: &str, seed: u64, max_steps: usize) -> Vec<(Picture, Picture)> {
     player.reset(ResetRequest::Seed(seed));
     let spec = player.pool.spec();
     let mut experts = Experts::new(memory_gym(), spec.id, 1, config.autoreset).unwrap();
-    let mut action = vec![0; spec.action_space.branches().len()];
+    let mut action = vec![0; spec.action_space.width()];
     let mut frames = Vec::new();
     loop {
         let mut view = vec![0; VIEW_BYTES];

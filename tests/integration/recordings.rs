@@ -94,7 +94,7 @@ fn progress_ends_at_the_final_info() {
         for seed in 0..4 {
             pool.reset(ResetRequest::Seed(seed), &mut blocks).unwrap();
             expert.reset();
-            let mut action = vec![0; spec.action_space.branches().len()];
+            let mut action = vec![0; spec.action_space.width()];
             for step in 0..5000 {
                 let batch = Batch::new(pool.layout(), &blocks);
                 expert.act(batch.features(), batch.vector_observation(), &mut action);

@@ -44,7 +44,7 @@ fn groups_are_reset_and_stepped_independently() {
     assert!(expected_first != expected_second);
     assert_eq!(first.batch().episode_length(), [0; 4]);
 
-    let actions = vec![1; 4 * specification.action_space.branches().len()];
+    let actions = vec![1; 4 * specification.action_space.width()];
     trainer.send(0, &actions).unwrap();
     let stepped = trainer.receive_any(TIMEOUT).unwrap();
     assert_eq!((stepped.group(), stepped.step()), (0, 2));
@@ -76,7 +76,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
         let stop = &stop;
         let running = scope.spawn(move || engine.run(stop).unwrap());
         let mut trainer = place.trainer("gym").unwrap();
-        let width = trainer.specification().action_space.branches().len();
+        let width = trainer.specification().action_space.width();
 
         assert_error!(trainer.reset(1, ResetRequest::All), ServiceError::NoSuchGroup { given: 1, .. });
         assert_error!(trainer.receive(0, TIMEOUT), ServiceError::NothingSent { group: 0 });
@@ -100,7 +100,7 @@ fn mistakes_of_a_trainer_are_typed_errors() {
         let mut actions = vec![0; 2 * width];
         actions[width] = 99;
         let wrong = trainer.send(0, &actions);
-        assert_error!(wrong, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given[0] == 99);
+        assert_error!(wrong, ServiceError::Action(ActionError::Range { env: 1, given, .. }) if given.starts_with("[99"));
 
         let mut held = Vec::new();
         for _ in 0..trainer.specification().batches_held {

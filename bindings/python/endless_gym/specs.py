@@ -90,9 +90,11 @@ class Spec:
 
     id: str
     summary: str
-    #: Number of choices of each branch of the action space.
+    #: The action space as the engine describes it.
+    described_actions: dict[str, Any]
+    #: Number of choices of each branch of the action space; none for a Box.
     branches: tuple[int, ...]
-    #: Whether the action space is MultiDiscrete; otherwise it is Discrete, with one branch.
+    #: Whether the action space is MultiDiscrete.
     multi_discrete: bool
     #: What the numbers of each branch mean: `actions[branch].choices[number]`.
     actions: tuple[ActionBranch, ...]
@@ -116,9 +118,7 @@ class Spec:
 
     def action_space(self) -> gymnasium.Space[Any]:
         """The original's action space."""
-        if self.multi_discrete:
-            return spaces.MultiDiscrete(list(self.branches))
-        return spaces.Discrete(self.branches[0])
+        return _space(self.described_actions)
 
     def batched_actions(self, actions: NDArray[np.int64]) -> NDArray[np.int64]:
         """Actions with a column for each branch, (n, branches), in the shape of a vector environment: (n,) for Discrete."""
@@ -219,13 +219,13 @@ def _plain(value: Any) -> Any:
 
 def described_spec(described: dict[str, Any]) -> Spec:
     """The specification that an engine publishes, or that the native module lists."""
-    ((kind, choices),) = described["action_space"].items()
-    multi_discrete = kind == "MultiDiscrete"
+    actions = described["action_space"]
     return Spec(
         id=described["id"],
         summary=described["summary"],
-        branches=tuple(choices) if multi_discrete else (choices,),
-        multi_discrete=multi_discrete,
+        described_actions=actions,
+        branches=(actions["Discrete"],) if "Discrete" in actions else tuple(actions.get("MultiDiscrete", ())),
+        multi_discrete="MultiDiscrete" in actions,
         actions=tuple(ActionBranch(branch["name"], _meanings(branch["choices"])) for branch in described["actions"]),
         vector_observation=described["vector_observation"],
         ground_truth=len(described["ground_truth"]),
@@ -237,6 +237,20 @@ def described_spec(described: dict[str, Any]) -> Spec:
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
         render_fps=described["render_fps"],
     )
+
+
+def _space(described: dict[str, Any]) -> gymnasium.Space[Any]:
+    """The space that an engine describes. A bound of None is infinite."""
+    ((kind, value),) = described.items()
+    if kind == "Discrete":
+        return spaces.Discrete(value)
+    if kind == "MultiDiscrete":
+        return spaces.MultiDiscrete(value)
+    if kind == "Tuple":
+        return spaces.Tuple([_space(part) for part in value])
+    low = np.array([-np.inf if bound is None else bound for bound in value["low"]], np.float32)
+    high = np.array([np.inf if bound is None else bound for bound in value["high"]], np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 def _meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:

@@ -21,15 +21,20 @@ use crate::errors;
 pub struct ActionShape {
     shape: Vec<usize>,
     meaning: &'static str,
+    /// Whether the numbers are float32, whose bits the engine receives.
+    is_box: bool,
 }
 
 impl ActionShape {
     /// The shape for one environment.
     pub fn single(space: &ActionSpace) -> Self {
         match space {
-            ActionSpace::Discrete(_) => ActionShape { shape: Vec::new(), meaning: "an integer" },
+            ActionSpace::Discrete(_) => ActionShape { shape: Vec::new(), meaning: "an integer", is_box: false },
             ActionSpace::MultiDiscrete(branches) => {
-                ActionShape { shape: vec![branches.len()], meaning: "an integer for each branch" }
+                ActionShape { shape: vec![branches.len()], meaning: "an integer for each branch", is_box: false }
+            }
+            ActionSpace::Box { low, .. } => {
+                ActionShape { shape: vec![low.len()], meaning: "a number for each dimension", is_box: true }
             }
         }
     }
@@ -38,18 +43,27 @@ impl ActionShape {
     pub fn group(space: &ActionSpace, num_envs: usize) -> Self {
         match space {
             ActionSpace::Discrete(_) => {
-                ActionShape { shape: vec![num_envs], meaning: "an integer for each environment" }
+                ActionShape { shape: vec![num_envs], meaning: "an integer for each environment", is_box: false }
             }
             ActionSpace::MultiDiscrete(branches) => ActionShape {
                 shape: vec![num_envs, branches.len()],
                 meaning: "an integer for each branch of each environment",
+                is_box: false,
+            },
+            ActionSpace::Box { low, .. } => ActionShape {
+                shape: vec![num_envs, low.len()],
+                meaning: "a number for each dimension of each environment",
+                is_box: true,
             },
         }
     }
 
-    /// Copies the integers of an array, or of a list of the same shape, into `to`, in C order. The engine checks their range.
+    /// Copies the numbers of an array, or of a list of the same shape, into `to`, in C order. The engine checks their range.
     pub fn copy(&self, given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
         to.clear();
+        if self.is_box {
+            return self.copy_floats(given, to);
+        }
         if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, i64>>() {
             self.check(array.shape())?;
             return append(&array, to, action);
@@ -81,6 +95,19 @@ impl ActionShape {
         self.check(array.shape())?;
         let array = array.call_method1("astype", ("int64",))?.cast_into::<PyArrayDyn<i64>>()?;
         append(&array.readonly(), to, action)
+    }
+
+    /// Copies the bits of numbers, as float32.
+    fn copy_floats(&self, given: &Bound<'_, PyAny>, to: &mut Vec<i32>) -> PyResult<()> {
+        let bits = |number: f32| Ok(number.to_bits().cast_signed());
+        if let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, f32>>() {
+            self.check(array.shape())?;
+            return append(&array, to, bits);
+        }
+        let array = given.py().import("numpy")?.call_method1("asarray", (given, "float32"))?;
+        let array = array.cast_into::<PyArrayDyn<f32>>()?;
+        self.check(array.shape())?;
+        append(&array.readonly(), to, bits)
     }
 
     fn check(&self, given: &[usize]) -> PyResult<()> {

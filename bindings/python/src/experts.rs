@@ -28,7 +28,7 @@ impl Experts {
             experts: Mutex::new(experts.map_err(|error| PyValueError::new_err(error.to_string()))?),
             features: spec.features.len(),
             vector_observation: spec.vector_observation,
-            branches: spec.action_space.branches().len(),
+            branches: spec.action_space.width(),
         })
     }
 

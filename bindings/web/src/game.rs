@@ -71,7 +71,7 @@ impl Game {
             expert_is_in: true,
             agent_memory: None,
             clues: Clues::new(pool.spec()),
-            action: vec![0; pool.spec().action_space.branches().len()],
+            action: vec![0; pool.spec().action_space.width()],
             recorder: Recorder::new(id, &options),
             pool,
             blocks,

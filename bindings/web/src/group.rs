@@ -40,7 +40,7 @@ impl Group {
             true => Policy::Experts(Experts::new(memory_gym(), id, num_envs, config.autoreset)?),
             false => Policy::Random(Generator::from_seed(seed)),
         };
-        let actions = vec![0; num_envs * spec.action_space.branches().len()];
+        let actions = vec![0; num_envs * spec.action_space.width()];
         Ok(Group { pool, blocks, policy, actions, episodes: 0, returns: 0.0, lengths: 0.0 })
     }
 

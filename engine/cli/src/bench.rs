@@ -301,7 +301,7 @@ impl Actions {
     const STEPS: usize = 1009;
 
     fn new(spec: &EnvSpec, num_envs: usize) -> Self {
-        let branches = spec.action_space.branches().len();
+        let branches = spec.action_space.width();
         let mut numbers = vec![0; (num_envs + Self::STEPS) * branches];
         RandomPolicy::new(spec, 0).act(&mut numbers);
         Actions { numbers, branches, length: num_envs * branches, step: 0 }

@@ -42,7 +42,7 @@ impl Film {
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::All, &mut blocks)?;
         let spec = pool.spec();
-        let actions = vec![0; spec.action_space.branches().len()];
+        let actions = vec![0; spec.action_space.width()];
         let player = match policy {
             Policy::Expert => Player::Expert(Experts::new(registry, &config.id, 1, config.autoreset)?),
             Policy::Random => Player::Random(RandomPolicy::new(spec, action_seed)),

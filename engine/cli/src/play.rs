@@ -2,7 +2,7 @@
 
 use clap::ValueEnum;
 use endless_gym_core::batch::Batch;
-use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::envs::{ActionSpace, EnvSpec};
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 
@@ -17,21 +17,29 @@ pub enum Policy {
 
 /// Uniformly random actions from a seed.
 pub struct RandomPolicy {
-    branches: Vec<i32>,
+    space: ActionSpace,
     random: SmallRng,
 }
 
 impl RandomPolicy {
     /// A policy for the action space of `spec`.
     pub fn new(spec: &EnvSpec, seed: u64) -> Self {
-        RandomPolicy { branches: spec.action_space.branches().to_vec(), random: SmallRng::seed_from_u64(seed) }
+        RandomPolicy { space: spec.action_space.clone(), random: SmallRng::seed_from_u64(seed) }
     }
 
-    /// Fills `actions`: one row per environment, one number per branch of the action space.
+    /// Fills `actions`: one row per environment. Infinite bounds of a box count as -1 and 1.
     pub fn act(&mut self, actions: &mut [i32]) {
-        for action in actions.chunks_exact_mut(self.branches.len()) {
-            for (number, choices) in action.iter_mut().zip(&self.branches) {
-                *number = self.random.random_range(0..*choices);
+        let RandomPolicy { space, random } = self;
+        for action in actions.chunks_exact_mut(space.width()) {
+            if let ActionSpace::Box { low, high } = space {
+                let finite = |bound: f32, other: f32| if bound.is_finite() { bound } else { other };
+                for (number, (low, high)) in action.iter_mut().zip(low.iter().zip(high.iter())) {
+                    let (low, high) = (finite(*low, -1.0), finite(*high, 1.0));
+                    *number = (low + random.random::<f32>() * (high - low)).to_bits().cast_signed();
+                }
+            }
+            for (number, choices) in action.iter_mut().zip(space.branches()) {
+                *number = random.random_range(0..*choices);
             }
         }
     }

@@ -33,7 +33,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
             }
             2 => {
                 let count = input.int_in_range(0..=pool.layout().blocks() - 1)?;
-                let actions = vec![0; spec.action_space.branches().len()];
+                let actions = vec![0; spec.action_space.width()];
                 assert!(pool.step(&actions, &mut zeroed(count)).is_err(), "{count} blocks are too few");
             }
             _ => playing::play(&mut pool, &mut blocks, input, 1)?,

@@ -39,9 +39,9 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     if pool.resume(&saved).is_ok() {
         assert_eq!(saved.len(), ENVS, "every environment is resumed");
         for _ in 0..30 {
-            pool.step(&vec![1; ENVS * spec.action_space.branches().len()], &mut blocks).expect("a resumed pool plays");
+            pool.step(&vec![1; ENVS * spec.action_space.width()], &mut blocks).expect("a resumed pool plays");
         }
-    } else if pool.step(&vec![0; ENVS * spec.action_space.branches().len()], &mut blocks).is_ok() {
+    } else if pool.step(&vec![0; ENVS * spec.action_space.width()], &mut blocks).is_ok() {
         panic!("a pool that was not resumed must be reset first");
     }
     Ok(())

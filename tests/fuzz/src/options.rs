@@ -25,7 +25,7 @@ pub(crate) fn target(input: &mut Unstructured<'_>) -> Result<()> {
     let Ok(mut pool) = playing::pool(spec, given, autoreset) else { return Ok(()) };
     let mut blocks = playing::reset(&mut pool);
     if later && pool.reset_with(ResetRequest::Seed(1), Some(&options), &mut blocks).is_err() {
-        pool.step(&vec![0; spec.action_space.branches().len()], &mut blocks).expect("a refused reset changes nothing");
+        pool.step(&vec![0; spec.action_space.width()], &mut blocks).expect("a refused reset changes nothing");
         return Ok(());
     }
     playing::play(&mut pool, &mut blocks, input, STEPS)?;

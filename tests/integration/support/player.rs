@@ -46,7 +46,7 @@ impl Player {
 
     /// Steps with the same number in all branches of all environments.
     pub fn step_all(&mut self, number: i32) {
-        let count = self.pool.layout().num_envs() * self.pool.spec().action_space.branches().len();
+        let count = self.pool.layout().num_envs() * self.pool.spec().action_space.width();
         self.step(&vec![number; count]);
     }
 

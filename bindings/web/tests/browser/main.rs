@@ -95,7 +95,7 @@ fn every_environment_is_played_with_the_keyboard() {
         browser.press("KeyN");
         let state = browser.value(STATE);
         assert_eq!(state["length"], before + 1, "{}", spec.id);
-        let expected = match spec.action_space.branches().len() {
+        let expected = match spec.action_space.width() {
             2 => json!([2, 1]),
             _ if spec.id == "Endless-MysteryPath-v0" => json!([2]),
             _ => json!([3]),

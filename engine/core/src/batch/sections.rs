@@ -284,7 +284,7 @@ impl ActionSection {
     pub(super) fn row_shape(self, space: &ActionSpace, num_envs: usize) -> Vec<usize> {
         match (self, self.row()) {
             (_, RowShape::Bytes(bytes)) => vec![bytes.div_ceil(num_envs)],
-            (ActionSection::Action, _) => vec![space.branches().len()],
+            (ActionSection::Action, _) => vec![space.width()],
             _ => vec![],
         }
     }

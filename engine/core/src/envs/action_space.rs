@@ -6,10 +6,12 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Action space of an environment, named after Gymnasium's spaces. In JSON, `{"Discrete": 4}` or `{"MultiDiscrete": [3, 3]}`.
+/// Action space of an environment, named after Gymnasium's spaces. In JSON, `{"Discrete": 4}`, `{"MultiDiscrete": [3, 3]}` or
+/// `{"Box": {"low": [-2.0], "high": [2.0]}}`, where null is an infinite bound.
 ///
-/// An action is one `i32` for each branch, from 0 to less than the branch's number of choices. Deserialising rejects a space
-/// without branches, and a branch without choices.
+/// An action is one `i32` for each branch, from 0 to less than the branch's number of choices. In a [`Box`](ActionSpace::Box), it is
+/// the bits of one `f32` for each dimension, which [`box_action`] reads. Deserialising rejects a space without branches or dimensions,
+/// a branch without choices, and a dimension whose lower bound is not below its upper bound.
 ///
 /// ```
 /// use endless_gym_core::envs::ActionSpace;
@@ -21,13 +23,20 @@ use thiserror::Error;
 ///     "the action of environment 1 must be in MultiDiscrete([3, 3]), got [3, 1]"
 /// );
 /// ```
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "ActionSpaceFields")]
 pub enum ActionSpace {
     /// One branch with this number of choices.
     Discrete(i32),
     /// Several branches, each with its own number of choices.
     MultiDiscrete(Cow<'static, [i32]>),
+    /// One float32 for each dimension. The environment clips numbers beyond the bounds, as Gymnasium's environments do.
+    Box {
+        /// Lower bounds.
+        low: Cow<'static, [f32]>,
+        /// Upper bounds.
+        high: Cow<'static, [f32]>,
+    },
 }
 
 impl ActionSpace {
@@ -36,30 +45,62 @@ impl ActionSpace {
         ActionSpace::MultiDiscrete(Cow::Borrowed(branches))
     }
 
-    /// Number of choices of each branch.
+    /// [`ActionSpace::Box`] from constant lists of the same length.
+    pub const fn bounded(low: &'static [f32], high: &'static [f32]) -> Self {
+        ActionSpace::Box { low: Cow::Borrowed(low), high: Cow::Borrowed(high) }
+    }
+
+    /// Number of numbers in an action.
+    pub fn width(&self) -> usize {
+        match self {
+            ActionSpace::Discrete(_) => 1,
+            ActionSpace::MultiDiscrete(branches) => branches.len(),
+            ActionSpace::Box { low, .. } => low.len(),
+        }
+    }
+
+    /// Number of choices of each branch. A [`Box`](ActionSpace::Box) has no branches.
     pub fn branches(&self) -> &[i32] {
         match self {
             ActionSpace::Discrete(n) => std::slice::from_ref(n),
             ActionSpace::MultiDiscrete(branches) => branches,
+            ActionSpace::Box { .. } => &[],
         }
     }
 
-    /// Checks the actions of `num_envs` environments: for each, a row with one number for each branch.
+    /// Checks the actions of `num_envs` environments, one row of [`width`](ActionSpace::width) numbers after the other.
     ///
     /// # Errors
     ///
-    /// [`ActionError`] if there are too few or too many numbers, or if one is out of its branch's range.
+    /// [`ActionError`] if there are too few or too many numbers, if one is outside its branch's range, or if one of a
+    /// [`Box`](ActionSpace::Box) is not a number.
     pub fn check(&self, num_envs: usize, actions: &[i32]) -> Result<(), ActionError> {
-        let branches = self.branches();
-        if Some(actions.len()) != num_envs.checked_mul(branches.len()) {
-            return Err(ActionError::Count { given: actions.len(), num_envs, branches: branches.len() });
+        let width = self.width();
+        if Some(actions.len()) != num_envs.checked_mul(width) {
+            return Err(ActionError::Count { given: actions.len(), num_envs, width });
         }
-        let fits = |action: &[i32]| action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a));
-        match actions.chunks_exact(branches.len().max(1)).enumerate().find(|(_, action)| !fits(action)) {
+        let branches = self.branches();
+        let fits = |action: &[i32]| match self {
+            ActionSpace::Box { .. } => box_action(action).iter().all(|number| !number.is_nan()),
+            _ => action.iter().zip(branches).all(|(a, n)| (0..*n).contains(a)),
+        };
+        match actions.chunks_exact(width.max(1)).enumerate().find(|(_, action)| !fits(action)) {
             None => Ok(()),
-            Some((env, action)) => Err(ActionError::Range { env, given: action.to_vec(), space: self.to_string() }),
+            Some((env, action)) => Err(ActionError::Range { env, given: self.shown(action), space: self.to_string() }),
         }
     }
+
+    fn shown(&self, action: &[i32]) -> String {
+        match self {
+            ActionSpace::Box { .. } => format!("{:?}", box_action(action)),
+            _ => format!("{action:?}"),
+        }
+    }
+}
+
+/// The numbers of an action in a [`Box`](ActionSpace::Box).
+pub fn box_action(action: &[i32]) -> &[f32] {
+    bytemuck::cast_slice(action)
 }
 
 impl fmt::Display for ActionSpace {
@@ -67,16 +108,18 @@ impl fmt::Display for ActionSpace {
         match self {
             ActionSpace::Discrete(n) => write!(f, "Discrete({n})"),
             ActionSpace::MultiDiscrete(branches) => write!(f, "MultiDiscrete({branches:?})"),
+            ActionSpace::Box { low, high } => write!(f, "Box({low:?}, {high:?})"),
         }
     }
 }
 
-/// An action space as in JSON.
+/// An action space in JSON.
 #[derive(Deserialize)]
 #[serde(rename = "ActionSpace")]
 enum ActionSpaceFields {
     Discrete(i32),
     MultiDiscrete(Vec<i32>),
+    Box { low: Vec<Option<f32>>, high: Vec<Option<f32>> },
 }
 
 impl TryFrom<ActionSpaceFields> for ActionSpace {
@@ -86,18 +129,31 @@ impl TryFrom<ActionSpaceFields> for ActionSpace {
         let space = match fields {
             ActionSpaceFields::Discrete(n) => ActionSpace::Discrete(n),
             ActionSpaceFields::MultiDiscrete(branches) => ActionSpace::MultiDiscrete(branches.into()),
+            ActionSpaceFields::Box { low, high } => {
+                let bounds =
+                    |given: Vec<Option<f32>>, none: f32| given.into_iter().map(|bound| bound.unwrap_or(none)).collect();
+                ActionSpace::Box { low: bounds(low, f32::NEG_INFINITY), high: bounds(high, f32::INFINITY) }
+            }
         };
-        let branches = space.branches();
-        if branches.is_empty() || branches.iter().any(|choices| *choices < 1) {
+        let is_valid = match &space {
+            ActionSpace::Box { low, high } => {
+                low.len() == high.len() && low.iter().zip(high.iter()).all(|(low, high)| low < high)
+            }
+            _ => space.branches().iter().all(|choices| *choices >= 1),
+        };
+        if space.width() == 0 || !is_valid {
             return Err(InvalidActionSpace { given: space.to_string() });
         }
         Ok(space)
     }
 }
 
-/// An action space has no branch, or a branch without choices.
+/// The action space has no branch or dimension, a branch without choices, or a dimension without a range.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("an action space must have at least one branch, and each at least one choice, got {given}")]
+#[error(
+    "an action space must have at least one branch, each with at least one choice, or a lower bound below the upper bound for each \
+     dimension, got {given}"
+)]
 pub struct InvalidActionSpace {
     /// The space that was given.
     pub given: String,
@@ -108,24 +164,24 @@ pub struct InvalidActionSpace {
 pub enum ActionError {
     /// Too few or too many numbers.
     #[error(
-        "actions must be a row of length {branches} for each of {num_envs} environments, {} numbers in all, got {given}",
-        num_envs.saturating_mul(*branches)
+        "actions must be a row of length {width} for each of {num_envs} environments, {} numbers in all, got {given}",
+        num_envs.saturating_mul(*width)
     )]
     Count {
         /// The length that was given.
         given: usize,
         /// Number of environments.
         num_envs: usize,
-        /// Number of branches of the action space.
-        branches: usize,
+        /// Number of numbers in an action.
+        width: usize,
     },
-    /// A number is out of its branch's range.
-    #[error("the action of environment {env} must be in {space}, got {given:?}")]
+    /// A number is out of its branch's range, or not a number.
+    #[error("the action of environment {env} must be in {space}, got {given}")]
     Range {
         /// Number of the first environment with such an action.
         env: usize,
         /// Its action.
-        given: Vec<i32>,
+        given: String,
         /// The action space.
         space: String,
     },
@@ -142,6 +198,10 @@ mod tests {
         for (space, json) in [
             (ActionSpace::Discrete(4), json!({"Discrete": 4})),
             (ActionSpace::multi_discrete(&[3, 5]), json!({"MultiDiscrete": [3, 5]})),
+            (
+                ActionSpace::bounded(&[-2.0, f32::NEG_INFINITY], &[2.5, f32::INFINITY]),
+                json!({"Box": {"low": [-2.0, null], "high": [2.5, null]}}),
+            ),
         ] {
             assert_eq!(serde_json::to_value(&space).unwrap(), json);
             assert_eq!(serde_json::from_value::<ActionSpace>(json).unwrap(), space);
@@ -154,6 +214,9 @@ mod tests {
             (json!({"Discrete": 0}), "Discrete(0)"),
             (json!({"MultiDiscrete": []}), "MultiDiscrete([])"),
             (json!({"MultiDiscrete": [3, -1]}), "MultiDiscrete([3, -1])"),
+            (json!({"Box": {"low": [], "high": []}}), "Box([], [])"),
+            (json!({"Box": {"low": [0.0], "high": [1.0, 2.0]}}), "Box([0.0], [1.0, 2.0])"),
+            (json!({"Box": {"low": [1.0], "high": [1.0]}}), "Box([1.0], [1.0])"),
         ] {
             let message = serde_json::from_value::<ActionSpace>(json).unwrap_err().to_string();
             assert!(message.ends_with(&format!("got {shown}")), "{message}");
@@ -165,7 +228,7 @@ mod tests {
     fn wrong_actions_are_refused() {
         let space = ActionSpace::Discrete(4);
         assert_eq!(space.check(3, &[0, 3, 1]), Ok(()));
-        assert_eq!(space.check(2, &[0, 3, 1]), Err(ActionError::Count { given: 3, num_envs: 2, branches: 1 }));
+        assert_eq!(space.check(2, &[0, 3, 1]), Err(ActionError::Count { given: 3, num_envs: 2, width: 1 }));
         assert_eq!(
             space.check(2, &[]).unwrap_err().to_string(),
             "actions must be a row of length 1 for each of 2 environments, 2 numbers in all, got 0"
@@ -174,6 +237,14 @@ mod tests {
             let error = space.check(2, &wrong).unwrap_err();
             assert!(matches!(error, ActionError::Range { env: found, .. } if found == env), "{error}");
         }
+        let space = ActionSpace::bounded(&[-2.0, -2.0], &[2.0, 2.0]);
+        let bits = |numbers: [f32; 2]| numbers.map(|number| number.to_bits() as i32);
+        assert_eq!(box_action(&bits([0.5, -3.0])), [0.5, -3.0]);
+        assert_eq!(space.check(1, &bits([0.5, -3.0])), Ok(()));
+        assert_eq!(
+            space.check(1, &bits([f32::NAN, 0.0])).unwrap_err().to_string(),
+            "the action of environment 0 must be in Box([-2.0, -2.0], [2.0, 2.0]), got [NaN, 0.0]"
+        );
         assert!(space.check(usize::MAX, &[0]).is_err());
         let none = ActionSpace::multi_discrete(&[]);
         assert_eq!(none.check(usize::MAX, &[]), Ok(()));

@@ -10,11 +10,11 @@ mod spec;
 mod task;
 pub mod view;
 
-pub use action_space::{ActionError, ActionSpace, InvalidActionSpace};
+pub use action_space::{ActionError, ActionSpace, InvalidActionSpace, box_action};
 pub use environment::{Environment, InvalidState, Transition};
 pub use expert::Expert;
 pub use parameters::{Parameter, ParameterError, ParameterKind, ResetParameters};
 pub use progress::Progress;
 pub use screen::{FRAME_BYTES, Frame, SCREEN};
-pub use spec::{ActionBranch, Choice, Column, EnvSpec, InfoColumn, UnknownEnvironment};
+pub use spec::{ActionBranch, Choice, Column, EnvSpec, InfoColumn, ObservationSpace, UnknownEnvironment};
 pub use task::{Task, TaskEnv};

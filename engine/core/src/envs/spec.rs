@@ -44,6 +44,39 @@ pub struct InfoColumn {
     pub description: &'static str,
 }
 
+/// Space of the feature observation, named after Gymnasium's spaces. In JSON as an [`ActionSpace`].
+///
+/// The features are float32 in any case. The space says what they stand for: Python returns integers of a
+/// [`Discrete`](ObservationSpace::Discrete) space as int64, and the parts of a [`Tuple`](ObservationSpace::Tuple) apart.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub enum ObservationSpace {
+    /// One integer from 0 to less than this number.
+    Discrete(i32),
+    /// Several integers, each from 0 to less than its number.
+    MultiDiscrete(&'static [i32]),
+    /// One float32 for each dimension.
+    Box {
+        /// Lower bounds; may be infinite.
+        low: &'static [f32],
+        /// Upper bounds; may be infinite.
+        high: &'static [f32],
+    },
+    /// Several observations, one after the other.
+    Tuple(&'static [ObservationSpace]),
+}
+
+impl ObservationSpace {
+    /// Number of features.
+    pub fn width(&self) -> usize {
+        match self {
+            ObservationSpace::Discrete(_) => 1,
+            ObservationSpace::MultiDiscrete(numbers) => numbers.len(),
+            ObservationSpace::Box { low, .. } => low.len(),
+            ObservationSpace::Tuple(parts) => parts.iter().map(ObservationSpace::width).sum(),
+        }
+    }
+}
+
 /// Everything that is fixed about an environment id.
 #[derive(Clone, Debug, Serialize)]
 pub struct EnvSpec {
@@ -65,6 +98,8 @@ pub struct EnvSpec {
     pub info: &'static [InfoColumn],
     /// Columns of the feature observation (float32), which the original does not have.
     pub features: &'static [Column],
+    /// What the features stand for; `None` for a box without bounds.
+    pub observation_space: Option<ObservationSpace>,
     /// Reset parameters with the original's names and defaults.
     pub parameters: &'static [Parameter],
     /// Frames per second for a human viewer.
@@ -84,6 +119,7 @@ impl EnvSpec {
             ground_truth_is_integer: false,
             info: &[],
             features: &[],
+            observation_space: None,
             parameters: &[],
             render_fps: 25,
         }

@@ -49,7 +49,7 @@ impl Experts {
             autoreset,
             features: spec.features.len(),
             vector_observation: spec.vector_observation,
-            branches: spec.action_space.branches().len(),
+            branches: spec.action_space.width(),
         })
     }
 

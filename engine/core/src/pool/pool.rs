@@ -32,7 +32,7 @@ use crate::raster::PixelFormat;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
 ///
-/// let actions = vec![0; 8 * pool.spec().action_space.branches().len()];
+/// let actions = vec![0; 8 * pool.spec().action_space.width()];
 /// for _ in 0..10 {
 ///     pool.step(&actions, &mut blocks)?;
 /// }

@@ -185,7 +185,7 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
         actions: &[i32],
         out: BatchMut<'_>,
     ) -> Result<(), WrongFrame> {
-        let branches = self.spec.action_space.branches().len();
+        let branches = self.spec.action_space.width();
         self.write(context, out, |env, slot, out, row| {
             slot.step(autoreset, context.draw, &actions[env * branches..][..branches], out, row);
         })
