@@ -90,7 +90,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
 
     Raises:
         FileNotFoundError: There is no such checkpoint.
-        ValueError: The file is not a checkpoint of this version.
+        ValueError: The file is not a checkpoint of this version, or its weights are not finite.
     """
     file = Path(path)
     if file.is_dir():
@@ -116,6 +116,12 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
         raise ValueError(
             f"checkpoint {file} must be of version {CHECKPOINT_VERSION}, got {version}; "
             "use the version of endless-gym that wrote it"
+        )
+    broken = [name for name, weights in agent.state_dict().items() if not bool(weights.isfinite().all())]
+    if broken:
+        raise ValueError(
+            f"checkpoint {file} has weights that are not finite, in {broken[0]}: its run had diverged; use an earlier "
+            "checkpoint, or train again with a smaller --ppo.learning-rate"
         )
     agent.eval()
     return Checkpoint(settings, agent, state["update"], state["steps"], state)

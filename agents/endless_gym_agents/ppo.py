@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 
@@ -15,6 +16,10 @@ from endless_gym_agents.memory import MemoryState, Minibatch
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.rollout import Segment
 from endless_gym_agents.settings import PPO
+
+
+class Diverged(ValueError):
+    """The loss, the gradient or the weights are no longer finite."""
 
 
 def linear_decay(initial: float, final: float, update: int, decay_updates: int) -> float:
@@ -109,8 +114,12 @@ def learn(
         ranks: The ranks of the run, each with a segment of its own environments; `None` for this process alone.
 
     Returns:
-        Metrics of the update by name: losses, gradient norm before clipping and so on, averaged over all minibatches; learning
-        rate, entropy coefficient, mean value, mean advantage and explained variance.
+        Metrics of the update by name: losses, gradient norm before clipping and so on, averaged over all minibatches; norm of
+        the weights after the update, learning rate, entropy coefficient, mean value, mean advantage and explained variance.
+
+    Raises:
+        Diverged: The loss or the gradient norm of a minibatch, or the norm of the weights after the update, is not finite. The
+            weights are then useless; on several ranks, every rank raises it.
     """
     learning_rate = linear_decay(settings.learning_rate, settings.final_learning_rate, update, settings.decay_updates)
     entropy_coefficient = linear_decay(
@@ -156,10 +165,16 @@ def learn(
         sums["gradient_norm"].add_(norm, alpha=1.0 / ranks.size)
     ranks.add(sums[name] for name in sorted(sums))
     metrics |= {name: total / len(minibatches) for name, total in sums.items()}
+    metrics["weight_norm"] = torch.stack(torch._foreach_norm([part.detach() for part in agent.parameters()])).norm()
     # One copy to the host for all metrics.
-    numbers = torch.stack(list(metrics.values())).cpu().tolist()
-    rates = {"learning_rate": learning_rate, "entropy_coefficient": entropy_coefficient}
-    return rates | dict(zip(metrics, numbers, strict=True))
+    numbers = dict(zip(metrics, torch.stack(list(metrics.values())).cpu().tolist(), strict=True))
+    for name in ("loss", "gradient_norm", "weight_norm"):
+        if not math.isfinite(numbers[name]):
+            raise Diverged(
+                f"update {update + 1} diverged: its {name} is {numbers[name]}; try a smaller --ppo.learning-rate (now "
+                f"{learning_rate:g}) or --ppo.max-gradient-norm (now {settings.max_gradient_norm:g}), or --no-bf16"
+            )
+    return {"learning_rate": learning_rate, "entropy_coefficient": entropy_coefficient} | numbers
 
 
 def add_gradients(agent: Agent, ranks: Ranks, share: float) -> None:

@@ -28,6 +28,7 @@ import tyro
 from rich.console import Console
 
 from endless_gym_agents import command, ray_session, search_ray, search_workers
+from endless_gym_agents.ppo import Diverged
 from endless_gym_agents.search_study import SearchArguments, Trial, Trials, resumable
 from endless_gym_agents.settings import PRESETS, Settings
 from endless_gym_agents.train import train
@@ -62,6 +63,8 @@ def run_trial(trial: Trial, settings: Settings) -> None:
             raise KeyboardInterrupt
     except torch.cuda.OutOfMemoryError:
         trial.fail("ran out of GPU memory")
+    except Diverged:
+        trial.fail("diverged")
     except BaseException:
         trial.interrupt()
         raise

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from endless_gym_agents import ray_session
+from endless_gym_agents.ppo import Diverged
 from endless_gym_agents.search_study import Trial, Trials, resumable
 from endless_gym_agents.search_workers import output_of, with_threads
 from endless_gym_agents.settings import from_dict, to_dict
@@ -127,13 +128,15 @@ def _trainable(trainer: Trainer, period: int, cpus: int) -> Callable[[dict[str, 
             settings, rows = resumable(given)
             for row in rows:
                 watch(row["update"], row)
-            exhausted = False
+            end = "done"
             try:
                 if done < last:
                     trainer(with_threads(settings, cpus), watch)
             except torch.cuda.OutOfMemoryError:
-                exhausted = True
-        tune.report({"update": done, "reward": reward, "end": "exhausted" if exhausted else "done"})
+                end = "ran out of GPU memory"
+            except Diverged:
+                end = "diverged"
+        tune.report({"update": done, "reward": reward, "end": end})
 
     return run
 
@@ -178,8 +181,8 @@ class _Study:
         if is_error:
             self.failed.append(trial.number)
             trial.postpone(f"failed; its log is {trial.settings.run}.log")
-        elif ended == "exhausted":
-            trial.fail("ran out of GPU memory")
+        elif ended not in ("", "done"):
+            trial.fail(ended)
         elif trial.pruned or ended:
             trial.complete()
         else:

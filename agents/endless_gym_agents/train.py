@@ -32,7 +32,7 @@ from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
 from endless_gym_agents.learnt import learnt
 from endless_gym_agents.logs import RECENT, Logger, SilentLogger, means
-from endless_gym_agents.ppo import learn, make_optimizer
+from endless_gym_agents.ppo import Diverged, learn, make_optimizer
 from endless_gym_agents.ranks import Ranks
 from endless_gym_agents.rollout import RolloutCollector
 from endless_gym_agents.settings import PRESETS, Settings, to_dict
@@ -63,6 +63,7 @@ def train(
         FileExistsError: The folder already contains a run.
         FileNotFoundError: There is no run to resume.
         EngineLost: The engine process failed, and was not replaced; see `Settings.on_engine_failure`.
+        Diverged: A loss, a gradient or the weights are no longer finite. The last checkpoint is from before.
     """
     settings, ranks = settings.validated(), Ranks()
     ranks.check(settings.environment.num_envs, settings.environment.groups)
@@ -109,7 +110,7 @@ def train_rank(
             agent.compile_parts()
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)
-        update, steps = 0, 0
+        update, steps, saved = 0, 0, resumed["update"] if resumed else 0
         episodes: deque[dict[str, float]] = deque(maxlen=RECENT)
         if resumed is not None:
             update, steps = resumed["update"], resumed["steps"]
@@ -126,6 +127,8 @@ def train_rank(
         ranks.copy_from_first(agent.state_dict().values())
 
         def save() -> None:
+            nonlocal saved
+            saved = update
             players = ranks.gathered(collector.state_dict())
             if players is None:
                 return
@@ -160,7 +163,10 @@ def train_rank(
             segment, ended = collector.collect(clock)
             with clock.measure("learning"):
                 states = [memory.state for memory in collector.memories]
-                learning = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"], ranks)
+                try:
+                    learning = learn(agent, optimizer, segment, states, update, ppo, generators["minibatches"], ranks)
+                except Diverged as error:
+                    raise Diverged(f"{error}; with --resume {run}, which has a checkpoint of update {saved}") from None
             new_steps = settings.environment.num_envs * ppo.steps
             update, steps = update + 1, steps + new_steps
             for infos in ranks.everywhere(ended):

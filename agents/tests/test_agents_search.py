@@ -103,6 +103,16 @@ def test_search_from_start_to_end(tmp_path: Path) -> None:
         Trials(small(tmp_path, parameters=("ppo.minibatches",)), QUIET)
 
 
+def test_a_trial_that_diverges_fails_and_the_search_continues(tmp_path: Path) -> None:
+    arguments = small(tmp_path, stage="single", parameters=("ppo.learning_rate",))
+    trials = Trials(replace(arguments, settings=changed(arguments.settings, ppo={"learning_rate": 1e20})), QUIET)
+    search.run_trials(trials)
+    ended = {trial.params["ppo.learning_rate"]: trial.state.name for trial in trials.study.trials}
+    assert ended.pop(1e20) == "FAIL"
+    assert len(ended) == 4 and set(ended.values()) == {"COMPLETE"}
+    assert trials.remaining() == (4, 0)
+
+
 def test_the_best_settings_are_replaced_atomically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader that has the old file open can read all of it."""
 
@@ -138,7 +148,7 @@ def test_a_failed_trial_is_resumed_only_by_the_next_call(tmp_path: Path) -> None
     run = configuration["settings"]["run"]
     first.end("a", is_error=True)
     assert first.begin("b") is not None
-    first._ended["b"] = "exhausted"
+    first._ended["b"] = "ran out of GPU memory"
     first.end("b", is_error=False)
     # The failed trial counts as one of the combinations.
     assert first.begin("c") is None
