@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from endless_gym_agents.command import Terminal
 from endless_gym_agents.settings import Settings, to_dict
 
 #: Log file in the folder of a run, with one JSON object per update.
@@ -32,7 +33,7 @@ class Logger:
         """
         from torch.utils.tensorboard import SummaryWriter
 
-        self.console = Console(highlight=False)
+        self.console = Terminal(highlight=False)
         self._updates = settings.ppo.updates
         progress = run / PROGRESS
         if progress.exists():
@@ -72,13 +73,12 @@ class Logger:
         )
         self.console.print(
             f"[bold]{step:>5}[/]/{self._updates} {metrics['steps']:>11,} steps {metrics['steps_per_second']:>8,.0f}/s  "
-            f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]",
-            soft_wrap=True,
+            f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]"
         )
 
     def print(self, text: str) -> None:
         """Print a line on the terminal."""
-        self.console.print(text, soft_wrap=True)
+        self.console.print(text)
 
     def close(self) -> None:
         """Close all files."""

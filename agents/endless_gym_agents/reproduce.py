@@ -112,7 +112,7 @@ def execute(arguments: ReproduceArguments) -> None:
         ValueError: An argument is invalid, a folder has another run, or a run failed.
         KeyboardInterrupt: The runs were stopped.
     """
-    console, scale = Console(highlight=False), planning.read_scale(arguments.scale)
+    console, scale = command.Terminal(highlight=False), planning.read_scale(arguments.scale)
     every = arguments.names == ("all",) or (arguments.list and not arguments.names)
     experiments = [definitions.load(name) for name in (definitions.names() if every else arguments.names)]
     if not experiments:

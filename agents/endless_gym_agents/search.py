@@ -25,7 +25,6 @@ from typing import Any
 
 import torch
 import tyro
-from rich.console import Console
 
 from endless_gym_agents import command, ray_session, search_ray, search_workers
 from endless_gym_agents.ppo import Diverged
@@ -94,7 +93,7 @@ def execute(arguments: SearchArguments) -> None:
     if arguments.ray:
         # Tune imports pyarrow, which Ray alone does not install.
         ray_session.check_installed("pyarrow")
-    trials = Trials(arguments, Console(highlight=False))
+    trials = Trials(arguments, command.Terminal(highlight=False))
     done, left = trials.remaining()
     trials.say(f"{done} trials done, {left} remaining, in {trials.folder}; Ctrl-C stops the search")
     try:

@@ -15,8 +15,6 @@ from multiprocessing import connection
 from types import FrameType
 from typing import Any
 
-from rich.console import Console
-
 from endless_gym_agents import command
 from endless_gym_agents.experiments import running
 from endless_gym_agents.search_study import SearchArguments, Trials
@@ -55,7 +53,7 @@ def run_workers(trials: Trials, work: Work) -> None:
         work: What a process does; a function that can be pickled.
 
     Raises:
-        KeyboardInterrupt: The search was interrupted by SIGINT or SIGTERM. The workers have stopped, with checkpoints.
+        KeyboardInterrupt: The search was interrupted by a signal. The workers have stopped, with checkpoints.
         ValueError: A worker failed.
     """
     arguments, context = trials.arguments, multiprocessing.get_context("spawn")
@@ -74,37 +72,37 @@ def run_workers(trials: Trials, work: Work) -> None:
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
+        if stopped and number != signal.SIGINT:
+            return  # Only another Ctrl-C stops the workers at once.
         stopped = True
         for process in alive.values():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGINT)
 
     trials.say(f"{arguments.workers} workers; the output of a trial is in {trials.folder}/trial-NNNN.log")
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        for slot in range(min(arguments.workers, trials.remaining()[1])):
-            if not stopped:
-                start(slot)
-        while alive:
-            connection.wait([process.sentinel for process in alive.values()])
-            for slot, process in list(alive.items()):
-                if process.exitcode is None:
-                    continue
-                del alive[slot]
-                status: int = process.exitcode
-                process.close()
-                in_time = time.monotonic() < trials.end
-                if status < 0 and not stopped and in_time and replaced < arguments.max_failures:
-                    replaced += 1
-                    trials.say(f"a worker was killed by signal {-status}; its trial is resumed")
+    with command.on_stop_signals(stop):
+        try:
+            for slot in range(min(arguments.workers, trials.remaining()[1])):
+                if not stopped:
                     start(slot)
-                elif status and not stopped:
-                    failed += 1
-    finally:
-        for process in alive.values():
-            process.kill()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+            while alive:
+                connection.wait([process.sentinel for process in alive.values()])
+                for slot, process in list(alive.items()):
+                    if process.exitcode is None:
+                        continue
+                    del alive[slot]
+                    status: int = process.exitcode
+                    process.close()
+                    in_time = time.monotonic() < trials.end
+                    if status < 0 and not stopped and in_time and replaced < arguments.max_failures:
+                        replaced += 1
+                        trials.say(f"a worker was killed by signal {-status}; its trial is resumed")
+                        start(slot)
+                    elif status and not stopped:
+                        failed += 1
+        finally:
+            for process in alive.values():
+                process.kill()
     if stopped:
         raise KeyboardInterrupt
     if failed:
@@ -117,5 +115,5 @@ def _worker(arguments: SearchArguments, end: float, machine: running.Machine, sl
     os.setsid()
     if machine.gpus and arguments.settings.device in ("auto", "cuda"):
         os.environ["CUDA_VISIBLE_DEVICES"] = machine.gpus[slot % len(machine.gpus)]
-    trials = Trials(arguments, Console(highlight=False, file=sys.stdout), end)
+    trials = Trials(arguments, command.Terminal(highlight=False, file=sys.stdout), end)
     sys.exit(command.run("endless-search", lambda: work(trials, machine.engine_threads)))

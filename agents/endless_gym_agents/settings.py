@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Literal
@@ -221,6 +222,8 @@ class Settings:
     """resume the run in this folder from its last checkpoint; its settings are the defaults of the other flags"""
     checkpoint_interval: int = 100
     """updates between two checkpoints; the last update always writes a checkpoint"""
+    checkpoint_minutes: float = 10.0
+    """largest number of minutes between two checkpoints; 0 for no limit"""
     keep_checkpoints: bool = False
     """keep all checkpoints, for evaluation, instead of only the last"""
     on_engine_failure: Literal["restart", "save", "fail"] = "restart"
@@ -277,6 +280,9 @@ class Settings:
                 number = value(self, name.replace("-", "_"))
                 if number < least:
                     raise ValueError(f"--{name} must be {least} or more, got {number}")
+        for name in ("checkpoint_minutes", "time_limit"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"--{name.replace('_', '-')} must be 0 or more minutes, got {getattr(self, name)}")
         if environment.num_envs % environment.groups:
             raise ValueError(
                 f"--environment.num-envs must be a multiple of --environment.groups, got {environment.num_envs} environments and "

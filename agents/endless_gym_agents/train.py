@@ -10,7 +10,6 @@ torchrun --nproc-per-node=4 -m endless_gym_agents.train -- --env MortarMayhem-v0
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import json
 import signal
@@ -104,13 +103,13 @@ def train_rank(
     }
 
     ppo, started, stop = settings.ppo, time.monotonic(), Interrupt(ranks)
-    with Environments(settings, episode_options, ranks) as environments, stop:
+    with stop, Environments(settings, episode_options, ranks) as environments:
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)
-        update, steps, saved = 0, 0, resumed["update"] if resumed else 0
+        update, steps, saved, saved_at = 0, 0, resumed["update"] if resumed else 0, started
         episodes: deque[dict[str, float]] = deque(maxlen=RECENT)
         if resumed is not None:
             update, steps = resumed["update"], resumed["steps"]
@@ -126,9 +125,9 @@ def train_rank(
                 collector.start_episodes([player["environments"] for player in players])
         ranks.copy_from_first(agent.state_dict().values())
 
-        def save() -> None:
-            nonlocal saved
-            saved = update
+        def save(keep: bool) -> None:
+            nonlocal saved, saved_at
+            saved, saved_at = update, time.monotonic()
             players = ranks.gathered(collector.state_dict())
             if players is None:
                 return
@@ -142,14 +141,14 @@ def train_rank(
                 "player": players[0] if ranks.size == 1 else {"ranks": players},
                 "episodes": list(episodes),
             }
-            checkpoint.save(run, state, settings.keep_checkpoints)
+            checkpoint.save(run, state, keep)
 
         logger = Logger(run, settings, update) if ranks.is_first else SilentLogger()
         # Written only after everything above has succeeded. A resumed run keeps its changed settings.
         if ranks.is_first:
             (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
         if resumed is None:
-            save()
+            save(settings.keep_checkpoints)
         where = f"{device}" if ranks.size == 1 else f"{ranks.size} ranks"
         logger.print(
             f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {where}, in {run}; Ctrl-C stops the run"
@@ -190,10 +189,14 @@ def train_rank(
                 stop.requested = True
             if watch is not None and watch(update, recent):
                 stop.requested = True
-            # All ranks stop after the same update.
-            stops = any(ranks.everywhere(stop.requested))
-            if update % settings.checkpoint_interval == 0 or update >= ppo.updates or stops:
-                save()
+            is_late = (
+                bool(settings.checkpoint_minutes) and time.monotonic() >= saved_at + 60 * settings.checkpoint_minutes
+            )
+            # All ranks stop, or write a checkpoint, after the same update.
+            stops, is_late = map(any, zip(*ranks.everywhere((stop.requested, is_late)), strict=True))
+            is_planned = update % settings.checkpoint_interval == 0 or update >= ppo.updates or stops
+            if is_planned or is_late:
+                save(settings.keep_checkpoints and is_planned)
         if success is not None:
             logger.print(f"the task is learnt: {success}; train longer with --no-stop-when-learnt")
         logger.print(f"{update} of {ppo.updates} updates done; continue with: endless-train --resume {run}")
@@ -229,10 +232,9 @@ def make_folder(settings: Settings, ranks: Ranks) -> tuple[str, bool]:
 
 
 class Interrupt:
-    """Context manager that turns the first SIGINT into a request to stop; the second one raises `KeyboardInterrupt`.
+    """Context manager that turns `command.STOP_SIGNALS` into a request to stop; a second SIGINT raises `KeyboardInterrupt`.
 
-    With several ranks, SIGTERM is such a request, too. `torchrun` forwards signals that the terminal has already sent, so signals
-    within two seconds count as one.
+    `torchrun` forwards signals that the terminal has already sent: with several ranks, signals within two seconds count as one.
 
     Attributes:
         requested: Whether the run should stop after the current update.
@@ -241,27 +243,27 @@ class Interrupt:
     def __init__(self, ranks: Ranks) -> None:
         self.requested = False
         self._ranks = ranks
-        self._before: dict[int, Any] = {}
+        self._handled = command.on_stop_signals(self._on_signal)
         self._first = 0.0
 
     def __enter__(self) -> Interrupt:
-        # Only the main thread can install handlers, and only it is interrupted.
-        with contextlib.suppress(ValueError):
-            for number in (signal.SIGINT, signal.SIGTERM) if self._ranks.size > 1 else (signal.SIGINT,):
-                self._before[number] = signal.signal(number, self._on_signal)
+        self._handled.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for number, handler in self._before.items():
-            # When one rank has ended, `torchrun` sends SIGTERM to the others; ignore it so that the environments are closed.
-            signal.signal(number, signal.SIG_IGN if number == signal.SIGTERM else handler)
+        self._handled.__exit__(None, None, None)
+        if self._ranks.size > 1:
+            # When one rank has ended, `torchrun` sends SIGTERM to the others, which are ending too.
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._first:
-            if self._ranks.size > 1 and time.monotonic() < self._first + 2.0:
-                return
-            raise KeyboardInterrupt
+        if self.requested:
+            # A scheduler or a closing terminal may send several signals; only another Ctrl-C asks for more.
+            if number == signal.SIGINT and (self._ranks.size == 1 or time.monotonic() >= self._first + 2.0):
+                raise KeyboardInterrupt
+            return
         self.requested, self._first = True, time.monotonic()
+        command.drop_lost_outputs()
         if self._ranks.is_first:
             print(
                 "\nstopping after this update, with a checkpoint; press Ctrl-C again to stop immediately",

@@ -21,6 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from endless_gym import make_vec
 from endless_gym_agents import checkpoint
 from endless_gym_agents.clock import Clock
+from endless_gym_agents.command import STOP_SIGNALS
 from endless_gym_agents.environments import Environments
 from endless_gym_agents.evaluate import evaluate, mean
 from endless_gym_agents.ppo import learn, make_optimizer
@@ -123,8 +124,9 @@ def test_runs_do_not_depend_on_threads_or_the_engine(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["thread", "process"])
-def test_ctrl_c_writes_a_checkpoint_and_frees_shared_memory(
-    engine: str, tmp_path: Path, segments: Callable[[], set[str]]
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_signal_writes_a_checkpoint_and_frees_shared_memory(
+    number: signal.Signals, engine: str, tmp_path: Path, segments: Callable[[], set[str]]
 ) -> None:
     run = tmp_path / "run"
     before = segments()
@@ -140,7 +142,7 @@ def test_ctrl_c_writes_a_checkpoint_and_frees_shared_memory(
     while not (run / "progress.jsonl").exists() or not (run / "progress.jsonl").read_text():
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0, output
     assert "stopping after this update" in output

@@ -19,6 +19,7 @@ from typing import IO, Protocol
 import torch
 
 from endless_gym_agents import checkpoint
+from endless_gym_agents.command import on_stop_signals
 from endless_gym_agents.experiments import planning
 from endless_gym_agents.experiments.planning import Job
 
@@ -117,7 +118,7 @@ class _Active:
 
 
 class Runner:
-    """Runs jobs; Ctrl-C (or SIGTERM) stops the running ones after their update, with checkpoints.
+    """Runs jobs; Ctrl-C, SIGTERM and SIGHUP stop the running ones after their update, with checkpoints.
 
     Attributes:
         failed: Jobs whose command failed.
@@ -140,25 +141,23 @@ class Runner:
     def run(self, planned: Sequence[Job]) -> None:
         """Run the jobs that are not done."""
         waiting = [job for job in planned if job.state() != "done"]
-        before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
         said = time.monotonic()
-        try:
-            while self._active or (waiting and not self.stopped):
-                taken = {active.slot for active in self._active}
-                for slot in sorted(set(range(self.machine.jobs)) - taken):
-                    while waiting and not self.stopped and not self._start(waiting.pop(0), slot):
-                        pass
-                time.sleep(_POLL)
-                for active in list(self._active):
-                    self._look(active)
-                if time.monotonic() - said > _REPORT:
-                    said = time.monotonic()
-                    self.say(left(planned, self.machine.jobs))
-        finally:
-            for active in self._active:
-                active.process.send_signal(signal.SIGKILL)
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        with on_stop_signals(self._stop):
+            try:
+                while self._active or (waiting and not self.stopped):
+                    taken = {active.slot for active in self._active}
+                    for slot in sorted(set(range(self.machine.jobs)) - taken):
+                        while waiting and not self.stopped and not self._start(waiting.pop(0), slot):
+                            pass
+                    time.sleep(_POLL)
+                    for active in list(self._active):
+                        self._look(active)
+                    if time.monotonic() - said > _REPORT:
+                        said = time.monotonic()
+                        self.say(left(planned, self.machine.jobs))
+            finally:
+                for active in self._active:
+                    active.process.send_signal(signal.SIGKILL)
 
     def _start(self, job: Job, slot: int) -> bool:
         """Start the first command of a job; false if another process is running or has completed it."""
@@ -222,6 +221,8 @@ class Runner:
         active.lock.close()
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self.stopped and number != signal.SIGINT:
+            return  # Only another Ctrl-C stops the jobs at once.
         again = ", now without waiting for the end of an update" if self.stopped else ""
         self.stopped = True
         self.say(f"stopping {len(self._active)} jobs with checkpoints{again or '; press Ctrl-C again to stop at once'}")

@@ -16,7 +16,7 @@ from endless_gym_agents.experiments import running
 
 
 class RayRunner(running.Runner):
-    """Runs jobs on a connected Ray; Ctrl-C (or SIGTERM) stops the running ones after their update, with checkpoints."""
+    """Runs jobs on a connected Ray; Ctrl-C, SIGTERM and SIGHUP stop the running ones after their update, with checkpoints."""
 
     def __init__(
         self, machine: running.Machine, say: Callable[[str], None], keep_checkpoints: bool = False, gpus: float = 0.0
