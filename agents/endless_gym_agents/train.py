@@ -10,6 +10,7 @@ torchrun --nproc-per-node=4 -m endless_gym_agents.train -- --env MortarMayhem-v0
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import signal
@@ -25,7 +26,7 @@ import torch
 
 from endless_gym import EngineLost
 from endless_gym.episodes import EpisodeOptions
-from endless_gym_agents import checkpoint, command
+from endless_gym_agents import checkpoint, command, run_folder
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
@@ -59,6 +60,7 @@ def train(
     Raises:
         RankLost: Another process of the run has ended.
         ValueError: The settings are invalid, or do not fit the run to resume.
+        RunInUse: Another process trains in the folder.
         FileExistsError: The folder already contains a run.
         FileNotFoundError: There is no run to resume.
         EngineLost: The engine process failed, and was not replaced; see `Settings.on_engine_failure`.
@@ -74,23 +76,22 @@ def train(
     if device.type == "cuda":
         torch.cuda.set_device(device)
         torch.set_float32_matmul_precision("high")  # TF32
-    with ranks.connected():
-        return train_rank(settings, ranks, device, watch, episode_options)
+    with ranks.connected(), contextlib.ExitStack() as held:
+        folder, has_begun = ranks.of_first(lambda: held.enter_context(run_folder.opened(settings, ranks.restarts)))
+        return train_rank(settings, ranks, device, Path(folder), has_begun, watch, episode_options)
 
 
 def train_rank(
     settings: Settings,
     ranks: Ranks,
     device: torch.device,
+    run: Path,
+    has_begun: bool,
     watch: Callable[[int, dict[str, float]], bool] | None,
     episode_options: EpisodeOptions | None,
 ) -> Path:
-    """The part of `train` that runs while the ranks are connected."""
+    """The part of `train` that runs while the ranks are connected and the folder `run` is locked."""
     resumed: dict[str, Any] | None = None
-    folder, has_begun = (
-        (settings.resume, True) if settings.resume else ranks.of_first(lambda: make_folder(settings, ranks))
-    )
-    run = Path(folder)
     if has_begun:
         resumed = checkpoint.load(run).state
         check_resumable(settings, checkpoint.read_settings(run))
@@ -207,28 +208,6 @@ def train_rank(
                 f"{failures[0]}; the checkpoint is of update {update}; continue with: endless-train --resume {run}"
             )
     return run
-
-
-def make_folder(settings: Settings, ranks: Ranks) -> tuple[str, bool]:
-    """Make the folder of a new run.
-
-    Returns:
-        The folder, and whether it contains a checkpoint of this run, from before `torchrun` restarted it.
-
-    Raises:
-        FileExistsError: The folder contains another run.
-        ValueError: The run was restarted, and its folder has no fixed name.
-    """
-    if ranks.restarts and not settings.run:
-        raise ValueError("a run that torchrun starts again needs --run, to find its checkpoint; got no folder")
-    run = Path(settings.run or f"runs/{settings.env}/{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
-    has_begun = bool(ranks.restarts) and (run / checkpoint.FOLDER / checkpoint.LAST).exists()
-    if (run / checkpoint.SETTINGS).exists() and not ranks.restarts:
-        raise FileExistsError(
-            f"{run} already contains a run; continue it with --resume {run}, or choose another folder"
-        )
-    run.mkdir(parents=True, exist_ok=True)
-    return str(run), has_begun
 
 
 class Interrupt:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from endless_gym_agents import checkpoint, enjoy, protocol
 from endless_gym_agents import train as training
 from endless_gym_agents.command import STOP_SIGNALS
 from endless_gym_agents.logs import read_progress
+from endless_gym_agents.run_folder import RunInUse
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.train import parse, train
 
@@ -141,3 +143,84 @@ def test_a_run_outlives_the_reader_of_its_output(tmp_path: Path) -> None:
         process.stdout.close()
         assert process.wait(120) == 0
     assert checkpoint.load(run).update == len(read_progress(run)) == 6
+
+
+def in_the_meantime(start: Callable[[], object]) -> Callable[[int, dict[str, float]], bool]:
+    """A function for `train` that starts something else after the first update."""
+
+    def watch(update: int, means: dict[str, float]) -> bool:
+        if update == 1:
+            start()
+        return False
+
+    return watch
+
+
+def test_a_second_process_cannot_train_in_the_folder_of_a_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    refused = pytest.raises(RunInUse, match=rf"{run} is in use by process {os.getpid()} on .* since 20\d\d-")
+
+    def start() -> None:
+        # A lock belongs to the open file, so one in this process stands for one in another.
+        with refused:
+            train(small("gru", run, learning_rate=1e-3))
+        with refused:
+            train(replace(small("gru", run), resume=str(run)))
+
+    train(small("gru", run), in_the_meantime(start))
+    train(replace(small("gru", run, updates=5), resume=str(run)), in_the_meantime(start))
+    assert [row["update"] for row in read_progress(run)] == [1, 2, 3, 4, 5]
+    assert not (run / "lock").exists()
+
+
+def test_runs_that_start_in_the_same_second_have_different_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda *_: "20260102-030405")
+    others: list[Path] = []
+    given = replace(small("none", tmp_path), run="")
+    first = train(given, in_the_meantime(lambda: others.extend(train(given) for _ in range(2))))
+    name = "runs/MortarMayhem-Grid-v0/none-1-20260102-030405"
+    assert [str(run) for run in (first, *others)] == [name, f"{name}-2", f"{name}-3"]
+    assert all(len(read_progress(run)) == 3 for run in (first, *others))
+
+
+def test_a_run_that_cannot_start_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="colour"):
+        train(changed(small("none", tmp_path / "run"), environment={"option": ("colour=1",)}))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_processes_started_at_once_train_in_their_own_folders_or_fail(tmp_path: Path) -> None:
+    """Three learning rates without a folder, and the same folder twice; then one run resumed twice."""
+    common = "--env MortarMayhem-Grid-v0 --preset quick --threads 1 --ppo.steps 16 --ppo.updates"
+
+    def started(arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "endless_gym_agents.train", *arguments.split()]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, cwd=tmp_path, text=True, **quiet)
+
+    def one_is_refused(*processes: subprocess.Popen[str]) -> None:
+        end = time.monotonic() + 200
+        while not (ended := [process for process in processes if process.poll() is not None]):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        (refused,) = ended
+        assert refused.stderr is not None
+        assert "same is in use by process" in refused.stderr.read()
+        (other,) = (process for process in processes if process is not refused)
+        other.send_signal(signal.SIGTERM)
+        assert (refused.returncode, other.wait(60)) == (1, 0)
+        rows = read_progress(tmp_path / "same")
+        assert [row["update"] for row in rows] == list(range(1, len(rows) + 1))
+
+    rates = ("0.001", "0.002", "0.003")
+    learning = [started(f"{common} 8 --ppo.learning-rate {rate}") for rate in rates]
+    assert [process.wait(200) for process in learning] == [0, 0, 0]
+    runs = sorted((tmp_path / "runs" / "MortarMayhem-Grid-v0").iterdir())
+    assert sorted(checkpoint.read_settings(run).ppo.learning_rate for run in runs) == list(map(float, rates))
+    assert all([row["update"] for row in read_progress(run)] == list(range(1, 9)) for run in runs)
+    one_is_refused(*(started(f"{common} 100000 --run same") for _ in range(2)))
+    one_is_refused(*(started("--resume same") for _ in range(2)))
