@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import select
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -24,7 +25,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 @contextlib.contextmanager
 def on_stop_signals(handler: Callable[[int, Any], object]) -> Iterator[None]:
     """Handle `STOP_SIGNALS`. A SIGHUP that is ignored, as under `nohup`, stays ignored."""
-    before: dict[int, Any] = {}
+    before: dict[signal.Signals, Any] = {}
     try:
         # Only the main thread can install handlers, and only it is interrupted.
         with contextlib.suppress(ValueError):
@@ -91,8 +92,51 @@ def main(
     name: str, arguments: type[T], execute: Callable[[T], object], text: str | None, given: list[str] | None = None
 ) -> int:
     """Parse the arguments `given` to a command, by default the process's, and `run` it; `text` is its module's docstring."""
-    parsed = tyro.cli(arguments, prog=name, description=description(text), args=given)
+    parsed = parse(arguments, name, text, given)
     return run(name, lambda: execute(parsed))
+
+
+def parse(
+    arguments: type[T], name: str, text: str | None, given: Sequence[str] | None = None, default: T | None = None
+) -> T:
+    """Parse the arguments `given` to a command as for `main`; the values of a repeated flag accumulate."""
+    given = joined(_repeatable(arguments), sys.argv[1:] if given is None else given)
+    known = tyro.MISSING_NONPROP if default is None else default
+    return tyro.cli(arguments, prog=name, description=description(text), args=given, default=known)
+
+
+def joined(repeatable: Collection[str], given: Sequence[str]) -> list[str]:
+    """The arguments with all values of each repeatable flag behind its first occurrence; tyro takes those of the last one."""
+    parts: list[list[str]] = []
+    of_flag: dict[str, list[str]] = {}
+    values: list[str] | None = None
+    for argument in given:
+        flag, equals, value = argument.partition("=")
+        flag = flag.replace("_", "-")
+        if flag in repeatable:
+            if flag not in of_flag:
+                parts.append(of_flag.setdefault(flag, [flag]))
+            of_flag[flag] += [value] if equals else []
+            values = None if equals else of_flag[flag]
+        elif values is None or argument.startswith("--"):
+            parts.append([argument])
+            values = None
+        else:
+            values.append(argument)
+    return [argument for part in parts for argument in part]
+
+
+def _repeatable(arguments: Any, prefix: str = "--") -> set[str]:
+    """The flags that take any number of values."""
+    names: set[str] = set()
+    for name, hint in get_type_hints(arguments, include_extras=True).items():
+        kind, *annotations = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        flag = "" if any(getattr(each, "name", None) == "" for each in annotations) else name.replace("_", "-")
+        if dataclasses.is_dataclass(kind):
+            names |= _repeatable(kind, f"{prefix}{flag}." if flag else prefix)
+        elif get_origin(kind) is tuple and Ellipsis in get_args(kind):
+            names.add(prefix + flag)
+    return names
 
 
 def description(text: str | None) -> str:

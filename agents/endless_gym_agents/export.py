@@ -243,12 +243,7 @@ def execute(arguments: ExportArguments) -> None:
 
 def main() -> int:
     """Entry point of this program; returns the exit status."""
-    arguments = tyro.cli(
-        ExportArguments,
-        prog="python -m endless_gym_agents.export",
-        description=command.description(__doc__),
-        args=sys.argv[1:],
-    )
+    arguments = command.parse(ExportArguments, "python -m endless_gym_agents.export", __doc__)
     return command.run("endless_gym_agents.export", lambda: execute(arguments))
 
 

@@ -123,9 +123,7 @@ def execute(arguments: RecordArguments) -> None:
 
 def main() -> int:
     """Entry point of the command `endless-record`; returns the exit status."""
-    arguments = tyro.cli(
-        RecordArguments, prog="endless-record", description=command.description(__doc__), args=sys.argv[1:]
-    )
+    arguments = command.parse(RecordArguments, "endless-record", __doc__)
     return recording.run("endless-record", lambda: execute(arguments))
 
 

@@ -24,7 +24,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-import tyro
 
 from endless_gym_agents import command, ray_session, search_ray, search_workers
 from endless_gym_agents.ppo import Diverged
@@ -115,9 +114,8 @@ def parse(arguments: list[str]) -> SearchArguments:
     chosen.add_argument("--preset", default="paper")
     preset = chosen.parse_known_args(arguments)[0].preset
     default = SearchArguments(settings=PRESETS.get(preset, PRESETS["paper"]))
-    text = command.description(__doc__)
     given = ray_session.with_address(arguments)
-    return tyro.cli(SearchArguments, prog="endless-search", description=text, args=given, default=default)
+    return command.parse(SearchArguments, "endless-search", __doc__, given, default=default)
 
 
 def main() -> int:

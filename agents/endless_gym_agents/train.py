@@ -323,8 +323,6 @@ def choose_device(name: str, ranks: Ranks | None = None) -> torch.device:
 
 def parse(arguments: list[str]) -> Settings:
     """Parse command-line arguments; the defaults are those of `--preset`, or the settings of the run to `--resume`."""
-    import tyro
-
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="paper")
     first.add_argument("--resume", default="")
@@ -335,7 +333,7 @@ def parse(arguments: list[str]) -> Settings:
         # tyro reports an unknown preset.
         defaults = PRESETS.get(chosen.preset, PRESETS["paper"])
     description = "Train one of the paper's agents with PPO: endless-train --env Endless-MortarMayhem-v0 --agent gru"
-    return tyro.cli(Settings, prog="endless-train", description=description, args=arguments, default=defaults)
+    return command.parse(Settings, "endless-train", description, arguments, default=defaults)
 
 
 def main() -> int:

@@ -17,6 +17,7 @@ from support import rest_of_terminal
 
 import endless_gym
 from endless_gym.cli import main as program_main
+from endless_gym.recording.command import _parser
 
 pytestmark = [pytest.mark.libraries, pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")]
 
@@ -341,3 +342,20 @@ def test_experts_play_with_next_step_auto_reset() -> None:
             ends += int(terminated.sum())
             successes += int(info.get("success", np.zeros(1)).sum())
         assert successes == ends
+
+
+def test_the_values_of_a_repeated_flag_accumulate() -> None:
+    repeated = [
+        "MortarMayhem-v0",
+        "--error-rate",
+        "0",
+        "0.1",
+        "--error-rate",
+        "0.2",
+        "--option",
+        "a=1",
+        "--option",
+        "b=2",
+    ]
+    given = _parser().parse_args(repeated)
+    assert (given.error_rate, given.option) == ([0.0, 0.1, 0.2], ["a=1", "b=2"])

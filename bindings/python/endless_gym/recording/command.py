@@ -98,7 +98,7 @@ def _execute(given: argparse.Namespace) -> None:
             given.id,
             given.episodes,
             policy=given.policy,
-            error_rates=given.error_rate,
+            error_rates=given.error_rate or [0.0],
             seed=given.seed,
             action_seed=given.action_seed,
             options=[_object(text) for text in given.options] or _parameters(given.option),
@@ -151,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
         "--error-rate",
         type=float,
         nargs="+",
-        default=[0.0],
+        action="extend",
         metavar="P",
         help="probability that a step takes a random action instead of the expert's; episodes cycle through several [default: 0]",
     )
