@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::entropy::{EntropyError, entropy};
 use super::seed_sequence::SeedSequence;
+use super::ziggurat::{HEIGHT, INSIDE, INVERSE_TAIL, TAIL, WIDTH};
 
 /// Maximum number of redraws in rejection sampling, after which it takes a biased draw. numpy has no such limit. Fewer than
 /// half of the draws are rejected, so no seed reaches it, but a deserialised state could.
@@ -106,6 +107,93 @@ impl Generator {
     #[inline]
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.random()
+    }
+
+    /// `random(dtype=float32)`: a multiple of 2⁻²⁴ in `[0, 1)`, from a 32-bit draw.
+    #[inline]
+    pub fn random_f32(&mut self) -> f32 {
+        const STEP: f32 = 1.0 / (1_u32 << 24) as f32;
+        (self.next_u32() >> 8) as f32 * STEP
+    }
+
+    /// `standard_normal()`, by the ziggurat method. Fewer than 1 % of the numbers need the exponential or the logarithm of the
+    /// platform's mathematical library; these equal numpy's bit for bit where both use the same library.
+    #[inline]
+    pub fn standard_normal(&mut self) -> f64 {
+        loop {
+            let word = self.bits.next_u64();
+            let layer = (word & 0xff) as usize;
+            let inside = (word >> 9) & 0x000f_ffff_ffff_ffff;
+            let x = f64::from_bits((inside as f64 * WIDTH[layer]).to_bits() | (word >> 8 & 1) << 63);
+            if inside < INSIDE[layer] {
+                return x;
+            }
+            if layer == 0 {
+                return self.normal_tail(inside >> 8 & 1 != 0);
+            }
+            if (HEIGHT[layer - 1] - HEIGHT[layer]) * self.random() + HEIGHT[layer] < (-0.5 * x * x).exp() {
+                return x;
+            }
+        }
+    }
+
+    #[cold]
+    fn normal_tail(&mut self, is_negative: bool) -> f64 {
+        loop {
+            let x = -INVERSE_TAIL * (-self.random()).ln_1p();
+            let y = -(-self.random()).ln_1p();
+            if y + y > x * x {
+                return if is_negative { -(TAIL + x) } else { TAIL + x };
+            }
+        }
+    }
+
+    /// `normal(mean, deviation)`: `mean + deviation * standard_normal()`, rounded after each operation as in numpy.
+    #[inline]
+    pub fn normal(&mut self, mean: f64, deviation: f64) -> f64 {
+        mean + deviation * self.standard_normal()
+    }
+
+    /// `shuffle(items)`, and with it `permutation`. Draws nothing for fewer than two items.
+    #[inline]
+    pub fn shuffle<T>(&mut self, items: &mut [T]) {
+        for last in (1..items.len()).rev() {
+            let other = self.up_to(last as u32) as usize;
+            items.swap(last, other);
+        }
+    }
+
+    /// `choice(count, size, replace=False)`: fills `indices` with different numbers in `0..count`. numpy uses another algorithm
+    /// for a `count` above 10,000.
+    ///
+    /// # Panics
+    ///
+    /// If `indices` is longer than `count`, for which numpy raises an error.
+    pub fn choice_without_replacement(&mut self, count: usize, indices: &mut [usize]) {
+        let size = indices.len();
+        assert!(size <= count, "cannot take {size} different numbers out of {count}");
+        // Robert Floyd's algorithm: a number that was drawn before is replaced by the largest possible one, which is new.
+        for (at, largest) in (count - size..count).enumerate() {
+            let drawn = self.integers(0, largest as i64 + 1) as usize;
+            indices[at] = if indices[..at].contains(&drawn) { largest } else { drawn };
+        }
+        for last in (1..size).rev() {
+            let other = self.integers(0, last as i64 + 1) as usize;
+            indices.swap(last, other);
+        }
+    }
+
+    /// A uniform number in `0..=max`: the lowest bits of 32-bit draws that suffice for it, until they are in range.
+    #[inline]
+    fn up_to(&mut self, max: u32) -> u32 {
+        let mask = u32::MAX.checked_shr(max.leading_zeros()).unwrap_or_default();
+        for _ in 0..MAX_REDRAWS {
+            let value = self.next_u32() & mask;
+            if value <= max {
+                return value;
+            }
+        }
+        0
     }
 
     /// A uniform number in `0..count`, for a count of 2 or more, from as many bits as numpy uses.

@@ -11,10 +11,13 @@
 
 mod entropy;
 mod generator;
+mod mersenne_twister;
 mod seed_sequence;
+mod ziggurat;
 
 pub use entropy::{EntropyError, entropy};
 pub use generator::Generator;
+pub use mersenne_twister::MersenneTwister;
 pub use seed_sequence::SeedSequence;
 
 #[cfg(test)]
@@ -54,6 +57,13 @@ mod tests {
         Choice(usize, usize),
         Uniform(u64, u64, u64),
         Random(u64),
+        #[serde(rename = "random_f32")]
+        RandomF32(u32),
+        Normal(u64, u64, u64),
+        /// Number of standard normals, and a checksum of their bits.
+        Normals(usize, u64),
+        Shuffle(Vec<usize>),
+        Distinct(usize, Vec<usize>),
     }
 
     fn cases() -> Cases {
@@ -120,6 +130,27 @@ mod tests {
                     Draw::Random(expected) => {
                         assert_eq!(rng.random().to_bits(), expected, "{place}");
                     }
+                    Draw::RandomF32(expected) => {
+                        assert_eq!(rng.random_f32().to_bits(), expected, "{place}");
+                    }
+                    Draw::Normal(mean, deviation, expected) => {
+                        let drawn = rng.normal(f64::from_bits(mean), f64::from_bits(deviation));
+                        assert_eq!(drawn.to_bits(), expected, "{place}");
+                    }
+                    Draw::Normals(count, expected) => {
+                        let drawn = (0..count).map(|_| rng.standard_normal().to_bits());
+                        assert_eq!(drawn.fold(0, |sum: u64, bits| sum.rotate_left(1) ^ bits), expected, "{place}");
+                    }
+                    Draw::Shuffle(ref expected) => {
+                        let mut items = indices[..expected.len()].to_vec();
+                        rng.shuffle(&mut items);
+                        assert_eq!(&items, expected, "{place}");
+                    }
+                    Draw::Distinct(count, ref expected) => {
+                        let mut drawn = vec![0; expected.len()];
+                        rng.choice_without_replacement(count, &mut drawn);
+                        assert_eq!(&drawn, expected, "{place}");
+                    }
                 }
             }
         }
@@ -169,6 +200,12 @@ mod tests {
         assert_eq!(rng.integers(i64::MAX, i64::MIN), i64::MAX);
         assert_eq!(rng.choice(&["only"]), &"only");
         assert_eq!(rng, untouched);
+    }
+
+    #[test]
+    #[should_panic(expected = "cannot take 4 different numbers out of 3")]
+    fn too_many_different_numbers_panic() {
+        Generator::from_seed(0).choice_without_replacement(3, &mut [0; 4]);
     }
 
     #[test]

@@ -3,8 +3,9 @@
     python record_random.py > cases.json
     python record_random.py --streams 2000 --draws 400 > wide.json    # a wider run, not stored
 
-numpy 1.26 and 2.x write the same cases. The file holds only integers: floats are stored as the
-64 bits of their IEEE 754 form, which avoids decimal conversions.
+numpy 1.26 and 2.x write the same cases; the tail of the normal distribution depends on the logarithm
+of the C library. The file holds only integers: floats are stored as the 64 bits of their IEEE 754 form,
+which avoids decimal conversions.
 """
 
 import argparse
@@ -29,6 +30,7 @@ EDGE_RANGES = [
     (-(2**63), 0), (-(2**63), 2**63 - 1), (-(2**63) + 1, 2**63 - 1), (2**63 - 3, 2**63 - 1),
     (-(2**63), -(2**63) + 1), (5, 6), (-1, 0),
 ]
+NORMALS = [(0.0, 1.0), (0.0, 0.1), (0.0, 0.3), (-2.5, 1e-3), (1e300, 0.0)]
 UNIFORMS = [
     (0.0, 1.0), (-1.0, 1.0), (0.0025, 0.0075), (0.002, 0.005), (3.25, 3.25), (-1e300, 1e300 / 3),
     (0.1, 0.3), (1e-310, 3e-310), (0.0, 360.0),
@@ -80,7 +82,9 @@ def integers(rng, picker):
 
 
 def draw(rng, picker):
-    kind = picker.choices(("integers", "choice", "uniform", "random"), (12, 3, 2, 2))[0]
+    kinds = {"integers": 12, "choice": 3, "uniform": 2, "random": 2}
+    kinds |= {"random_f32": 2, "normal": 3, "shuffle": 1, "distinct": 1}
+    kind = picker.choices(list(kinds), list(kinds.values()))[0]
     if kind == "integers":
         return integers(rng, picker)
     if kind == "choice":
@@ -89,12 +93,34 @@ def draw(rng, picker):
     if kind == "uniform":
         low, high = picker.choice(UNIFORMS)
         return {"uniform": [bits(low), bits(high), bits(rng.uniform(low, high))]}
+    if kind == "random_f32":
+        return {"random_f32": int(np.float32(rng.random(dtype=np.float32)).view(np.uint32))}
+    if kind == "normal":
+        mean, deviation = picker.choice(NORMALS)
+        return {"normal": [bits(mean), bits(deviation), bits(rng.normal(mean, deviation))]}
+    if kind == "shuffle":
+        items = np.arange(picker.choice((0, 1, 2, 3, 16, 17, 52)))
+        rng.shuffle(items)
+        return {"shuffle": items.tolist()}
+    if kind == "distinct":
+        count = picker.choice((1, 2, 16, 36, 64))
+        size = picker.choice((0, 1, count // 6, count // 2, count))
+        return {"distinct": [count, rng.choice(count, size, replace=False).tolist()]}
     return {"random": bits(rng.random())}
+
+
+def normals(rng, count):
+    """A checksum of so many standard normals that all branches of the ziggurat occur."""
+    checksum = 0
+    for number in rng.standard_normal(count):
+        checksum = (checksum << 1 | checksum >> 63) & 0xFFFFFFFFFFFFFFFF ^ bits(number)
+    return {"normals": [count, checksum]}
 
 
 def stream(seed, spawn_key, count, picker):
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=spawn_key)))
     draws = [draw(rng, picker) for _ in range(count)]
+    draws.append(normals(rng, 20_000))
     # One draw of each kind at the end checks the state and the kept half after the last draw.
     draws.append({"integers": [0, 2**32, [int(rng.integers(0, 2**32))]]})
     draws.append({"random": bits(rng.random())})
