@@ -65,7 +65,10 @@ pub(crate) fn toys() -> &'static Registry {
         let mut registry = Registry::new().with::<Toy>().unwrap();
         let two = EnvSpec::new("Toy-Vector-v0", "Two branches", ActionSpace::multi_discrete(&[3, 3]));
         let specs = [EnvSpec { vector_observation: 5, features: FEATURES, ..two }, plain()];
-        specs.into_iter().for_each(|spec| registry.register::<TaskEnv<Toy>>(spec, ()).unwrap());
+        for spec in specs {
+            let id = spec.id;
+            registry.register::<TaskEnv<Toy>>(spec, id).unwrap();
+        }
         registry
     });
     &REGISTRY

@@ -38,6 +38,9 @@ pub trait Environment: Send + Sync {
     /// Creates an environment. The caller must [`reset`](Environment::reset) it before any other call.
     fn new(assets: &Arc<Self::Assets>) -> Self;
 
+    /// Seeds the generators that the rules keep themselves, before the reset of an episode that has a seed.
+    fn seed(&mut self, _seed: u64) {}
+
     /// Starts an episode with these assets, which may differ from the last episode's.
     fn reset(&mut self, assets: &Arc<Self::Assets>, random: &mut Generator);
 

@@ -173,6 +173,7 @@ enum Value {
 /// A complete and valid set of reset parameters: the given values, and defaults for all others.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResetParameters {
+    id: &'static str,
     values: Vec<(&'static str, Value)>,
 }
 
@@ -195,7 +196,12 @@ impl ResetParameters {
             .iter()
             .map(|p| Ok((p.name, given.get(p.name).map_or_else(|| Ok(p.default_value()), |v| p.parse(v))?)))
             .collect::<Result<_, _>>()?;
-        Ok(ResetParameters { values })
+        Ok(ResetParameters { id, values })
+    }
+
+    /// The environment id that they are for.
+    pub fn id(&self) -> &'static str {
+        self.id
     }
 
     fn value(&self, name: &str) -> Option<&Value> {

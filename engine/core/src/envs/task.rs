@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde::{Serialize, de::DeserializeOwned};
 
 use super::environment::{Environment, InvalidState, Transition};
+use super::expert::Expert;
 use super::parameters::ResetParameters;
 use super::progress::Progress;
 use super::spec::EnvSpec;
@@ -18,7 +19,8 @@ use crate::raster::Canvas;
 /// episodes: [`Default`] creates it, and [`reset`](Task::reset) comes before every other call. Draw all random numbers from the
 /// given generator, so that seed, reset parameters and actions determine an episode.
 ///
-/// Implement [`Environment`] instead to share rules among several ids, to keep pictures, or to repaint only what changed.
+/// Rules that several ids share list them in [`specs`](Task::specs). Implement [`Environment`] instead to keep pictures, or to
+/// repaint only what changed.
 ///
 /// ```
 /// use endless_gym_core::batch::{Batch, zeroed};
@@ -79,8 +81,18 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
     /// Id, spaces, reset parameters, features and infos.
     fn spec() -> EnvSpec;
 
-    /// The typed reset parameters. `given` is complete, and every value is within its limits.
+    /// The specification of every id that these rules play; by default, only [`spec`](Task::spec).
+    fn specs() -> Vec<EnvSpec> {
+        vec![Self::spec()]
+    }
+
+    /// The typed reset parameters. `given` is complete, every value is within its limits, and its
+    /// [`id`](ResetParameters::id) says which of several ids is played.
     fn parameters(given: &ResetParameters) -> Self::Parameters;
+
+    /// Seeds the generators that the rules keep themselves, before the reset of an episode that has a seed. Rules that only draw
+    /// from the given generator need none.
+    fn seed(&mut self, _seed: u64) {}
 
     /// Starts an episode.
     fn reset(&mut self, parameters: &Self::Parameters, random: &mut Generator);
@@ -105,6 +117,11 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
         Vec::new()
     }
 
+    /// A scripted expert for an id, if there is one.
+    fn expert(_id: &str) -> Option<Box<dyn Expert>> {
+        None
+    }
+
     /// Whether the rules can reach a restored state, so that no later call panics. A snapshot may be forged.
     fn is_valid(&self, _parameters: &Self::Parameters) -> bool {
         true
@@ -119,17 +136,22 @@ pub struct TaskEnv<T: Task> {
 }
 
 impl<T: Task> Environment for TaskEnv<T> {
-    type Variant = ();
+    /// The id.
+    type Variant = &'static str;
     type Assets = T::Parameters;
     type State = T;
     type Scene = T;
 
-    fn assets((): (), parameters: &ResetParameters) -> T::Parameters {
+    fn assets(_id: &'static str, parameters: &ResetParameters) -> T::Parameters {
         T::parameters(parameters)
     }
 
     fn new(assets: &Arc<T::Parameters>) -> Self {
         TaskEnv { parameters: Arc::clone(assets), task: T::default() }
+    }
+
+    fn seed(&mut self, seed: u64) {
+        self.task.seed(seed);
     }
 
     fn reset(&mut self, assets: &Arc<T::Parameters>, random: &mut Generator) {
@@ -188,5 +210,9 @@ impl<T: Task> Environment for TaskEnv<T> {
 
     fn info(&self, out: &mut [f64]) {
         self.task.info(&self.parameters, out);
+    }
+
+    fn expert(id: &'static str) -> Option<Box<dyn Expert>> {
+        T::expert(id)
     }
 }

@@ -79,6 +79,9 @@ impl<E: Environment> EnvSlot<E> {
         if self.independent_episodes {
             self.env = E::new(&self.assets);
         }
+        if let Some(seed) = self.episode_seed {
+            self.env.seed(seed);
+        }
         self.env.reset(&self.assets, &mut self.random);
         self.frame_stack.restart(|| self.env.scene());
         self.episode_return = 0.0;

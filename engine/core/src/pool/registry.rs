@@ -42,13 +42,16 @@ impl Registry {
         Ok(())
     }
 
-    /// Adds the id of a task and returns the registry.
+    /// Adds the ids of a task and returns the registry.
     ///
     /// # Errors
     ///
-    /// [`DuplicateEnvironment`] if the registry has the id already.
+    /// [`DuplicateEnvironment`] if the registry has an id already.
     pub fn with<T: Task>(mut self) -> Result<Self, DuplicateEnvironment> {
-        self.register::<TaskEnv<T>>(T::spec(), ())?;
+        for spec in T::specs() {
+            let id = spec.id;
+            self.register::<TaskEnv<T>>(spec, id)?;
+        }
         Ok(self)
     }
 
