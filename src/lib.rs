@@ -17,6 +17,7 @@ use std::io::Write;
 use std::process::ExitCode;
 
 pub use endless_gym_memory_gym::{DEFAULT_ENV_ID, memory_gym};
+pub use endless_gym_popgym::popgym;
 
 /// Runs the program `endless` with the environments of `registry` and the arguments of this process. In a program with
 /// custom environments, it is all that `main` needs:

@@ -15,6 +15,7 @@ mod next_options;
 mod own_environment;
 mod play_page;
 mod pool;
+mod popgym;
 mod program;
 mod recordings;
 mod service;

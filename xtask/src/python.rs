@@ -127,6 +127,14 @@ pub fn original() -> Result<PathBuf, String> {
     Ok(tools("original", &base, &["memory-gym==1.0.2", "numpy==1.26.4"])?.join("bin/python"))
 }
 
+/// The path of the Python that has POPGym.
+pub fn popgym() -> Result<PathBuf, String> {
+    let base =
+        interpreter(ORIGINAL).ok_or("CPython 3.11 is missing, which numpy's version of the recordings supports")?;
+    let packages = ["popgym==1.0.7", "gymnasium==1.4.0", "mazelib==0.9.16", "cython==3.3.1", "numpy==2.4.6"];
+    Ok(tools("popgym", &base, &packages)?.join("bin/python"))
+}
+
 /// Builds the wheel with a cargo profile; the Rust tests use `dev`.
 pub fn wheel(profile: &str) -> Result<(), String> {
     let bin = environment()?.join("bin");

@@ -17,9 +17,10 @@ const TOOLS: [&str; 3] = ["maturin==1.16.0", "wheel==0.48.0", "ziglang==0.17.1"]
 const PLATFORM: &str = "manylinux_2_17";
 
 /// The published crates, dependencies first.
-const CRATES: [&str; 7] = [
+const CRATES: [&str; 8] = [
     "endless-gym-core",
     "endless-gym-memory-gym",
+    "endless-gym-popgym",
     "endless-gym-service",
     "endless-gym-page",
     "endless-gym-view",

@@ -59,6 +59,7 @@ fn not_run(what: &str) -> Result<(), String> {
 /// Compares with the original, with a fixed seed.
 pub fn test_original() -> Result<(), String> {
     let mut cargo = shell::cargo(&["test", "--locked", "--test", "integration", "--", "--ignored", "live::"]);
+    cargo.env("ENDLESS_POPGYM_PYTHON", python::popgym()?);
     run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("PROPTEST_RNG_SEED", PROPERTY_SEED))
 }
 
@@ -66,6 +67,7 @@ pub fn test_original() -> Result<(), String> {
 pub fn live(steps: u64) -> Result<(), String> {
     let tests = ["test", "--release", "--locked", "--test", "integration", "--", "--ignored", "--nocapture", "live::"];
     let mut cargo = shell::cargo(&tests);
+    cargo.env("ENDLESS_POPGYM_PYTHON", python::popgym()?);
     run(cargo.env("ENDLESS_ORIGINAL_PYTHON", python::original()?).env("ENDLESS_LIVE_STEPS", steps.to_string()))
 }
 

@@ -1,0 +1,117 @@
+//! Autoencode: watch a deck, then name its suits in reverse order.
+
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::deck::{DECK, Deck, Face};
+use crate::ids::{SUITS, ids, place};
+
+const IDS: [&str; 3] = ids!("Autoencode");
+const DECKS: [usize; 3] = [1, 2, 3];
+
+/// Number of decks, and the reward.
+pub struct Parameters {
+    decks: usize,
+    reward: f64,
+}
+
+/// The state of an episode. The agent watches until all cards have been dealt.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Autoencode {
+    deck: Deck,
+    /// Number of suits that the agent has named.
+    named: usize,
+    /// The suit that is shown.
+    card: u8,
+}
+
+impl Task for Autoencode {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        const FEATURES: &[Column] = &[
+            Column { name: "mode", description: "1 while the agent watches, 0 when it names suits" },
+            Column { name: "suit", description: "the suit of the card, 0 to 3; 0 from the second card to name on" },
+        ];
+        let summary = "Watch a deck, then name its suits in reverse order";
+        EnvSpec {
+            actions: SUITS,
+            features: FEATURES,
+            observation_space: Some(ObservationSpace::Tuple(&[
+                ObservationSpace::Discrete(2),
+                ObservationSpace::Discrete(4),
+            ])),
+            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let decks = DECKS[place(&IDS, given.id())];
+        Parameters { decks, reward: 1.0 / (decks * DECK) as f64 }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.deck.shuffle(parameters.decks, Face::Suit, random);
+        self.card = self.deck.deal();
+        self.named = 0;
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        if self.deck.left() > 0 {
+            self.card = self.deck.deal();
+            return Transition::default();
+        }
+        // The last card dealt is the first of the deck. After the end, only the last remains to be named.
+        let last = parameters.decks * DECK - 1;
+        let correct = action[0] == i32::from(self.deck.cards()[self.named]);
+        let terminated = self.named == last;
+        self.named = last.min(self.named + 1);
+        self.card = 0;
+        Transition {
+            reward: if correct { parameters.reward } else { -parameters.reward },
+            terminated,
+            truncated: false,
+        }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out[0] = if self.deck.left() > 0 { 1.0 } else { 0.0 };
+        out[1] = self.card.into();
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        self.deck.is_valid(parameters.decks, Face::Suit) && self.named < parameters.decks * DECK
+    }
+
+    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Memory::default()))
+    }
+}
+
+/// Remembers all suits.
+#[derive(Default)]
+struct Memory {
+    suits: Vec<i32>,
+    names: bool,
+}
+
+impl Expert for Memory {
+    fn reset(&mut self) {
+        *self = Memory::default();
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        if !self.names {
+            self.suits.push(features[1] as i32);
+            self.names = features[0] == 0.0;
+        }
+        action[0] = if self.names { self.suits.pop().unwrap_or_default() } else { 0 };
+    }
+}

@@ -1,0 +1,110 @@
+//! Battleship: find hidden ships; a shot only says whether it hit.
+
+use endless_gym_core::envs::{ActionSpace, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{ids, place};
+
+const IDS: [&str; 3] = ids!("Battleship");
+const SIZES: [usize; 3] = [8, 10, 12];
+const SHIPS: [i64; 4] = [2, 3, 3, 4];
+/// Squares that ships cover.
+const COVERED: i32 = 12;
+/// The largest board's size.
+const ROWS: usize = 12;
+
+/// The board's size, and the rewards.
+pub struct Parameters {
+    size: usize,
+    hit: f64,
+    miss: f64,
+}
+
+/// The state of an episode. The bits of a row are its columns.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Battleship {
+    ships: [u16; ROWS],
+    shots: [u16; ROWS],
+    hits: i32,
+    steps: i32,
+    is_hit: bool,
+}
+
+impl Battleship {
+    /// Places a ship where it fits, by drawing until it does.
+    fn place_ship(&mut self, board: i64, ship: i64, random: &mut Generator) {
+        loop {
+            let start = [random.integers(0, board), random.integers(0, board)];
+            let (axis, backwards) = (random.integers(0, 2) as usize, random.integers(0, 2) == 1);
+            let mut end = start;
+            end[axis] += if backwards { 1 - ship } else { ship - 1 };
+            if !(0..board).contains(&end[axis]) {
+                continue;
+            }
+            let (top, bottom) = (start[0].min(end[0]) as usize, start[0].max(end[0]) as usize);
+            let (left, right) = (start[1].min(end[1]), start[1].max(end[1]));
+            let columns = ((1_u16 << (right - left + 1)) - 1) << left;
+            if self.ships[top..=bottom].iter().all(|row| row & columns == 0) {
+                self.ships[top..=bottom].iter_mut().for_each(|row| *row |= columns);
+                return;
+            }
+        }
+    }
+}
+
+impl Task for Battleship {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const FEATURES: &[Column] = &[Column { name: "hit", description: "1 if the last shot hit, otherwise 0" }];
+        let spec = |(id, size): (_, usize)| {
+            let summary = "Find hidden ships; a shot only says whether it hit";
+            let actions = ActionSpace::MultiDiscrete(vec![size as i32; 2].into());
+            EnvSpec {
+                features: FEATURES,
+                observation_space: Some(ObservationSpace::Discrete(2)),
+                ..EnvSpec::new(id, summary, actions)
+            }
+        };
+        IDS.into_iter().zip(SIZES).map(spec).collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let size = SIZES[place(&IDS, given.id())];
+        let misses = (size * size) as i32 - COVERED;
+        Parameters { size, hit: 1.0 / f64::from(COVERED), miss: -1.0 / f64::from(misses) }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        *self = Battleship::default();
+        for ship in SHIPS {
+            self.place_ship(parameters.size as i64, ship, random);
+        }
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        let (row, column) = (action[0] as usize, 1 << action[1]);
+        self.is_hit = self.ships[row] & !self.shots[row] & column != 0;
+        self.shots[row] |= column;
+        self.hits += i32::from(self.is_hit);
+        self.steps = self.steps.saturating_add(1);
+        Transition {
+            reward: if self.is_hit { parameters.hit } else { parameters.miss },
+            terminated: self.hits == COVERED,
+            truncated: self.steps as usize >= parameters.size * parameters.size,
+        }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out[0] = f32::from(u8::from(self.is_hit));
+    }
+
+    fn is_valid(&self, _: &Parameters) -> bool {
+        (0..=COVERED).contains(&self.hits) && self.steps >= 0
+    }
+}

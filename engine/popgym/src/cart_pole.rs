@@ -1,0 +1,195 @@
+//! Position Only, Velocity Only and Noisy Position Only Cart Pole: balance a pole on a cart of which the observation shows half.
+
+use std::f64::consts::PI;
+
+use endless_gym_core::envs::{
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, Expert, ObservationSpace, Parameter, ResetParameters, Task,
+    Transition,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{ids, place};
+
+const IDS: [[&str; 3]; 3] =
+    [ids!("PositionOnlyCartPole"), ids!("VelocityOnlyCartpole"), ids!("NoisyPositionOnlyCartPole")];
+const LENGTHS: [u32; 3] = [200, 400, 600];
+const DEVIATIONS: [f64; 3] = [0.1, 0.2, 0.3];
+
+const PARAMETERS: &[Parameter] = &[
+    Parameter::float(
+        "low",
+        -0.05,
+        -1.0,
+        0.0,
+        "Lower bound of the first positions (m, rad) and velocities (m/s, rad/s).",
+    ),
+    Parameter::float("high", 0.05, 0.0, 1.0, "Upper bound of the first positions and velocities."),
+];
+
+// Gymnasium's CartPole-v1, in SI units.
+const GRAVITY: f64 = 9.8;
+const MASS_POLE: f64 = 0.1;
+const TOTAL_MASS: f64 = 0.1 + 1.0;
+/// Half the pole's length.
+const LENGTH: f64 = 0.5;
+const POLE_MOMENT: f64 = MASS_POLE * LENGTH;
+const FORCE: f64 = 10.0;
+const SECONDS: f64 = 0.02;
+const MAX_X: f64 = 2.4;
+const MAX_ANGLE: f64 = 12.0 * 2.0 * PI / 360.0;
+/// Bounds of the observed positions.
+const HIGH: [f32; 2] = [(MAX_X * 2.0) as f32, (MAX_ANGLE * 2.0) as f32];
+
+/// What is observed, and the length of an episode.
+pub struct Parameters {
+    velocities: bool,
+    /// Standard deviation of the noise.
+    noise: Option<f64>,
+    length: u32,
+    low: f64,
+    high: f64,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CartPole {
+    x: f64,
+    velocity: f64,
+    angle: f64,
+    angular_velocity: f64,
+    observation: [f32; 2],
+    steps: u32,
+    /// Whether the pole has fallen or the cart has left the track.
+    has_failed: bool,
+}
+
+impl CartPole {
+    /// Observes two numbers, with noise.
+    fn observe(&mut self, numbers: [f64; 2], parameters: &Parameters, random: &mut Generator) {
+        self.observation = numbers.map(|number| number as f32);
+        if let Some(deviation) = parameters.noise {
+            for (number, high) in self.observation.iter_mut().zip(HIGH) {
+                *number = (*number + random.normal(0.0, deviation) as f32).clamp(-high, high);
+            }
+        }
+    }
+}
+
+impl Task for CartPole {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const ACTIONS: &[ActionBranch] = &[ActionBranch {
+            name: "push",
+            choices: &[
+                Choice { name: "left", description: "pushes the cart to the left" },
+                Choice { name: "right", description: "pushes the cart to the right" },
+            ],
+        }];
+        const POSITIONS: &[Column] = &[
+            Column { name: "position", description: "position of the cart, m" },
+            Column { name: "angle", description: "angle of the pole, rad" },
+        ];
+        const VELOCITIES: &[Column] = &[
+            Column { name: "velocity", description: "velocity of the cart, m/s; at first its position, m" },
+            Column {
+                name: "angular velocity",
+                description: "angular velocity of the pole, rad/s; at first its angle, rad",
+            },
+        ];
+        const BOUNDED: ObservationSpace = ObservationSpace::Box { low: &[-HIGH[0], -HIGH[1]], high: &HIGH };
+        const UNBOUNDED: ObservationSpace =
+            ObservationSpace::Box { low: &[f32::NEG_INFINITY; 2], high: &[f32::INFINITY; 2] };
+        let families = [
+            ("Balance a pole, seeing only positions", POSITIONS, BOUNDED),
+            ("Balance a pole, seeing only velocities", VELOCITIES, UNBOUNDED),
+            ("Balance a pole, seeing only positions, with noise", POSITIONS, BOUNDED),
+        ];
+        let specs = IDS.into_iter().zip(families).flat_map(|(ids, (summary, features, space))| {
+            ids.map(|id| EnvSpec {
+                actions: ACTIONS,
+                features,
+                observation_space: Some(space),
+                parameters: PARAMETERS,
+                render_fps: 50,
+                ..EnvSpec::new(id, summary, ActionSpace::Discrete(2))
+            })
+        });
+        specs.collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let at = place(&IDS.concat(), given.id());
+        let (family, level) = (at / 3, at % 3);
+        Parameters {
+            velocities: family == 1,
+            noise: (family == 2).then_some(DEVIATIONS[level]),
+            length: if family == 2 { LENGTHS[0] } else { LENGTHS[level] },
+            low: given.float("low", -0.05),
+            high: given.float("high", 0.05),
+        }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        let [x, velocity, angle, angular_velocity] = [(); 4].map(|()| random.uniform(parameters.low, parameters.high));
+        *self = CartPole { x, velocity, angle, angular_velocity, ..CartPole::default() };
+        // The original shows positions here, also where it later shows velocities.
+        self.observe([x, angle], parameters, random);
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], random: &mut Generator) -> Transition {
+        // Every operation rounds as in Gymnasium.
+        let force = if action[0] == 1 { FORCE } else { -FORCE };
+        let (sin, cos) = (self.angle.sin(), self.angle.cos());
+        let push = (force + POLE_MOMENT * (self.angular_velocity * self.angular_velocity) * sin) / TOTAL_MASS;
+        let angular_acceleration =
+            (GRAVITY * sin - cos * push) / (LENGTH * (4.0 / 3.0 - MASS_POLE * (cos * cos) / TOTAL_MASS));
+        let acceleration = push - POLE_MOMENT * angular_acceleration * cos / TOTAL_MASS;
+        self.x += SECONDS * self.velocity;
+        self.velocity += SECONDS * acceleration;
+        self.angle += SECONDS * self.angular_velocity;
+        self.angular_velocity += SECONDS * angular_acceleration;
+        let fails = self.x < -MAX_X || self.x > MAX_X || self.angle < -MAX_ANGLE || self.angle > MAX_ANGLE;
+        // Only steps after the end fail twice.
+        let reward = if fails && self.has_failed { -1.0 } else { 1.0 / f64::from(parameters.length) };
+        self.has_failed |= fails;
+        self.steps = self.steps.saturating_add(1);
+        let observed =
+            if parameters.velocities { [self.velocity, self.angular_velocity] } else { [self.x, self.angle] };
+        self.observe(observed, parameters, random);
+        Transition { reward, terminated: fails, truncated: self.steps >= parameters.length }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out.copy_from_slice(&self.observation);
+    }
+
+    fn expert(id: &str) -> Option<Box<dyn Expert>> {
+        let family = place(&IDS.concat(), id) / 3;
+        (family == 0).then(|| Box::new(Differences::default()) as Box<dyn Expert>)
+    }
+}
+
+/// Estimates velocities from differences of positions, and pushes to the side to which the pole will fall.
+#[derive(Default)]
+struct Differences {
+    last: Option<[f32; 2]>,
+}
+
+impl Expert for Differences {
+    fn reset(&mut self) {
+        self.last = None;
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        let now = [features[0], features[1]];
+        let [x, angle] = self.last.replace(now).unwrap_or(now);
+        let (velocity, angular_velocity) = ((now[0] - x) / SECONDS as f32, (now[1] - angle) / SECONDS as f32);
+        action[0] = i32::from(now[1] + 0.25 * angular_velocity + 0.02 * now[0] + 0.05 * velocity > 0.0);
+    }
+}

@@ -1,0 +1,166 @@
+//! Concentration: turn over two cards at a time, and find the pairs.
+
+use endless_gym_core::envs::{ActionSpace, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::deck::{DECK, Deck, Face};
+use crate::ids::{ids, numbered, place};
+
+const IDS: [&str; 3] = ids!("Concentration");
+const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Colour), (1, Face::Rank)];
+
+/// Number of decks, what makes a pair, the length of an episode, and the rewards.
+pub struct Parameters {
+    decks: usize,
+    face: Face,
+    length: u32,
+    pair: f64,
+    failure: f64,
+}
+
+/// The state of an episode. Cards on the table are bits.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Concentration {
+    deck: Deck,
+    /// Cards of found pairs.
+    found: u128,
+    /// The card that waits for a second one.
+    first: Option<u8>,
+    /// Cards that the observation shows.
+    shown: u128,
+    steps: u32,
+}
+
+impl Task for Concentration {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        let spec = |(id, (decks, face)): (_, (usize, Face))| {
+            let description = match face {
+                Face::Colour => "the card's colour, 0 or 1; 2 if it is face down",
+                _ => "the card's rank, 0 to 12; 13 if it is face down",
+            };
+            let cards = decks * DECK;
+            let summary = "Turn over two cards at a time, and find the pairs";
+            let faces = vec![face.count() as i32 + 1; cards].leak();
+            let features = numbered("card", cards, description);
+            EnvSpec {
+                features,
+                observation_space: Some(ObservationSpace::MultiDiscrete(faces)),
+                ..EnvSpec::new(id, summary, ActionSpace::Discrete(cards as i32))
+            }
+        };
+        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let (decks, face) = VARIANTS[place(&IDS, given.id())];
+        let cards = (decks * DECK) as f64;
+        let length = (2.0 * cards - cards / (2.0 * cards - 1.0)).ceil();
+        Parameters { decks, face, length: length as u32, pair: 1.0 / (cards / 2.0), failure: -1.0 / length }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.deck.shuffle(parameters.decks, parameters.face, random);
+        (self.found, self.first, self.shown, self.steps) = (0, None, 0, 0);
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        let card = action[0] as u8;
+        let bit = |card: u8| 1_u128 << card;
+        let first = self.first.take();
+        self.shown = self.found | bit(card) | first.map_or(0, bit);
+        self.steps = self.steps.saturating_add(1);
+        let is_found = self.found & bit(card) != 0;
+        let mut reward = 0.0;
+        match first {
+            None if is_found => reward = parameters.failure,
+            None => self.first = Some(card),
+            Some(first) => {
+                let face = |card: u8| self.deck.cards()[usize::from(card)];
+                if !is_found && first != card && face(first) == face(card) {
+                    self.found = self.shown;
+                    reward = parameters.pair;
+                } else {
+                    reward = 2.0 * parameters.failure;
+                }
+            }
+        }
+        let terminated = self.found.count_ones() as usize == self.deck.cards().len();
+        Transition { reward, terminated, truncated: self.steps >= parameters.length }
+    }
+
+    fn features(&self, parameters: &Parameters, out: &mut [f32]) {
+        let face_down = parameters.face.count() as f32;
+        for (number, (out, card)) in out.iter_mut().zip(self.deck.cards()).enumerate() {
+            *out = if self.shown >> number & 1 == 1 { (*card).into() } else { face_down };
+        }
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let cards = parameters.decks * DECK;
+        self.deck.is_valid(parameters.decks, parameters.face)
+            && (self.found | self.shown) >> cards == 0
+            && self.first.is_none_or(|card| usize::from(card) < cards)
+    }
+
+    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Memory::default()))
+    }
+}
+
+/// Remembers every card. Completes pairs that it knows, and otherwise turns over a card that it does not know.
+#[derive(Default)]
+struct Memory {
+    /// The face of each card that was seen.
+    known: Vec<Option<i32>>,
+    /// Whether each card's pair was found.
+    found: Vec<bool>,
+    /// The cards of this turn.
+    turned: Vec<usize>,
+}
+
+impl Memory {
+    /// The card that makes a pair with this one, if it is known.
+    fn partner(&self, of: usize) -> Option<usize> {
+        let face = self.known[of]?;
+        (0..self.known.len()).find(|card| *card != of && !self.found[*card] && self.known[*card] == Some(face))
+    }
+
+    fn choose(&self) -> Option<usize> {
+        let cards = 0..self.known.len();
+        let pair = match self.turned.first() {
+            Some(first) => self.partner(*first),
+            None => cards.clone().find(|card| !self.found[*card] && self.partner(*card).is_some()),
+        };
+        pair.or_else(|| cards.clone().find(|card| self.known[*card].is_none()))
+    }
+}
+
+impl Expert for Memory {
+    fn reset(&mut self) {
+        *self = Memory::default();
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        self.known.resize(features.len(), None);
+        self.found.resize(features.len(), false);
+        for card in &self.turned {
+            self.known[*card] = Some(features[*card] as i32);
+        }
+        if let [first, second] = self.turned[..] {
+            if self.known[first] == self.known[second] {
+                (self.found[first], self.found[second]) = (true, true);
+            }
+            self.turned.clear();
+        }
+        let card = self.choose().unwrap_or_default();
+        self.turned.push(card);
+        action[0] = card as i32;
+    }
+}

@@ -1,0 +1,123 @@
+//! Count Recall: count the cards of each kind, and say how many of the queried kind there have been.
+
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::deck::{DECK, Deck, Face};
+use crate::ids::{ids, numbered, place};
+
+const IDS: [&str; 3] = ids!("CountRecall");
+const VARIANTS: [(usize, Face); 3] = [(1, Face::Colour), (2, Face::Suit), (4, Face::Rank)];
+/// Most kinds of cards.
+const KINDS: usize = 13;
+
+/// Number of decks, what tells cards apart, and the reward.
+pub struct Parameters {
+    decks: usize,
+    face: Face,
+    reward: f64,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CountRecall {
+    cards: Deck,
+    queries: Deck,
+    counts: [u8; KINDS],
+    card: u8,
+    query: u8,
+}
+
+impl CountRecall {
+    fn deal(&mut self) {
+        (self.card, self.query) = (self.cards.deal(), self.queries.deal());
+        let count = &mut self.counts[usize::from(self.card)];
+        *count = count.saturating_add(1);
+    }
+}
+
+impl Task for CountRecall {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const FEATURES: &[Column] = &[
+            Column { name: "card", description: "the kind of the card: colour, suit or rank, from 0" },
+            Column { name: "query", description: "the kind whose count is asked" },
+        ];
+        let spec = |(id, (decks, face)): (_, (usize, Face))| {
+            let summary = "Count the cards of each kind, and say how many of the queried kind there have been";
+            let most = decks * DECK / face.count();
+            let ground_truth = numbered("counts", face.count(), "number of cards of the kind so far");
+            let kinds = vec![face.count() as i32; 2].leak();
+            let actions = ActionSpace::Discrete(most as i32 + 1);
+            EnvSpec {
+                features: FEATURES,
+                observation_space: Some(ObservationSpace::MultiDiscrete(kinds)),
+                ground_truth,
+                ..EnvSpec::new(id, summary, actions)
+            }
+        };
+        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let (decks, face) = VARIANTS[place(&IDS, given.id())];
+        Parameters { decks, face, reward: 1.0 / (decks * DECK - 1) as f64 }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.cards.shuffle(parameters.decks, parameters.face, random);
+        self.queries.shuffle(parameters.decks, parameters.face, random);
+        self.counts = [0; KINDS];
+        self.deal();
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        let correct = action[0] == i32::from(self.counts[usize::from(self.query)]);
+        self.deal();
+        let reward = if correct { parameters.reward } else { -parameters.reward };
+        Transition { reward, terminated: self.cards.left() == 0, truncated: false }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out[0] = self.card.into();
+        out[1] = self.query.into();
+    }
+
+    fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {
+        for (out, count) in out.iter_mut().zip(self.counts) {
+            *out = count.into();
+        }
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let Parameters { decks, face, .. } = *parameters;
+        self.cards.is_valid(decks, face) && self.queries.is_valid(decks, face) && usize::from(self.query) < KINDS
+    }
+
+    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Counts::default()))
+    }
+}
+
+/// Counts the cards.
+#[derive(Default)]
+struct Counts([i32; KINDS]);
+
+impl Expert for Counts {
+    fn reset(&mut self) {
+        *self = Counts::default();
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        self.0[features[0] as usize] += 1;
+        action[0] = self.0[features[1] as usize];
+    }
+}

@@ -1,0 +1,189 @@
+//! Labyrinth Escape and Labyrinth Explore: walk through a maze, seeing only the squares around.
+
+use endless_gym_core::envs::{
+    ActionBranch, ActionSpace, Choice, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{ids, numbered, place};
+use crate::maze::{Maze, Place};
+
+const IDS: [[&str; 3]; 2] = [ids!("LabyrinthEscape"), ids!("LabyrinthExplore")];
+/// Cells from the left to the right, between walls.
+const CELLS: [usize; 3] = [5, 7, 9];
+const LENGTH: u32 = 1024;
+/// Cells of the observation.
+const VIEW: usize = 9;
+/// The last action, before the first.
+const NONE: u8 = 4;
+
+const FREE: f32 = 0.0;
+const WALL: f32 = 1.0;
+const START: f32 = 2.0;
+const GOAL: f32 = 3.0;
+
+/// The maze's size and the agent's task.
+pub struct Parameters {
+    cells: usize,
+    escapes: bool,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Labyrinth {
+    maze: Maze,
+    position: Place,
+    /// Squares that the agent has been on, as bits of rows.
+    explored: Vec<u32>,
+    /// Squares that are no wall and have not been explored.
+    left: u32,
+    /// Reward for a new square.
+    reward: f64,
+    action: u8,
+    steps: u32,
+}
+
+impl Labyrinth {
+    /// The square in a direction; the agent's own square if that is a wall or outside.
+    fn moved(&self, action: i32, escapes: bool) -> Place {
+        let Place { row, column } = self.position;
+        let last = self.maze.size() - 1;
+        let to = match action {
+            0 => Place { row, column: column.saturating_sub(1) },
+            1 => Place { row, column: last.min(column + 1) },
+            2 => Place { row: row.saturating_sub(1), column },
+            _ => Place { row: last.min(row + 1), column },
+        };
+        if self.square(to, escapes) == WALL { self.position } else { to }
+    }
+
+    fn square(&self, place: Place, escapes: bool) -> f32 {
+        if escapes && place == self.maze.goal {
+            GOAL
+        } else if place == self.maze.start {
+            START
+        } else if self.maze.is_wall(place) {
+            WALL
+        } else {
+            FREE
+        }
+    }
+
+    /// Marks the agent's square as explored. Returns whether it was new.
+    fn explore(&mut self) -> bool {
+        let Place { row, column } = self.position;
+        let is_new = self.explored[row] >> column & 1 == 0;
+        self.explored[row] |= 1 << column;
+        self.left = self.left.saturating_sub(is_new.into());
+        is_new
+    }
+}
+
+impl Task for Labyrinth {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const ACTIONS: &[ActionBranch] = &[ActionBranch {
+            name: "move",
+            choices: &[
+                Choice { name: "left", description: "walks one square to the left, unless there is a wall" },
+                Choice { name: "right", description: "walks one square to the right" },
+                Choice { name: "up", description: "walks one square up" },
+                Choice { name: "down", description: "walks one square down" },
+            ],
+        }];
+        const GROUND_TRUTH: &[Column] = &[
+            Column { name: "x", description: "column of the agent, from 0 on the left" },
+            Column { name: "y", description: "row of the agent, from 0 at the top" },
+        ];
+        const SPACE: ObservationSpace = ObservationSpace::MultiDiscrete(&[5; VIEW + 1]);
+        let squares = "a square around the agent, row by row: 0 free, 1 wall, 2 start, 3 exit; at the left and the upper border, the \
+                       view has only two columns or rows, followed by walls";
+        let action = Column { name: "action", description: "the last action, 0 to 3; at first 4" };
+        let features = [numbered("square", VIEW, squares), &[action]].concat().leak();
+        let summaries = [
+            "Find the exit of a maze, seeing only the squares around",
+            "Explore a maze, seeing only the squares around",
+        ];
+        let specs = IDS.into_iter().zip(summaries).flat_map(|(ids, summary)| {
+            let features: &'static [Column] = features;
+            ids.map(|id| EnvSpec {
+                actions: ACTIONS,
+                features,
+                observation_space: Some(SPACE),
+                ground_truth: GROUND_TRUTH,
+                ..EnvSpec::new(id, summary, ActionSpace::Discrete(4))
+            })
+        });
+        specs.collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let at = place(&IDS.concat(), given.id());
+        Parameters { cells: CELLS[at % 3], escapes: at < 3 }
+    }
+
+    fn seed(&mut self, seed: u64) {
+        self.maze.seed(seed);
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.maze.generate(parameters.cells, random);
+        self.position = self.maze.start;
+        self.explored.clear();
+        self.explored.resize(self.maze.size(), 0);
+        let free = self.maze.free();
+        self.reward = 1.0 / f64::from(free);
+        self.left = free + 1;
+        self.explore();
+        (self.action, self.steps) = (NONE, 0);
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        self.position = self.moved(action[0], parameters.escapes);
+        let is_new = self.explore();
+        self.action = action[0] as u8;
+        self.steps = self.steps.saturating_add(1);
+        let (mut reward, mut terminated) = (-1.0 / f64::from(LENGTH), false);
+        if parameters.escapes && self.position == self.maze.goal {
+            reward += 1.0;
+            terminated = true;
+        } else if !parameters.escapes {
+            if is_new {
+                reward = self.reward;
+            }
+            terminated = self.left == 0;
+        }
+        Transition { reward, terminated, truncated: self.steps == LENGTH - 1 }
+    }
+
+    fn features(&self, parameters: &Parameters, out: &mut [f32]) {
+        let Place { row, column } = self.position;
+        let (top, left) = (row.saturating_sub(1), column.saturating_sub(1));
+        let size = self.maze.size();
+        for (number, out) in out[..VIEW].iter_mut().enumerate() {
+            let place = Place { row: top + number / 3, column: left + number % 3 };
+            let is_inside = place.row < size.min(row + 2) && place.column < size.min(column + 2);
+            *out = if is_inside { self.square(place, parameters.escapes) } else { WALL };
+        }
+        out[VIEW] = self.action.into();
+    }
+
+    fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {
+        out[0] = self.position.column as f64;
+        out[1] = self.position.row as f64;
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        let size = 2 * parameters.cells + 1;
+        self.maze.is_valid(size)
+            && self.explored.len() == size
+            && self.position.row < size
+            && self.position.column < size
+    }
+}

@@ -1,0 +1,115 @@
+//! Mazes by the hunt-and-kill algorithm of the Python package mazelib 0.9.16, from which the original takes them.
+
+use endless_gym_core::random::{Generator, MersenneTwister};
+use serde::{Deserialize, Serialize};
+
+/// A square.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Place {
+    /// From 0 at the top.
+    pub row: usize,
+    /// From 0 on the left.
+    pub column: usize,
+}
+
+/// A square maze. Cells, at odd rows and columns, are separated by walls or passages.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Maze {
+    /// Bits of rows: 1 for a wall.
+    walls: Vec<u32>,
+    /// Where the agent starts, in the outer wall.
+    pub start: Place,
+    /// The exit, in the opposite wall.
+    pub goal: Place,
+    /// The generators that the original shares among all mazes of a process: Python's, and numpy's.
+    random: Option<(MersenneTwister, MersenneTwister)>,
+}
+
+impl Maze {
+    /// Seeds the maze's generators.
+    pub fn seed(&mut self, seed: u64) {
+        // The original refuses seeds of more than 32 bits.
+        let numpy = MersenneTwister::from_numpy_seed(seed as u32);
+        self.random = Some((MersenneTwister::from_python_seed(seed), numpy));
+    }
+
+    /// Makes a maze of `cells` times `cells` cells. `random` seeds the maze's generators if nothing else has.
+    pub fn generate(&mut self, cells: usize, random: &mut Generator) {
+        if self.random.is_none() {
+            self.seed(random.integers(0, 1 << 32) as u64);
+        }
+        let Some((mut python, mut numpy)) = self.random.take() else { return };
+        let size = 2 * cells + 1;
+        self.walls.clear();
+        self.walls.resize(size, u32::MAX);
+        let odd = |python: &mut MersenneTwister| 2 * python.randbelow(cells as u32) as usize + 1;
+        let cell = |python: &mut MersenneTwister| Place { row: odd(python), column: odd(python) };
+        let mut at = cell(&mut python);
+        self.open(at);
+        self.walk(at, &mut python, &mut numpy);
+        for _ in 0..size * size {
+            at = cell(&mut python);
+            if !self.is_wall(at) {
+                self.walk(at, &mut python, &mut numpy);
+            }
+        }
+        let last = size - 1;
+        let side = python.randbelow(4);
+        let (start, goal) = (odd(&mut python), odd(&mut python));
+        (self.start, self.goal) = match side {
+            0 => (Place { row: 0, column: start }, Place { row: last, column: goal }),
+            1 => (Place { row: last, column: start }, Place { row: 0, column: goal }),
+            2 => (Place { row: start, column: 0 }, Place { row: goal, column: last }),
+            _ => (Place { row: start, column: last }, Place { row: goal, column: 0 }),
+        };
+        self.random = Some((python, numpy));
+    }
+
+    /// Walks at random from a cell, and opens passages to unvisited cells until there is none around.
+    fn walk(&mut self, mut at: Place, python: &mut MersenneTwister, numpy: &mut MersenneTwister) {
+        loop {
+            let mut around = [at; 4];
+            let mut count = 0;
+            let Place { row, column } = at;
+            let up = row.checked_sub(2).map(|row| Place { row, column });
+            let left = column.checked_sub(2).map(|column| Place { row, column });
+            let candidates = [up, Some(Place { row: row + 2, column }), left, Some(Place { row, column: column + 2 })];
+            for place in candidates.into_iter().flatten() {
+                if place.row < self.size() && place.column < self.size() && self.is_wall(place) {
+                    around[count] = place;
+                    count += 1;
+                }
+            }
+            let around = &mut around[..count];
+            numpy.shuffle(around);
+            let Some(next) = around.get(python.randbelow(count as u32) as usize).copied() else { return };
+            self.open(next);
+            self.open(Place { row: (row + next.row) / 2, column: (column + next.column) / 2 });
+            at = next;
+        }
+    }
+
+    fn open(&mut self, place: Place) {
+        self.walls[place.row] &= !(1 << place.column);
+    }
+
+    /// Rows and columns.
+    pub fn size(&self) -> usize {
+        self.walls.len()
+    }
+
+    /// Whether a square inside the maze is a wall.
+    pub fn is_wall(&self, place: Place) -> bool {
+        self.walls[place.row] >> place.column & 1 == 1
+    }
+
+    /// Number of squares that are no walls.
+    pub fn free(&self) -> u32 {
+        self.walls.iter().map(|row| row.count_zeros()).sum()
+    }
+
+    /// Whether a restored maze has this size.
+    pub fn is_valid(&self, size: usize) -> bool {
+        self.size() == size && self.random.as_ref().is_none_or(|(python, numpy)| python.is_valid() && numpy.is_valid())
+    }
+}

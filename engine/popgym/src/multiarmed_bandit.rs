@@ -1,0 +1,80 @@
+//! Multiarmed Bandit: find the arms that pay best.
+
+use endless_gym_core::envs::{ActionSpace, Column, EnvSpec, ObservationSpace, ResetParameters, Task, Transition};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{ids, numbered, place};
+
+const IDS: [&str; 3] = ids!("MultiarmedBandit");
+/// Arms, and the length of an episode.
+const VARIANTS: [(usize, u32); 3] = [(10, 200), (20, 400), (30, 600)];
+/// Most arms.
+const ARMS: usize = 30;
+
+/// Arms, the length of an episode, and the reward.
+pub struct Parameters {
+    arms: usize,
+    length: u32,
+    reward: f64,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MultiarmedBandit {
+    /// How likely each arm pays.
+    arms: [f32; ARMS],
+    steps: u32,
+    has_paid: bool,
+}
+
+impl Task for MultiarmedBandit {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const FEATURES: &[Column] = &[Column { name: "paid", description: "1 if the last arm paid, otherwise 0" }];
+        let spec = |(id, (arms, _)): (_, (usize, _))| EnvSpec {
+            features: FEATURES,
+            observation_space: Some(ObservationSpace::Discrete(2)),
+            ground_truth: numbered("bandits", arms, "probability that the arm pays"),
+            ..EnvSpec::new(id, "Find the arms that pay best", ActionSpace::Discrete(arms as i32))
+        };
+        IDS.into_iter().zip(VARIANTS).map(spec).collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let (arms, length) = VARIANTS[place(&IDS, given.id())];
+        Parameters { arms, length, reward: 1.0 / f64::from(length) }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        *self = MultiarmedBandit::default();
+        self.arms[..parameters.arms].fill_with(|| random.random_f32());
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], random: &mut Generator) -> Transition {
+        // numpy compares a Python float with a float32 in float32.
+        self.has_paid = (random.random() as f32) < self.arms[action[0] as usize];
+        self.steps = self.steps.saturating_add(1);
+        let reward = if self.has_paid { parameters.reward } else { -parameters.reward };
+        Transition { reward, terminated: false, truncated: self.steps >= parameters.length }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out[0] = f32::from(u8::from(self.has_paid));
+    }
+
+    fn ground_truth(&self, _: &Parameters, out: &mut [f64]) {
+        for (out, arm) in out.iter_mut().zip(self.arms) {
+            *out = arm.into();
+        }
+    }
+
+    fn is_valid(&self, _: &Parameters) -> bool {
+        self.arms.iter().all(|arm| (0.0..1.0).contains(arm))
+    }
+}

@@ -1,0 +1,130 @@
+//! Position Only and Noisy Position Only Pendulum: swing a pendulum up, seeing only its angle.
+
+use std::f64::consts::PI;
+use std::hint::black_box;
+
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, ObservationSpace, Parameter, ResetParameters, Task, Transition, box_action,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{ids, place};
+
+const IDS: [[&str; 3]; 2] = [ids!("PositionOnlyPendulum"), ids!("NoisyPositionOnlyPendulum")];
+const LENGTHS: [u32; 3] = [200, 150, 100];
+const DEVIATIONS: [f64; 3] = [0.1, 0.2, 0.3];
+
+const PARAMETERS: &[Parameter] = &[
+    Parameter::float("x_init", PI, 0.0, 100.0, "Bound of the first angle, rad: it is drawn from -x_init to x_init."),
+    Parameter::float("y_init", 1.0, 0.0, 8.0, "Bound of the first angular velocity, rad/s."),
+];
+
+// Gymnasium's Pendulum-v1, in SI units.
+const MAX_SPEED: f64 = 8.0;
+const MAX_TORQUE: f32 = 2.0;
+const SECONDS: f64 = 0.05;
+/// Acceleration by gravity: 3 g / (2 l).
+const GRAVITY: f64 = 15.0;
+/// Acceleration by torque: 3 / (m l²).
+const TORQUE: f32 = 3.0;
+/// Half the range of Gymnasium's rewards, which POPGym maps to -1..1.
+const HALF_RANGE: f64 = 16.2736044 / 2.0;
+
+/// What is observed, and the length of an episode.
+pub struct Parameters {
+    /// Standard deviation of the noise.
+    noise: Option<f64>,
+    length: u32,
+    x_init: f64,
+    y_init: f64,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Pendulum {
+    angle: f64,
+    velocity: f64,
+    observation: [f32; 2],
+    steps: u32,
+}
+
+impl Pendulum {
+    fn observe(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.observation = [self.angle.cos() as f32, self.angle.sin() as f32];
+        if let Some(deviation) = parameters.noise {
+            for number in &mut self.observation {
+                *number = (*number + random.normal(0.0, deviation) as f32).clamp(-1.0, 1.0);
+            }
+        }
+    }
+}
+
+/// A square as the power of the mathematical library, which numpy calls for `x ** 2`. Its last bit may differ from that of
+/// `x * x`, by which compilers replace a constant power.
+fn square(x: f64) -> f64 {
+    x.powf(black_box(2.0))
+}
+
+impl Task for Pendulum {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        Self::specs().swap_remove(0)
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        const FEATURES: &[Column] = &[
+            Column { name: "cos", description: "cosine of the angle from the upright position" },
+            Column { name: "sin", description: "sine of the angle" },
+        ];
+        let summaries =
+            ["Swing a pendulum up, seeing only its angle", "Swing a pendulum up, seeing only its angle, with noise"];
+        let specs = IDS.into_iter().zip(summaries).flat_map(|(ids, summary)| {
+            ids.map(|id| EnvSpec {
+                features: FEATURES,
+                observation_space: Some(ObservationSpace::Box { low: &[-1.0; 2], high: &[1.0; 2] }),
+                parameters: PARAMETERS,
+                render_fps: 30,
+                ..EnvSpec::new(id, summary, ActionSpace::bounded(&[-MAX_TORQUE], &[MAX_TORQUE]))
+            })
+        });
+        specs.collect()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let at = place(&IDS.concat(), given.id());
+        let (family, level) = (at / 3, at % 3);
+        Parameters {
+            noise: (family == 1).then_some(DEVIATIONS[level]),
+            length: if family == 1 { LENGTHS[0] } else { LENGTHS[level] },
+            x_init: given.float("x_init", PI),
+            y_init: given.float("y_init", 1.0),
+        }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        let [angle, velocity] = [parameters.x_init, parameters.y_init].map(|bound| random.uniform(-bound, bound));
+        *self = Pendulum { angle, velocity, ..Pendulum::default() };
+        self.observe(parameters, random);
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], random: &mut Generator) -> Transition {
+        // Every operation rounds as in Gymnasium; torque and its cost are float32.
+        let torque = box_action(action)[0].clamp(-MAX_TORQUE, MAX_TORQUE);
+        let torque_cost = 0.001 * torque.powf(black_box(2.0));
+        let angle = (self.angle + PI).rem_euclid(2.0 * PI) - PI;
+        let cost = square(angle) + 0.1 * square(self.velocity) + f64::from(torque_cost);
+        let velocity = self.velocity + (GRAVITY * self.angle.sin() + f64::from(TORQUE * torque)) * SECONDS;
+        self.velocity = velocity.clamp(-MAX_SPEED, MAX_SPEED);
+        self.angle += self.velocity * SECONDS;
+        self.steps = self.steps.saturating_add(1);
+        self.observe(parameters, random);
+        let reward = (-cost + HALF_RANGE) / HALF_RANGE / f64::from(parameters.length);
+        Transition { reward, terminated: false, truncated: self.steps >= parameters.length }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out.copy_from_slice(&self.observation);
+    }
+}

@@ -1,0 +1,92 @@
+//! Repeat First: name the suit of the first card, step after step.
+
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::deck::{DECK, Deck, Face};
+use crate::ids::{SUITS, ids, place};
+
+const IDS: [&str; 3] = ids!("RepeatFirst");
+const DECKS: [usize; 3] = [1, 8, 16];
+
+/// Number of decks, and the reward.
+pub struct Parameters {
+    decks: usize,
+    reward: f64,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RepeatFirst {
+    deck: Deck,
+    first: u8,
+    card: u8,
+}
+
+impl Task for RepeatFirst {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        const FEATURES: &[Column] = &[Column { name: "suit", description: "the suit of the card, 0 to 3" }];
+        let summary = "Name the suit of the first card";
+        EnvSpec {
+            actions: SUITS,
+            features: FEATURES,
+            observation_space: Some(ObservationSpace::Discrete(4)),
+            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let decks = DECKS[place(&IDS, given.id())];
+        Parameters { decks, reward: 1.0 / (decks * DECK - 1) as f64 }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.deck.shuffle(parameters.decks, Face::Suit, random);
+        self.first = self.deck.deal();
+        self.card = self.first;
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        let reward = if action[0] == i32::from(self.first) { parameters.reward } else { -parameters.reward };
+        let terminated = self.deck.left() <= 1;
+        self.card = self.deck.deal();
+        Transition { reward, terminated, truncated: false }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out[0] = self.card.into();
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        self.deck.is_valid(parameters.decks, Face::Suit)
+    }
+
+    fn expert(_: &str) -> Option<Box<dyn Expert>> {
+        Some(Box::new(Memory::default()))
+    }
+}
+
+/// Repeats the first card.
+#[derive(Default)]
+struct Memory {
+    first: Option<i32>,
+}
+
+impl Expert for Memory {
+    fn reset(&mut self) {
+        self.first = None;
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        action[0] = *self.first.get_or_insert(features[0] as i32);
+    }
+}

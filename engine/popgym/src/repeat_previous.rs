@@ -1,0 +1,100 @@
+//! Repeat Previous: name the suit of the card that was shown some steps ago.
+
+use std::collections::VecDeque;
+
+use endless_gym_core::envs::{
+    ActionSpace, Column, EnvSpec, Expert, ObservationSpace, ResetParameters, Task, Transition,
+};
+use endless_gym_core::random::Generator;
+use serde::{Deserialize, Serialize};
+
+use crate::deck::{DECK, Deck, Face};
+use crate::ids::{SUITS, ids, place};
+
+const IDS: [&str; 3] = ids!("RepeatPrevious");
+/// Number of decks, and which card to name: 1 is the card that is shown.
+const VARIANTS: [(usize, usize); 3] = [(1, 4), (2, 32), (3, 64)];
+
+/// Number of decks, which card to name, and the reward.
+pub struct Parameters {
+    decks: usize,
+    k: usize,
+    reward: f64,
+}
+
+/// The state of an episode.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RepeatPrevious {
+    deck: Deck,
+    card: u8,
+}
+
+impl Task for RepeatPrevious {
+    type Parameters = Parameters;
+
+    fn spec() -> EnvSpec {
+        const FEATURES: &[Column] = &[Column { name: "suit", description: "the suit of the card, 0 to 3" }];
+        let summary = "Name the suit of the card that was shown some steps ago";
+        EnvSpec {
+            actions: SUITS,
+            features: FEATURES,
+            observation_space: Some(ObservationSpace::Discrete(4)),
+            ..EnvSpec::new(IDS[0], summary, ActionSpace::Discrete(4))
+        }
+    }
+
+    fn specs() -> Vec<EnvSpec> {
+        IDS.map(|id| EnvSpec { id, ..Self::spec() }).into()
+    }
+
+    fn parameters(given: &ResetParameters) -> Parameters {
+        let (decks, k) = VARIANTS[place(&IDS, given.id())];
+        Parameters { decks, k, reward: 1.0 / (decks * DECK - k) as f64 }
+    }
+
+    fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
+        self.deck.shuffle(parameters.decks, Face::Suit, random);
+        self.card = self.deck.deal();
+    }
+
+    fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
+        let reward = match self.deck.dealt(parameters.k - 1) {
+            Some(suit) if action[0] == i32::from(suit) => parameters.reward,
+            Some(_) => -parameters.reward,
+            None => 0.0,
+        };
+        let terminated = self.deck.left() <= 1;
+        self.card = self.deck.deal();
+        Transition { reward, terminated, truncated: false }
+    }
+
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        out[0] = self.card.into();
+    }
+
+    fn is_valid(&self, parameters: &Parameters) -> bool {
+        self.deck.is_valid(parameters.decks, Face::Suit)
+    }
+
+    fn expert(id: &str) -> Option<Box<dyn Expert>> {
+        let (_, k) = VARIANTS[place(&IDS, id)];
+        Some(Box::new(Memory { k, suits: VecDeque::with_capacity(k + 1) }))
+    }
+}
+
+/// Remembers the last `k` suits.
+struct Memory {
+    k: usize,
+    suits: VecDeque<i32>,
+}
+
+impl Expert for Memory {
+    fn reset(&mut self) {
+        self.suits.clear();
+    }
+
+    fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
+        self.suits.push_back(features[0] as i32);
+        action[0] = if self.suits.len() < self.k { 0 } else { self.suits.pop_front().unwrap_or_default() };
+    }
+}
