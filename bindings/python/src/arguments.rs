@@ -9,9 +9,9 @@ use endless_gym::service::timeout_from_seconds;
 use numpy::{
     Element, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
 };
-use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::exceptions::{PyException, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyByteArray;
+use pyo3::types::{PyByteArray, PySequence};
 use serde::de::DeserializeOwned;
 use serde_json::Value as Json;
 
@@ -80,11 +80,8 @@ impl ActionShape {
         if given.is_instance_of::<PyByteArray>() {
             return Err(no_integers()?);
         }
-        // numpy refuses lists whose items have different lengths.
-        let Ok(array) = given.py().import("numpy")?.call_method1("asarray", (given,)) else {
-            return Err(self.error("a list of items with different shapes"));
-        };
-        let array = array.cast_into::<PyUntypedArray>()?;
+        let array = given.py().import("numpy")?.call_method1("asarray", (given,));
+        let array = array.or_else(|refusal| Err(self.refused(given, refusal)?))?.cast_into::<PyUntypedArray>()?;
         // The dtype of an empty list is float64.
         if array.is_empty() {
             self.check(array.shape())?;
@@ -104,10 +101,30 @@ impl ActionShape {
             self.check(array.shape())?;
             return append(&array, to, bits);
         }
-        let array = given.py().import("numpy")?.call_method1("asarray", (given, "float32"))?;
-        let array = array.cast_into::<PyArrayDyn<f32>>()?;
+        let array = given.py().import("numpy")?.call_method1("asarray", (given, "float32"));
+        let array = array.or_else(|refusal| Err(self.refused(given, refusal)?))?.cast_into::<PyArrayDyn<f32>>()?;
         self.check(array.shape())?;
         append(&array.readonly(), to, bits)
+    }
+
+    /// The error for actions that numpy refuses; its cause is numpy's.
+    fn refused(&self, given: &Bound<'_, PyAny>, refusal: PyErr) -> PyResult<PyErr> {
+        let py = given.py();
+        if !refusal.is_instance_of::<PyException>(py) {
+            return Ok(refusal); // Ctrl-C, for example.
+        }
+        let error = if refusal.is_instance_of::<PyValueError>(py) && given.is_instance_of::<PySequence>() {
+            // Lists whose items have different lengths.
+            self.error("a list of items with different shapes")
+        } else {
+            PyTypeError::new_err(format!(
+                "actions must be numbers that numpy can read, got {}: {}; pass `actions.detach().cpu()` for a PyTorch tensor",
+                given.get_type().name()?,
+                refusal.value(py)
+            ))
+        };
+        error.set_cause(py, Some(refusal));
+        Ok(error)
     }
 
     fn check(&self, given: &[usize]) -> PyResult<()> {

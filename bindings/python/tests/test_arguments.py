@@ -98,6 +98,16 @@ def test_single_environment_checks_seeds_actions_and_snapshots() -> None:
 GRID = "MortarMayhem-Grid-v0"
 
 
+class Refusing:
+    """An object that does not become an array, as a tensor on a GPU or one with gradients."""
+
+    def __init__(self, reason: BaseException) -> None:
+        self.reason = reason
+
+    def __array__(self, *arguments: object, **more: object) -> np.ndarray:
+        raise self.reason
+
+
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize(
     ("id", "shape", "meaning"),
@@ -118,8 +128,16 @@ def test_actions_have_the_shape_of_the_action_space(where, id: str, shape: tuple
                 with pytest.raises(ValueError, match=f"^{re.escape(given)}$"):
                     call(actions)
         ragged = [[0, 0], [0], [0, 0]]
-        with pytest.raises(ValueError, match="got a list of items with different shapes"):
+        with pytest.raises(ValueError, match="got a list of items with different shapes") as shapes:
             envs.step(ragged)
+        assert "inhomogeneous" in str(shapes.value.__cause__)
+        for reason in (TypeError("can't convert cuda:0"), RuntimeError("requires grad"), NotImplementedError("meta")):
+            for actions in (Refusing(reason), [Refusing(reason)] * 3):
+                with pytest.raises(TypeError, match=rf"{reason}; pass `actions\.detach\(\)\.cpu\(\)`") as raised:
+                    envs.step(actions)
+                assert raised.value.__cause__ is reason
+        with pytest.raises(KeyboardInterrupt):
+            envs.step(Refusing(KeyboardInterrupt()))
         flat = bytes(right.ravel().tolist())
         for actions in (flat, bytearray(flat), right * 0.5, right.astype(bool), right.astype(str), None):
             with pytest.raises(TypeError, match=r"^actions must be integers, got "):
