@@ -43,6 +43,9 @@ class Backend:
 
     @property
     def groups(self) -> int: ...
+    # The result of each group that the caller does not have yet; the caller sets the entries of those that it has to `None`.
+    @property
+    def kept(self) -> list[Arrays | None]: ...
     # Reset a group, and return its arrays.
     def reset(self, group: int, request: Reset | None = None, options: str | None = None) -> Arrays: ...
     # Step group 0, and return its arrays.

@@ -205,16 +205,14 @@ class TrackedVectorEnv(EndlessVectorEnv):
         ]
 
     def step(self, actions: Any) -> Step:
-        self._trackers[0].before_step()
-        return self._tracked(0, super().step(actions))
+        with self._turns[0]:
+            self._trackers[0].before_step()
+        return super().step(actions)
 
     def send(self, actions: Any, group: int = 0) -> None:
-        self._trackers[self._group(group)].before_step()
-        super().send(actions, group)
-
-    def recv(self, group: int | None = None) -> Step:
-        step = super().recv(group)
-        return self._tracked(step[4]["group"], step)
+        with self._turns[self._group(group)]:
+            self._trackers[self._group(group)].before_step()
+            super().send(actions, group)
 
     def set_options(
         self,
@@ -247,6 +245,7 @@ class TrackedVectorEnv(EndlessVectorEnv):
         super()._sent_reset(group, envs, given, text)
         self._trackers[group].sent_reset(envs)
 
-    def _tracked(self, group: int, step: Step) -> Step:
+    def _received(self, group: int, arrays: _native.Arrays) -> Step:
+        step = super()._received(group, arrays)
         self._trackers[group].after_step(step[2], step[4])
         return step

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -50,6 +52,10 @@ class Reconnection(NamedTuple):
 @documented(all_specs().values())
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
+
+    Threads may call it at the same time, for example one for each group: a call waits for the calls of other threads to the same
+    group. `send` and `recv` of a group belong together, so a group should be stepped by one thread. Only one thread may use
+    `recv()` without a group.
 
     `metadata["actions"]`, `metadata["ground_truth"]` and `metadata["features"]` contain the meanings of the numbers.
 
@@ -106,6 +112,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.metadata.update(metadata(described))
         #: Whether `info` has the last observation of an episode that ended, with same-step auto-reset.
         self.has_final_observation = results.has_final_observation
+        # A thread's call to a group waits for another thread's; a signal handler's call within a call does not.
+        self._turns = [threading.RLock() for _ in range(backend.groups)]
+        self._drawing = threading.Lock()
+        # The backend keeps each result here until the caller has it, since a signal handler may raise in between. Nothing between
+        # the entry's removal and the return to the caller may call a function, where Python would run the handler.
+        self._kept = backend.kept
         self._resets = ResetRequests(num_envs, backend.groups, first_env)
         self._options = NextOptions(backend, num_envs, options, knows_options)
 
@@ -168,8 +180,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             TimeoutError: A served engine did not answer in time. `recv` can still return the result.
             EngineLost: A served engine has ended; see `reconnect`.
             TooManyBatchesHeld: As for `reset`.
+            KeyboardInterrupt: Ctrl-C. If the step was played, `recv` returns its result until the next request.
         """
-        return self._results.step(self._backend.step(actions))
+        with self._turns[0]:
+            step = self._received(0, self._backend.step(actions))
+        self._kept[0] = None
+        return step
 
     def send(self, actions: Any, group: int = 0) -> None:
         """Step a group without waiting for the result, which `recv` returns.
@@ -185,7 +201,9 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             ValueError: As for `step`, or there is no such group.
             RuntimeError: The group's last `send` or `send_reset` has not been received.
         """
-        self._backend.send(actions, self._group(group))
+        group = self._group(group)
+        with self._turns[group]:
+            self._backend.send(actions, group)
 
     def recv(self, group: int | None = None) -> Step:
         """Wait for the result of a group's `send` or `send_reset`, and return it as `step` does.
@@ -203,9 +221,12 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             EngineLost: A served engine has ended; see `reconnect`.
             TooManyBatchesHeld: As for `reset`. The result can still be received.
         """
-        number, arrays = self._backend.receive(None if group is None else self._group(group))
-        step = self._results.step(arrays)
+        wanted = range(self.num_groups) if group is None else (self._group(group),)
+        kept = [(number, arrays) for number in wanted if (arrays := self._kept[number]) is not None]
+        number, arrays = kept[0] if kept else self._backend.receive(None if group is None else wanted[0])
+        step = self._received(number, arrays)
         step[4]["group"] = number
+        self._kept[number] = None
         return step
 
     def send_reset(self, group: int = 0, *, seed: Seeds = None) -> None:
@@ -221,9 +242,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """
         group = self._group(group)
         request, envs = self._resets.request(seed, None, group), range(self.num_envs)
-        text = self._before_reset(group, envs, {})
-        self._backend.send_reset(group, request, text)
-        self._sent_reset(group, envs, {}, text)
+        with self._turns[group]:
+            text = self._before_reset(group, envs, {})
+            self._backend.send_reset(group, request, text)
+            self._sent_reset(group, envs, {}, text)
 
     def set_options(
         self,
@@ -251,7 +273,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             TimeoutError: A served engine did not answer in time. The call may be repeated.
         """
         groups = range(self.num_groups) if group is None else [self._group(group)]
-        self._options.set_all(groups, self._resets.envs(mask, "mask"), options)
+        with contextlib.ExitStack() as turns:
+            for number in groups:
+                turns.enter_context(self._turns[number])
+            self._options.set_all(groups, self._resets.envs(mask, "mask"), options)
 
     def running_episodes(self, group: int = 0) -> list[RunningEpisode]:
         """Seeds and options of a group's running episodes; see `RunningEpisode`.
@@ -260,7 +285,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             ValueError: There is no such group.
             RuntimeError: As for `snapshot`.
         """
-        return list(running_episodes(self._backend, self._group(group), range(self.num_envs)).values())
+        with self._turns[self._group(group)]:
+            return list(running_episodes(self._backend, self._group(group), range(self.num_envs)).values())
 
     def snapshot(self, env: int, group: int = 0) -> bytes:
         """The complete state of one environment, which `restore` accepts for any environment of the same id.
@@ -269,7 +295,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             ValueError: There is no such environment or group.
             RuntimeError: It has not been reset, or the group's last `send` or `send_reset` has not been received.
         """
-        return self._backend.snapshot(self._group(group), self._env(env))
+        with self._turns[self._group(group)]:
+            return self._backend.snapshot(self._group(group), self._env(env))
 
     def restore(self, snapshots: Mapping[int, bytes], group: int = 0) -> tuple[Any, dict[str, Any]]:
         """Set the states of environments of a group, all of which must have been reset once, to those of snapshots.
@@ -287,11 +314,17 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             RuntimeError: As for `snapshot`.
         """
         group = self._group(group)
-        for env, snapshot in snapshots.items():
-            self._backend.restore(group, self._env(env), snapshot)
-            self._options.forget(group, [env])
-        # Resetting no environments returns the current observations.
-        return self._results.start(self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None))
+        if not isinstance(snapshots, Mapping):
+            shown = f"got {type(snapshots).__name__}; pass {{env: snapshot}}"
+            raise TypeError(f"snapshots must be a mapping from numbers of environments to snapshots, {shown}")
+        with self._turns[group]:
+            for env, snapshot in snapshots.items():
+                self._backend.restore(group, self._env(env), snapshot)
+                self._options.forget(group, [env])
+            # Resetting no environments returns the current observations.
+            arrays = self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None)
+            self._kept[group] = None
+            return self._results.start(arrays)
 
     def render(self, group: int = 0) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
         """A picture of each environment of a group, indexed `[row][column][channel]`; `None` without a render mode.
@@ -307,7 +340,10 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         group = self._group(group)
         if self._renderer is None:
             return None
-        return self._renderer.render(self._backend.snapshot(group, env) for env in range(self.num_envs))
+        with self._turns[group]:
+            snapshots = [self._backend.snapshot(group, env) for env in range(self.num_envs)]
+        with self._drawing:
+            return self._renderer.render(snapshots)
 
     def ground_truth_view(self, env: int = 0) -> NDArray[np.uint8]:
         """The original's debug rendering of an environment of group 0, uint8 (336, 336, 3), indexed `[row][column][channel]`.
@@ -318,7 +354,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """
         if not isinstance(self._backend, _native.Pools):
             raise RuntimeError("the environments are in another process; make them with `make_vec` for this")
-        return self._backend.ground_truth_view(self._env(env))
+        with self._turns[0]:
+            return self._backend.ground_truth_view(self._env(env))
 
     def adopt(self, group: int = 0) -> tuple[Any, dict[str, Any]]:
         """The current observations and info of a group, without starting an episode.
@@ -344,7 +381,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """
         if not isinstance(self._backend, _native.Connection):
             raise RuntimeError("the environments are in this process; use `snapshot` to save them")
-        return self._backend.checkpoint()
+        with self._turns[0]:
+            return self._backend.checkpoint()
 
     def reconnect(self, timeout: float = 30.0) -> Reconnection:
         """Connect to the engine that replaced one that has ended. Its environments must then be reset, or adopted (`adopt`) if
@@ -374,6 +412,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Disconnect, and stop the engine if `serve` started it. Arrays remain valid."""
+        self._kept[:] = [None] * self.num_groups
         try:
             self._backend.close()
         finally:
@@ -399,15 +438,26 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self, group: int, request: _native.Reset | None, mask: Any, given: Options
     ) -> tuple[Any, dict[str, Any]]:
         envs = self._resets.envs(mask)
-        text = self._before_reset(group, envs, given)
-        try:
-            start = self._results.start(self._backend.reset(group, request, text))
-        except (TimeoutError, _native.TooManyBatchesHeld):
-            # `recv` can still return the result.
-            self._sent_reset(group, envs, given, text)
-            raise
-        self._options.started(group, envs, given, text)
+        with self._turns[group]:
+            text = self._before_reset(group, envs, given)
+            try:
+                start = self._results.start(self._backend.reset(group, request, text))
+            except (TimeoutError, _native.TooManyBatchesHeld):
+                # `recv` can still return the result.
+                self._sent_reset(group, envs, given, text)
+                raise
+            except KeyboardInterrupt:
+                # The same, if the reset was sent at all.
+                self._sent_reset(group, envs, given, text)
+                self._options.forget(group, envs)
+                raise
+            self._options.started(group, envs, given, text)
+        self._kept[group] = None
         return start
+
+    def _received(self, group: int, arrays: _native.Arrays) -> Step:
+        """The result of a step, or of a reset that was sent."""
+        return self._results.step(arrays)
 
     def _sent_reset(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:
         self._options.started(group, envs, given, text)

@@ -2,6 +2,8 @@
 //!
 //! [`Connection`] has the same methods as the groups in this process ([`Pools`](crate::pool::Pools)).
 
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use endless_gym::batch::Block;
@@ -11,7 +13,8 @@ use endless_gym::service::{
 };
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyTuple};
+use pyo3::sync::MutexExt;
+use pyo3::types::{PyBytes, PyList, PyTuple};
 
 use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::arrays::{self, Owner};
@@ -19,6 +22,9 @@ use crate::{errors, logs};
 
 /// Longest time between two runs of Python's signal handlers, including that of Ctrl-C.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Longest time for which a waiting thread keeps the trainer from others.
+const SHARED_SLICE: Duration = Duration::from_millis(1);
 
 /// The steps of a group in the current engine and in the lost one, and what became of the last request.
 type GroupFound = (Option<u64>, Option<u64>, &'static str);
@@ -35,16 +41,22 @@ unsafe impl Owner for Lease {
     }
 }
 
-/// The trainer of an engine in another process.
-#[pyclass(module = "endless_gym._native")]
+/// The trainer of an engine in another process. Threads may call it at the same time: none holds the trainer while it waits for
+/// the interpreter's lock, and a waiting thread gives it away between slices of its timeout.
+#[pyclass(frozen, module = "endless_gym._native")]
 pub struct Connection {
     /// `None` after `close`.
-    trainer: Option<Trainer>,
+    trainer: Mutex<Option<Trainer>>,
+    /// Whether threads have competed for the trainer, so that slices must be short.
+    is_shared: AtomicBool,
     groups: usize,
     /// Seconds to wait for each answer.
     timeout: f64,
     action_shape: ActionShape,
-    actions: Vec<i32>,
+    /// Memory for actions, taken while they are copied.
+    actions: Mutex<Vec<i32>>,
+    /// The arrays that each group last returned, until the caller has them: an exception of a signal handler may come in between.
+    kept: Kept,
     process: u32,
 }
 
@@ -61,8 +73,16 @@ impl Connection {
         let specification = trainer.specification();
         let action_shape = ActionShape::group(&specification.action_space, specification.num_envs);
         let groups = specification.groups;
-        let (actions, process) = (Vec::new(), std::process::id());
-        Ok(Connection { trainer: Some(trainer), groups, timeout, action_shape, actions, process })
+        Ok(Connection {
+            trainer: Mutex::new(Some(trainer)),
+            is_shared: AtomicBool::new(false),
+            groups,
+            timeout,
+            action_shape,
+            actions: Mutex::default(),
+            kept: Kept::new(py, groups)?,
+            process: std::process::id(),
+        })
     }
 
     /// Number of groups.
@@ -71,49 +91,58 @@ impl Connection {
         self.groups
     }
 
+    /// The results that the caller does not have yet, by group; it replaces those that it has by `None`.
+    #[getter]
+    fn kept<'py>(&self, py: Python<'py>) -> Bound<'py, PyList> {
+        self.kept.list(py)
+    }
+
     /// The engine's specification, as JSON text.
-    fn specification(&mut self) -> PyResult<String> {
-        let text = serde_json::to_string(self.trainer()?.specification());
+    fn specification(&self, py: Python<'_>) -> PyResult<String> {
+        let text = self.with(py, |trainer| Ok(serde_json::to_string(trainer.specification())))?;
         text.map_err(|error| PyRuntimeError::new_err(error.to_string()))
     }
 
     /// Resets a group.
     #[pyo3(signature = (group, request=None, options=None))]
     fn reset<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         group: usize,
         request: Option<Reset>,
         options: Option<&str>,
     ) -> PyResult<Bound<'py, PyTuple>> {
-        self.send_reset(group, request, options)?;
+        self.send_reset(py, group, request, options)?;
         Ok(self.receive(py, Some(group))?.1)
     }
 
     /// Steps group 0.
-    fn step<'py>(&mut self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
-        self.send(actions, 0)?;
+    fn step<'py>(&self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
+        self.send(py, actions, 0)?;
         Ok(self.receive(py, Some(0))?.1)
     }
 
     /// Requests a step, whose result `receive` returns.
-    fn send(&mut self, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
-        self.trainer()?;
-        self.action_shape.copy(actions, &mut self.actions)?;
-        let trainer = self.trainer.as_mut().ok_or_else(errors::closed)?;
-        trainer.send(group, &self.actions).map_err(errors::service)
+    fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
+        self.with(py, |_| Ok(()))?;
+        // Reading the actions may call any Python code.
+        let mut numbers = std::mem::take(&mut *lock(&self.actions));
+        self.action_shape.copy(actions, &mut numbers)?;
+        self.with(py, |trainer| trainer.send(group, &numbers))?;
+        *lock(&self.actions) = numbers;
+        self.kept.set(py, group, None)
     }
 
     /// Requests a reset, whose result `receive` returns.
     #[pyo3(signature = (group, request=None, options=None))]
-    fn send_reset(&mut self, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
+    fn send_reset(&self, py: Python<'_>, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
         let options: Option<OptionMap> = options.map(arguments::options).transpose()?;
-        let request = Reset::request(request.as_ref());
-        self.trainer()?.reset_with(group, request, options.as_ref()).map_err(errors::service)
+        self.with(py, |trainer| trainer.reset_with(group, Reset::request(request.as_ref()), options.as_ref()))?;
+        self.kept.set(py, group, None)
     }
 
     /// Waits for the answer of `group`, or of any group for `None`. Returns the group's number and arrays.
-    fn receive<'py>(&mut self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
+    fn receive<'py>(&self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
         let received = self.wait(py, |trainer, slice| match group {
             Some(group) => trainer.receive(group, slice),
             None => trainer.receive_any(slice),
@@ -121,44 +150,51 @@ impl Connection {
         let group = received.group();
         let lease = Bound::new(py, Lease(received))?;
         let arrays = arrays::sections(&lease, lease.get().0.batch().layout())?;
+        self.kept.set(py, group, Some(&arrays))?;
         Ok((group, arrays))
     }
 
     /// The state of one environment of a group.
-    fn snapshot<'py>(&mut self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
+    fn snapshot<'py>(&self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
         let bytes = self.wait(py, |trainer, slice| trainer.snapshot(group, env, slice))?;
         Ok(PyBytes::new(py, &bytes))
     }
 
     /// Sets the state of one environment of a group to that of a snapshot.
-    fn restore(&mut self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
+    fn restore(&self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
         self.wait(py, |trainer, slice| trainer.restore(group, env, snapshot, slice))
     }
 
     /// Sets the options of next episodes; see `arguments::options`.
-    fn set_options(&mut self, py: Python<'_>, group: usize, sets: &str) -> PyResult<()> {
+    fn set_options(&self, py: Python<'_>, group: usize, sets: &str) -> PyResult<()> {
         let sets: Vec<NextOptions> = arguments::options(sets)?;
         self.wait(py, |trainer, slice| trainer.set_options(group, &sets, slice))
     }
 
     /// Seeds and options of the running episodes.
-    fn running_episodes(&mut self, py: Python<'_>, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
+    fn running_episodes(&self, py: Python<'_>, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
         let episodes = self.wait(py, |trainer, slice| trainer.running_episodes(group, &envs, slice))?;
         Ok(episodes.into_iter().map(arguments::episode).collect())
     }
 
     /// Saves all environments of the engine to its checkpoint file. Returns the step of each group.
-    fn checkpoint(&mut self, py: Python<'_>) -> PyResult<Vec<u64>> {
+    fn checkpoint(&self, py: Python<'_>) -> PyResult<Vec<u64>> {
         self.wait(py, Trainer::checkpoint)
     }
 
     /// Connects to the engine of the same name that replaced a lost one. Returns whether it is another engine, its incarnation,
     /// and for each group `(step, lost_step, last_request)`.
-    fn reconnect(&mut self, py: Python<'_>, timeout: f64) -> PyResult<(bool, u64, Vec<GroupFound>)> {
-        let trainer = self.trainer()?;
+    fn reconnect(&self, py: Python<'_>, timeout: f64) -> PyResult<(bool, u64, Vec<GroupFound>)> {
+        self.with(py, |_| Ok(()))?;
         logs::start(py)?;
-        let found = wait_for_engine(py, timeout, |slice| trainer.reconnect(slice))?;
+        let found = wait_for_engine(py, timeout, |slice| {
+            lock(&self.trainer).as_mut().map(|trainer| trainer.reconnect(slice)).transpose()
+        })?;
+        let found = found.ok_or_else(errors::closed)?;
         logs::flush(py)?;
+        for group in 0..if found.restarted { self.groups } else { 0 } {
+            self.kept.set(py, group, None)?;
+        }
         let group = |group: GroupReconnection| {
             let last = match group.last_request {
                 LastRequest::None => "none",
@@ -173,36 +209,79 @@ impl Connection {
     }
 
     /// Disconnects. Arrays remain valid. If another call is waiting, for example when a signal handler calls this, the connection
-    /// stays open.
-    fn close(slf: &Bound<'_, Self>) {
-        if let Ok(mut connection) = slf.try_borrow_mut() {
-            connection.trainer = None;
-        }
+    /// is closed as soon as that call gives the trainer away.
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| *lock(&self.trainer) = None);
     }
 }
 
 impl Connection {
+    /// Calls the trainer, which answers at once.
+    fn with<T>(&self, py: Python<'_>, call: impl FnOnce(&mut Trainer) -> Result<T, ServiceError>) -> PyResult<T> {
+        self.check_process()?;
+        // Without a detour through the interpreter's lock, which another thread might take.
+        let mut trainer = match self.trainer.try_lock() {
+            Ok(trainer) => trainer,
+            Err(_) => {
+                self.is_shared.store(true, Ordering::Relaxed);
+                self.trainer.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner)
+            }
+        };
+        call(trainer.as_mut().ok_or_else(errors::closed)?).map_err(errors::service)
+    }
+
     /// Waits for an answer of the engine; see [`wait`].
     fn wait<T: Send>(
-        &mut self,
+        &self,
         py: Python<'_>,
         mut answer: impl FnMut(&mut Trainer, Duration) -> Result<T, ServiceError> + Send,
     ) -> PyResult<T> {
+        self.check_process()?;
         let timeout = arguments::timeout(self.timeout)?;
-        let trainer = self.trainer()?;
-        wait(py, timeout, |slice| answer(trainer, slice))
+        let answer = wait(py, timeout, |slice| {
+            let is_shared = self.is_shared.load(Ordering::Relaxed);
+            let slice = if is_shared { slice.min(SHARED_SLICE) } else { slice };
+            let answer = lock(&self.trainer).as_mut().map(|trainer| answer(trainer, slice)).transpose();
+            if is_shared && matches!(answer, Err(ServiceError::TimedOut { .. })) {
+                // A mutex is not fair: the other threads need time to take it.
+                std::thread::sleep(SHARED_SLICE / 10);
+            }
+            answer
+        })?;
+        answer.ok_or_else(errors::closed)
     }
 
-    /// The trainer, unless the connection is closed or belongs to another process.
-    fn trainer(&mut self) -> PyResult<&mut Trainer> {
-        let trainer = self.trainer.as_mut().ok_or_else(errors::closed)?;
+    /// An error if the connection belongs to another process.
+    fn check_process(&self) -> PyResult<()> {
         if self.process == std::process::id() {
-            return Ok(trainer);
+            return Ok(());
         }
         Err(PyRuntimeError::new_err(
             "this connection belongs to the process that this process was forked from; connect to another engine in the child",
         ))
     }
+}
+
+/// The last results of groups; see `Connection`.
+pub struct Kept(Py<PyList>);
+
+impl Kept {
+    pub fn new(py: Python<'_>, groups: usize) -> PyResult<Self> {
+        Ok(Kept(PyList::new(py, (0..groups).map(|_| py.None()))?.unbind()))
+    }
+
+    pub fn list<'py>(&self, py: Python<'py>) -> Bound<'py, PyList> {
+        self.0.bind(py).clone()
+    }
+
+    pub fn set(&self, py: Python<'_>, group: usize, arrays: Option<&Bound<'_, PyTuple>>) -> PyResult<()> {
+        self.0.bind(py).set_item(group, arrays)
+    }
+}
+
+/// A lock whose contents are valid even if a thread has panicked.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Calls `answer` with slices of the timeout, without the interpreter's lock, until it returns anything but a timeout. Runs

@@ -2,6 +2,8 @@
 //!
 //! [`Pools`] has the same methods as a connection to an engine, and raises the same errors.
 
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
 use endless_gym::batch::Block;
 use endless_gym::envs::view::{VIEW, VIEW_BYTES};
 use endless_gym::memory_gym;
@@ -10,10 +12,12 @@ use endless_gym::service::ServiceError;
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyTuple};
+use pyo3::sync::MutexExt;
+use pyo3::types::{PyBytes, PyList, PyTuple};
 
 use crate::arguments::{self, ActionShape, Episode, Reset};
 use crate::buffers::Buffers;
+use crate::connection::{Kept, lock};
 use crate::{arrays, errors};
 
 /// Checks the configuration of a group, from JSON text, without making environments.
@@ -42,17 +46,26 @@ enum Message {
     Reset { request: Option<Reset>, options: Option<OptionMap> },
 }
 
-/// Groups of environments of one id; each group is stepped in lockstep.
-#[pyclass(module = "endless_gym._native")]
+/// Groups of environments of one id; each group is stepped in lockstep. Threads may call it at the same time; one after the other
+/// is served.
+#[pyclass(frozen, module = "endless_gym._native")]
 pub struct Pools {
+    state: Mutex<State>,
+    groups: usize,
+    action_shape: ActionShape,
+    /// Memory for actions that have not been checked yet, taken while they are copied.
+    unchecked: Mutex<Vec<i32>>,
+    /// As for a connection.
+    kept: Kept,
+    process: u32,
+}
+
+/// The groups, and what was sent to them.
+struct State {
     /// Empty after `close`.
     pools: Vec<Group>,
     /// Messages that were sent but not yet received, in order; at most one for each group.
     pending: Vec<(usize, Message)>,
-    action_shape: ActionShape,
-    /// Actions that have not been checked yet.
-    unchecked: Vec<i32>,
-    process: u32,
 }
 
 #[pymethods]
@@ -60,7 +73,7 @@ impl Pools {
     /// Makes one group for each configuration, which is JSON text. There must be at least one, and all must have the same id and
     /// number of environments. They share `num_threads` threads, one per core for 0.
     #[new]
-    fn new(configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
+    fn new(py: Python<'_>, configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
         let threads = Threads::new(num_threads).map_err(errors::pool)?;
         let group = |config: &String| {
             let pool = Pool::new(memory_gym(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
@@ -70,9 +83,10 @@ impl Pools {
         let first = &pools.first().ok_or_else(errors::closed)?.pool;
         Ok(Pools {
             action_shape: ActionShape::group(&first.spec().action_space, first.layout().num_envs()),
-            pools,
-            pending: Vec::new(),
-            unchecked: Vec::new(),
+            groups: pools.len(),
+            kept: Kept::new(py, pools.len())?,
+            state: Mutex::new(State { pools, pending: Vec::new() }),
+            unchecked: Mutex::default(),
             process: std::process::id(),
         })
     }
@@ -80,125 +94,155 @@ impl Pools {
     /// Number of groups.
     #[getter]
     fn groups(&self) -> usize {
-        self.pools.len()
+        self.groups
+    }
+
+    /// The results that the caller does not have yet; see `Connection`.
+    #[getter]
+    fn kept<'py>(&self, py: Python<'py>) -> Bound<'py, PyList> {
+        self.kept.list(py)
     }
 
     /// The layout of a batch, as JSON text.
-    fn layout(&self) -> PyResult<String> {
-        let layout = self.pools.first().ok_or_else(errors::closed)?.pool.layout();
-        serde_json::to_string(layout).map_err(|error| PyRuntimeError::new_err(error.to_string()))
+    fn layout(&self, py: Python<'_>) -> PyResult<String> {
+        let state = self.state(py)?;
+        serde_json::to_string(state.pools[0].pool.layout()).map_err(|error| PyRuntimeError::new_err(error.to_string()))
     }
 
     /// Resets a group.
     #[pyo3(signature = (group, request=None, options=None))]
     fn reset<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         group: usize,
         request: Option<Reset>,
         options: Option<&str>,
     ) -> PyResult<Bound<'py, PyTuple>> {
         let options: Option<OptionMap> = options.map(arguments::options).transpose()?;
-        self.idle(group)?.reset(py, request.as_ref(), options.as_ref())
+        let arrays = self.state(py)?.idle(group)?.reset(py, request.as_ref(), options.as_ref())?;
+        self.kept.set(py, group, Some(&arrays))?;
+        Ok(arrays)
     }
 
     /// Steps group 0.
-    fn step<'py>(&mut self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
-        self.check(0)?;
-        self.action_shape.copy(actions, &mut self.unchecked)?;
-        if self.is_pending(0) {
-            self.check_message(0)?;
+    fn step<'py>(&self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyTuple>> {
+        let mut unchecked = self.copied(py, actions)?;
+        let mut state = self.state(py)?;
+        if state.is_pending(0) {
+            state.check_message(0, &unchecked)?;
         }
-        let group = &mut self.pools[0];
-        std::mem::swap(&mut group.actions, &mut self.unchecked);
-        group.step(py)
+        let group = &mut state.pools[0];
+        std::mem::swap(&mut group.actions, &mut unchecked);
+        *lock(&self.unchecked) = unchecked;
+        let arrays = group.step(py)?;
+        self.kept.set(py, 0, Some(&arrays))?;
+        Ok(arrays)
     }
 
     /// Queues a step, which `receive` executes. The actions are copied.
-    fn send(&mut self, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
-        self.check(group)?;
-        self.action_shape.copy(actions, &mut self.unchecked)?;
-        self.check_message(group)?;
-        std::mem::swap(&mut self.pools[group].actions, &mut self.unchecked);
-        self.pending.push((group, Message::Step));
-        Ok(())
+    fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, group: usize) -> PyResult<()> {
+        self.state(py)?.check(group)?;
+        let mut unchecked = self.copied(py, actions)?;
+        let mut state = self.state(py)?;
+        state.check_message(group, &unchecked)?;
+        std::mem::swap(&mut state.pools[group].actions, &mut unchecked);
+        *lock(&self.unchecked) = unchecked;
+        state.pending.push((group, Message::Step));
+        self.kept.set(py, group, None)
     }
 
     /// Queues a reset, which `receive` executes.
     #[pyo3(signature = (group, request=None, options=None))]
-    fn send_reset(&mut self, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
+    fn send_reset(&self, py: Python<'_>, group: usize, request: Option<Reset>, options: Option<&str>) -> PyResult<()> {
         let options = options.map(arguments::options).transpose()?;
-        self.idle(group)?;
-        self.pending.push((group, Message::Reset { request, options }));
-        Ok(())
+        let mut state = self.state(py)?;
+        state.idle(group)?;
+        state.pending.push((group, Message::Reset { request, options }));
+        self.kept.set(py, group, None)
     }
 
     /// Executes the message sent to a group, or for `None` the first one sent. Returns the group's number and its arrays.
-    fn receive<'py>(&mut self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
-        self.check(group.unwrap_or(0))?;
-        let place = self.pending.iter().position(|(number, _)| group.is_none_or(|group| group == *number));
+    fn receive<'py>(&self, py: Python<'py>, group: Option<usize>) -> PyResult<(usize, Bound<'py, PyTuple>)> {
+        let mut state = self.state(py)?;
+        state.check(group.unwrap_or(0))?;
+        let place = state.pending.iter().position(|(number, _)| group.is_none_or(|group| group == *number));
         let Some(place) = place else {
             return Err(errors::service(ServiceError::NothingSent { group: group.unwrap_or(0) }));
         };
-        let (number, message) = self.pending.remove(place);
-        let group = &mut self.pools[number];
+        let (number, message) = state.pending.remove(place);
+        let group = &mut state.pools[number];
         let arrays = match message {
-            Message::Step => group.step(py),
-            Message::Reset { request, options } => group.reset(py, request.as_ref(), options.as_ref()),
+            Message::Step => group.step(py)?,
+            Message::Reset { request, options } => group.reset(py, request.as_ref(), options.as_ref())?,
         };
-        Ok((number, arrays?))
+        self.kept.set(py, number, Some(&arrays))?;
+        Ok((number, arrays))
     }
 
-    fn snapshot<'py>(&mut self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self.idle(group)?.pool.snapshot(env).map_err(errors::snapshot)?;
+    fn snapshot<'py>(&self, py: Python<'py>, group: usize, env: usize) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.state(py)?.idle(group)?.pool.snapshot(env).map_err(errors::snapshot)?;
         Ok(PyBytes::new(py, &bytes))
     }
 
-    fn restore(&mut self, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
-        self.idle(group)?.pool.restore(env, snapshot).map_err(errors::snapshot)
+    fn restore(&self, py: Python<'_>, group: usize, env: usize, snapshot: &[u8]) -> PyResult<()> {
+        self.state(py)?.idle(group)?.pool.restore(env, snapshot).map_err(errors::snapshot)
     }
 
     /// Sets the options of next episodes; see `arguments::options`.
-    fn set_options(&mut self, group: usize, sets: &str) -> PyResult<()> {
+    fn set_options(&self, py: Python<'_>, group: usize, sets: &str) -> PyResult<()> {
         let sets: Vec<NextOptions> = arguments::options(sets)?;
-        self.idle(group)?.pool.set_options(&sets).map_err(errors::pool)
+        self.state(py)?.idle(group)?.pool.set_options(&sets).map_err(errors::pool)
     }
 
     /// Seeds and options of the running episodes.
-    fn running_episodes(&mut self, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
-        let pool = &self.idle(group)?.pool;
+    fn running_episodes(&self, py: Python<'_>, group: usize, envs: Vec<usize>) -> PyResult<Vec<Episode>> {
+        let mut state = self.state(py)?;
+        let pool = &state.idle(group)?.pool;
         let episodes = envs.into_iter().map(|env| pool.running_episode(env).map(arguments::episode));
         episodes.collect::<Result<_, _>>().map_err(errors::pool)
     }
 
     /// The ground-truth view of an environment of group 0, indexed \[row\]\[column\]\[channel\].
-    fn ground_truth_view<'py>(&mut self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyAny>> {
-        self.check(0)?;
+    fn ground_truth_view<'py>(&self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyAny>> {
         let mut view = vec![0; VIEW_BYTES];
-        self.pools[0].pool.ground_truth_view(env, &mut view).map_err(errors::pool)?;
+        self.state(py)?.pools[0].pool.ground_truth_view(env, &mut view).map_err(errors::pool)?;
         Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
     }
 
-    /// Releases the environments, unless another thread is stepping them. Arrays remain valid.
-    fn close(slf: &Bound<'_, Self>) {
-        if let Ok(mut pools) = slf.try_borrow_mut() {
-            pools.pools.clear();
-            pools.pending.clear();
+    /// Releases the environments, after the step of another thread. Arrays remain valid.
+    fn close(&self, py: Python<'_>) {
+        if self.process == std::process::id() {
+            let mut state = self.state.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner);
+            state.pools.clear();
+            state.pending.clear();
         }
     }
 }
 
 impl Pools {
-    /// An error if the environments are closed or belong to another process, or if there is no such group.
-    fn check(&self, group: usize) -> PyResult<()> {
-        if self.pools.is_empty() {
-            return Err(errors::closed());
-        }
+    /// The groups; an error if the environments are closed or belong to another process.
+    fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         if self.process != std::process::id() {
             return Err(PyRuntimeError::new_err(
                 "these environments belong to the process that this process was forked from; make new ones after the fork",
             ));
         }
+        let state = self.state.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner);
+        if state.pools.is_empty() { Err(errors::closed()) } else { Ok(state) }
+    }
+
+    /// The actions as the engine's numbers. Reading them may call any Python code, so the groups must not be locked.
+    fn copied(&self, py: Python<'_>, actions: &Bound<'_, PyAny>) -> PyResult<Vec<i32>> {
+        drop(self.state(py)?);
+        let mut numbers = std::mem::take(&mut *lock(&self.unchecked));
+        self.action_shape.copy(actions, &mut numbers)?;
+        Ok(numbers)
+    }
+}
+
+impl State {
+    /// An error if there is no such group.
+    fn check(&self, group: usize) -> PyResult<()> {
         if group < self.pools.len() {
             Ok(())
         } else {
@@ -219,10 +263,9 @@ impl Pools {
         Ok(&mut self.pools[group])
     }
 
-    /// The checks of a step with the actions in `unchecked`, in the order in which a trainer makes them for an engine.
-    fn check_message(&mut self, group: usize) -> PyResult<()> {
-        self.idle(group)?;
-        check_actions(&self.pools[group].pool, &self.unchecked).map_err(errors::pool)
+    /// The checks of a step with these actions, in the order in which a trainer makes them for an engine.
+    fn check_message(&mut self, group: usize, actions: &[i32]) -> PyResult<()> {
+        check_actions(&self.idle(group)?.pool, actions).map_err(errors::pool)
     }
 }
 

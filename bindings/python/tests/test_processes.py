@@ -3,6 +3,7 @@
 import gc
 import logging
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,6 +150,61 @@ def test_an_interrupted_step_is_played_once() -> None:
         assert envs.reconnect().groups[0] == (2, None, "played")
         for _ in range(20):
             np.testing.assert_array_equal(envs.step(ACTIONS)[0], twin.step(ACTIONS)[0])
+
+
+def interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("where", [endless_gym.serve, endless_gym.make_vec])
+@pytest.mark.parametrize("kind", ["step", "recv"])
+@pytest.mark.parametrize("arguments", [{}, {"autoreset": "same_step", "episode_info": True}])
+def test_the_result_of_an_interrupted_step_is_kept(where: Any, kind: str, arguments: dict[str, Any]) -> None:
+    """Signals at 150 random moments around a step, against environments that play the same without interrupts."""
+    draws, interrupted, received = random.Random(1), 0, 0
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        with where(ID, 4, 1, seed=1, **arguments) as envs, endless_gym.make_vec(ID, 4, 1, seed=1, **arguments) as twin:
+            envs.reset()
+            twin.reset()
+            for _ in range(150):
+                result = None
+                if kind == "recv":
+                    envs.send(ACTIONS)
+                try:
+                    signal.setitimer(signal.ITIMER_REAL, draws.uniform(1e-6, 1e-3))
+                    result = envs.step(ACTIONS) if kind == "step" else envs.recv()
+                    signal.setitimer(signal.ITIMER_REAL, 0)
+                except KeyboardInterrupt:
+                    interrupted += 1
+                if result is None:
+                    try:
+                        result = envs.recv()
+                        received += 1
+                    except RuntimeError as error:
+                        assert kind == "step" and "nothing was sent" in str(error)
+                        result = envs.step(ACTIONS)  # It was not played.
+                expected = twin.step(ACTIONS)
+                for one, two in zip(result[:4], expected[:4], strict=True):
+                    np.testing.assert_array_equal(one, two)
+            with pytest.raises(RuntimeError, match="nothing was sent to group 0"):
+                envs.recv()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert interrupted > 10 and received > 0
+
+
+def test_a_request_drops_the_result_that_was_kept() -> None:
+    with endless_gym.make_vec(ID, 4, seed=1) as envs, endless_gym.make_vec(ID, 4, seed=1) as twin:
+        for each in (envs, twin):
+            each.reset()
+            each.step(ACTIONS)
+        envs._kept[0] = envs._backend.step(ACTIONS)  # as if interrupted
+        twin.step(ACTIONS)
+        np.testing.assert_array_equal(envs.step(ACTIONS)[0], twin.step(ACTIONS)[0])
+        with pytest.raises(RuntimeError, match="nothing was sent"):
+            envs.recv()
 
 
 def test_package_includes_the_program() -> None:

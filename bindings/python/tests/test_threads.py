@@ -1,0 +1,70 @@
+"""Threads that use the same vector environment."""
+
+import asyncio
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+import endless_gym
+
+ID = "MortarMayhem-Grid-v0"
+ACTIONS = np.array([0, 1, 2, 3])
+WHERE = [endless_gym.serve, endless_gym.make_vec]
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_a_thread_for_each_group_plays_what_one_thread_plays(where: Any) -> None:
+    def play(envs: endless_gym.EndlessVectorEnv, group: int) -> list[Any]:
+        steps = [envs.reset(group=group)[0].sum()]
+        for number in range(60):
+            envs.send((ACTIONS + number) % 4, group)
+            observation, reward, terminated, _, info = envs.recv(group)
+            assert info["group"] == group
+            steps.append((observation.sum(), reward.tolist(), terminated.tolist()))
+        return steps
+
+    with endless_gym.make_vec(ID, 4, seed=3, groups=3) as alone:
+        expected = [play(alone, group) for group in range(3)]
+    with where(ID, 4, seed=3, groups=3) as envs, ThreadPoolExecutor(3) as threads:
+        assert list(threads.map(play, [envs] * 3, range(3))) == expected
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_other_threads_render_and_save_while_one_steps(where: Any) -> None:
+    with where(ID, 4, seed=3, render_mode="rgb_array") as envs:
+        envs.reset()
+        ended, shown = threading.Event(), []
+
+        def observe() -> None:
+            while not ended.is_set():
+                pictures = envs.render()
+                assert pictures is not None
+                shown.append(pictures[0].shape)
+                assert len(envs.running_episodes()) == 4 and envs.snapshot(2)
+
+        with ThreadPoolExecutor(2) as threads:
+            observers = [threads.submit(observe) for _ in range(2)]
+            for _ in range(200):
+                envs.step(ACTIONS)
+            ended.set()
+            for observer in observers:
+                observer.result()
+        assert shown and set(shown) == {(84, 84, 3)}
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_steps_of_asyncio_threads_take_turns(where: Any) -> None:
+    async def play(envs: endless_gym.EndlessVectorEnv) -> None:
+        await asyncio.gather(*(asyncio.to_thread(envs.step, ACTIONS) for _ in range(20)))
+
+    # `gather` holds all results.
+    with where(ID, 4, seed=3, copy=True) as envs, endless_gym.make_vec(ID, 4, seed=3) as twin:
+        envs.reset()
+        twin.reset()
+        asyncio.run(play(envs))
+        for _ in range(20):
+            twin.step(ACTIONS)
+        np.testing.assert_array_equal(envs.step(ACTIONS)[0], twin.step(ACTIONS)[0])
