@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
+import functools
+import inspect
 import math
 import operator
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 #: Largest unsigned 64-bit integer: the largest seed, and the largest count that the engine can read.
 MAX_U64 = 2**64 - 1
@@ -60,17 +66,52 @@ def timeout(given: float) -> float:
     return seconds
 
 
-def seeding(seed: int | None, seeds: range | Sequence[int] | None) -> dict[str, Any]:
-    """The arguments `seed` and `seeds` as the JSON object of the engine's `Seeding`.
+def named(*, instead: Mapping[str, str]) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """A decorator that makes a function refuse unknown keyword arguments with the name of the one that is meant.
+
+    Args:
+        instead: What to use instead of arguments that other libraries have; for others, the nearest name is proposed.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        known = inspect.signature(function).parameters
+
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            for name in kwargs.keys() - known.keys():
+                near = difflib.get_close_matches(name, known, 1)
+                hint = instead.get(name) or (f"did you mean `{near[0]}`?" if near else f"it has {', '.join(known)}")
+                raise TypeError(f"{function.__name__}() has no argument `{name}`; {hint}")
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def first_seed(seed: Any, total_envs: int) -> int:
+    """The seed of the first of some environments, which are seeded with consecutive numbers.
+
+    Raises:
+        TypeError: It is not an integer.
+        ValueError: It is negative, or the last seed would not fit into 64 bits.
+    """
+    return integer("seed", seed, 0, MAX_U64 - (total_envs - 1))
+
+
+def seeding(seed: int | None, seeds: range | Sequence[int] | None, total_envs: int) -> dict[str, Any]:
+    """The arguments `seed` and `seeds` for `total_envs` environments as the JSON object of the engine's `Seeding`.
 
     Raises:
         TypeError: A seed is not an integer.
         ValueError: A seed is out of range, or `seeds` is empty.
     """
-    seed = None if seed is None else integer("seed", seed)
+    seed = None if seed is None else first_seed(seed, total_envs)
     if seeds is None:
         return {"continue": {"seed": seed}}
     if not isinstance(seeds, range):
+        if not isinstance(seeds, Iterable) or isinstance(seeds, (str, bytes)):
+            raise TypeError(f"seeds must be a range or a list of integers, one for each episode, got {seeds!r}")
         seeds = [integer("seeds", each) for each in seeds]
     if not seeds:
         raise ValueError(f"seeds must have at least one seed, got {seeds}")

@@ -25,6 +25,16 @@ Options = Mapping[str, Any]
 #: Largest total number of environments of all engines of one trainer.
 MAX_TOTAL_ENVS = 2**32 - 1
 
+#: Arguments of other libraries' vector environments, and what `make_vec` and `serve` have instead.
+INSTEAD = {
+    "autoreset_mode": "the auto-reset mode is `autoreset`",
+    "max_episode_steps": "the reset parameter `max_steps` limits the steps of an episode: options={'max_steps': 100}",
+    "max_steps": "it is a reset parameter: options={'max_steps': 100}",
+    "env_id": "the environment's id is `id`",
+    "num_workers": "the number of threads is `num_threads`",
+    "vectorization_mode": "all environments are stepped on the threads of `num_threads`; only `gymnasium.make_vec` has it",
+}
+
 #: The names of the auto-reset modes.
 AutoresetName = Literal["next_step", "same_step", "disabled"]
 
@@ -69,10 +79,10 @@ def checked_arguments(
     num_envs = integer("num_envs", num_envs, 1, _native.MAX_ENVS)
     groups = integer("groups", groups, 1, _native.MAX_GROUPS)
     threads = integer("num_threads", num_threads or 0, 0, _native.MAX_THREADS)
-    source = seeding(seed, seeds)
     first_env = integer("first_env", first_env, 0, MAX_TOTAL_ENVS)
     end = first_env + groups * num_envs
     total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
+    source = seeding(seed, seeds, total_envs)
     frames, features = contents(observation, frames)
     pools = [
         {

@@ -7,8 +7,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from endless_gym import _native
+from endless_gym.arguments import named
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import MODES, AutoresetMode, AutoresetName, Options, checked_arguments, options_list
+from endless_gym.configuration import (
+    INSTEAD,
+    MODES,
+    AutoresetMode,
+    AutoresetName,
+    Options,
+    checked_arguments,
+    options_list,
+)
 from endless_gym.episodes import EpisodeOptions, TrackedVectorEnv, validate_episode_options
 from endless_gym.rendering import VECTOR_MODES, View, checked_view
 from endless_gym.results import Results
@@ -16,6 +25,7 @@ from endless_gym.specs import Frames, ObservationName, described_spec, json_text
 from endless_gym.vector import EndlessVectorEnv
 
 
+@named(instead=INSTEAD)
 def make_vec(
     id: str,
     num_envs: int = 1,

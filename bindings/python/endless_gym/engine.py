@@ -14,9 +14,9 @@ from itertools import count
 from typing import Any
 
 from endless_gym import _native
-from endless_gym.arguments import integer
+from endless_gym.arguments import integer, named
 from endless_gym.arguments import timeout as checked_timeout
-from endless_gym.configuration import AutoresetMode, AutoresetName, Options, checked_arguments
+from endless_gym.configuration import INSTEAD, AutoresetMode, AutoresetName, Options, checked_arguments
 from endless_gym.create import connect
 from endless_gym.engine_log import EngineLog, level
 from endless_gym.episodes import EpisodeOptions, validate_episode_options
@@ -103,6 +103,7 @@ def _end(process: subprocess.Popen[bytes], log: EngineLog, owner: int) -> None:
             _native.running_engines()
 
 
+@named(instead=INSTEAD)
 def serve(
     id: str,
     num_envs: int = 1,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endless_gym import _native
-from endless_gym.arguments import MAX_U64, integer
+from endless_gym.arguments import first_seed, integer
 
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
 
@@ -27,11 +27,14 @@ class ResetRequests:
     def request(self, seed: Seeds, mask: Any, group: int) -> _native.Reset | None:
         """A reset of a group."""
         if mask is None and not _has_items(seed):
-            return None if seed is None else integer("seed", seed)
+            return None if seed is None else self._first_seed(seed)
         chosen = np.ones(self._num_envs, dtype=np.bool_) if mask is None else self._mask(mask, "reset_mask")
         seeds = self._seeds(seed, group)
         reset = [int(wanted) * (1 if given is None else 2) for wanted, given in zip(chosen, seeds, strict=True)]
         return reset, [given or 0 for given in seeds]
+
+    def _first_seed(self, seed: Any) -> int:
+        return first_seed(seed, self._first_env + self._num_groups * self._num_envs)
 
     def _mask(self, given: Any, name: str) -> NDArray[np.bool_]:
         mask = np.asarray(given)
@@ -44,9 +47,8 @@ class ResetRequests:
         if seed is None:
             return [None] * self._num_envs
         if not _has_items(seed):
-            # Sums wrap, as in the engine.
-            first = integer("seed", seed) + self._first_env + group * self._num_envs
-            return [(first + env) & MAX_U64 for env in range(self._num_envs)]
+            first = self._first_seed(seed) + self._first_env + group * self._num_envs
+            return list(range(first, first + self._num_envs))
         given: list[Any] = list(seed)
         if len(given) == self._num_envs * self._num_groups:
             given = given[group * self._num_envs :][: self._num_envs] if self._num_groups > 1 else given

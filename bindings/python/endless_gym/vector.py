@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -98,6 +99,8 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._engine = engine
         self._results = results
         self._described = described
+        #: The id's entry in Gymnasium's registry; `None` for an id that is not registered, such as one of an engine of your own.
+        self.spec = deepcopy(gymnasium.registry.get(f"EndlessGym/{described.id}"))
         self.num_envs = num_envs = results.num_envs
         self.num_groups = backend.groups
         self.single_observation_space = results.observation_space
@@ -277,6 +280,15 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             for number in groups:
                 turns.enter_context(self._turns[number])
             self._options.set_all(groups, self._resets.envs(mask, "mask"), options)
+
+    @property
+    def max_episode_steps(self) -> list[int]:
+        """The step limit of each environment of group 0 with the reset parameters of its running episode; -1 for none.
+
+        Raises:
+            RuntimeError: As for `snapshot`.
+        """
+        return [self._described.max_episode_steps(running.options) for running in self.running_episodes()]
 
     def running_episodes(self, group: int = 0) -> list[RunningEpisode]:
         """Seeds and options of a group's running episodes; see `RunningEpisode`.

@@ -261,3 +261,53 @@ def test_any_nonzero_byte_of_a_flag_is_true() -> None:
     # A part of another array, with strides.
     parts = raw[::2].view(np.bool_), np.arange(6.0)[::2], np.arange(6, dtype=np.int32)[::2], infos[::2]
     np.testing.assert_array_equal(_native.ended_episodes(*parts, [True, False])[1], [0, 2, 0])
+
+
+@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+def test_unknown_arguments_are_refused_with_the_name_that_is_meant(where) -> None:
+    for name, value, hint in (
+        ("autoreset_mode", "same_step", "the auto-reset mode is `autoreset`"),
+        ("max_episode_steps", 10, "the reset parameter `max_steps` limits the steps of an episode"),
+        ("num_env", 3, "did you mean `num_envs`?"),
+        ("zzz", 3, "it has id, num_envs, num_threads, "),
+    ):
+        message = f"{where.__name__}() has no argument `{name}`; {hint}"
+        with pytest.raises(TypeError, match=f"^{re.escape(message)}"):
+            where("MortarMayhem-Grid-v0", **{name: value})
+
+
+@pytest.mark.parametrize("where", [endless_gym.make_vec, endless_gym.serve])
+def test_seeds_that_do_not_fit_are_refused(where) -> None:
+    largest = 2**64 - 1
+    with where("MortarMayhem-Grid-v0", 2, groups=2) as envs:
+        message = f"seed must be 0 to {largest - 3}, got {largest - 2}"
+        with pytest.raises(ValueError, match=message):
+            envs.reset(seed=largest - 2)
+        with pytest.raises(ValueError, match=message):
+            envs.reset(seed=largest - 2, options={"reset_mask": np.array([True, False])})
+        with pytest.raises(ValueError, match=message):
+            envs.send_reset(1, seed=largest - 2)
+        with pytest.raises(ValueError, match=message):
+            where("MortarMayhem-Grid-v0", 2, groups=2, seed=largest - 2)
+        envs.reset(seed=largest - 3)
+        assert [episode.seed for episode in envs.running_episodes(1)] == [largest - 1, largest]
+        envs.reset(seed=[largest, 0])
+
+
+def test_arguments_of_the_wrong_kind_are_named() -> None:
+    with pytest.raises(TypeError, match=r"^seeds must be a range or a list of integers, one for each episode, got 7$"):
+        endless_gym.make_vec("MortarMayhem-Grid-v0", seeds=7)  # type: ignore[arg-type]
+    with endless_gym.make_vec("MortarMayhem-Grid-v0", 2, seed=1) as envs:
+        envs.reset()
+        with pytest.raises(TypeError, match=r"snapshots must be a mapping .* got bytes; pass {env: snapshot}"):
+            envs.restore(envs.snapshot(0))  # type: ignore[arg-type]
+
+
+def test_vector_environments_know_their_id_and_step_limits() -> None:
+    options = [{"max_steps": 20}, {}]
+    for where in (endless_gym.make_vec, endless_gym.serve):
+        with where("Endless-MysteryPath-v0", 2, options=options) as envs:
+            assert envs.spec is not None and envs.spec.id == "EndlessGym/Endless-MysteryPath-v0"
+            assert repr(envs) == "EndlessVectorEnv(EndlessGym/Endless-MysteryPath-v0, num_envs=2)"
+            envs.reset()
+            assert envs.max_episode_steps == [20, -1]
