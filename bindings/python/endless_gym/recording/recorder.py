@@ -219,6 +219,8 @@ def _env_spec(
     """The specification that recreates the environment, with frames in the original's format, since Minari stores it as JSON."""
     # A copy, since the registry's own must not change.
     env_spec = copy.deepcopy(gymnasium.spec(f"EndlessGym/{described.id}"))
+    # Episodes are recorded in new environments; this one starts each of its episodes like a new one.
+    env_spec.kwargs["independent_episodes"] = True
     if len(options) == 1 and options[0]:
         env_spec.kwargs["options"] = dict(options[0])
     if observation != "rgb":
