@@ -59,6 +59,11 @@ class NextOptions:
             for group in range(backend.groups):
                 self.forget(group, range(num_envs))
 
+    @property
+    def created(self) -> list[Options]:
+        """The options given at creation for each environment of group 0."""
+        return list(self._created * self._num_envs if len(self._created) == 1 else self._created[: self._num_envs])
+
     def forget(self, group: int, envs: Iterable[int]) -> None:
         """Treat the options of these environments as unknown until their next reset."""
         self._sent[group].update(dict.fromkeys(envs, _UNKNOWN))

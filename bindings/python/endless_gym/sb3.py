@@ -68,6 +68,7 @@ class EndlessVecEnv(VecEnv):
         self.metadata = envs.metadata
         self._actions: np.ndarray | None = None
         self.info: dict[str, Any] = {}
+        self._has_options = False
         self._start = time.perf_counter()
         self._running: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
@@ -84,21 +85,24 @@ class EndlessVecEnv(VecEnv):
     def reset(self) -> VecEnvObs:
         """Start an episode in every environment, with the seeds of `seed` and the options of `set_options`.
 
+        The options, one dict for all environments or one for each, apply until the next `reset`.
+
         Returns:
             The observations: uint8 (num_envs, 84, 84, 3), or a dict of arrays. The infos are in `reset_infos`.
 
         Raises:
-            ValueError: The options of the environments differ, or a reset parameter is unknown or out of its range.
+            ValueError: A reset parameter is unknown or out of its range. The seeds and the options are forgotten.
         """
-        options = self._options[0]
-        if any(other != options for other in self._options):
-            raise ValueError("all environments of a batch must have the same options, got different ones")
-        seeds = None if self._seeds[0] is None else list(self._seeds)
-        observations: VecEnvObs
-        observations, self.info = self.envs.reset(seed=seeds, options=options or None)
-        self.reset_infos = [_row(self.info, index) for index in range(self.num_envs)]
+        seeds, options = self._seeds, self._options
+        # As in `DummyVecEnv`, they are for one reset; also if it fails, so that the next one can succeed.
         self._reset_seeds()
         self._reset_options()
+        if any(options) or self._has_options:
+            self.envs.set_options(options)
+            self._has_options = any(options)
+        observations: VecEnvObs
+        observations, self.info = self.envs.reset(seed=None if seeds[0] is None else seeds)
+        self.reset_infos = [_row(self.info, index) for index in range(self.num_envs)]
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -134,9 +138,16 @@ class EndlessVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return the attribute of the batch once for each of `indices`; it is the same for all environments."""
-        value = getattr(self.envs, attr_name)
-        return [value for _ in self._get_indices(indices)]
+        """Return an attribute of each environment of `indices`: a space, the step limit or the reset parameters of its episode
+        (`max_episode_steps`, `reset_params`), or an attribute of the batch, which all environments share.
+        """
+        chosen = list(self._get_indices(indices))
+        if attr_name in ("max_episode_steps", "reset_params"):
+            each = getattr(self.envs, attr_name)
+            return [each[index] for index in chosen]
+        own = attr_name in ("action_space", "observation_space")
+        value = getattr(self if own else self.envs, attr_name)
+        return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Not supported: the environments of a batch have no individual attributes."""

@@ -118,6 +118,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         # A thread's call to a group waits for another thread's; a signal handler's call within a call does not.
         self._turns = [threading.RLock() for _ in range(backend.groups)]
         self._drawing = threading.Lock()
+        self._has_begun = False
         # The backend keeps each result here until the caller has it, since a signal handler may raise in between. Nothing between
         # the entry's removal and the return to the caller may call a function, where Python would run the handler.
         self._kept = backend.kept
@@ -282,13 +283,23 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
             self._options.set_all(groups, self._resets.envs(mask, "mask"), options)
 
     @property
-    def max_episode_steps(self) -> list[int]:
-        """The step limit of each environment of group 0 with the reset parameters of its running episode; -1 for none.
+    def reset_params(self) -> list[dict[str, Any]]:
+        """The reset parameters of the running episode of each environment of group 0, the defaults included; before the first
+        reset, those given at creation.
 
         Raises:
-            RuntimeError: As for `snapshot`.
+            RuntimeError: The last `send` or `send_reset` has not been received.
         """
-        return [self._described.max_episode_steps(running.options) for running in self.running_episodes()]
+        if self._has_begun:
+            given: Sequence[Options] = [running.options for running in self.running_episodes()]
+        else:
+            given = self._options.created
+        return [{**self._described.reset_parameters, **each} for each in given]
+
+    @property
+    def max_episode_steps(self) -> list[int]:
+        """The step limit of each environment of group 0 with its `reset_params`; -1 for none."""
+        return [self._described.max_episode_steps(parameters) for parameters in self.reset_params]
 
     def running_episodes(self, group: int = 0) -> list[RunningEpisode]:
         """Seeds and options of a group's running episodes; see `RunningEpisode`.
@@ -335,6 +346,7 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 self._options.forget(group, [env])
             # Resetting no environments returns the current observations.
             arrays = self._backend.reset(group, ([0] * self.num_envs, [0] * self.num_envs), None)
+            self._has_begun = True
             self._kept[group] = None
             return self._results.start(arrays)
 
@@ -464,11 +476,13 @@ class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 self._options.forget(group, envs)
                 raise
             self._options.started(group, envs, given, text)
+        self._has_begun = True
         self._kept[group] = None
         return start
 
     def _received(self, group: int, arrays: _native.Arrays) -> Step:
         """The result of a step, or of a reset that was sent."""
+        self._has_begun = True
         return self._results.step(arrays)
 
     def _sent_reset(self, group: int, envs: Sequence[int], given: Options, text: str | None) -> None:

@@ -135,6 +135,34 @@ class TestStableBaselines3:
                 return
         pytest.fail("no episode ended")
 
+    def test_attributes_and_options_are_those_of_dummy_vec_env(self):
+        from stable_baselines3.common.vec_env import DummyVecEnv
+
+        id, each = "Endless-MysteryPath-v0", [{"max_steps": 20}, {}, {"max_steps": 30}]
+        dummy = DummyVecEnv([lambda: endless_gym.Env(id)] * 3)
+        venv = self.make(id, num_envs=3)
+
+        def compare() -> None:
+            for name in ("action_space", "observation_space", "max_episode_steps", "reset_params", "render_mode"):
+                assert venv.get_attr(name) == dummy.get_attr(name), name
+                assert venv.get_attr(name, [2]) == dummy.get_attr(name, [2]), name
+            assert [spec.id for spec in venv.get_attr("spec")] == [f"EndlessGym/{id}"] * 3
+
+        compare()
+        for options in (each, {"max_steps": 25}, None, each):
+            for envs in (venv, dummy):
+                envs.seed(5)
+                if options is not None:
+                    envs.set_options(options)
+            np.testing.assert_array_equal(venv.reset(), dummy.reset())
+            compare()
+        for envs in (venv, dummy):
+            envs.set_options([{}, {"colour": 1}, {}])
+            with pytest.raises(ValueError, match="colour"):
+                envs.reset()
+        venv.reset()
+        venv.close()
+
     def test_dict_observations_stay_dicts(self):
         venv = self.make(DICT_ID, num_envs=3)
         obs = venv.reset()
@@ -156,9 +184,6 @@ class TestStableBaselines3:
         first = venv.reset()
         venv.seed(5)
         np.testing.assert_array_equal(first, venv.reset())
-        venv.set_options([{"command_show_duration": [2]}, {}])
-        with pytest.raises(ValueError, match="same options"):
-            venv.reset()
         venv.close()
 
     def test_wrappers_and_ppo_accept_the_adapter(self):
