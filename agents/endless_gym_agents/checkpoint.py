@@ -132,7 +132,11 @@ def read_settings(run: str | Path) -> Settings:
 
     Raises:
         FileNotFoundError: The folder contains no run.
+        ValueError: The run is of another program, or of another version of this one.
     """
     if not (Path(run) / SETTINGS).exists():
         raise FileNotFoundError(f"no run in {run}; expected a folder with {SETTINGS}, as endless-train writes it")
-    return from_dict(json.loads((Path(run) / SETTINGS).read_text()))
+    try:
+        return from_dict(json.loads((Path(run) / SETTINGS).read_text()))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{Path(run) / SETTINGS} is not of this version of endless-train ({error})") from None

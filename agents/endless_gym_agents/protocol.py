@@ -99,12 +99,13 @@ def find(paths: tuple[Path, ...], last: bool) -> list[tuple[Path, list[Path]]]:
     return list(found.items())
 
 
-def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment]:
+def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] | None = None) -> list[Experiment]:
     """Evaluate all checkpoints.
 
     Args:
         arguments: The arguments.
         console: Where the progress bar is shown.
+        failed: Receives why a run cannot be evaluated, if other runs can; `None` to raise the first such error.
 
     Returns:
         The results, with runs that differ only in their seeds grouped into experiments.
@@ -130,7 +131,14 @@ def evaluate_runs(arguments: EvalArguments, console: Console) -> list[Experiment
             run: Run | None = None
             for file in files:
                 bar.reset(episodes, description=f"episodes of {file.name}")
-                loaded = checkpoint.load(file, device)
+                try:
+                    loaded = checkpoint.load(file, device)
+                except (OSError, ValueError) as error:
+                    if failed is None or len(runs) == 1:
+                        raise
+                    failed.append(str(error))
+                    bar.advance(checkpoints)
+                    continue
                 settings = loaded.settings
                 if run is None:
                     run = Run(str(folder), settings.seed)
@@ -182,24 +190,30 @@ def execute(arguments: EvalArguments) -> None:
     if arguments.json not in ("", "-") and not Path(arguments.json).resolve().parent.is_dir():
         raise FileNotFoundError(f"cannot write {arguments.json}: no folder {Path(arguments.json).parent}")
     messages, start = Console(stderr=True), time.monotonic()
-    experiments = evaluate_runs(arguments, messages)
-    for experiment in experiments:
-        if not experiment.common_steps():
-            raise ValueError(
-                f"the {len(experiment.runs)} runs of {experiment.env}, {experiment.label}, have no checkpoints at a common "
-                "number of steps; evaluate them separately, or train with the same --checkpoint-interval and --keep-checkpoints"
-            )
+    failed: list[str] = []
+    found = evaluate_runs(arguments, messages, failed)
+    experiments = [experiment for experiment in found if experiment.common_steps()]
+    failed += [
+        f"the {len(experiment.runs)} runs of {experiment.env}, {experiment.label}, have no checkpoints at a common "
+        "number of steps; evaluate them separately, or train with the same --checkpoint-interval and --keep-checkpoints"
+        for experiment in found
+        if experiment not in experiments
+    ]
+    if not experiments:
+        raise ValueError("; ".join(failed))
     names = ("first_seed", "seeds", "repetitions", "action_seed", "greedy")
     written = to_json(experiments, {name: getattr(arguments, name) for name in names}, arguments.episodes)
     written["seconds"] = time.monotonic() - start
     if arguments.json == "-":
         print(json.dumps(written, indent=1))
-        return
-    if arguments.json:
-        Path(arguments.json).write_text(json.dumps(written) + "\n")
-    console = Console()
-    for experiment in experiments:
-        console.print(table(experiment))
+    else:
+        if arguments.json:
+            Path(arguments.json).write_text(json.dumps(written) + "\n")
+        console = Console()
+        for experiment in experiments:
+            console.print(table(experiment))
+    if failed:
+        raise ValueError(f"the others are evaluated; {'; '.join(failed)}")
 
 
 def main() -> int:

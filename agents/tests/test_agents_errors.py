@@ -31,6 +31,7 @@ PROGRAMS = {
         ("endless-train --resume nowhere", "no run in nowhere; expected a folder with settings.json"),
         (f"endless-train {GRID} --environment.option command_count=[1] colour=1", ".*colour"),
         (f"endless-train {GRID} --environment.option colour=1 --environment.engine process", ".*colour"),
+        ("endless-train --resume foreign", "foreign/settings.json is not of this version of endless-train"),
         ("endless-eval", "no path given; expected checkpoint files"),
         ("endless-eval nowhere", "no such file or folder: nowhere; expected a checkpoint file"),
         ("endless-eval .", "no checkpoint in .; expected the folder of a run"),
@@ -82,6 +83,8 @@ def test_user_error_prints_one_line_and_leaves_no_file(
 ) -> None:
     (tmp_path / "text.pt").write_text("not a checkpoint\n")
     (tmp_path / "text.json").write_text("{}")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "settings.json").write_text('{"learning_rate": 1}')
     run = {"run": "a", "seed": 1, "steps": [10], "metrics": {"task_progress": [0.5]}}
     experiment = {"env": "MysteryPath-v0", "label": "gru", "options": {}, "runs": [run]}
     (tmp_path / "one.json").write_text(json.dumps({"experiments": [experiment]}))
@@ -96,4 +99,9 @@ def test_user_error_prints_one_line_and_leaves_no_file(
     error = capsys.readouterr().err
     assert re.match(f"{program}: {message}", error), error
     assert error.count("\n") == 1
-    assert {file.name for file in tmp_path.rglob("*") if file.is_file()} == {"text.pt", "text.json", "one.json"}
+    assert {file.name for file in tmp_path.rglob("*") if file.is_file()} == {
+        "text.pt",
+        "text.json",
+        "one.json",
+        "settings.json",
+    }

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import sys
 import time
 from collections import Counter
@@ -139,6 +140,22 @@ def test_evaluation_plays_each_seed_equally_often_and_is_reproducible(runs: Path
     assert to_json(again, {}, True) == to_json(once, {}, True)
     other = evaluate_runs(small(runs, action_seed=1), quiet)
     assert to_json(other, {}, True) != to_json(once, {}, True)
+
+
+def test_a_foreign_run_does_not_prevent_the_evaluation_of_others(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(runs, tmp_path / "runs")
+    foreign = tmp_path / "runs" / "b" / "checkpoints" / "last.pt"
+    foreign.write_text("of another library\n")
+    arguments = ["endless-eval", str(tmp_path / "runs"), "--last", "--seeds", "2", "--json", str(tmp_path / "all.json")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert protocol.main() == 1
+    output = capsys.readouterr()
+    assert output.err.startswith(f"endless-eval: the others are evaluated; {foreign} is not a checkpoint"), output.err
+    assert "gru_16" in output.out and "ppo" in output.out
+    written = json.loads((tmp_path / "all.json").read_text())
+    assert [len(experiment["runs"]) for experiment in written["experiments"]] == [1, 1]
 
 
 def test_progress_callback_counts_every_episode(runs: Path) -> None:
