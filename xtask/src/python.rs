@@ -189,7 +189,17 @@ pub fn test_libraries() -> Result<(), String> {
     let rllib = sync("rllib", "bindings/python", &["--group", "rllib"])?;
     // Documentation snippets, an example and the notebook use the agents.
     [&environment, &rllib].into_iter().try_for_each(|environment| install_with_agents(environment))?;
-    let pythons = [("ENDLESS_LIBRARIES_PYTHON", rllib.as_path())];
+    let gymnasiums = ["1.1.0", "1.2.3"].map(|version| {
+        let packages = [&format!("gymnasium=={version}"), "numpy==2.4.6"];
+        let folder = tools(&format!("gymnasium-{version}"), &base()?, &packages)?;
+        Ok::<_, String>(format!("{version}={}", folder.display()))
+    });
+    let gymnasiums = gymnasiums.into_iter().collect::<Result<Vec<_>, _>>()?.join("/bin/python:");
+    let pythons = [
+        ("ENDLESS_LIBRARIES_PYTHON", rllib.as_path()),
+        // `pytest` appends the path of the program to the last folder.
+        ("ENDLESS_GYMNASIUM_PYTHONS", Path::new(&gymnasiums)),
+    ];
     pytest(&environment, "bindings/python", "(slow or libraries) and not original", &pythons)
 }
 

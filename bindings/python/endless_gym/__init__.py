@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from endless_gym.create import connect, make_vec
     from endless_gym.engine import serve
     from endless_gym.recording import record
+    from endless_gym.statistics import RecordEpisodeStatistics
     from endless_gym.vector import EndlessVectorEnv
     from endless_gym.watching import watch
 
@@ -35,6 +36,7 @@ __all__ = [
     "Env",
     "Experts",
     "Frames",
+    "RecordEpisodeStatistics",
     "ReplayStep",
     "TooManyBatchesHeld",
     "WindowClosed",
@@ -61,6 +63,7 @@ _LATER = {
     "make_vec": "create",
     "record": "recording",
     "watch": "watching",
+    "RecordEpisodeStatistics": "statistics",
 }
 
 

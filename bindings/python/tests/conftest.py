@@ -35,6 +35,13 @@ def libraries_python() -> str:
     return _python("ENDLESS_LIBRARIES_PYTHON", "the group `rllib`")
 
 
+@pytest.fixture(scope="session")
+def gymnasium_python() -> dict[str, str]:
+    """Pythons with numpy and only an old Gymnasium, by its version."""
+    pythons = _python("ENDLESS_GYMNASIUM_PYTHONS", "old versions of Gymnasium").split(":")
+    return dict(python.split("=", 1) for python in pythons)
+
+
 @pytest.fixture
 def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A folder for Ray's logs and sockets, whose paths must be short. Nothing is sent or written elsewhere."""
