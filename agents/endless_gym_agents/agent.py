@@ -36,11 +36,12 @@ from torch import Tensor, nn
 
 from endless_gym.interop import torch_view
 from endless_gym.specs import Frames, Spec
+from endless_gym_agents import own
 from endless_gym_agents.acting import ActingWeights, acting_weights, linear_relu, weights_version
 from endless_gym_agents.encoders import FRAME, Encoder, Observation, Shapes, orthogonal
 from endless_gym_agents.heads import Perceptron, PolicyHead, ReconstructionHead, ValueHead
 from endless_gym_agents.memory import AnyMemory, MemoryState, Minibatch, NoMemory
-from endless_gym_agents.recurrent import RecurrentMemory
+from endless_gym_agents.recurrent import CellMemory, RecurrentMemory
 from endless_gym_agents.settings import Settings
 from endless_gym_agents.transformer import TransformerMemory
 from endless_gym_agents.transforms import FrameStack, Identity, ObservationTransform, PositionalEncoding, TransformState
@@ -189,6 +190,9 @@ class Agent(nn.Module):
             gating = settings.transformer.gating or settings.agent == "gtrxl"
             transformer = dataclasses.replace(settings.transformer, window=settings.window(), gating=gating)
             self.memory = TransformerMemory(self.encoder.width, transformer, settings.positions(), self.device)
+        elif settings.is_own_agent:
+            cell, options = own.load("--agent", settings.agent), settings.agent_options()
+            self.memory = CellMemory(cell, self.encoder.width, settings.recurrence, options, self.device)
         else:
             self.memory = NoMemory(self.encoder.width, self.device)
         has_memory = not isinstance(self.memory, NoMemory)

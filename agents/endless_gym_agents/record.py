@@ -76,7 +76,7 @@ class AgentPlayer:
         self._agent, self._action_seed, self._greedy = agent, action_seed, greedy
         self._spec = spec(agent.settings.env)
         #: The name of the algorithm in a data set.
-        self.name = f"PPO, agent {agent.settings.agent}"
+        self.name = f"PPO, agent {agent.settings.agent_name}"
         #: The observation that the agent needs.
         self.observation: ObservationName | None = agent.settings.environment.observation
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -65,13 +65,11 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
     The update that `step` returns is the next hidden state, float (parts, layers, n, hidden size).
     """
 
-    def __init__(
-        self, kind: Literal["gru", "lstm"], input_width: int, settings: Recurrence, device: torch.device
-    ) -> None:
+    def __init__(self, kind: str, input_width: int, settings: Recurrence, device: torch.device) -> None:
         """Make the layers with orthogonal weights and zero biases.
 
         Args:
-            kind: The kind of the recurrent layers.
+            kind: The kind of the recurrent layers, `gru` or `lstm`.
             input_width: Size of the encoded observations.
             settings: Number and size of the layers, and the length of a sequence.
             device: Device of the states.
@@ -89,9 +87,7 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
                 f"--recurrence.residual needs inputs of the hidden size {self.width}, got an input width of {input_width}; "
                 "add --recurrence.embedding"
             )
-        self.embedding = None
-        if settings.embedding:
-            self.embedding = nn.Sequential(orthogonal(nn.Linear(input_width, self.width)), nn.ReLU())
+        self.embedding = _embedding(input_width, settings)
         layers = nn.LSTM if kind == "lstm" else nn.GRU
         self.recurrent = layers(self.width if settings.embedding else input_width, self.width, settings.layers)
         for name, parameter in self.recurrent.named_parameters():
@@ -197,6 +193,86 @@ class RecurrentMemory(Memory[RecurrentState, Tensor, RecurrentMinibatch]):
         if not torch.is_autocast_enabled(self.device.type):
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, enabled=False)
+
+
+class CellMemory(RecurrentMemory):
+    """A recurrent memory around a cell of your own: a `torch.nn.Module` that computes one step.
+
+    The cell is made by `Class(input_width, hidden_size, **options)`, with `--recurrence.hidden-size` and `--agent-option`. Its
+    `forward(x, state)` takes inputs float (n, input_width) and states float (n, state_width), and returns the outputs
+    (n, width) and the next states. Its attributes `width` and `state_width` are the hidden size by default. An episode starts
+    with the state 0.
+
+    Gradients flow back through as many steps as `--recurrence.sequence-length` says.
+    """
+
+    def __init__(
+        self,
+        make: type[nn.Module],
+        input_width: int,
+        settings: Recurrence,
+        options: dict[str, Any],
+        device: torch.device,
+    ) -> None:
+        """Make the memory.
+
+        Args:
+            make: The class of the cell.
+            input_width: Size of the encoded observations.
+            settings: Hidden size, embedding and sequence length.
+            options: Further arguments of the class.
+            device: Device of the states.
+
+        Raises:
+            ValueError: The class does not take these arguments, or the settings are those of other layers.
+        """
+        nn.Module.__init__(self)
+        if settings.layers != 1 or settings.residual:
+            raise ValueError(
+                "--recurrence.layers and --recurrence.residual have no effect on an agent of your own; use --agent-option"
+            )
+        self.settings, self.device, self.parts = settings, device, 1
+        self.embedding = _embedding(input_width, settings)
+        try:
+            self.cell = make(
+                settings.hidden_size if settings.embedding else input_width, settings.hidden_size, **options
+            )
+        except TypeError as error:
+            raise ValueError(
+                f"{make.__name__} cannot be made of an input width, a hidden size and --agent-option: {error}"
+            ) from error
+        self.width = int(getattr(self.cell, "width", settings.hidden_size))
+        self._state_width = int(getattr(self.cell, "state_width", settings.hidden_size))
+
+    def initial_state(self, num_envs: int) -> RecurrentState:
+        return RecurrentState(torch.zeros((1, 1, num_envs, self._state_width), device=self.device))
+
+    def refresh(self, dtype: torch.dtype) -> None:
+        pass
+
+    def step(self, x: Tensor, state: RecurrentState, reset_mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        hidden = state.hidden[0, 0]
+        if reset_mask is not None:
+            hidden = hidden.masked_fill(reset_mask.unsqueeze(-1), 0.0)
+        with self._float32():
+            y, hidden = self.cell(x.float(), hidden)
+        return y, hidden[None, None]
+
+    def forward(self, x: Tensor, minibatch: RecurrentMinibatch) -> Tensor:
+        hidden, outputs = minibatch.initial_hidden[0, 0], []
+        with self._float32():
+            # Longer sequences come first, so those that have ended are at the end.
+            for step in x.float().split(minibatch.batch_sizes.tolist()):
+                y, hidden = self.cell(step, hidden[: len(step)])
+                outputs.append(y)
+        return torch.cat(outputs)
+
+
+def _embedding(input_width: int, settings: Recurrence) -> nn.Sequential | None:
+    """The fully connected layer before the recurrent layers, if there is one."""
+    if not settings.embedding:
+        return None
+    return nn.Sequential(orthogonal(nn.Linear(input_width, settings.hidden_size)), nn.ReLU())
 
 
 def packed(time: Tensor, env: Tensor, lengths: Tensor, envs: int) -> tuple[Tensor, Tensor]:

@@ -90,7 +90,8 @@ def label(settings: Settings) -> str:
     """Name of an agent and its variations, as in the published curves (where `_lr` marks a different learning rate)."""
     trxl = settings.agent in ("trxl", "gtrxl")
     agents = {"none": "ppo", "stack": f"{settings.model.stack}stack", "position": "pos_enc"}
-    name = agents.get(settings.agent, settings.agent)
+    name = agents.get(settings.agent, settings.agent_name)
+    name += "".join(f"_{option}" for option in settings.agent_option)
     if settings.agent == "gtrxl":
         name += f"_b{settings.transformer.gate_bias:g}"
     if settings.agent in ("gru", "lstm") and settings.recurrence.hidden_size != Recurrence().hidden_size:
@@ -117,7 +118,15 @@ class Experiments:
         # The engine and its threads do not affect learning, and runs of different lengths belong to the same experiment.
         environment = replace(settings.environment, engine="thread", num_threads=0)
         networks = (settings.recurrence, settings.transformer, settings.model)
-        key = (settings.env, settings.agent, settings.bf16, environment, networks, replace(settings.ppo, updates=0))
+        key = (
+            settings.env,
+            settings.agent,
+            settings.agent_option,
+            settings.bf16,
+            environment,
+            networks,
+            replace(settings.ppo, updates=0),
+        )
         if key not in self._found:
             name, taken = label(settings), [one.label for one in self.all() if one.env == settings.env]
             number = sum(other == name or other.startswith(f"{name} (") for other in taken)

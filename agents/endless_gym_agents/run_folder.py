@@ -65,7 +65,7 @@ def opened(settings: Settings, restarts: int = 0) -> Iterator[tuple[str, bool]]:
 
 def _new_folder(settings: Settings) -> Path:
     """Make the folder of a run without a given one; runs that start in the same second get different folders."""
-    name = f"{settings.agent}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = f"{settings.agent_name}-{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     for suffix in itertools.chain([""], (f"-{number}" for number in itertools.count(2))):
         run = Path("runs", settings.env, name + suffix)
         with contextlib.suppress(FileExistsError):

@@ -220,7 +220,7 @@ class Trials:
 
         optuna.logging.set_verbosity(logging.ERROR)
         self.arguments, self.console, base = arguments, console, arguments.settings
-        self.folder = Path(arguments.folder or f"searches/{base.env}/{base.agent}")
+        self.folder = Path(arguments.folder or f"searches/{base.env}/{base.agent_name}")
         limit = 60 * arguments.minutes if arguments.minutes else float("inf")
         self.end = time.monotonic() + limit if end is None else end
         self.postponed: set[int] = set()

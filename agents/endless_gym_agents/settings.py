@@ -7,6 +7,7 @@ follow the hyperparameter table of the paper where possible.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import math
 from dataclasses import dataclass, field
@@ -14,9 +15,11 @@ from operator import attrgetter
 from typing import Any, Literal
 
 from endless_gym.specs import DEFAULT_ENV_ID, spec
+from endless_gym_agents import own
 from endless_gym_agents.metrics import is_finite
 
-AgentName = Literal["gru", "lstm", "trxl", "gtrxl", "none", "stack", "position"]
+#: The agents of the package. Others are classes of your own; see `Settings.agent`.
+AGENTS = ("gru", "lstm", "trxl", "gtrxl", "none", "stack", "position")
 PresetName = Literal["paper", "old", "throughput", "throughput-512", "quick"]
 
 #: Seeds of the training episodes. Evaluation uses seeds from 200,000 on, so its levels are never seen in training.
@@ -195,9 +198,12 @@ class Settings:
 
     env: str = DEFAULT_ENV_ID
     """environment id; `endless list` lists them"""
-    agent: AgentName = "gru"
-    """gru, lstm, trxl (Transformer-XL) or gtrxl (gated Transformer-XL); or a baseline without memory: none, stack (stacked grey
-    frames) or position (encoded step number as an observation)"""
+    agent: str = "gru"
+    """gru, lstm, trxl (Transformer-XL) or gtrxl (gated Transformer-XL); a baseline without memory: none, stack (stacked grey
+    frames) or position (encoded step number as an observation); or a memory of your own: module:Class or file.py:Class, a class
+    as `endless_gym_agents.recurrent.CellMemory` describes"""
+    agent_option: tuple[str, ...] = ()
+    """arguments of the class of an agent of your own, each as NAME=VALUE with a JSON value"""
     preset: PresetName = "paper"
     """defaults of all other settings. paper: the final hyperparameters of the paper; old: those of its previous study;
     throughput: many environments and short rollouts, with gradients through 32 steps instead of the paper's 512;
@@ -253,18 +259,25 @@ class Settings:
         Raises:
             ValueError: A parameter is not NAME=VALUE, or its value is not JSON.
         """
-        options = {}
-        for given in self.environment.option:
-            name, equals, text = given.partition("=")
-            try:
-                options[name] = json.loads(text.lower() if text in ("True", "False") else text)
-            except json.JSONDecodeError:
-                equals = ""
-            if not equals:
-                raise ValueError(
-                    f"--environment.option must be NAME=VALUE with a JSON value, such as 'command_count=[2]', got `{given}`"
-                )
-        return options
+        return _named_values("--environment.option", self.environment.option, "'command_count=[2]'")
+
+    def agent_options(self) -> dict[str, Any]:
+        """The arguments of an agent of your own by name.
+
+        Raises:
+            ValueError: As for `options`.
+        """
+        return _named_values("--agent-option", self.agent_option, "'layers=2'")
+
+    @property
+    def is_own_agent(self) -> bool:
+        """Whether the agent is a class outside this package."""
+        return ":" in self.agent
+
+    @property
+    def agent_name(self) -> str:
+        """The agent's name in tables and folders: for one of your own, that of its class."""
+        return self.agent.rpartition(":")[2]
 
     def validated(self) -> Settings:
         """These settings, validated, with the canonical environment id.
@@ -274,6 +287,16 @@ class Settings:
         """
         env_spec = spec(self.env)
         env_spec.max_episode_steps(self.options())  # raises if the options determine no episode length
+        if self.is_own_agent:
+            own.load("--agent", self.agent)
+        elif self.agent not in AGENTS:
+            near = difflib.get_close_matches(self.agent, AGENTS, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise ValueError(
+                f"--agent must be one of {', '.join(AGENTS)}, or module:Class or file.py:Class, got `{self.agent}`{hint}"
+            )
+        if self.agent_options() and not self.is_own_agent:
+            raise ValueError(f"--agent-option needs an agent of your own, got --agent {self.agent}")
         environment, ppo, transformer = self.environment, self.ppo, self.transformer
         for least, names in _LEAST.items():
             for name in names:
@@ -320,7 +343,8 @@ class Settings:
         # As many environment steps as the paper's run of this agent in this environment.
         steps = paper_run_length(env_spec.id, self.agent) * PAPER_STEPS_PER_UPDATE
         updates = ppo.updates or -(-steps // (environment.num_envs * ppo.steps))
-        return _replace(dataclasses.replace(self, env=env_spec.id), ppo={"updates": updates})
+        agent = own.resolved(self.agent) if self.is_own_agent else self.agent
+        return _replace(dataclasses.replace(self, env=env_spec.id, agent=agent), ppo={"updates": updates})
 
     def positions(self) -> int:
         """Rows of the table of positional encodings, with the default resolved."""
@@ -333,6 +357,24 @@ class Settings:
     def _longest_episode(self) -> int:
         """Longest possible episode in steps; 0 in endless environments and without a step limit."""
         return max(0, spec(self.env).max_episode_steps(self.options())) if is_finite(self.env) else 0
+
+
+def _named_values(flag: str, items: tuple[str, ...], example: str) -> dict[str, Any]:
+    """The values of items NAME=VALUE by name.
+
+    Raises:
+        ValueError: An item is not NAME=VALUE, or its value is not JSON.
+    """
+    values = {}
+    for given in items:
+        name, equals, text = given.partition("=")
+        try:
+            values[name] = json.loads(text.lower() if text in ("True", "False") else text)
+        except json.JSONDecodeError:
+            equals = ""
+        if not equals:
+            raise ValueError(f"{flag} must be NAME=VALUE with a JSON value, such as {example}, got `{given}`")
+    return values
 
 
 def value(settings: Settings, name: str) -> Any:
@@ -422,4 +464,4 @@ def from_dict(values: dict[str, Any]) -> Settings:
         if dataclasses.is_dataclass(kind := part.default_factory):
             values[part.name] = kind(**values[part.name])
     values["environment"] = dataclasses.replace(values["environment"], option=tuple(values["environment"].option))
-    return Settings(**values)
+    return Settings(**values | {"agent_option": tuple(values.get("agent_option", ()))})

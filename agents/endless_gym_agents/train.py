@@ -26,7 +26,7 @@ import torch
 
 from endless_gym import EngineLost
 from endless_gym.episodes import EpisodeOptions
-from endless_gym_agents import checkpoint, command, run_folder
+from endless_gym_agents import checkpoint, command, own, run_folder
 from endless_gym_agents.agent import make_agent
 from endless_gym_agents.clock import Clock
 from endless_gym_agents.environments import Environments
@@ -151,9 +151,8 @@ def train_rank(
         if resumed is None:
             save(settings.keep_checkpoints)
         where = f"{device}" if ranks.size == 1 else f"{ranks.size} ranks"
-        logger.print(
-            f"{settings.env}: {settings.agent}, {agent.num_parameters:,} parameters, on {where}, in {run}; Ctrl-C stops the run"
-        )
+        network = f"{settings.agent_name}, {agent.num_parameters:,} parameters"
+        logger.print(f"{settings.env}: {network}, on {where}, in {run}; Ctrl-C stops the run")
 
         success: str | None = None
         clock, stops = Clock(), False
@@ -263,8 +262,9 @@ def check_resumable(settings: Settings, before: Settings) -> None:
     # The engine and its threads may change, and so may all of PPO except whether the auxiliary heads exist.
     had = before.environment
     environment = dataclasses.replace(settings.environment, engine=had.engine, num_threads=had.num_threads)
-    settings = dataclasses.replace(settings, environment=environment)
-    for name in ("env", "agent", "preset", "seed", "environment", "model", "recurrence", "transformer"):
+    agent = own.resolved(settings.agent) if settings.is_own_agent else settings.agent
+    settings = dataclasses.replace(settings, environment=environment, agent=agent)
+    for name in ("env", "agent", "agent_option", "preset", "seed", "environment", "model", "recurrence", "transformer"):
         given, had = getattr(settings, name), getattr(before, name)
         if given != had:
             raise ValueError(
