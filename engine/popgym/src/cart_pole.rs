@@ -170,26 +170,36 @@ impl Task for CartPole {
     }
 
     fn expert(id: &str) -> Option<Box<dyn Expert>> {
-        let family = place(&IDS.concat(), id) / 3;
-        (family == 0).then(|| Box::new(Differences::default()) as Box<dyn Expert>)
+        match place(&IDS.concat(), id) / 3 {
+            0 => Some(Box::new(Balance::default())),
+            1 => Some(Box::new(Balance { sees_velocities: true, ..Balance::default() })),
+            _ => None,
+        }
     }
 }
 
-/// Estimates velocities from differences of positions, and pushes to the side to which the pole will fall.
+/// Pushes to the side to which the pole will fall. Estimates velocities from positions, or positions from velocities.
 #[derive(Default)]
-struct Differences {
-    last: Option<[f32; 2]>,
+struct Balance {
+    sees_velocities: bool,
+    /// The last positions.
+    last: Option<[f64; 2]>,
 }
 
-impl Expert for Differences {
+impl Expert for Balance {
     fn reset(&mut self) {
         self.last = None;
     }
 
     fn act(&mut self, features: &[f32], _: &[f32], action: &mut [i32]) {
-        let now = [features[0], features[1]];
-        let [x, angle] = self.last.replace(now).unwrap_or(now);
-        let (velocity, angular_velocity) = ((now[0] - x) / SECONDS as f32, (now[1] - angle) / SECONDS as f32);
-        action[0] = i32::from(now[1] + 0.25 * angular_velocity + 0.02 * now[0] + 0.05 * velocity > 0.0);
+        let seen = [f64::from(features[0]), f64::from(features[1])];
+        // The first observation shows positions in any case.
+        let last = self.last.unwrap_or(seen);
+        let ([x, angle], [velocity, angular_velocity]) = match self.last {
+            Some(_) if self.sees_velocities => ([0, 1].map(|axis| last[axis] + SECONDS * seen[axis]), seen),
+            _ => (seen, [0, 1].map(|axis| (seen[axis] - last[axis]) / SECONDS)),
+        };
+        self.last = Some([x, angle]);
+        action[0] = i32::from(angle + 0.3 * angular_velocity + 0.02 * x + 0.05 * velocity > 0.0);
     }
 }

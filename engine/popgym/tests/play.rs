@@ -1,0 +1,152 @@
+//! Tests of all ids in pools: experts, snapshots, threads, and forged states.
+
+use endless_gym_core::batch::{Batch, Block, zeroed};
+use endless_gym_core::envs::{ActionSpace, EnvSpec};
+use endless_gym_core::pool::{Autoreset, Experts, Pool, PoolConfig, ResetRequest, Seeding, Threads};
+use endless_gym_core::random::Generator;
+use endless_gym_popgym::popgym;
+
+struct Player {
+    pool: Pool,
+    blocks: Vec<Block>,
+}
+
+impl Player {
+    /// Environments whose first episodes have seeds from `seed` on.
+    fn new(id: &str, num_envs: usize, threads: usize, seed: u64) -> Self {
+        let seeding = Seeding::Continue { seed: Some(1) };
+        let config = PoolConfig { features: true, frames: None, seeding, ..PoolConfig::new(id, num_envs) };
+        let pool = Pool::new(popgym(), &config, &Threads::new(threads).unwrap()).unwrap();
+        let blocks = zeroed(pool.layout().blocks());
+        let mut player = Player { pool, blocks };
+        player.pool.reset(ResetRequest::Seed(seed), &mut player.blocks).unwrap();
+        player
+    }
+
+    fn step(&mut self, actions: &[i32]) {
+        self.pool.step(actions, &mut self.blocks).unwrap();
+    }
+
+    fn batch(&self) -> Batch<'_> {
+        Batch::new(self.pool.layout(), &self.blocks)
+    }
+}
+
+fn actions(spec: &EnvSpec, num_envs: usize, random: &mut Generator) -> Vec<i32> {
+    let one = |random: &mut Generator| -> Vec<i32> {
+        match &spec.action_space {
+            ActionSpace::Box { low, .. } => low
+                .iter()
+                .map(|low| (random.uniform((*low).into(), -f64::from(*low)) as f32).to_bits().cast_signed())
+                .collect(),
+            space => space.branches().iter().map(|choices| random.integers(0, (*choices).into()) as i32).collect(),
+        }
+    };
+    (0..num_envs).flat_map(|_| one(random)).collect()
+}
+
+#[test]
+fn a_snapshot_continues_identically_and_threads_change_nothing() {
+    const ENVS: usize = 64;
+    for spec in popgym().specs() {
+        let mut random = Generator::from_seed(3);
+        let (mut one, mut two) = (Player::new(spec.id, ENVS, 1, 5), Player::new(spec.id, ENVS, 2, 5));
+        for step in 0..230 {
+            if step == 30 {
+                // Another pool, whose environments have played other episodes.
+                let mut restored = Player::new(spec.id, ENVS, 2, 900);
+                (0..7).for_each(|_| restored.step(&actions(spec, ENVS, &mut random)));
+                for env in 0..ENVS {
+                    restored.pool.restore(env, &one.pool.snapshot(env).unwrap()).unwrap();
+                }
+                two = restored;
+            }
+            let actions = actions(spec, ENVS, &mut random);
+            one.step(&actions);
+            two.step(&actions);
+            assert!(one.batch().bytes() == two.batch().bytes(), "{}, step {step}", spec.id);
+        }
+        assert!(one.batch().bytes() != Player::new(spec.id, ENVS, 1, 5).batch().bytes(), "{}", spec.id);
+    }
+}
+
+#[test]
+fn seeds_and_actions_determine_an_episode_whatever_was_played_before() {
+    for spec in popgym().specs() {
+        let (mut fresh, mut used) = (Player::new(spec.id, 4, 1, 5), Player::new(spec.id, 4, 1, 77));
+        let mut random = Generator::from_seed(4);
+        (0..150).for_each(|_| used.step(&actions(spec, 4, &mut random)));
+        used.pool.reset(ResetRequest::Seed(5), &mut used.blocks).unwrap();
+        for step in 0..300 {
+            assert!(fresh.batch().bytes() == used.batch().bytes(), "{}, step {step}", spec.id);
+            let actions = actions(spec, 4, &mut random);
+            fresh.step(&actions);
+            used.step(&actions);
+        }
+    }
+}
+
+#[test]
+fn a_snapshot_with_a_changed_byte_is_refused_or_plays_on() {
+    for spec in popgym().specs() {
+        let mut random = Generator::from_seed(6);
+        let mut player = Player::new(spec.id, 1, 1, 8);
+        player.step(&actions(spec, 1, &mut random));
+        let snapshot = player.pool.snapshot(0).unwrap();
+        for _ in 0..400 {
+            let mut forged = snapshot.clone();
+            let at = random.integers(0, forged.len() as i64) as usize;
+            forged[at] = random.integers(0, 256) as u8;
+            if player.pool.restore(0, &forged).is_ok() {
+                (0..40).for_each(|_| player.step(&actions(spec, 1, &mut random)));
+            }
+        }
+    }
+}
+
+/// The mean return of experts in so many episodes.
+fn expert_return(id: &str, episodes: usize) -> f64 {
+    let mut player = Player::new(id, episodes, 1, 0);
+    let mut experts = Experts::new(popgym(), id, episodes, Autoreset::NextStep).unwrap();
+    let mut actions = vec![0; episodes];
+    let mut returns: Vec<Option<f64>> = vec![None; episodes];
+    while returns.iter().any(Option::is_none) {
+        experts.act(&player.batch(), &mut actions).unwrap();
+        player.step(&actions);
+        let batch = player.batch();
+        for (env, first) in returns.iter_mut().enumerate() {
+            if batch.terminated()[env] + batch.truncated()[env] > 0 {
+                first.get_or_insert(batch.episode_return()[env]);
+            }
+        }
+    }
+    returns.iter().flatten().sum::<f64>() / episodes as f64
+}
+
+#[test]
+fn experts_reach_what_can_be_reached() {
+    let ids: Vec<_> = popgym().specs().map(|spec| spec.id).collect();
+    let mut played = Vec::new();
+    // A family, and the least mean return for each difficulty.
+    for (family, least) in [
+        ("Autoencode", [1.0; 3]),
+        ("Concentration", [0.5, 0.5, 0.5]),
+        ("CountRecall", [1.0; 3]),
+        ("HigherLower", [0.5; 3]),
+        ("PositionOnlyCartPole", [1.0; 3]),
+        ("RepeatFirst", [1.0; 3]),
+        ("RepeatPrevious", [1.0; 3]),
+        ("VelocityOnlyCartpole", [1.0; 3]),
+    ] {
+        for (level, least) in ["Easy", "Medium", "Hard"].into_iter().zip(least) {
+            let id = format!("popgym-{family}{level}-v0");
+            let found = expert_return(&id, 100);
+            println!("{id}: {found}");
+            assert!(found > least - 1e-9, "{id}: {found}");
+            played.push(id);
+        }
+    }
+    for id in ids {
+        assert_eq!(popgym().expert(id).is_ok(), played.iter().any(|played| played == id), "{id}");
+    }
+}
