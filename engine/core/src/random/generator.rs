@@ -157,9 +157,17 @@ impl Generator {
     /// `shuffle(items)`, and with it `permutation`. Draws nothing for fewer than two items.
     #[inline]
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
-        for last in (1..items.len()).rev() {
-            let other = self.up_to(last as u32) as usize;
-            items.swap(last, other);
+        let mut last = items.len().saturating_sub(1);
+        for _ in 0..items.len().saturating_mul(MAX_REDRAWS as usize) {
+            if last == 0 {
+                break;
+            }
+            // numpy draws as many bits as `last` has, until they are in range. A draw that is not swaps the item with itself: a branch
+            // would often be predicted wrongly.
+            let drawn = (self.next_u32() & u32::MAX >> (last as u32).leading_zeros()) as usize;
+            let is_in_range = drawn <= last;
+            items.swap(last, if is_in_range { drawn } else { last });
+            last -= usize::from(is_in_range);
         }
     }
 
@@ -181,19 +189,6 @@ impl Generator {
             let other = self.integers(0, last as i64 + 1) as usize;
             indices.swap(last, other);
         }
-    }
-
-    /// A uniform number in `0..=max`: the lowest bits of 32-bit draws that suffice for it, until they are in range.
-    #[inline]
-    fn up_to(&mut self, max: u32) -> u32 {
-        let mask = u32::MAX.checked_shr(max.leading_zeros()).unwrap_or_default();
-        for _ in 0..MAX_REDRAWS {
-            let value = self.next_u32() & mask;
-            if value <= max {
-                return value;
-            }
-        }
-        0
     }
 
     /// A uniform number in `0..count`, for a count of 2 or more, from as many bits as numpy uses.
