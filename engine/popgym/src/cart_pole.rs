@@ -47,6 +47,7 @@ pub struct Parameters {
     /// Standard deviation of the noise.
     noise: Option<f64>,
     length: u32,
+    reward: f64,
     low: f64,
     high: f64,
 }
@@ -126,10 +127,12 @@ impl Task for CartPole {
     fn parameters(given: &ResetParameters) -> Parameters {
         let at = place(&IDS.concat(), given.id());
         let (family, level) = (at / 3, at % 3);
+        let length = if family == 2 { LENGTHS[0] } else { LENGTHS[level] };
         Parameters {
             velocities: family == 1,
             noise: (family == 2).then_some(DEVIATIONS[level]),
-            length: if family == 2 { LENGTHS[0] } else { LENGTHS[level] },
+            length,
+            reward: 1.0 / f64::from(length),
             low: given.float("low", -0.05),
             high: given.float("high", 0.05),
         }
@@ -156,7 +159,7 @@ impl Task for CartPole {
         self.angular_velocity += SECONDS * angular_acceleration;
         let fails = self.x < -MAX_X || self.x > MAX_X || self.angle < -MAX_ANGLE || self.angle > MAX_ANGLE;
         // Only steps after the end fail twice.
-        let reward = if fails && self.has_failed { -1.0 } else { 1.0 / f64::from(parameters.length) };
+        let reward = if fails && self.has_failed { -1.0 } else { parameters.reward };
         self.has_failed |= fails;
         self.steps = self.steps.saturating_add(1);
         let observed =

@@ -19,17 +19,25 @@ pub struct Parameters {
     failure: f64,
 }
 
-/// The state of an episode. Cards on the table are bits.
+/// The state of an episode.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Concentration {
     deck: Deck,
-    /// Cards of found pairs.
+    /// What the observation shows of each card.
+    view: Vec<u8>,
+    /// Cards of found pairs, as bits.
     found: u128,
     /// The card that waits for a second one.
     first: Option<u8>,
-    /// Cards that the observation shows.
-    shown: u128,
+    /// The one or two cards that the last step showed.
+    shown: [u8; 2],
     steps: u32,
+}
+
+impl Concentration {
+    fn is_found(&self, card: u8) -> bool {
+        self.found >> card & 1 == 1
+    }
 }
 
 impl Task for Concentration {
@@ -67,24 +75,33 @@ impl Task for Concentration {
 
     fn reset(&mut self, parameters: &Parameters, random: &mut Generator) {
         self.deck.shuffle(parameters.decks, parameters.face, random);
-        (self.found, self.first, self.shown, self.steps) = (0, None, 0, 0);
+        self.view.clear();
+        self.view.resize(self.deck.cards().len(), parameters.face.count() as u8);
+        (self.found, self.first, self.shown, self.steps) = (0, None, [0; 2], 0);
     }
 
     fn step(&mut self, parameters: &Parameters, action: &[i32], _: &mut Generator) -> Transition {
         let card = action[0] as u8;
-        let bit = |card: u8| 1_u128 << card;
         let first = self.first.take();
-        self.shown = self.found | bit(card) | first.map_or(0, bit);
+        for card in self.shown {
+            if !self.is_found(card) {
+                self.view[usize::from(card)] = parameters.face.count() as u8;
+            }
+        }
+        self.shown = [first.unwrap_or(card), card];
+        for card in self.shown {
+            self.view[usize::from(card)] = self.deck.cards()[usize::from(card)];
+        }
+        let is_found = self.is_found(card);
         self.steps = self.steps.saturating_add(1);
-        let is_found = self.found & bit(card) != 0;
         let mut reward = 0.0;
         match first {
             None if is_found => reward = parameters.failure,
             None => self.first = Some(card),
             Some(first) => {
-                let face = |card: u8| self.deck.cards()[usize::from(card)];
-                if !is_found && first != card && face(first) == face(card) {
-                    self.found = self.shown;
+                let is_pair = self.view[usize::from(first)] == self.view[usize::from(card)];
+                if is_pair && !is_found && first != card {
+                    self.found |= 1 << first | 1 << card;
                     reward = parameters.pair;
                 } else {
                     reward = 2.0 * parameters.failure;
@@ -95,18 +112,17 @@ impl Task for Concentration {
         Transition { reward, terminated, truncated: self.steps >= parameters.length }
     }
 
-    fn features(&self, parameters: &Parameters, out: &mut [f32]) {
-        let face_down = parameters.face.count() as f32;
-        for (number, (out, card)) in out.iter_mut().zip(self.deck.cards()).enumerate() {
-            *out = if self.shown >> number & 1 == 1 { (*card).into() } else { face_down };
+    fn features(&self, _: &Parameters, out: &mut [f32]) {
+        for (out, card) in out.iter_mut().zip(&self.view) {
+            *out = (*card).into();
         }
     }
 
     fn is_valid(&self, parameters: &Parameters) -> bool {
         let cards = parameters.decks * DECK;
         self.deck.is_valid(parameters.decks, parameters.face)
-            && (self.found | self.shown) >> cards == 0
-            && self.first.is_none_or(|card| usize::from(card) < cards)
+            && self.view.len() == cards
+            && self.shown.into_iter().chain(self.first).all(|card| usize::from(card) < cards)
     }
 
     fn expert(_: &str) -> Option<Box<dyn Expert>> {
