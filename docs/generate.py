@@ -27,8 +27,13 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def family(name: str) -> list[Spec]:
-    """The environments whose ids contain a name."""
-    return [spec for spec in SPECS if name in spec["id"]]
+    """The environments whose ids contain a name, in any case."""
+    return [spec for spec in SPECS if name.lower() in spec["id"].lower()]
+
+
+def memory_gym() -> list[Spec]:
+    """The environments of Memory Gym."""
+    return [spec for spec in SPECS if not spec["id"].startswith("popgym-")]
 
 
 def merged(specs: list[Spec], rows: Callable[[Spec], Iterable[tuple[str, ...]]]) -> list[tuple[str, ...]]:
@@ -37,26 +42,65 @@ def merged(specs: list[Spec], rows: Callable[[Spec], Iterable[tuple[str, ...]]])
     for spec in specs:
         for row in rows(spec):
             ids.setdefault(row, []).append(short(spec))
-    return [("all" if len(names) == len(specs) else ", ".join(names), *row) for row, names in ids.items()]
+    return [("all" if len(names) == len(specs) else levels(names), *row) for row, names in ids.items()]
+
+
+def levels(names: list[str]) -> str:
+    """Ids, with the name of the family in place of its three difficulties."""
+    return re.sub(r"(\w+)Easy, \1Medium, \1Hard", r"\1", ", ".join(names))
 
 
 def short(spec: Spec) -> str:
-    """An id without its version."""
-    return spec["id"].removesuffix("-v0")
+    """An id without its version and POPGym's prefix."""
+    return spec["id"].removesuffix("-v0").removeprefix("popgym-")
 
 
 def overview(_: str) -> str:
-    """Environments with links to their sections."""
+    """Memory Gym's environments with links to their sections."""
     rows = []
-    for spec in SPECS:
+    for spec in memory_gym():
         name = re.sub(r"Endless-|B?(-Grid)?-v0", "", spec["id"])
         page = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
-        ((kind, choices),) = spec["action_space"].items()
         link = f"[`{spec['id']}`]({page}.md#{spec['id'].lower()})"
-        rows.append(
-            (link, f"`{kind}({choices})`".replace(" ", "\N{NO-BREAK SPACE}"), spec["render_fps"], spec["summary"])
-        )
+        rows.append((link, space(spec["action_space"]), spec["render_fps"], spec["summary"]))
     return table(["id", "actions", "frames per second", "task"], rows)
+
+
+def space(described: dict[str, Any]) -> str:
+    """A space as Gymnasium writes it."""
+
+    def text(described: dict[str, Any]) -> str:
+        ((kind, value),) = described.items()
+        if kind == "Tuple":
+            return f"Tuple({', '.join(map(text, value))})"
+        if kind == "Box":
+            bounds = [[value[end], sign] for end, sign in (("low", "-inf"), ("high", "inf"))]
+            low, high = (sorted({sign if each is None else f"{each:.3g}" for each in given}) for given, sign in bounds)
+            if len(low) == len(high) == 1:
+                return f"Box({low[0]}, {high[0]}, ({len(value['low'])},))"
+            return f"Box({[round(each, 3) for each in value['low']]}, {[round(each, 3) for each in value['high']]})"
+        if kind == "MultiDiscrete" and len(set(value)) == 1 < len(value) - 2:
+            return f"MultiDiscrete([{value[0]}] * {len(value)})"
+        return f"{kind}({value})"
+
+    return f"`{text(described)}`".replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def variants(name: str) -> str:
+    """The ids of a family with their spaces."""
+    return table(
+        ["id", "actions", "observation"],
+        ((f"`{each['id']}`", space(each["action_space"]), space(each["observation_space"])) for each in family(name)),
+    )
+
+
+def choices(name: str) -> str:
+    """The meanings of an action's numbers in a family with one branch."""
+    (branch,) = family(name)[0]["actions"]
+    return table(
+        ["action", "name", "meaning"],
+        ((number, each["name"], each["description"]) for number, each in enumerate(branch["choices"])),
+    )
 
 
 def actions(_: str) -> str:
@@ -67,7 +111,7 @@ def actions(_: str) -> str:
             place = f"`action[{branch}]`" if len(spec["actions"]) > 1 else "`action`"
             yield place, *(f"{choice['name']}: {choice['description']}" for choice in described["choices"])
 
-    found = merged(SPECS, rows)
+    found = merged(memory_gym(), rows)
     most = max((row[0] for row in found), key=len)
     numbers = [str(number) for number in range(max(map(len, found)) - 2)]
     rest = [
@@ -84,6 +128,9 @@ def parameters(name: str) -> str:
         for each in spec["parameters"]:
             key = (f"`{each['name']}`", allowed(each), each["description"])
             found.setdefault(key, {})[short(spec)] = f"`{json.dumps(each['default'])}`"
+    if all(len(defaults) == len(specs) and len(set(defaults.values())) == 1 for defaults in found.values()):
+        same = ((*key[:2], next(iter(defaults.values())), key[2]) for key, defaults in found.items())
+        return table(["reset parameter", "allowed", "default", "meaning"], same)
     rows = [
         (parameter, limits, *(defaults.get(short(spec), "") for spec in specs), meaning)
         for (parameter, limits, meaning), defaults in found.items()
@@ -109,12 +156,16 @@ def infos(name: str) -> str:
 
 
 def ground_truth(name: str) -> str:
-    """The numbers of `info["ground_truth"]`, which the endless id of a family has."""
-    columns = next(spec["ground_truth"] for spec in family(name) if spec["ground_truth"])
-    return table(
-        ["index", "name", "meaning"],
-        ((place, f"`{each['name']}`", each["description"]) for place, each in enumerate(columns)),
-    )
+    """The numbers of `info["ground_truth"]`, of the id of a family that has most."""
+    columns = max((spec["ground_truth"] for spec in family(name)), key=len)
+    places: dict[tuple[str, str], list[int]] = {}
+    for place, each in enumerate(columns):
+        places.setdefault((re.sub(r"\d+", "{}", each["name"]), each["description"]), []).append(place)
+    rows = []
+    for (template, meaning), same in places.items():
+        names = f"`{ranges(template, [columns[place]['name'] for place in same])}`"
+        rows.append((f"{same[0]} to {same[-1]}" if len(same) > 1 else same[0], names, meaning))
+    return table(["index", "name", "meaning"], rows)
 
 
 def features(name: str) -> str:
@@ -209,6 +260,8 @@ def message(text: str, arguments: str, fields: str) -> str:
 HELP = tomllib.loads((ROOT / "docs/error_help.toml").read_text())
 PARTS = {
     "environments": overview,
+    "variants": variants,
+    "choices": choices,
     "actions": actions,
     "parameters": parameters,
     "infos": infos,
@@ -222,20 +275,23 @@ def main() -> None:
     """Write or check all pages."""
     SPECS.extend(json.load(sys.stdin))
     pages = {file: file.read_text() for file in sorted((ROOT / "docs").rglob("*.md"))}
-    described = " ".join(pages.values())
-    missing = [spec["id"] for spec in SPECS if f"## {spec['id']}\n" not in described]
+    part = re.compile(r"(<!-- generated: ([\w-]+) ?([\w ]*?) -->\n).*?(<!-- end -->)", re.S)
+    new = {
+        file: part.sub(lambda found: f"{found[1]}\n{PARTS[found[2]](found[3])}\n\n{found[4]}", text)
+        for file, text in pages.items()
+    }
+    described = " ".join(new.values())
+    # A section, or a row of a table.
+    ways = ("## {}\n", "\n| `{}` |")
+    missing = [spec["id"] for spec in SPECS if not any(way.format(spec["id"]) in described for way in ways)]
     listed = set(" ".join(re.findall(r"<!-- generated: errors ([\w ]+) -->", described)).split())
     missing += [name for name, found in error_types().items() if found and name not in listed]
     if missing or (missing := list(HELP.keys() - error_types().keys())):
         raise SystemExit(f"docs/ does not describe, or describes in vain: {', '.join(missing)}")
-    stale = []
-    for file, text in pages.items():
-        part = re.compile(r"(<!-- generated: ([\w-]+) ?([\w ]*?) -->\n).*?(<!-- end -->)", re.S)
-        new = part.sub(lambda found: f"{found[1]}\n{PARTS[found[2]](found[3])}\n\n{found[4]}", text)
-        if new != text:
-            stale.append(str(file.relative_to(ROOT)))
-            if "--check" not in sys.argv:
-                file.write_text(new)
+    stale = [str(file.relative_to(ROOT)) for file, text in pages.items() if new[file] != text]
+    if "--check" not in sys.argv:
+        for file, text in new.items():
+            file.write_text(text)
     if stale:
         print("stale, run `cargo xtask docs --write`:" if "--check" in sys.argv else "written:", ", ".join(stale))
         sys.exit("--check" in sys.argv)

@@ -3,9 +3,9 @@
 //!
 //! This crate re-exports the public API of its member crates:
 //!
-//! - [`memory_gym`]: the registry of the ten ids; [`envs`]: spaces, reset parameters, scripted experts, and the trait
-//!   [`Task`](envs::Task) for custom environments, which use [`raster`] to draw and [`random`] for random numbers;
-//!   [`pool`]: many environments in this process; [`batch`]: what a step returns; [`trace`]: replay of recorded
+//! - [`environments`]: the registry of all ids, those of [`memory_gym`] and [`popgym`]; [`envs`]: spaces, reset
+//!   parameters, scripted experts, and the trait [`Task`](envs::Task) for custom environments, which use [`raster`] to
+//!   draw and [`random`] for random numbers; [`pool`]: many environments in this process; [`batch`]: what a step returns; [`trace`]: replay of recorded
 //!   episodes. These are in `endless-gym-core`, which needs no operating system services and builds for WebAssembly.
 //! - [`service`]: an engine, its trainer and observers, as processes that share memory. This is `endless-gym-service`.
 //!
@@ -15,9 +15,21 @@
 
 use std::io::Write;
 use std::process::ExitCode;
+use std::sync::LazyLock;
 
 pub use endless_gym_memory_gym::{DEFAULT_ENV_ID, memory_gym};
 pub use endless_gym_popgym::popgym;
+
+/// The registry of the program `endless`: the ids of [`memory_gym`], then those of [`popgym`].
+///
+/// ```
+/// assert_eq!(endless_gym::environments().specs().count(), 58);
+/// ```
+pub fn environments() -> &'static pool::Registry {
+    static REGISTRY: LazyLock<pool::Registry> =
+        LazyLock::new(|| endless_gym_popgym::register(memory_gym().clone()).expect("the suites have different ids"));
+    &REGISTRY
+}
 
 /// Runs the program `endless` with the environments of `registry` and the arguments of this process. In a program with
 /// custom environments, it is all that `main` needs:

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    endless_gym::program(endless_gym::memory_gym())
+    endless_gym::program(endless_gym::environments())
 }
