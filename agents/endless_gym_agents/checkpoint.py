@@ -127,6 +127,30 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> Checkpoint:
     return Checkpoint(settings, agent, state["update"], state["steps"], state)
 
 
+def start_from(agent: Agent, path: str | Path) -> str:
+    """Copy the weights of a checkpoint into an agent. The encoder and the heads keep their values where the shapes differ.
+
+    Returns:
+        A line of text that says which weights were copied.
+
+    Raises:
+        FileNotFoundError: As for `load`.
+        ValueError: As for `load`, or the memories or the layers after them differ.
+    """
+    own = agent.state_dict()
+    given = load(path).agent.state_dict()
+    fitting = {name: part for name, part in given.items() if name in own and own[name].shape == part.shape}
+    missing = sorted(own.keys() - fitting.keys())
+    core = [name for name in missing if name.startswith(("memory.", "body."))]
+    if core or not fitting:
+        raise ValueError(
+            f"--init-from {path}: its {', '.join(core)} do not fit this agent's; use the same --agent and sizes"
+        )
+    agent.load_state_dict(own | fitting)
+    others = f"; newly initialised: {', '.join(missing)}" if missing else ""
+    return f"started from {len(fitting)} of {len(own)} tensors of {path}{others}"
+
+
 def read_settings(run: str | Path) -> Settings:
     """Read the settings of the run in folder `run`.
 

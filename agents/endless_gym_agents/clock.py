@@ -35,3 +35,11 @@ class Clock:
         """Return the seconds by phase since the last call, and start again from 0."""
         taken, self.seconds = dict(self.seconds), defaultdict(float)
         return taken
+
+
+def duration(seconds: float) -> str:
+    """A duration for a line of text, such as `2.5 hours`."""
+    for unit, size in (("days", 86_400.0), ("hours", 3_600.0), ("minutes", 60.0)):
+        if seconds >= size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} seconds"

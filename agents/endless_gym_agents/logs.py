@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 import secrets
+from collections import deque
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from endless_gym_agents.clock import duration
 from endless_gym_agents.command import Terminal
 from endless_gym_agents.settings import Settings, to_dict
 
@@ -18,31 +20,37 @@ from endless_gym_agents.settings import Settings, to_dict
 PROGRESS = "progress.jsonl"
 #: Number of most recent episodes over which means are computed.
 RECENT = 100
+#: Seconds from which a run is announced as long: a day.
+_LONG = 86_400.0
 
 
 class Logger:
     """Writes the metrics of each update."""
 
-    def __init__(self, run: Path, settings: Settings, update: int = 0) -> None:
+    def __init__(self, run: Path, settings: Settings, update: int = 0, steps: int = 0) -> None:
         """Open the logs of a run.
 
         Args:
             run: Folder of the run.
             settings: Settings of the run.
             update: Number of updates so far; entries of later updates are removed.
+            steps: Number of environment steps so far.
         """
         from torch.utils.tensorboard import SummaryWriter
 
         self.console = Terminal(highlight=False)
         self._updates = settings.ppo.updates
+        self._recent: deque[float] = deque(maxlen=20)
+        self._has_warned = False
         progress = run / PROGRESS
         if progress.exists():
             kept = [row for row in read_progress(run) if row["update"] <= update]
             progress.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
         self._progress = progress.open("a")
-        self._board: Any = SummaryWriter(str(run), purge_step=update + 1)  # type: ignore[no-untyped-call]
+        # The axis is environment steps, in which runs of different settings can be compared.
+        self._board: Any = SummaryWriter(str(run), purge_step=steps + 1)  # type: ignore[no-untyped-call]
         rows = "\n".join(f"|{name}|{value}|" for name, value in _flat(to_dict(settings)))
-        self._board.add_text("settings", f"|setting|value|\n|-|-|\n{rows}", update)
+        self._board.add_text("settings", f"|setting|value|\n|-|-|\n{rows}", steps)
         self._wandb: Any = _weights_and_biases(run, settings, self.console) if settings.wandb else None
 
     def update(self, metrics: dict[str, Any], seconds: dict[str, float]) -> None:
@@ -56,14 +64,16 @@ class Logger:
         numbers = {name: None if math.isnan(value) else value for name, value in row.items()}
         self._progress.write(json.dumps(numbers) + "\n")
         self._progress.flush()
-        step = metrics["update"]
+        update, steps = metrics["update"], metrics["steps"]
         for name, value in row.items():
             if name not in ("update", "steps"):
-                self._board.add_scalar(name if "/" in name else f"learning/{name}", value, step)
-        self._board.add_scalar("steps", metrics["steps"], step)
+                self._board.add_scalar(name if "/" in name else f"learning/{name}", value, steps)
+        self._board.add_scalar("update", update, steps)
         if self._wandb is not None:
-            self._wandb.log(row, step=step)
+            self._wandb.log(row, step=steps)
         total = sum(seconds.values()) or 1.0
+        self._recent.append(total)
+        left = (self._updates - update) * sum(self._recent) / len(self._recent)
         shares = " ".join(f"{name} {value / total:4.0%}" for name, value in seconds.items())
         reward = metrics.get("episode/reward")
         episodes = (
@@ -72,9 +82,17 @@ class Logger:
             else (f"reward {reward:.4f} length {metrics['episode/length']:.1f}")
         )
         self.console.print(
-            f"[bold]{step:>5}[/]/{self._updates} {metrics['steps']:>11,} steps {metrics['steps_per_second']:>8,.0f}/s  "
+            f"[bold]{update:>5}[/]/{self._updates} {steps:>11,} steps {metrics['steps_per_second']:>8,.0f}/s "
+            f"{duration(left):>12} left  "
             f"[green]{episodes}[/]  loss {metrics['loss']:.4f} entropy {metrics['entropy']:.3f}  [dim]{shares}[/]"
         )
+
+        if not self._has_warned and left > _LONG:
+            self._has_warned = True
+            self.print(
+                f"at this speed the run takes {duration(left)} more; shorter: --preset quick (minutes), "
+                "--total-steps, or a GPU"
+            )
 
     def print(self, text: str) -> None:
         """Print a line on the terminal."""

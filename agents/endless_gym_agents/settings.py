@@ -37,7 +37,7 @@ _LEAST = {
         *("model.stack", "model.vector-width", "model.head-width", "checkpoint-interval"),
     ),
     0: (
-        *("threads", "ppo.updates", "environment.num-threads"),
+        *("threads", "total-steps", "ppo.updates", "environment.num-threads"),
         *("model.body-width", "transformer.positions", "transformer.window"),
     ),
 }
@@ -226,6 +226,11 @@ class Settings:
     """folder of the run; empty for runs/ENV/AGENT-SEED-TIME"""
     resume: str = ""
     """resume the run in this folder from its last checkpoint; its settings are the defaults of the other flags"""
+    init_from: str = ""
+    """start from the weights of this checkpoint, or of the last one of the run in this folder, for transfer and curricula;
+    weights whose shapes differ, as those of another action space, keep their initial values. The optimizer is new"""
+    total_steps: int = 0
+    """environment steps of the run, rounded up to a whole update; replaces --ppo.updates"""
     checkpoint_interval: int = 100
     """updates between two checkpoints; the last update always writes a checkpoint"""
     checkpoint_minutes: float = 10.0
@@ -341,10 +346,12 @@ class Settings:
                 f"{transformer.positional_encoding}"
             )
         # As many environment steps as the paper's run of this agent in this environment.
-        steps = paper_run_length(env_spec.id, self.agent) * PAPER_STEPS_PER_UPDATE
-        updates = ppo.updates or -(-steps // (environment.num_envs * ppo.steps))
+        steps = self.total_steps or paper_run_length(env_spec.id, self.agent) * PAPER_STEPS_PER_UPDATE
+        updates = (0 if self.total_steps else ppo.updates) or -(-steps // (environment.num_envs * ppo.steps))
         agent = own.resolved(self.agent) if self.is_own_agent else self.agent
-        return _replace(dataclasses.replace(self, env=env_spec.id, agent=agent), ppo={"updates": updates})
+        return _replace(
+            dataclasses.replace(self, env=env_spec.id, agent=agent, total_steps=0), ppo={"updates": updates}
+        )
 
     def positions(self) -> int:
         """Rows of the table of positional encodings, with the default resolved."""

@@ -108,6 +108,7 @@ def train_rank(
         agent = make_agent(settings, environments.spec, device)
         if settings.compile:
             agent.compile_parts()
+        started_from = checkpoint.start_from(agent, settings.init_from) if settings.init_from and not resumed else ""
         optimizer = make_optimizer(agent, ppo.learning_rate)
         collector = RolloutCollector(agent, environments, ppo.steps, generators["actions"], ranks)
         update, steps, saved, saved_at = 0, 0, resumed["update"] if resumed else 0, started
@@ -144,7 +145,7 @@ def train_rank(
             }
             checkpoint.save(run, state, keep)
 
-        logger = Logger(run, settings, update) if ranks.is_first else SilentLogger()
+        logger = Logger(run, settings, update, steps) if ranks.is_first else SilentLogger()
         # Written only after everything above has succeeded. A resumed run keeps its changed settings.
         if ranks.is_first:
             (run / checkpoint.SETTINGS).write_text(json.dumps(to_dict(settings), indent=1) + "\n")
@@ -153,6 +154,9 @@ def train_rank(
         where = f"{device}" if ranks.size == 1 else f"{ranks.size} ranks"
         network = f"{settings.agent_name}, {agent.num_parameters:,} parameters"
         logger.print(f"{settings.env}: {network}, on {where}, in {run}; Ctrl-C stops the run")
+
+        if started_from:
+            logger.print(started_from)
 
         success: str | None = None
         clock, stops = Clock(), False

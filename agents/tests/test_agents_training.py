@@ -196,11 +196,13 @@ def test_run_can_be_resumed_from_update_0(tmp_path: Path) -> None:
     assert len(progress(run)) == 1
     (run / "checkpoints" / "last.pt").unlink()
     os.link(run / "checkpoints" / "update-000000.pt", run / "checkpoints" / "last.pt")
+    # TensorBoard orders its files by their names, which contain the second and a number.
+    time.sleep(1 - time.time() % 1)
     train(parse(["--resume", str(run)]))
     assert progress(run) == progress(train(small("gru", tmp_path / "through", 2)))
     board = EventAccumulator(str(run))
     board.Reload()
-    assert [event.step for event in board.Scalars("steps")] == [1, 2]
+    assert [event.step for event in board.Scalars("update")] == [128, 256]
 
 
 def test_a_gpu_has_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -296,9 +298,52 @@ def test_tensorboard_files_contain_the_metrics(tmp_path: Path) -> None:
     board.Reload()
     losses = [event.value for event in board.Scalars("learning/policy_loss")]
     assert losses == pytest.approx([row["policy_loss"] for row in progress(run)], rel=1e-5)
-    assert {"episode/reward", "seconds/stepping", "seconds/inference", "seconds/learning"} <= set(
-        board.Tags()["scalars"]
+    assert [event.step for event in board.Scalars("learning/policy_loss")] == [row["steps"] for row in progress(run)]
+    assert {
+        "episode/reward",
+        "episode/task_progress",
+        "seconds/stepping",
+        "seconds/inference",
+        "seconds/learning",
+    } <= set(board.Tags()["scalars"])
+
+
+def test_total_steps_set_the_length_and_each_line_has_the_time_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = train(replace(small("none", tmp_path / "run", 99), total_steps=300))
+    assert [row["steps"] for row in progress(run)] == [128, 256, 384]
+    train(parse(["--resume", str(run), "--total-steps", "500"]))
+    assert [row["steps"] for row in progress(run)] == [128, 256, 384, 512]
+    lines = [line for line in capsys.readouterr().out.splitlines() if "steps" in line and "/s" in line]
+    assert len(lines) == 4 and all("seconds left" in line for line in lines)
+
+
+def test_a_long_run_says_so_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = replace(small("none", tmp_path / "run"), total_steps=10**12, time_limit=1e-4)
+    train(given)
+    assert capsys.readouterr().out.count("at this speed the run takes ") == 1
+
+
+def test_a_run_starts_from_the_weights_of_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = train(small("gru", tmp_path / "first", 2))
+    given = replace(small("gru", tmp_path / "second", 1, option=("command_count=[3]",)), init_from=str(first))
+    given = replace(given, keep_checkpoints=True)
+    second = train(given)
+    start = checkpoint.load(checkpoint.files(second)[0])
+    assert start.update == 0 and checkpoint.read_settings(second).init_from == str(first)
+    assert same(start.agent.state_dict(), checkpoint.load(first).agent.state_dict())
+    # Other actions: the policy's output layer is new.
+    other = changed(
+        replace(given, env="Endless-MortarMayhem-v0", run=str(tmp_path / "third")), environment={"option": ()}
     )
+    third = train(other)
+    assert "newly initialised: policy" in capsys.readouterr().out
+    one, two = (checkpoint.load(checkpoint.files(run)[0]).agent for run in (second, third))
+    assert torch.equal(one.memory.recurrent.weight_hh_l0, two.memory.recurrent.weight_hh_l0)
+    other = replace(given, agent="none", run=str(tmp_path / "fourth"))
+    with pytest.raises(ValueError, match=r"its body\.0\.weight do not fit"):
+        train(changed(other, recurrence={"hidden_size": 5}, model={"vector_width": 3, "head_width": 3}))
 
 
 @pytest.mark.slow

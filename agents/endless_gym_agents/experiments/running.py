@@ -19,6 +19,7 @@ from typing import IO, Protocol
 import torch
 
 from endless_gym_agents import checkpoint
+from endless_gym_agents.clock import duration
 from endless_gym_agents.command import on_stop_signals
 from endless_gym_agents.experiments import planning
 from endless_gym_agents.experiments.planning import Job
@@ -271,11 +272,3 @@ def left(planned: Sequence[Job], side_by_side: int) -> str:
                 ", and its evaluation" if evaluated and not any(evaluated) else ""
             )
     return text
-
-
-def duration(seconds: float) -> str:
-    """A duration for a line of text, such as `2.5 hours`."""
-    for unit, size in (("days", 86_400.0), ("hours", 3_600.0), ("minutes", 60.0)):
-        if seconds >= size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.0f} seconds"
