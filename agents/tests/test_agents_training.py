@@ -342,7 +342,7 @@ def test_a_run_starts_from_the_weights_of_another(tmp_path: Path, capsys: pytest
     one, two = (checkpoint.load(checkpoint.files(run)[0]).agent for run in (second, third))
     assert torch.equal(one.memory.recurrent.weight_hh_l0, two.memory.recurrent.weight_hh_l0)
     other = replace(given, agent="none", run=str(tmp_path / "fourth"))
-    with pytest.raises(ValueError, match=r"its body\.0\.weight do not fit"):
+    with pytest.raises(ValueError, match=r"its body\.0\.bias, body\.0\.weight do not fit"):
         train(changed(other, recurrence={"hidden_size": 5}, model={"vector_width": 3, "head_width": 3}))
 
 
