@@ -5,11 +5,13 @@ mod actions;
 use std::sync::Arc;
 
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main, measurement::WallTime};
-use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters};
+use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters};
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 use endless_gym_memory_gym::mortar_mayhem::{self, MortarMayhem};
 use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
 use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};
+use endless_gym_memory_gym::{FRAME, SCREEN};
 use serde_json::Map;
 
 use actions::Actions;
@@ -29,8 +31,10 @@ fn measure<E: Environment>(group: &mut BenchmarkGroup<'_, WallTime>, spec: &EnvS
         });
     });
     group.bench_function(format!("{}/reset", spec.id), |bencher| bencher.iter(|| env.reset(&assets, &mut random)));
-    let mut frame = vec![0; FRAME_BYTES];
-    group.bench_function(format!("{}/draw", spec.id), |bencher| bencher.iter(|| env.draw(&mut frame)));
+    let mut frame = vec![0; FRAME.bytes()];
+    group.bench_function(format!("{}/draw", spec.id), |bencher| {
+        bencher.iter(|| E::paint(env.shared(), &env.scene(), &mut Canvas::new(&mut frame, SCREEN, SCREEN)));
+    });
     let mut features = vec![0.0; spec.features.len()];
     group.bench_function(format!("{}/features", spec.id), |bencher| bencher.iter(|| env.features(&mut features)));
 }

@@ -5,9 +5,10 @@ mod actions;
 
 use std::sync::Arc;
 
-use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters, SCREEN};
+use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::DirtySurface;
+use endless_gym_memory_gym::SCREEN;
 use endless_gym_memory_gym::mortar_mayhem::{self, MortarMayhem};
 use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
 use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};

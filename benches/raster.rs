@@ -1,8 +1,8 @@
 //! Cost of painting in a step, and of what is made once for each set of reset parameters.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use endless_gym::envs::{FRAME_BYTES, SCREEN};
 use endless_gym_core::raster::{Canvas, DirtySurface, Disc, PixelFormat, Rect, Sprite, Surface};
+use endless_gym_memory_gym::{FRAME, SCREEN};
 
 fn round_surface(side: usize) -> Surface {
     let mut surface = Surface::new(side, side);
@@ -14,9 +14,9 @@ fn round_surface(side: usize) -> Surface {
 
 fn paint(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("raster/paint");
-    let mut frame = vec![0; FRAME_BYTES];
+    let mut frame = vec![0; FRAME.bytes()];
     let mut canvas = Canvas::new(&mut frame, SCREEN, SCREEN);
-    let picture = vec![7; FRAME_BYTES];
+    let picture = vec![7; FRAME.bytes()];
     group.bench_function("fill", |bencher| bencher.iter(|| canvas.fill([0, 0, 255])));
     group.bench_function("paste", |bencher| bencher.iter(|| canvas.paste(&picture)));
     let tile = Rect::new(24, 36, 12, 12);
@@ -40,7 +40,7 @@ fn store(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("raster/store");
     let mut surface = DirtySurface::new(SCREEN, SCREEN);
     surface.canvas().fill([10, 20, 30]);
-    let mut picture = vec![0; FRAME_BYTES];
+    let mut picture = vec![0; FRAME.bytes()];
     let plain = PixelFormat::default();
     for (name, format) in [
         ("grayscale", PixelFormat { grayscale: true, ..plain }),

@@ -13,14 +13,14 @@ use std::hint::black_box;
 use std::sync::Arc;
 
 use endless_gym_core::batch::Block;
-use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters, SCREEN};
+use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters};
 use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::Canvas;
-use endless_gym_memory_gym::memory_gym;
 use endless_gym_memory_gym::mortar_mayhem::{self, MortarMayhem};
 use endless_gym_memory_gym::mystery_path::{self, MysteryPath};
 use endless_gym_memory_gym::searing_spotlights::{self, SearingSpotlights};
+use endless_gym_memory_gym::{FRAME, SCREEN, memory_gym};
 use memmap2::{Advice, MmapMut};
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::Map;
@@ -77,7 +77,7 @@ impl<E: Environment> Players<E> {
 
     /// Paints the first frames, which also touches the memory.
     fn paint(&self, frames: &mut [u8]) {
-        for (player, frame) in self.players.iter().zip(frames.chunks_exact_mut(FRAME_BYTES)) {
+        for (player, frame) in self.players.iter().zip(frames.chunks_exact_mut(FRAME.bytes())) {
             E::paint(&self.assets, &player.shown, &mut Canvas::new(frame, SCREEN, SCREEN));
         }
     }
@@ -86,7 +86,7 @@ impl<E: Environment> Players<E> {
     fn step<const PHASE: u8>(&mut self, frames: &mut [u8]) {
         let actions = self.actions.next();
         let branches = actions.len() / self.players.len();
-        let own = frames.len() > FRAME_BYTES;
+        let own = frames.len() > FRAME.bytes();
         for (number, player) in self.players.iter_mut().enumerate() {
             if player.ended {
                 player.env.reset(&self.assets, &mut player.random);
@@ -101,7 +101,7 @@ impl<E: Environment> Players<E> {
                     black_box(&scene);
                 } else if scene != player.shown {
                     if PHASE == PAINTED {
-                        let frame = &mut frames[if own { number * FRAME_BYTES } else { 0 }..][..FRAME_BYTES];
+                        let frame = &mut frames[if own { number * FRAME.bytes() } else { 0 }..][..FRAME.bytes()];
                         let mut canvas = Canvas::new(frame, SCREEN, SCREEN);
                         E::repaint(&self.assets, &player.shown, &scene, &mut canvas);
                     }
@@ -151,7 +151,7 @@ fn player_step<E: Environment + 'static, const PHASE: u8>(
     huge: bool,
 ) -> Step {
     let mut players = Players::<E>::new(spec, variant, num_envs, WARM_UP);
-    let mut frames = memory(frames * FRAME_BYTES, huge);
+    let mut frames = memory(frames * FRAME.bytes(), huge);
     players.paint(&mut frames);
     Box::new(move || players.step::<PHASE>(&mut frames))
 }

@@ -62,18 +62,18 @@ pub mod batch {
 /// Environment ids: spaces, reset parameters, scripted experts.
 pub mod envs {
     pub use endless_gym_core::envs::{
-        ActionBranch, ActionError, ActionSpace, Choice, Column, EnvSpec, Expert, FRAME_BYTES, InfoColumn,
-        InvalidActionSpace, InvalidState, ObservationSpace, Parameter, ParameterError, ParameterKind, Progress,
-        ResetParameters, SCREEN, Task, Transition, UnknownEnvironment, box_action, view,
+        ActionBranch, ActionError, ActionSpace, Choice, Column, EnvSpec, Expert, InfoColumn, InvalidActionSpace,
+        InvalidState, ObservationSpace, Parameter, ParameterError, ParameterKind, Progress, ResetParameters, Task,
+        Transition, UnknownEnvironment, box_action, view,
     };
 }
 
 /// Many environments in this process, stepped in lockstep.
 pub mod pool {
     pub use endless_gym_core::pool::{
-        Autoreset, DuplicateEnvironment, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool,
-        PoolConfig, PoolError, Registry, ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION,
-        SavedEnv, Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
+        Autoreset, Experts, ExpertsError, MAX_ENVS, MAX_THREADS, NextOptions, OptionMap, Pool, PoolConfig, PoolError,
+        Registry, RegistryError, ResetOptions, ResetRequest, ResumeError, RunningEpisode, SNAPSHOT_VERSION, SavedEnv,
+        Seeding, SnapshotError, Threads, UnknownAutoreset, WrongFrame,
     };
     pub use endless_gym_core::random::EntropyError;
 }
@@ -85,7 +85,7 @@ pub mod random {
 
 /// A rasteriser that paints exactly the same pixels as pygame 2.4, for custom environments.
 pub mod raster {
-    pub use endless_gym_core::raster::{Canvas, CornerRadii, Rect, Rgb, Surface};
+    pub use endless_gym_core::raster::{Canvas, CornerRadii, FrameShape, Rect, Rgb, Surface};
 }
 
 /// Engines that serve environments in shared memory, their trainers and observers.

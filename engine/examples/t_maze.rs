@@ -14,7 +14,7 @@ use endless_gym::envs::{
 };
 use endless_gym::memory_gym;
 use endless_gym::random::Generator;
-use endless_gym::raster::{Canvas, Rect};
+use endless_gym::raster::{Canvas, FrameShape, Rect};
 use serde::{Deserialize, Serialize};
 
 const LEFT: i32 = 0;
@@ -65,6 +65,7 @@ impl Task for TMaze {
 
     fn spec() -> EnvSpec {
         EnvSpec {
+            frame: Some(FrameShape::rgb(84, 84)),
             actions: ACTIONS,
             parameters: PARAMETERS,
             features: FEATURES,

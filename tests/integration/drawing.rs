@@ -6,11 +6,12 @@
 use crate::support::player::random_actions;
 use crate::support::recorded::{options, pixel_format, property_cases};
 use endless_gym::batch::{Batch, BatchSection, Block, Frames, zeroed};
-use endless_gym::envs::{self, EnvSpec, FRAME_BYTES, SCREEN};
+use endless_gym::envs::EnvSpec;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
     Autoreset, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads, WrongFrame,
 };
+use endless_gym_memory_gym::{FRAME, SCREEN};
 use proptest::prelude::*;
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
@@ -55,7 +56,7 @@ fn play_irregularly(pool: &mut Pool, other: &mut Pool, steps: usize, random: &mu
                 pool.reset(ResetRequest::Each { reset: &reset, seed: &seed }, &mut buffers[used])?;
             }
             6 => pool.reset(ResetRequest::Seed(random.random()), &mut buffers[used])?,
-            7 => pool.ground_truth_view(0, &mut vec![0; envs::view::VIEW_BYTES])?,
+            7 => drop(pool.ground_truth_view(0)?),
             8 => other.step(&random_actions(spec, NUM_ENVS, random), &mut buffers[used])?,
             // Usually, use a few buffers in turn, like a trainer that holds batches.
             _ => {
@@ -134,7 +135,7 @@ fn the_drawing_check_finds_a_changed_pixel() {
     pool.reset(ResetRequest::All, &mut buffer).unwrap();
     let (env, x, y) = (1, 83, 2);
     let corrupt = |buffer: &mut [Block]| {
-        layout.write::<u8>(buffer, BatchSection::Observation)[env * FRAME_BYTES + (x * SCREEN + y) * 3 + 1] ^= 1;
+        layout.write::<u8>(buffer, BatchSection::Observation)[env * FRAME.bytes() + (x * SCREEN + y) * 3 + 1] ^= 1;
     };
 
     corrupt(&mut buffer);

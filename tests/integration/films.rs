@@ -8,7 +8,6 @@ use crate::support::place::Place;
 use crate::support::player::Player;
 use crate::support::process::text;
 use endless_gym::batch::{Frames, PixelFormat};
-use endless_gym::envs::view::VIEW_BYTES;
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, Experts, PoolConfig, ResetRequest};
 
@@ -33,8 +32,7 @@ fn frames(id: &str, seed: u64, max_steps: usize) -> Vec<(Picture, Picture)> {
     let mut action = vec![0; spec.action_space.width()];
     let mut frames = Vec::new();
     loop {
-        let mut view = vec![0; VIEW_BYTES];
-        player.pool.ground_truth_view(0, &mut view).unwrap();
+        let view = player.pool.ground_truth_view(0).unwrap().pixels;
         let view = (0..SIDE * SIDE).map(|place| {
             let at = (place / SIDE * 4 * SIDE * 4 + place % SIDE * 4) * 3;
             [view[at], view[at + 1], view[at + 2]]

@@ -5,9 +5,10 @@ use std::collections::VecDeque;
 use crate::support::player::{Player, random_actions};
 use crate::support::recorded::pixel_formats;
 use endless_gym::batch::{BatchSection, Frames, PixelFormat};
-use endless_gym::envs::{EnvSpec, FRAME_BYTES, Parameter, SCREEN};
+use endless_gym::envs::{EnvSpec, Parameter};
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, PoolConfig, PoolError, ResetOptions, Seeding};
+use endless_gym_memory_gym::{FRAME, SCREEN};
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
 use serde_json::Value as Json;
@@ -60,7 +61,7 @@ fn compare(spec: &EnvSpec, frames: Frames, steps: usize) {
     let mut other = started(spec, frames);
     let what = format!("{}: {frames:?}", spec.id);
     let section = other.pool.layout().section(BatchSection::Observation).unwrap();
-    assert_eq!(section.shape(), frames.shape(), "{what}");
+    assert_eq!(section.shape(), frames.shape(FRAME), "{what}");
     let mut past: Vec<VecDeque<Vec<u8>>> = Vec::new();
     for env in 0..NUM_ENVS {
         past.push(vec![convert(row(&standard, BatchSection::Observation, env), frames.format); frames.stack].into());
@@ -130,6 +131,6 @@ fn a_restored_stack_repeats_its_frame() {
     (0..3).for_each(|_| player.step_all(1));
     player.pool.restore(1, &snapshot).unwrap();
     player.observe();
-    let (first, second) = row(&player, BatchSection::Observation, 1).split_at(FRAME_BYTES);
+    let (first, second) = row(&player, BatchSection::Observation, 1).split_at(FRAME.bytes());
     assert!(first == second);
 }

@@ -2,7 +2,6 @@
 
 use crate::support::player::Player;
 use endless_gym::envs::EnvSpec;
-use endless_gym::envs::view::VIEW_BYTES;
 use endless_gym::memory_gym;
 use endless_gym::pool::{Autoreset, OptionMap, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError};
 use proptest::prelude::*;
@@ -20,9 +19,7 @@ fn play(player: &mut Player, steps: usize, random: &mut SmallRng) {
 }
 
 fn ground_truth_view(player: &mut Player) -> Vec<u8> {
-    let mut view = vec![0; VIEW_BYTES];
-    player.pool.ground_truth_view(0, &mut view).unwrap();
-    view
+    player.pool.ground_truth_view(0).unwrap().pixels
 }
 
 /// The batches of the seeded episode and of later ones, and the final state.

@@ -13,6 +13,7 @@ mod live;
 mod meanings;
 mod next_options;
 mod own_environment;
+mod own_frames;
 mod play_page;
 mod pool;
 mod popgym;

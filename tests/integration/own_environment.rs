@@ -8,7 +8,7 @@ use endless_gym::batch::{Frames, PixelFormat};
 use endless_gym::envs::InvalidState;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
-    Autoreset, DuplicateEnvironment, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, SnapshotError, Threads,
+    Autoreset, Pool, PoolConfig, Registry, RegistryError, ResetOptions, ResetRequest, SnapshotError, Threads,
 };
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
@@ -136,6 +136,6 @@ fn options_are_checked_and_ids_are_unique() {
     let error = Pool::new(memory_gym(), &config, &Threads::new(1).unwrap()).map(drop).unwrap_err();
     assert!(error.to_string().starts_with("no environment `TMaze-v0`; there are MortarMayhem-v0, "), "{error}");
     let twice = registry().with::<TMaze>().map(drop);
-    assert_eq!(twice, Err(DuplicateEnvironment { id: ID.to_owned() }));
+    assert_eq!(twice, Err(RegistryError::Duplicate { id: ID }));
     assert_eq!(memory_gym().clone().with::<TMaze>().unwrap().specs().count(), 11);
 }

@@ -4,11 +4,12 @@ use std::collections::HashSet;
 
 use crate::support::player::{Player, random_actions};
 use crate::support::recorded::{options as any_options, property_cases};
-use endless_gym::envs::{self, ActionError};
+use endless_gym::envs::ActionError;
 use endless_gym::memory_gym;
 use endless_gym::pool::{
     Autoreset, MAX_THREADS, Pool, PoolConfig, PoolError, ResetOptions, ResetRequest, Seeding, Threads,
 };
+use endless_gym_memory_gym::FRAME;
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand::rngs::SmallRng;
@@ -27,7 +28,7 @@ fn config(num_envs: usize) -> PoolConfig {
 
 /// The observation of an environment.
 fn frame(player: &Player, env: usize) -> Vec<u8> {
-    player.batch().observation()[env * envs::FRAME_BYTES..][..envs::FRAME_BYTES].to_vec()
+    player.batch().observation()[env * FRAME.bytes()..][..FRAME.bytes()].to_vec()
 }
 
 /// The first observation of the environment with that seed.

@@ -83,7 +83,7 @@ def checked_arguments(
     end = first_env + groups * num_envs
     total_envs = end if total_envs is None else integer("total_envs", total_envs, end, MAX_TOTAL_ENVS)
     source = seeding(seed, seeds, total_envs)
-    frames, features = contents(observation, frames)
+    frames, features = contents(described, observation, frames)
     pools = [
         {
             "id": described.id,

@@ -70,7 +70,7 @@ class Env(gymnasium.Env[Any, Any]):
     ) -> None:
         self._spec = spec(id)
         self._view = checked_view(render_mode, view, SINGLE_MODES)
-        self._frames, self._features = contents(observation, frames)
+        self._frames, self._features = contents(self._spec, observation, frames)
         self._independent_episodes = bool(independent_episodes)
         # The frame rate and the meanings differ from id to id.
         fps = {"render_fps": self._spec.render_fps}
@@ -137,7 +137,7 @@ class Env(gymnasium.Env[Any, Any]):
         return self._observation(arrays), self._info(arrays)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Play one step. As in the original, `terminated` reports every end of an episode, also by the step limit.
+        """Play one step. As in the original, `terminated` reports every end of an episode of Memory Gym, also by the step limit.
 
         Raises:
             ResetNeeded: The environment has not been reset.
@@ -148,7 +148,7 @@ class Env(gymnasium.Env[Any, Any]):
         self._check_window()
         if not self._was_reset:
             raise ResetNeeded("call `env.reset()` before `env.step()`")
-        arrays, reward, terminated, end = self._native.step(action)
+        arrays, reward, terminated, truncated, end = self._native.step(action)
         info = self._info(arrays)
         if end is not None:
             info["reward"], info["length"], values = end
@@ -157,7 +157,7 @@ class Env(gymnasium.Env[Any, Any]):
         self._is_shown = False
         if self.render_mode == "human":
             self._show()
-        return self._observation(arrays), reward, terminated, False, info
+        return self._observation(arrays), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The current frame or view of the render mode; `None` for `human` and without a render mode."""
@@ -249,6 +249,8 @@ class Env(gymnasium.Env[Any, Any]):
 
     def _observation(self, arrays: _native.SingleArrays) -> Observation:
         frames, features, vector, _ = arrays
+        if features is not None:
+            features = self._spec.feature_observation(features)
         parts = {"visual_observation": frames, "features": features, "vector_observation": vector}
         given = {key: array for key, array in parts.items() if array is not None}
         return given if len(given) > 1 else next(iter(given.values()))

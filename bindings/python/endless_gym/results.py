@@ -68,7 +68,7 @@ class Results:
         arrays = self._copied(arrays)
         reward, terminated, truncated = (arrays[place] for place in self._steps)
         info = self._info(arrays)
-        self._add_ends(info, arrays, terminated)
+        self._add_ends(info, arrays, terminated | truncated)
         return self._observation(arrays), reward, terminated, truncated, info
 
     def _places(self, prefix: str) -> list[tuple[str, int]]:
@@ -79,9 +79,13 @@ class Results:
         return tuple(array.copy() for array in arrays) if self.copy else arrays
 
     def _observation(self, arrays: _native.Arrays) -> Any:
-        if len(self._observed) == 1:
-            return arrays[self._observed[0][1]]
-        return {key: arrays[place] for key, place in self._observed}
+        return self._named({key: arrays[place] for key, place in self._observed})
+
+    def _named(self, parts: dict[str, Any]) -> Any:
+        """The parts as a dict, or the only one."""
+        if "features" in parts:
+            parts["features"] = self.described.feature_observation(parts["features"])
+        return parts if len(parts) > 1 else next(iter(parts.values()))
 
     def _info(self, arrays: _native.Arrays) -> dict[str, Any]:
         if self._truth is None:
@@ -109,6 +113,5 @@ class Results:
             return
         observations = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
-            parts = {key: arrays[place][env] for key, place in self._final_observed}
-            observations[env] = parts if len(parts) > 1 else next(iter(parts.values()))
+            observations[env] = self._named({key: arrays[place][env] for key, place in self._final_observed})
         info["final_obs"], info["_final_obs"] = observations, ended

@@ -47,9 +47,9 @@ class Frames:
     #: A stack of more than 1 adds a leading axis, like Gymnasium's `FrameStackObservation`.
     stack: int = 1
 
-    def shape(self) -> tuple[int, ...]:
-        """Shape of one environment's observation."""
-        return tuple(_native.frame_shape(json_text(self.configuration())))
+    def shape(self, size: tuple[int, int, int] = (84, 84, 3)) -> tuple[int, ...]:
+        """Shape of one environment's observation, for frames of a width, a height and a number of channels."""
+        return tuple(_native.frame_shape(json_text(self.configuration()), size))
 
     def configuration(self) -> dict[str, Any]:
         """The JSON object of the engine's `Frames`.
@@ -98,6 +98,8 @@ class Spec:
     multi_discrete: bool
     #: What the numbers of each branch mean: `actions[branch].choices[number]`.
     actions: tuple[ActionBranch, ...]
+    #: Width, height and channels of a frame; `None` if the environment has features only.
+    frame: tuple[int, int, int] | None
     #: Length of the vector observation; 0 without one.
     vector_observation: int
     #: Length of `info["ground_truth"]`; 0 without one.
@@ -110,6 +112,8 @@ class Spec:
     info: tuple[tuple[str, bool], ...]
     #: Names of the feature observation's columns.
     features: tuple[str, ...]
+    #: The space of the features as the engine describes it; `None` for a box without bounds.
+    described_features: dict[str, Any] | None
     #: What its numbers mean.
     feature_columns: tuple[Meaning, ...]
     #: Reset parameters with their defaults.
@@ -127,13 +131,23 @@ class Spec:
     def observation_space(self, frames: Frames | None = Frames(), features: bool = False) -> gymnasium.Space[Any]:
         """The original's observation space, or with the feature observation instead of or beside the frames."""
         parts: dict[str, gymnasium.Space[Any]] = {}
-        if frames is not None:
-            parts["visual_observation"] = spaces.Box(0, 255, frames.shape(), np.uint8)
-        if features:
-            parts["features"] = spaces.Box(-np.inf, np.inf, (len(self.features),), np.float32)
+        if frames is not None and self.frame is not None:
+            parts["visual_observation"] = spaces.Box(0, 255, frames.shape(self.frame), np.uint8)
+        if features or self.frame is None:
+            parts["features"] = self.feature_space()
         if self.vector_observation:
             parts["vector_observation"] = spaces.Box(0, 1, (self.vector_observation,), np.float32)
         return spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
+
+    def feature_space(self) -> gymnasium.Space[Any]:
+        """The space of the feature observation."""
+        if self.described_features is None:
+            return spaces.Box(-np.inf, np.inf, (len(self.features),), np.float32)
+        return _space(self.described_features)
+
+    def feature_observation(self, features: NDArray[np.float32]) -> Any:
+        """Features, float32 (..., features), as observations of the feature space, without a copy where that is a Box."""
+        return features if self.described_features is None else _observation(self.described_features, features)
 
     def max_episode_steps(self, options: Mapping[str, Any]) -> int:
         """The step limit of an episode with these reset parameters, as in the original; -1 for none.
@@ -185,13 +199,20 @@ def spec(id: str) -> Spec:
     return known[name]
 
 
-def contents(observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
-    """The format of the frames, `None` without frames, and whether a batch has the feature observation."""
+def contents(described: Spec, observation: ObservationName, frames: Frames | None) -> tuple[Frames | None, bool]:
+    """The format of the frames, `None` without frames, and whether a batch has the feature observation.
+
+    An environment without frames has its features for `rgb`, too.
+    """
     if not isinstance(observation, str) or observation not in OBSERVATIONS:
         raise ValueError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {observation!r}")
     if frames is not None and not isinstance(frames, Frames):
         raise TypeError(f"frames must be endless_gym.Frames or None, got {frames!r}")
     has_frames, has_features = OBSERVATIONS[observation]
+    if described.frame is None:
+        if frames is not None or observation == "rgb+features":
+            raise ValueError(f"{described.id} has no frames, only features")
+        return None, True
     if frames is not None and not has_frames:
         raise ValueError(f"frames must be None, since the observation `{observation}` has no frames, got {frames}")
     return (frames or Frames()) if has_frames else None, has_features
@@ -227,12 +248,14 @@ def described_spec(described: dict[str, Any]) -> Spec:
         branches=(actions["Discrete"],) if "Discrete" in actions else tuple(actions.get("MultiDiscrete", ())),
         multi_discrete="MultiDiscrete" in actions,
         actions=tuple(ActionBranch(branch["name"], _meanings(branch["choices"])) for branch in described["actions"]),
+        frame=None if described["frame"] is None else tuple(described["frame"].values()),
         vector_observation=described["vector_observation"],
         ground_truth=len(described["ground_truth"]),
         ground_truth_columns=_meanings(described["ground_truth"]),
         ground_truth_is_integer=described["ground_truth_is_integer"],
         info=tuple((column["name"], column["is_integer"]) for column in described["info"]),
         features=tuple(column["name"] for column in described["features"]),
+        described_features=described["observation_space"],
         feature_columns=_meanings(described["features"]),
         reset_parameters={parameter["name"]: parameter["default"] for parameter in described["parameters"]},
         render_fps=described["render_fps"],
@@ -251,6 +274,30 @@ def _space(described: dict[str, Any]) -> gymnasium.Space[Any]:
     low = np.array([-np.inf if bound is None else bound for bound in value["low"]], np.float32)
     high = np.array([np.inf if bound is None else bound for bound in value["high"]], np.float32)
     return spaces.Box(low, high, dtype=np.float32)
+
+
+def _width(described: dict[str, Any]) -> int:
+    """Number of numbers of a space."""
+    ((kind, value),) = described.items()
+    if kind == "Discrete":
+        return 1
+    if kind == "Tuple":
+        return sum(map(_width, value))
+    return len(value if kind == "MultiDiscrete" else value["low"])
+
+
+def _observation(described: dict[str, Any], features: NDArray[np.float32]) -> Any:
+    """The observations of a space whose numbers are the last axis."""
+    ((kind, value),) = described.items()
+    if kind == "Discrete":
+        return features[..., 0].astype(np.int64)
+    if kind == "MultiDiscrete":
+        return features.astype(np.int64)
+    if kind == "Box":
+        return features
+    ends = np.cumsum([_width(part) for part in value])
+    parts = np.split(features, ends[:-1], axis=-1)
+    return tuple(_observation(part, numbers) for part, numbers in zip(value, parts, strict=True))
 
 
 def _meanings(described: Iterable[dict[str, str]]) -> tuple[Meaning, ...]:

@@ -5,6 +5,7 @@ use std::time::Duration;
 use endless_gym::batch::Frames;
 use endless_gym::envs::ActionSpace;
 use endless_gym::pool::{ResetRequest, RunningEpisode};
+use endless_gym::raster::FrameShape;
 use endless_gym::service::timeout_from_seconds;
 use numpy::{
     Element, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
@@ -164,10 +165,11 @@ pub fn action(given: i64) -> PyResult<i32> {
     i32::try_from(given).map_err(range)
 }
 
-/// The shape of an observation, from the JSON text of its frames' format.
+/// The shape of an observation, from the JSON text of its frames' format and a frame's width, height and channels.
 #[pyfunction]
-pub fn frame_shape(frames: &str) -> PyResult<Vec<usize>> {
-    Ok(json::<Frames>(frames)?.shape())
+pub fn frame_shape(frames: &str, size: (usize, usize, usize)) -> PyResult<Vec<usize>> {
+    let (width, height, channels) = size;
+    Ok(json::<Frames>(frames)?.shape(FrameShape { width, height, channels }))
 }
 
 /// A configuration from JSON text that the package has written.

@@ -3,8 +3,9 @@
 use std::ffi::c_void;
 
 use endless_gym::batch::{BatchSection, Block, Dtype, Layout, MAX_DIMENSIONS, RowShape, Section, SectionTable};
+use endless_gym::envs::view::Picture;
 use numpy::npyffi::{NPY_ARRAY_ALIGNED, NPY_ARRAY_C_CONTIGUOUS, NpyTypes, PY_ARRAY_API, PyArrayObject, npy_intp};
-use numpy::{PyArrayDescr, PyArrayDescrMethods, dtype, npyffi};
+use numpy::{PyArray1, PyArrayDescr, PyArrayDescrMethods, PyArrayMethods, dtype, npyffi};
 use pyo3::PyClass;
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
@@ -116,4 +117,9 @@ unsafe fn array<'py>(
         }
         Ok(array)
     }
+}
+
+/// A picture, uint8 (height, width, 3).
+pub fn picture(py: Python<'_>, Picture { width, height, pixels }: Picture) -> PyResult<Bound<'_, PyAny>> {
+    Ok(PyArray1::from_vec(py, pixels).reshape([height, width, 3])?.into_any())
 }

@@ -5,11 +5,9 @@
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use endless_gym::batch::Block;
-use endless_gym::envs::view::{VIEW, VIEW_BYTES};
 use endless_gym::memory_gym;
 use endless_gym::pool::{NextOptions, OptionMap, Pool, PoolConfig, PoolError, Threads};
 use endless_gym::service::ServiceError;
-use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::sync::MutexExt;
@@ -204,9 +202,7 @@ impl Pools {
 
     /// The ground-truth view of an environment of group 0, indexed \[row\]\[column\]\[channel\].
     fn ground_truth_view<'py>(&self, py: Python<'py>, env: usize) -> PyResult<Bound<'py, PyAny>> {
-        let mut view = vec![0; VIEW_BYTES];
-        self.state(py)?.pools[0].pool.ground_truth_view(env, &mut view).map_err(errors::pool)?;
-        Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
+        arrays::picture(py, self.state(py)?.pools[0].pool.ground_truth_view(env).map_err(errors::pool)?)
     }
 
     /// Releases the environments, after the step of another thread. Arrays remain valid.

@@ -1,17 +1,17 @@
 //! One environment with the interface of the original. Every step returns newly allocated arrays.
 
 use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
-use endless_gym::envs::view::{VIEW, VIEW_BYTES, rgb_array};
-use endless_gym::envs::{ActionSpace, FRAME_BYTES, SCREEN};
+use endless_gym::envs::ActionSpace;
+use endless_gym::envs::view::rgb_array;
 use endless_gym::memory_gym;
-use endless_gym::pool::{OptionMap, Pool, ResetRequest, SavedEnv, Threads};
+use endless_gym::pool::{OptionMap, Pool, PoolError, ResetRequest, SavedEnv, Threads};
 use numpy::{Element, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arguments::{self, ActionShape};
-use crate::errors;
+use crate::{arrays, errors};
 
 /// Frames, features, vector observation and ground truth; `None` for those that the environment does not have.
 type Arrays<'py> = [Option<Bound<'py, PyAny>>; 4];
@@ -44,13 +44,13 @@ impl Single {
         self.arrays(py)
     }
 
-    /// The arrays, the reward, and whether the episode ended; if it did, its return, its length and the info columns.
+    /// The arrays, the reward, and whether the episode terminated and was truncated; if it ended, its return, its length and the info columns.
     #[allow(clippy::type_complexity)]
     fn step<'py>(
         &mut self,
         py: Python<'py>,
         action: &Bound<'py, PyAny>,
-    ) -> PyResult<(Arrays<'py>, f64, bool, Option<(f64, i32, Vec<f64>)>)> {
+    ) -> PyResult<(Arrays<'py>, f64, bool, bool, Option<(f64, i32, Vec<f64>)>)> {
         match (&self.pool.spec().action_space, action.extract::<i64>()) {
             (ActionSpace::Discrete(_), Ok(action)) => {
                 self.action.clear();
@@ -60,16 +60,17 @@ impl Single {
         }
         self.pool.step(&self.action, &mut self.blocks).map_err(errors::pool)?;
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        let ended = batch.terminated()[0] != 0;
-        let end = ended.then(|| (batch.episode_return()[0], batch.episode_length()[0], batch.info().to_vec()));
-        Ok((self.arrays(py)?, batch.reward()[0], ended, end))
+        let (terminated, truncated) = (batch.terminated()[0] != 0, batch.truncated()[0] != 0);
+        let end = (terminated || truncated)
+            .then(|| (batch.episode_return()[0], batch.episode_length()[0], batch.info().to_vec()));
+        Ok((self.arrays(py)?, batch.reward()[0], terminated, truncated, end))
     }
 
     /// The last frame of the original's format, indexed \[row\]\[column\]\[channel\].
     fn rgb_array<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let mut picture = vec![0; FRAME_BYTES];
-        rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), &mut picture);
-        Ok(PyArray1::from_vec(py, picture).reshape([SCREEN, SCREEN, 3])?.into_any())
+        let spec = self.pool.spec();
+        let shape = spec.frame.ok_or_else(|| errors::pool(PoolError::NoFrame { id: spec.id }))?;
+        arrays::picture(py, rgb_array(Batch::new(self.pool.layout(), &self.blocks).observation(), shape))
     }
 
     /// The ground-truth view, indexed \[row\]\[column\]\[channel\]: the one after the last view, as in the original, or that of the
@@ -78,9 +79,7 @@ impl Single {
         if of_current_step {
             self.pool.align_ground_truth_view(0).map_err(errors::pool)?;
         }
-        let mut view = vec![0; VIEW_BYTES];
-        self.pool.ground_truth_view(0, &mut view).map_err(errors::pool)?;
-        Ok(PyArray1::from_vec(py, view).reshape([VIEW, VIEW, 3])?.into_any())
+        arrays::picture(py, self.pool.ground_truth_view(0).map_err(errors::pool)?)
     }
 
     /// The progress of the episode: for each quantity its name, its value, and the value at which the task is complete.

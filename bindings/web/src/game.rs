@@ -3,11 +3,10 @@
 use std::rc::Rc;
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
-use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::envs::{self, Expert};
+use endless_gym_core::envs::Expert;
 use endless_gym_core::pool::{Autoreset, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::trace::{Recorder, Trace};
-use endless_gym_memory_gym::memory_gym;
+use endless_gym_memory_gym::{SCREEN, memory_gym};
 use serde_json::{Map, Value as Json, json};
 
 use crate::agent::{Agent, Memory};
@@ -40,7 +39,6 @@ pub struct Game {
     script: Option<(Trace, usize)>,
     observation: Vec<u8>,
     view: Vec<u8>,
-    magnified: Vec<u8>,
 }
 
 impl Game {
@@ -80,7 +78,6 @@ impl Game {
             script,
             observation: vec![0; RGBA_BYTES],
             view: vec![0; RGBA_BYTES],
-            magnified: vec![0; VIEW_BYTES],
         };
         game.reset(seed)?;
         Ok(game)
@@ -173,10 +170,9 @@ impl Game {
     /// Draws both pictures. Call it once per step, since each call advances the clue's picture in the ground-truth
     /// view.
     fn draw(&mut self) -> Result<(), WebError> {
-        self.pool.ground_truth_view(0, &mut self.magnified)?;
-        put_view(&self.magnified, &mut self.view);
+        put_view(&self.pool.ground_truth_view(0)?, &mut self.view);
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        put_observation(batch.observation(), &mut self.observation, envs::SCREEN);
+        put_observation(batch.observation(), &mut self.observation, SCREEN);
         Ok(())
     }
 

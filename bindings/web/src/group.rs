@@ -1,10 +1,9 @@
 //! Self-playing environments of one id.
 
 use endless_gym_core::batch::{Batch, Block, zeroed};
-use endless_gym_core::envs;
 use endless_gym_core::pool::{Experts, OptionMap, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, Threads};
 use endless_gym_core::random::Generator;
-use endless_gym_memory_gym::memory_gym;
+use endless_gym_memory_gym::{FRAME, memory_gym};
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;
@@ -70,7 +69,7 @@ impl Group {
 
     /// The observations, one after the other.
     pub fn observations(&self) -> impl Iterator<Item = &[u8]> {
-        Batch::new(self.pool.layout(), &self.blocks).observation().chunks_exact(envs::FRAME_BYTES)
+        Batch::new(self.pool.layout(), &self.blocks).observation().chunks_exact(FRAME.bytes())
     }
 
     /// Episodes so far, and the means of their returns and lengths.

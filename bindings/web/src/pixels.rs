@@ -1,7 +1,7 @@
 //! Converts frames to the format of a browser's canvas: RGBA, \[row\]\[column\].
 
-use endless_gym_core::envs::SCREEN;
-use endless_gym_core::envs::view::VIEW;
+use endless_gym_core::envs::view::Picture;
+use endless_gym_memory_gym::SCREEN;
 
 /// Bytes of a frame.
 pub const RGBA_BYTES: usize = SCREEN * SCREEN * 4;
@@ -18,11 +18,11 @@ pub fn put_observation(observation: &[u8], out: &mut [u8], stride: usize) {
 }
 
 /// Writes a magnified ground-truth view, indexed \[row\]\[column\]\[channel\], reduced to the frame's size.
-pub fn put_view(view: &[u8], out: &mut [u8]) {
-    const SCALE: usize = VIEW / SCREEN;
-    let (pixels, out) = (view.as_chunks::<3>().0, out.as_chunks_mut::<4>().0);
+pub fn put_view(view: &Picture, out: &mut [u8]) {
+    let scale = view.width / SCREEN;
+    let (pixels, out) = (view.pixels.as_chunks::<3>().0, out.as_chunks_mut::<4>().0);
     for (row, to) in out.chunks_exact_mut(SCREEN).enumerate() {
-        for (to, [red, green, blue]) in to.iter_mut().zip(pixels[row * SCALE * VIEW..].iter().step_by(SCALE)) {
+        for (to, [red, green, blue]) in to.iter_mut().zip(pixels[row * scale * view.width..].iter().step_by(scale)) {
             *to = [*red, *green, *blue, 255];
         }
     }
@@ -31,16 +31,16 @@ pub fn put_view(view: &[u8], out: &mut [u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use endless_gym_core::envs::FRAME_BYTES;
-    use endless_gym_core::envs::view::VIEW_BYTES;
+    use endless_gym_memory_gym::FRAME;
 
     #[test]
     fn pictures_are_not_transposed() {
         let (x, y) = (5, 70);
-        let mut observation = [0; FRAME_BYTES];
+        let mut observation = [0; FRAME.bytes()];
         observation[(x * SCREEN + y) * 3 + 1] = 9;
-        let mut view = vec![0; VIEW_BYTES];
-        view[(y * 4 * VIEW + x * 4) * 3 + 1] = 9;
+        let side = 4 * SCREEN;
+        let mut view = Picture { width: side, height: side, pixels: vec![0; side * side * 3] };
+        view.pixels[(y * 4 * side + x * 4) * 3 + 1] = 9;
         let mut wide = vec![0; SCREEN * (SCREEN + 3) * 4];
         put_observation(&observation, &mut wide, SCREEN + 3);
         assert_eq!(wide[(y * (SCREEN + 3) + x) * 4..][..4], [0, 9, 0, 255]);

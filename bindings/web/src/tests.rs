@@ -1,7 +1,7 @@
 //! Tests the interface as JavaScript uses it.
 
 use super::*;
-use endless_gym_core::envs::SCREEN;
+use endless_gym_memory_gym::SCREEN;
 use endless_gym_memory_gym::memory_gym;
 use serde_json::{Value as Json, json};
 

@@ -1,6 +1,6 @@
 //! Many environments as one picture.
 
-use endless_gym_core::envs::SCREEN;
+use endless_gym_memory_gym::SCREEN;
 use serde_json::{Value as Json, json};
 
 use crate::error::WebError;

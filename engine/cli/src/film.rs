@@ -1,9 +1,8 @@
 //! An episode that a policy plays, frame by frame.
 
 use endless_gym_core::batch::{Batch, Block, Frames, zeroed};
-use endless_gym_core::envs::view::VIEW_BYTES;
-use endless_gym_core::pool::{Experts, Pool, PoolConfig, Registry, ResetRequest, Threads};
-use endless_gym_core::raster::PixelFormat;
+use endless_gym_core::envs::view::{Picture, rgb_array};
+use endless_gym_core::pool::{Experts, Pool, PoolConfig, PoolError, Registry, ResetRequest, Threads};
 
 use super::failure::Failure;
 use super::play::{Policy, RandomPolicy};
@@ -35,8 +34,7 @@ impl Film {
         policy: Policy,
         action_seed: u64,
     ) -> Result<Self, Failure> {
-        let format = PixelFormat { row_major: true, ..PixelFormat::default() };
-        let frames = Some(Frames { format, stack: 1 });
+        let frames = Some(Frames::default());
         let config = PoolConfig { num_envs: 1, total_envs: 1, features: true, frames, ..config.clone() };
         let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
         let mut blocks = zeroed(pool.layout().blocks());
@@ -54,17 +52,16 @@ impl Film {
         Batch::new(self.pool.layout(), &self.blocks)
     }
 
-    /// The observation, uint8 (84, 84, 3), indexed \[row\]\[column\]\[channel\].
-    pub fn observation(&self) -> &[u8] {
-        self.batch().observation()
+    /// The observation.
+    pub fn observation(&self) -> Result<Picture, Failure> {
+        let spec = self.pool.spec();
+        let shape = spec.frame.ok_or(PoolError::NoFrame { id: spec.id })?;
+        Ok(rgb_array(self.batch().observation(), shape))
     }
 
-    /// The ground-truth view, uint8 (336, 336, 3), indexed \[row\]\[column\]\[channel\]. Each call shows the next
-    /// picture of a clue, as in the original; call it once per step.
-    pub fn ground_truth_view(&mut self) -> Result<Vec<u8>, Failure> {
-        let mut view = vec![0; VIEW_BYTES];
-        self.pool.ground_truth_view(0, &mut view)?;
-        Ok(view)
+    /// The ground-truth view. Each call shows the next picture of a clue, as in the original; call it once per step.
+    pub fn ground_truth_view(&mut self) -> Result<Picture, Failure> {
+        Ok(self.pool.ground_truth_view(0)?)
     }
 
     /// Return and length of the episode so far.
@@ -75,7 +72,7 @@ impl Film {
     /// Plays one step, unless the episode has ended. Returns whether there was a step.
     pub fn step(&mut self) -> Result<bool, Failure> {
         let batch = Batch::new(self.pool.layout(), &self.blocks);
-        if batch.terminated()[0] == 1 {
+        if batch.has_ended(0) {
             return Ok(false);
         }
         match &mut self.player {

@@ -1,8 +1,7 @@
 //! The pictures of a film.
 
 use clap::ValueEnum;
-use endless_gym_core::envs::SCREEN;
-use endless_gym_core::envs::view::VIEW;
+use endless_gym_core::raster::FrameShape;
 
 use super::failure::Failure;
 use super::film::Film;
@@ -30,29 +29,30 @@ pub struct Picture {
 }
 
 impl View {
-    /// Width and height of the pictures.
-    pub fn size(self) -> (usize, usize) {
-        (if self == View::Both { 2 * SCREEN + GAP } else { SCREEN }, SCREEN)
+    /// Width and height of the pictures of a frame.
+    pub fn size(self, FrameShape { width, height, .. }: FrameShape) -> (usize, usize) {
+        (if self == View::Both { 2 * width + GAP } else { width }, height)
     }
 
     /// The picture of the film's current step. Call it once per step.
     pub fn picture(self, film: &mut Film) -> Result<Picture, Failure> {
         let view = film.ground_truth_view()?;
-        let view = view.as_chunks::<3>().0;
-        let agent = film.observation().as_chunks::<3>().0;
+        let agent = film.observation()?;
         // The view is the frame, magnified: reduce it to the frame's size.
-        let magnified = VIEW / SCREEN;
+        let (width, height) = (agent.width, agent.height);
+        let magnified = view.width / width;
+        let (of_agent, of_view) = (agent.pixels.as_chunks::<3>().0, view.pixels.as_chunks::<3>().0);
         let mut pixels = Vec::new();
-        for row in 0..SCREEN {
-            let of_agent = || agent[row * SCREEN..][..SCREEN].iter().copied();
-            let of_view = || view[row * magnified * VIEW..][..VIEW].iter().step_by(magnified).copied();
+        for row in 0..height {
+            let of_agent = || of_agent[row * width..][..width].iter().copied();
+            let of_view = || of_view[row * magnified * view.width..][..view.width].iter().step_by(magnified).copied();
             match self {
                 View::Agent => pixels.extend(of_agent()),
                 View::GroundTruth => pixels.extend(of_view()),
                 View::Both => pixels.extend(of_agent().chain([GAP_COLOUR; GAP]).chain(of_view())),
             }
         }
-        let (width, height) = self.size();
+        let (width, height) = self.size(FrameShape::rgb(width, height));
         Ok(Picture { width, height, pixels })
     }
 }

@@ -20,14 +20,14 @@ pub struct Args {
     environment: EnvironmentArgs,
 }
 
-/// Runs `endless frames`: for the start and each step of the first episode, writes the observation, uint8 (84, 84, 3), and the
-/// ground-truth view, uint8 (336, 336, 3), both indexed \[row\]\[column\]\[channel\].
+/// Runs `endless frames`: for the start and each step of the first episode, writes the observation and the ground-truth view,
+/// such as uint8 (84, 84, 3) and (336, 336, 3), both indexed \[row\]\[column\]\[channel\].
 pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
     let mut film = Film::new(registry, &args.environment.configure(&args.id, 1)?)?;
     let mut stdout = io::stdout().lock();
     for _ in 0..=args.steps {
         let view = film.ground_truth_view()?;
-        match stdout.write_all(film.observation()).and_then(|()| stdout.write_all(&view)) {
+        match stdout.write_all(&film.observation()?.pixels).and_then(|()| stdout.write_all(&view.pixels)) {
             Err(error) if error.kind() == ErrorKind::BrokenPipe => break,
             written => written.map_err(|error| format!("cannot write to standard output: {error}"))?,
         }

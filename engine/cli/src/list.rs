@@ -1,6 +1,7 @@
 //! `endless list`.
 
-use endless_gym_core::envs::{ActionBranch, EnvSpec, SCREEN};
+use endless_gym_core::batch::Frames;
+use endless_gym_core::envs::{ActionBranch, EnvSpec};
 use endless_gym_core::pool::Registry;
 use serde_json::json;
 
@@ -28,7 +29,7 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
             let spec = registry.spec(id)?;
             match () {
                 _ if args.json => print_json(&as_json(spec)),
-                _ if args.picture.applies() => {
+                _ if args.picture.applies() && spec.frame.is_some() => {
                     print(format_args!("{}\n{}", picture(registry, spec, output::width())?, description(spec)))
                 }
                 _ => print(description(spec)),
@@ -46,17 +47,19 @@ pub fn run(registry: &Registry, args: &Args) -> Result<(), Failure> {
 }
 
 fn observation(spec: &EnvSpec) -> String {
-    let frame = format!("uint8 ({SCREEN}, {SCREEN}, 3)");
-    match spec.vector_observation {
-        0 => frame,
-        length => format!("{frame} and float32 ({length},)"),
-    }
+    let frame = spec.frame.map(|frame| format!("uint8 ({}, {}, {})", frame.width, frame.height, frame.channels));
+    let length = if frame.is_none() { spec.features.len() } else { spec.vector_observation };
+    let vector = (length > 0).then(|| match &spec.observation_space {
+        Some(space) if frame.is_none() => space.to_string(),
+        _ => format!("float32 ({length},)"),
+    });
+    frame.into_iter().chain(vector).collect::<Vec<_>>().join(" and ")
 }
 
 fn as_json(spec: &EnvSpec) -> serde_json::Value {
     let mut value = json!(spec);
     value["action_branches"] = json!(spec.action_space.branches());
-    value["observation_shape"] = json!([SCREEN, SCREEN, 3]);
+    value["observation_shape"] = json!(spec.frame.map(|frame| Frames::default().shape(frame)));
     value
 }
 
@@ -71,7 +74,8 @@ fn description(spec: &EnvSpec) -> String {
     let mut parts = vec![format!("{}: {}\n", spec.id, spec.summary)];
     parts.push(format!("actions      {}", spec.action_space));
     parts.extend(spec.actions.iter().map(|branch| format!("  {}: {}", branch.name, choices(branch))));
-    parts.push(format!("observation  {}, indexed [x][y][channel]", observation(spec)));
+    let index = if spec.frame.is_some() { ", indexed [x][y][channel]" } else { "" };
+    parts.push(format!("observation  {}{index}", observation(spec)));
     if !spec.ground_truth.is_empty() {
         parts.push(format!("ground truth float64 ({},), in 0 to 1", spec.ground_truth.len()));
     }

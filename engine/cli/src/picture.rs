@@ -3,8 +3,8 @@
 use std::io::{self, IsTerminal};
 
 use clap::ValueEnum;
-use endless_gym_core::envs::view::VIEW;
-use endless_gym_core::envs::{EnvSpec, SCREEN};
+use endless_gym_core::envs::EnvSpec;
+use endless_gym_core::envs::view::Picture;
 use endless_gym_core::pool::{PoolConfig, Registry, Seeding};
 
 use super::failure::Failure;
@@ -40,11 +40,8 @@ fn true_colour(colorterm: &str, no_color: &str) -> bool {
     matches!(colorterm, "truecolor" | "24bit") && no_color.is_empty()
 }
 
-/// Pixels of the frame per pixel of the picture, in each direction.
-const SCALE: usize = 2;
-
 /// Pixels of the picture in each direction. A character shows two of them, one above the other.
-const SIDE: usize = SCREEN / SCALE;
+const SIDE: usize = 42;
 
 /// Spaces between two pictures.
 const GAP: usize = 2;
@@ -64,10 +61,10 @@ pub fn picture(registry: &Registry, spec: &EnvSpec, columns: u16) -> Result<Stri
     for _ in 0..TYPICAL_STEP {
         film.step()?;
     }
-    let reduced = |frame: &[u8], side| Pixels { side, pixels: frame.as_chunks().0.to_vec() }.resized(SIDE);
-    let mut pictures = vec![("ground truth", reduced(&film.ground_truth_view()?, VIEW))];
+    let reduced = |picture: &Picture| Pixels::from(picture).resized(SIDE);
+    let mut pictures = vec![("ground truth", reduced(&film.ground_truth_view()?))];
     if usize::from(columns) >= 2 * SIDE + GAP {
-        pictures.insert(0, ("observation", reduced(film.observation(), SCREEN)));
+        pictures.insert(0, ("observation", reduced(&film.observation()?)));
     }
     Ok(half_blocks(&pictures))
 }

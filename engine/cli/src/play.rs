@@ -74,11 +74,11 @@ impl EpisodeStatistics {
 
     /// Adds one step of a group.
     pub fn add(&mut self, batch: &Batch<'_>) {
-        let terminated = batch.terminated();
-        self.steps += terminated.len() as u64;
-        self.running_return = batch.episode_return().iter().sum::<f64>() / terminated.len() as f64;
+        let num_envs = batch.layout().num_envs();
+        self.steps += num_envs as u64;
+        self.running_return = batch.episode_return().iter().sum::<f64>() / num_envs as f64;
         let info = batch.info();
-        for env in (0..terminated.len()).filter(|env| terminated[*env] == 1) {
+        for env in (0..num_envs).filter(|env| batch.has_ended(*env)) {
             self.episodes += 1;
             self.returns += batch.episode_return()[env];
             self.lengths += f64::from(batch.episode_length()[env]);

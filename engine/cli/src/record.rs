@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
 use clap::Parser;
-use endless_gym_core::pool::{PoolConfig, Registry, ResetOptions, Seeding};
+use endless_gym_core::pool::{PoolConfig, PoolError, Registry, ResetOptions, Seeding};
 
 use super::failure::Failure;
 use super::film::Film;
@@ -116,7 +116,8 @@ fn film(registry: &Registry, args: &FilmArgs) -> Result<(), Failure> {
     // A PNG's header holds the number of pictures, so the episodes are played twice.
     let pictures = if Format::of(&args.film)? == Format::Png { args.count(registry)? } else { 0 };
     let fps = args.fps.unwrap_or(u16::try_from(spec.render_fps)?);
-    let shape = Shape { size: args.view.size(), scale: usize::from(args.scale), fps, pictures };
+    let size = args.view.size(spec.frame.ok_or(PoolError::NoFrame { id: spec.id })?);
+    let shape = Shape { size, scale: usize::from(args.scale), fps, pictures };
     let stop = stop::on_signal()?;
     // Create the environment first, so that invalid options are reported before a file exists.
     let mut next = Some(args.start(registry, 0)?);

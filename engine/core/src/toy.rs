@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::envs::{ActionSpace, Column, EnvSpec, InfoColumn, ResetParameters, Task, TaskEnv, Transition};
 use crate::pool::Registry;
 use crate::random::Generator;
-use crate::raster::{Canvas, Rect};
+use crate::raster::{Canvas, FrameShape, Rect};
 
 /// A square moves by its action from a random column, until it leaves the frame.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -16,6 +16,7 @@ pub(crate) struct Toy {
     steps: u32,
 }
 
+const FRAME: Option<FrameShape> = Some(FrameShape::rgb(84, 84));
 const FEATURES: &[Column] =
     &[Column { name: "x", description: "column" }, Column { name: "steps", description: "steps" }];
 const GROUND_TRUTH: &[Column] = &[Column { name: "x", description: "column, in 0..=1" }];
@@ -26,7 +27,13 @@ impl Task for Toy {
 
     fn spec() -> EnvSpec {
         let space = ActionSpace::Discrete(4);
-        EnvSpec { features: FEATURES, ground_truth: GROUND_TRUTH, info: INFO, ..EnvSpec::new("Toy-v0", "Leave", space) }
+        EnvSpec {
+            frame: FRAME,
+            features: FEATURES,
+            ground_truth: GROUND_TRUTH,
+            info: INFO,
+            ..EnvSpec::new("Toy-v0", "Leave", space)
+        }
     }
 
     fn parameters(_: &ResetParameters) {}
@@ -64,7 +71,7 @@ pub(crate) fn toys() -> &'static Registry {
     static REGISTRY: LazyLock<Registry> = LazyLock::new(|| {
         let mut registry = Registry::new().with::<Toy>().unwrap();
         let two = EnvSpec::new("Toy-Vector-v0", "Two branches", ActionSpace::multi_discrete(&[3, 3]));
-        let specs = [EnvSpec { vector_observation: 5, features: FEATURES, ..two }, plain()];
+        let specs = [EnvSpec { frame: FRAME, vector_observation: 5, features: FEATURES, ..two }, plain()];
         for spec in specs {
             let id = spec.id;
             registry.register::<TaskEnv<Toy>>(spec, id).unwrap();
@@ -75,5 +82,5 @@ pub(crate) fn toys() -> &'static Registry {
 }
 
 fn plain() -> EnvSpec {
-    EnvSpec::new("Toy-Plain-v0", "Nothing optional", ActionSpace::Discrete(2))
+    EnvSpec { frame: FRAME, ..EnvSpec::new("Toy-Plain-v0", "Nothing optional", ActionSpace::Discrete(2)) }
 }

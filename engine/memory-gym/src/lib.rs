@@ -10,6 +10,7 @@ mod character_sprites;
 mod controls;
 pub mod mortar_mayhem;
 pub mod mystery_path;
+mod screen;
 pub mod searing_spotlights;
 mod vector;
 
@@ -22,6 +23,7 @@ use endless_gym_core::envs::{EnvSpec, Environment};
 use endless_gym_core::pool::Registry;
 use mortar_mayhem::MortarMayhem;
 use mystery_path::MysteryPath;
+pub use screen::{FRAME, SCREEN};
 use searing_spotlights::SearingSpotlights;
 
 /// The environment id that commands and training programs use by default.

@@ -23,7 +23,7 @@ pub mod repeat_previous;
 
 use std::sync::LazyLock;
 
-use endless_gym_core::pool::{DuplicateEnvironment, Registry};
+use endless_gym_core::pool::{Registry, RegistryError};
 
 /// The registry of the POPGym ids.
 ///
@@ -40,8 +40,8 @@ pub fn popgym() -> &'static Registry {
 ///
 /// # Errors
 ///
-/// [`DuplicateEnvironment`] if the registry has one of the ids already.
-pub fn register(registry: Registry) -> Result<Registry, DuplicateEnvironment> {
+/// [`RegistryError`] if the registry has one of the ids already.
+pub fn register(registry: Registry) -> Result<Registry, RegistryError> {
     registry
         .with::<autoencode::Autoencode>()?
         .with::<battleship::Battleship>()?

@@ -4,7 +4,7 @@
 //! environment as stored in the batch.
 
 use endless_gym_core::batch::{Batch, BatchSection, Frames, Section};
-use endless_gym_core::envs::SCREEN;
+use endless_gym_core::raster::FrameShape;
 use endless_gym_service::{BatchLease, ServiceSpecification};
 use serde::Deserialize;
 use serde_json::{Value as Json, json};
@@ -36,12 +36,12 @@ impl Selection {
 }
 
 /// The memory layout of a frame: its strides in bytes. A grayscale frame has one channel.
-fn describe(frames: Frames) -> Json {
-    let (format, side) = (frames.format, SCREEN);
-    let channels = if format.grayscale { 1 } else { 3 };
-    let (pixel, channel) = if format.channels_first { (1, side * side) } else { (channels, 1) };
-    let (x, y) = if format.row_major { (pixel, pixel * side) } else { (pixel * side, pixel) };
-    json!({"width": side, "height": side, "channels": channels, "x": x, "y": y, "channel": channel, "stack": frames.stack})
+fn describe(frames: Frames, FrameShape { width, height, channels }: FrameShape) -> Json {
+    let format = frames.format;
+    let channels = if format.grayscale { 1 } else { channels };
+    let (pixel, channel) = if format.channels_first { (1, width * height) } else { (channels, 1) };
+    let (x, y) = if format.row_major { (pixel, pixel * width) } else { (pixel * height, pixel) };
+    json!({"width": width, "height": height, "channels": channels, "x": x, "y": y, "channel": channel, "stack": frames.stack})
 }
 
 /// The message with `about` as its JSON, and the selected environments' data from a batch.
@@ -57,8 +57,8 @@ pub(crate) fn encode(
         about["batch"] = rows(specification, &batch, &envs);
         about["batch"]["step"] = json!(lease.step());
         about["batch"]["group"] = json!(lease.group());
-        if let Some(frames) = specification.frames {
-            about["batch"]["frame"] = describe(frames);
+        if let Some((frames, shape)) = specification.frames.zip(specification.frame) {
+            about["batch"]["frame"] = describe(frames, shape);
             pixels = newest_frames(specification, frames, &batch, &envs);
         }
     }
@@ -97,7 +97,7 @@ fn rows(specification: &ServiceSpecification, batch: &Batch<'_>, envs: &[usize])
                 "reward": batch.reward().get(*env),
                 "return": batch.episode_return().get(*env),
                 "length": batch.episode_length().get(*env),
-                "ended": batch.terminated().get(*env).is_some_and(|flag| *flag != 0),
+                "ended": batch.has_ended(*env),
                 "features": if names.is_empty() { &[] } else { row },
             })
         })

@@ -4,7 +4,6 @@ use arbitrary::Unstructured;
 use ciborium::Value;
 use endless_gym_core::batch::{Block, zeroed};
 use endless_gym_core::envs::EnvSpec;
-use endless_gym_core::envs::view::VIEW_BYTES;
 use endless_gym_core::pool::{
     Autoreset, Pool, PoolConfig, ResetOptions, ResetRequest, Seeding, SnapshotError, Threads,
 };
@@ -166,9 +165,9 @@ impl Game {
     /// Plays a restored state, and then another episode.
     fn play_on(&mut self) {
         self.pool.observe(&mut self.blocks).unwrap();
-        self.pool.ground_truth_view(0, &mut [0; VIEW_BYTES]).unwrap();
+        self.pool.ground_truth_view(0).unwrap();
         self.play(40);
-        self.pool.ground_truth_view(0, &mut [0; VIEW_BYTES]).unwrap();
+        self.pool.ground_truth_view(0).unwrap();
         self.pool.snapshot(0).unwrap();
         self.pool.reset(ResetRequest::All, &mut self.blocks).unwrap();
         self.play(2);

@@ -132,7 +132,7 @@ def record(
         )
         for number in range(count)
     ]
-    frames, has_features = contents(observation, frames)
+    frames, has_features = contents(described, observation, frames)
     threads = integer("num_threads", num_threads or len(os.sched_getaffinity(0)), 1, _native.MAX_THREADS)
     name = dataset or f"endless-gym/{described.id}/{_short(player)}-v0"
     start = time.perf_counter()

@@ -1,26 +1,26 @@
 //! Converts the newest frame of an observation from any format to RGB rows.
 
 use endless_gym_core::batch::Frames;
-use endless_gym_core::envs::SCREEN;
+use endless_gym_core::raster::FrameShape;
 
 use super::picture::Pixels;
 
 /// The newest frame of one environment's observation in that format. Missing bytes are black.
-pub fn newest(observation: &[u8], frames: Frames) -> Pixels {
-    let bytes: usize = frames.format.shape(SCREEN, SCREEN).iter().product();
-    let frame = observation.get((frames.stack - 1) * bytes..).unwrap_or_default();
+pub fn newest(observation: &[u8], frames: Frames, shape: FrameShape) -> Pixels {
     let format = frames.format;
+    let FrameShape { width, height, channels } = shape;
+    let channels = if format.grayscale { 1 } else { channels };
+    let bytes = width * height * channels;
+    let frame = observation.get((frames.stack - 1) * bytes..).unwrap_or_default();
     let byte = |at: usize| frame.get(at).copied().unwrap_or_default();
-    let pixel = |place: usize| {
-        let (row, column) = (place / SCREEN, place % SCREEN);
-        let at = if format.row_major { place } else { column * SCREEN + row };
-        match (format.grayscale, format.channels_first) {
-            (true, _) => [byte(at); 3],
-            (false, true) => std::array::from_fn(|channel| byte(channel * SCREEN * SCREEN + at)),
-            (false, false) => std::array::from_fn(|channel| byte(at * 3 + channel)),
-        }
-    };
-    Pixels { side: SCREEN, pixels: (0..SCREEN * SCREEN).map(pixel).collect() }
+    Pixels::framed(width, height, |x, y| {
+        let at = if format.row_major { y * width + x } else { x * height + y };
+        // One channel is a shade of grey, and a fourth one is not shown.
+        std::array::from_fn(|color| {
+            let channel = if channels == 1 { 0 } else { color };
+            byte(if format.channels_first { channel * width * height + at } else { at * channels + channel })
+        })
+    })
 }
 
 #[cfg(test)]
@@ -28,7 +28,7 @@ mod tests {
     use endless_gym_core::batch::{Batch, zeroed};
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
     use endless_gym_core::raster::PixelFormat;
-    use endless_gym_memory_gym::memory_gym;
+    use endless_gym_memory_gym::{FRAME, memory_gym};
 
     use super::*;
 
@@ -40,7 +40,7 @@ mod tests {
         for _ in 0..5 {
             pool.step(&[1, 2], &mut blocks).unwrap();
         }
-        newest(Batch::new(pool.layout(), &blocks).observation(), frames)
+        newest(Batch::new(pool.layout(), &blocks).observation(), frames, FRAME)
     }
 
     #[test]

@@ -5,6 +5,7 @@ use endless_gym_core::envs::EnvSpec;
 use endless_gym_core::pool::{
     Autoreset, OptionMap, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads,
 };
+use endless_gym_core::raster::FrameShape;
 
 use super::super::failure::Failure;
 use super::frame::newest;
@@ -50,7 +51,7 @@ impl Game {
 
     /// Whether the episode has ended.
     pub fn is_over(&self) -> bool {
-        self.batch().terminated()[0] == 1
+        self.batch().has_ended(0)
     }
 
     /// Plays one step, unless the episode has ended.
@@ -61,9 +62,9 @@ impl Game {
         Ok(())
     }
 
-    /// What the agent sees.
+    /// What the agent sees; black without frames.
     pub fn frame(&self) -> Pixels {
-        newest(self.batch().observation(), Frames::default())
+        newest(self.batch().observation(), Frames::default(), self.spec().frame.unwrap_or(FrameShape::rgb(1, 1)))
     }
 
     /// Seed, steps and rewards.

@@ -1,6 +1,6 @@
 //! Pictures of half blocks: a character shows two pixels, one above the other.
 
-use endless_gym_core::envs::SCREEN;
+use endless_gym_core::envs::view::Picture;
 use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::style::Color;
@@ -14,6 +14,17 @@ pub struct Pixels {
 }
 
 impl Pixels {
+    /// The smallest square around a picture, in whose middle it lies on black. `color` returns the colour of the pixel (x, y).
+    pub fn framed(width: usize, height: usize, color: impl Fn(usize, usize) -> [u8; 3]) -> Pixels {
+        let side = width.max(height);
+        let (left, top) = ((side - width) / 2, (side - height) / 2);
+        let pixel = |place: usize| match ((place % side).checked_sub(left), (place / side).checked_sub(top)) {
+            (Some(x), Some(y)) if x < width && y < height => color(x, y),
+            _ => [0; 3],
+        };
+        Pixels { side, pixels: (0..side * side).map(pixel).collect() }
+    }
+
     /// The same picture with another side: magnified, or reduced by averaging pixels.
     pub fn resized(&self, side: usize) -> Pixels {
         let range = |place: usize| place * self.side / side..((place + 1) * self.side).div_ceil(side);
@@ -27,6 +38,13 @@ impl Pixels {
             })
         };
         Pixels { side, pixels: (0..side * side).map(average).collect() }
+    }
+}
+
+impl From<&Picture> for Pixels {
+    fn from(picture: &Picture) -> Pixels {
+        let colors = picture.pixels.as_chunks().0;
+        Pixels::framed(picture.width, picture.height, |x, y| colors[y * picture.width + x])
     }
 }
 
@@ -44,18 +62,18 @@ impl Widget for &Pixels {
     }
 }
 
-/// The largest side of a frame's picture that fits into `columns` and `lines`: a multiple of the frame's side, or less
+/// The largest side of a picture of a frame with side `own` that fits into `columns` and `lines`: a multiple of `own`, or less
 /// if that does not fit. It is even, so that the picture ends with a whole character; 0 if there is no room.
-pub fn fitting(columns: u16, lines: u16) -> usize {
+pub fn fitting(columns: u16, lines: u16, own: usize) -> usize {
     let room = usize::from(columns).min(2 * usize::from(lines));
-    if room >= SCREEN { room / SCREEN * SCREEN } else { room & !1 }
+    if room >= own { (room / own * own) & !1 } else { room & !1 }
 }
 
 #[cfg(test)]
 mod tests {
     use endless_gym_core::batch::{Batch, Frames, zeroed};
     use endless_gym_core::pool::{Pool, PoolConfig, ResetRequest, Threads};
-    use endless_gym_memory_gym::memory_gym;
+    use endless_gym_memory_gym::{FRAME, SCREEN, memory_gym};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
@@ -69,7 +87,7 @@ mod tests {
         let mut blocks = zeroed(pool.layout().blocks());
         pool.reset(ResetRequest::Seed(4), &mut blocks).unwrap();
         let observation = Batch::new(pool.layout(), &blocks).observation();
-        (newest(observation, Frames::default()), observation.as_chunks::<3>().0.to_vec())
+        (newest(observation, Frames::default(), FRAME), observation.as_chunks::<3>().0.to_vec())
     }
 
     #[test]
@@ -79,7 +97,7 @@ mod tests {
         assert!((0..SCREEN).any(|x| (0..SCREEN / 2).any(|y| colour(x, 2 * y) != colour(x, 2 * y + 1))));
         for scale in [1, 2] {
             let side = (SCREEN * scale) as u16;
-            assert_eq!(fitting(side + 3, side / 2 + 1), usize::from(side));
+            assert_eq!(fitting(side + 3, side / 2 + 1, SCREEN), usize::from(side));
             let mut terminal = Terminal::new(TestBackend::new(side + 3, side / 2 + 1)).unwrap();
             let area = Rect::new(2, 1, side, side / 2);
             terminal.draw(|frame| frame.render_widget(&picture.resized(side.into()), area)).unwrap();
@@ -109,6 +127,9 @@ mod tests {
         let mut buffer = Buffer::empty(Rect::new(0, 0, 5, 2));
         (&picture).render(Rect::new(0, 0, 5, 2), &mut buffer);
         assert_eq!(buffer[(4, 1)].symbol(), "▀");
-        assert_eq!([fitting(0, 9), fitting(80, 21), fitting(83, 50), fitting(200, 50)], [0, 42, 82, 84]);
+        assert_eq!(
+            [(0, 9), (80, 21), (83, 50), (200, 50)].map(|(columns, lines)| fitting(columns, lines, SCREEN)),
+            [0, 42, 82, 84]
+        );
     }
 }

@@ -154,11 +154,12 @@ impl Player {
 /// Draws the picture in the middle and the lines below it.
 fn draw(frame: &mut Frame<'_>, game: &Game, lines: &[String]) {
     let (above, below) = status::divide(frame.area(), LINES);
-    let side = fitting(above.width, above.height);
+    let picture = game.frame();
+    let side = fitting(above.width, above.height, picture.side);
     if side > 0 {
         let columns = side as u16;
         let area = Rect::new(above.x + (above.width - columns) / 2, above.y, columns, columns / 2);
-        frame.render_widget(&game.frame().resized(side), area);
+        frame.render_widget(&picture.resized(side), area);
     }
     status::draw(frame, below, lines);
 }

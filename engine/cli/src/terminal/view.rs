@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use endless_gym_core::batch::Frames;
-use endless_gym_core::envs::SCREEN;
+use endless_gym_core::raster::FrameShape;
 use endless_gym_service::{Observed, ServiceError};
 use ratatui::Frame;
 use ratatui::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
@@ -33,6 +33,9 @@ const SLICE: Duration = Duration::from_millis(20);
 /// The smallest side of an environment's picture, unless the terminal is smaller.
 const MIN_SIDE: usize = 28;
 
+/// The largest side of the picture of a small frame.
+const MAX_SIDE: usize = 84;
+
 /// Lines below the pictures.
 const LINES: u16 = 3;
 
@@ -52,7 +55,7 @@ pub struct TerminalArgs {
 
 /// The environments that are shown, by group and number.
 struct Wall {
-    frames: Option<Frames>,
+    frames: Option<(Frames, FrameShape)>,
     num_envs: usize,
     groups: usize,
     /// By group, when it was last seen and its first environments.
@@ -66,17 +69,23 @@ impl Wall {
     fn add(&mut self, observed: &Observed) {
         let group = observed.lease.group();
         let is_recent = self.seen.get(&group).is_some_and(|(time, _)| time.elapsed() < INTERVAL);
-        let Some(frames) = self.frames.filter(|_| !is_recent) else { return };
-        let bytes: usize = frames.shape().iter().product();
+        let Some((frames, shape)) = self.frames.filter(|_| !is_recent) else { return };
+        let bytes: usize = frames.shape(shape).iter().product();
         let batch = observed.lease.batch();
-        let pictures = batch.observation().chunks_exact(bytes).take(self.places).map(|rows| newest(rows, frames));
+        let pictures =
+            batch.observation().chunks_exact(bytes).take(self.places).map(|rows| newest(rows, frames, shape));
         self.seen.insert(group, (Instant::now(), pictures.collect()));
+    }
+
+    /// Side of a picture in its own size.
+    fn own(&self) -> usize {
+        self.frames.map_or(1, |(_, shape)| shape.width.max(shape.height))
     }
 
     /// Draws as many environments as fit, and returns their number.
     fn draw(&self, frame: &mut Frame<'_>, area: Rect) -> usize {
         let total = self.seen.values().map(|(_, pictures)| pictures.len()).sum();
-        let Grid { side, columns, rows } = Grid::new(area, total);
+        let Grid { side, columns, rows } = Grid::new(area, total, self.own());
         if side == 0 {
             return 0;
         }
@@ -103,8 +112,8 @@ struct Grid {
 impl Grid {
     /// The largest squares of which `count` fit; if there are too many, as many squares of the smallest useful size as
     /// fit.
-    fn new(area: Rect, count: usize) -> Self {
-        let largest = fitting(area.width, area.height).min(SCREEN);
+    fn new(area: Rect, count: usize, own: usize) -> Self {
+        let largest = fitting(area.width, area.height, own).min((MAX_SIDE / own).max(1) * own);
         let grid = |side: usize| {
             let columns = (usize::from(area.width) + 1) / (side + 1);
             Grid { side, columns, rows: (usize::from(area.height) + 1) / (side / 2 + 1) }
@@ -124,7 +133,7 @@ pub fn run(service: &str, args: &TerminalArgs) -> Result<(), Failure> {
     let specification = observers.specification().clone();
     let groups = args.group.map_or(specification.groups, |_| 1);
     let mut wall = Wall {
-        frames: specification.frames,
+        frames: specification.frames.zip(specification.frame),
         num_envs: specification.num_envs,
         groups,
         seen: BTreeMap::new(),
@@ -187,7 +196,7 @@ fn lines(title: &str, statistics: &Statistics, rate: f64, has_ended: bool) -> [S
 
 fn draw(frame: &mut Frame<'_>, wall: &mut Wall, [first, last]: [String; 2]) {
     let (above, below) = status::divide(frame.area(), LINES);
-    let Grid { columns, rows, .. } = Grid::new(above, usize::MAX);
+    let Grid { columns, rows, .. } = Grid::new(above, usize::MAX, wall.own());
     wall.places = (columns * rows).max(1);
     let shown = wall.draw(frame, above);
     let total = wall.num_envs * wall.groups;
@@ -201,6 +210,7 @@ fn draw(frame: &mut Frame<'_>, wall: &mut Wall, [first, last]: [String; 2]) {
 
 #[cfg(test)]
 mod tests {
+    use endless_gym_memory_gym::{FRAME, SCREEN};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
     use ratatui::style::Color;
@@ -212,7 +222,7 @@ mod tests {
             |group: usize, env: u8| Pixels { side: SCREEN, pixels: vec![[group as u8, env, 7]; SCREEN * SCREEN] };
         let pictures = |group| (0..count).map(|env| picture(group, env)).collect();
         Wall {
-            frames: Some(Frames::default()),
+            frames: Some((Frames::default(), FRAME)),
             num_envs: count.into(),
             groups,
             seen: (0..groups).map(|group| (group, (Instant::now(), pictures(group)))).collect(),
@@ -222,7 +232,7 @@ mod tests {
 
     #[test]
     fn grids_are_as_large_as_fits() {
-        let grid = |columns, lines, count| Grid::new(Rect::new(0, 0, columns, lines), count);
+        let grid = |columns, lines, count| Grid::new(Rect::new(0, 0, columns, lines), count, SCREEN);
         assert_eq!(grid(200, 60, 1), Grid { side: 84, columns: 2, rows: 1 });
         assert_eq!(grid(169, 85, 4), Grid { side: 84, columns: 2, rows: 2 });
         assert_eq!(grid(80, 21, 1).side, 42);

@@ -2,8 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::envs::SCREEN;
-use crate::raster::PixelFormat;
+use crate::raster::{FrameShape, PixelFormat};
 
 /// Maximum number of frames in an observation.
 pub const MAX_STACK: usize = 64;
@@ -32,12 +31,14 @@ impl Frames {
     ///
     /// ```
     /// use endless_gym_core::batch::Frames;
+    /// use endless_gym_core::raster::FrameShape;
     ///
-    /// assert_eq!(Frames::default().shape(), [84, 84, 3]);
-    /// assert_eq!(Frames { stack: 4, ..Frames::default() }.shape(), [4, 84, 84, 3]);
+    /// let frame = FrameShape::rgb(84, 84);
+    /// assert_eq!(Frames::default().shape(frame), [84, 84, 3]);
+    /// assert_eq!(Frames { stack: 4, ..Frames::default() }.shape(frame), [4, 84, 84, 3]);
     /// ```
-    pub fn shape(self) -> Vec<usize> {
-        let frame = self.format.shape(SCREEN, SCREEN);
+    pub fn shape(self, frame: FrameShape) -> Vec<usize> {
+        let frame = self.format.shape(frame);
         if self.stack == 1 { frame } else { [vec![self.stack], frame].concat() }
     }
 }

@@ -261,9 +261,11 @@ impl BatchSection {
         let columns = |count: usize| (count > 0).then(|| vec![count]);
         let final_of = |section: BatchSection| section.row_shape(spec, contents).filter(|_| contents.final_observation);
         match self {
-            BatchSection::Observation => contents.frames.map(Frames::shape),
+            BatchSection::Observation => contents.frames.zip(spec.frame).map(|(frames, frame)| frames.shape(frame)),
             BatchSection::VectorObservation => columns(spec.vector_observation),
-            BatchSection::Features => columns(spec.features.len()).filter(|_| contents.features),
+            BatchSection::Features => {
+                columns(spec.features.len()).filter(|_| contents.features || spec.frame.is_none())
+            }
             BatchSection::GroundTruth => columns(spec.ground_truth.len()),
             BatchSection::Reward
             | BatchSection::Terminated

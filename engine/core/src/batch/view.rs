@@ -134,6 +134,11 @@ impl<'a> Batch<'a> {
         self.layout
     }
 
+    /// Whether an environment's episode ended in this step, terminated or truncated. False if there is no such environment.
+    pub fn has_ended(&self, env: usize) -> bool {
+        [self.terminated(), self.truncated()].iter().any(|flags| flags.get(env).is_some_and(|flag| *flag != 0))
+    }
+
     /// All sections and the padding between them, without the writer's stamp.
     pub fn bytes(&self) -> &'a [u8] {
         bytemuck::cast_slice(&self.blocks[..self.blocks.len().min(self.layout.section_blocks())])

@@ -9,7 +9,6 @@ use thiserror::Error;
 use super::expert::Expert;
 use super::parameters::ResetParameters;
 use super::progress::Progress;
-use super::screen::SCREEN;
 use crate::random::Generator;
 use crate::raster::Canvas;
 
@@ -59,15 +58,9 @@ pub trait Environment: Send + Sync {
     /// Changes a canvas that shows `shown` into one that shows `scene`, by painting only what may differ.
     fn repaint(assets: &Self::Assets, shown: &Self::Scene, scene: &Self::Scene, canvas: &mut Canvas<'_>);
 
-    /// Draws the observation in full. `frame` has [`FRAME_BYTES`](super::FRAME_BYTES) bytes, indexed
-    /// \[x\]\[y\]\[channel\].
-    ///
-    /// # Panics
-    ///
-    /// If `frame` has another length.
-    fn draw(&self, frame: &mut [u8]) {
-        Self::paint(self.shared(), &self.scene(), &mut Canvas::new(frame, SCREEN, SCREEN));
-    }
+    /// Writes the pixels of a scene, for frames of 1 or 4 channels, which a canvas does not have. The byte of channel `c` of the pixel
+    /// `(x, y)` is `(x * height + y) * channels + c`. All bytes are 0 before.
+    fn write_pixels(_assets: &Self::Assets, _scene: &Self::Scene, _pixels: &mut [u8]) {}
 
     /// Draws the original's ground-truth view at the observation's size, before the original scales it up. Advances the
     /// animations that the original advances with every view.

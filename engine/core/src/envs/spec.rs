@@ -1,10 +1,13 @@
 //! The specification of an environment id: spaces, reset parameters, info columns.
 
+use std::fmt;
+
 use serde::Serialize;
 use thiserror::Error;
 
 use super::action_space::ActionSpace;
 use super::parameters::Parameter;
+use crate::raster::FrameShape;
 
 /// One branch of an action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -77,6 +80,20 @@ impl ObservationSpace {
     }
 }
 
+impl fmt::Display for ObservationSpace {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            ObservationSpace::Discrete(n) => write!(f, "Discrete({n})"),
+            ObservationSpace::MultiDiscrete(numbers) => write!(f, "MultiDiscrete({numbers:?})"),
+            ObservationSpace::Box { low, .. } => write!(f, "Box({},)", low.len()),
+            ObservationSpace::Tuple(parts) => {
+                let parts: Vec<String> = parts.iter().map(ToString::to_string).collect();
+                write!(f, "Tuple({})", parts.join(", "))
+            }
+        }
+    }
+}
+
 /// Everything that is fixed about an environment id.
 #[derive(Clone, Debug, Serialize)]
 pub struct EnvSpec {
@@ -86,6 +103,8 @@ pub struct EnvSpec {
     pub summary: &'static str,
     /// The original's action space.
     pub action_space: ActionSpace,
+    /// Size of the frame; `None` if the environment has features only, which every batch then contains.
+    pub frame: Option<FrameShape>,
     /// The meaning of an action's numbers, in the order of its branches.
     pub actions: &'static [ActionBranch],
     /// Length of the vector observation (float32 in 0..=1); 0 if there is none.
@@ -107,12 +126,13 @@ pub struct EnvSpec {
 }
 
 impl EnvSpec {
-    /// An id without reset parameters, infos and features, at 25 frames per second. `summary` is the agent's task in one line.
+    /// An id without frames, reset parameters, infos and features, at 25 frames per second. `summary` is the agent's task in one line.
     pub const fn new(id: &'static str, summary: &'static str, action_space: ActionSpace) -> Self {
         EnvSpec {
             id,
             summary,
             action_space,
+            frame: None,
             actions: &[],
             vector_observation: 0,
             ground_truth: &[],

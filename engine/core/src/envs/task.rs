@@ -62,8 +62,7 @@ use crate::raster::Canvas;
 /// }
 ///
 /// let registry = Registry::new().with::<Repeat>()?;
-/// let config = PoolConfig { features: true, frames: None, ..PoolConfig::new("Repeat-v0", 8) };
-/// let mut pool = Pool::new(&registry, &config, &Threads::new(1)?)?;
+/// let mut pool = Pool::new(&registry, &PoolConfig::new("Repeat-v0", 8), &Threads::new(1)?)?;
 /// let mut blocks = zeroed(pool.layout().blocks());
 /// pool.reset(ResetRequest::Seed(1), &mut blocks)?;
 /// let numbers: Vec<i32> = Batch::new(pool.layout(), &blocks).features().iter().map(|number| *number as i32).collect();
@@ -105,6 +104,10 @@ pub trait Task: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwn
 
     /// Draws the frame on a black canvas.
     fn paint(&self, _parameters: &Self::Parameters, _canvas: &mut Canvas<'_>) {}
+
+    /// Writes the pixels of a frame with 1 or 4 channels, instead of [`paint`](Task::paint). The byte of channel `c` of the pixel `(x, y)`
+    /// is `(x * height + y) * channels + c`. All bytes are 0 before.
+    fn write_pixels(&self, _parameters: &Self::Parameters, _pixels: &mut [u8]) {}
 
     /// Writes the ground truth, float64 in the order of [`EnvSpec::ground_truth`].
     fn ground_truth(&self, _parameters: &Self::Parameters, _out: &mut [f64]) {}
@@ -178,6 +181,10 @@ impl<T: Task> Environment for TaskEnv<T> {
 
     fn repaint(assets: &T::Parameters, _shown: &T, scene: &T, canvas: &mut Canvas<'_>) {
         Self::paint(assets, scene, canvas);
+    }
+
+    fn write_pixels(assets: &T::Parameters, scene: &T, pixels: &mut [u8]) {
+        scene.write_pixels(assets, pixels);
     }
 
     fn draw_ground_truth(&mut self, canvas: &mut Canvas<'_>) {

@@ -1,48 +1,59 @@
 //! The pictures that the original's `render` returns.
 //!
-//! They are indexed \[row\]\[column\]\[channel\], as in image libraries, whereas observations are indexed
+//! They are indexed \[row\]\[column\]\[channel\], as in image libraries, while observations are indexed
 //! \[x\]\[y\]\[channel\].
 
 use super::environment::Environment;
-use super::screen::{FRAME_BYTES, SCREEN};
-use crate::raster::Canvas;
+use crate::raster::{Canvas, FrameShape, Rgb};
 
 /// Scale of the ground-truth view relative to an observation.
 const SCALE: usize = 4;
 
-/// Width and height of the ground-truth view in pixels.
-pub const VIEW: usize = SCREEN * SCALE;
+/// An RGB picture.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Picture {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Number of rows.
+    pub height: usize,
+    /// 3 bytes for each pixel, row by row.
+    pub pixels: Vec<u8>,
+}
 
-/// Bytes of the ground-truth view: 336x336 RGB.
-pub const VIEW_BYTES: usize = VIEW * VIEW * 3;
-
-/// Draws the ground-truth view, the original's `render()` in the mode `debug_rgb_array`, into the first [`VIEW_BYTES`]
-/// bytes of `out`.
-///
-/// # Panics
-///
-/// If `out` is shorter.
-pub fn ground_truth_view<E: Environment>(env: &mut E, out: &mut [u8]) {
-    let mut frame = [0; FRAME_BYTES];
-    env.draw_ground_truth(&mut Canvas::new(&mut frame, SCREEN, SCREEN));
-    let pixels = frame.as_chunks::<3>().0;
-    for (row, line) in out[..VIEW_BYTES].chunks_exact_mut(VIEW * 3).enumerate() {
-        for (x, magnified) in line.as_chunks_mut::<3>().0.as_chunks_mut::<SCALE>().0.iter_mut().enumerate() {
-            magnified.fill(pixels[x * SCREEN + row / SCALE]);
+impl Picture {
+    /// The pixels of a canvas, each magnified to a square with side `scale`.
+    fn from_columns(pixels: &[Rgb], FrameShape { width, height, .. }: FrameShape, scale: usize) -> Self {
+        let mut picture = Vec::with_capacity(pixels.len() * 3 * scale * scale);
+        for row in 0..height * scale {
+            for x in 0..width {
+                picture.extend_from_slice(pixels[x * height + row / scale].repeat(scale).as_slice());
+            }
         }
+        Picture { width: width * scale, height: height * scale, pixels: picture }
     }
 }
 
-/// Converts an observation to the original's `render()` in the mode `rgb_array`. Both have [`FRAME_BYTES`] bytes.
-///
-/// # Panics
-///
-/// If one of them is shorter.
-pub fn rgb_array(observation: &[u8], out: &mut [u8]) {
-    let pixels = observation[..FRAME_BYTES].as_chunks::<3>().0;
-    for (index, pixel) in out[..FRAME_BYTES].as_chunks_mut::<3>().0.iter_mut().enumerate() {
-        *pixel = pixels[index % SCREEN * SCREEN + index / SCREEN];
+/// The ground-truth view of an environment with that frame: the original's `render()` in the mode `debug_rgb_array`.
+pub(crate) fn ground_truth_view<E: Environment>(env: &mut E, shape: FrameShape) -> Picture {
+    let mut frame = vec![0; shape.width * shape.height * 3];
+    if shape.channels == 3 {
+        env.draw_ground_truth(&mut Canvas::new(&mut frame, shape.width, shape.height));
+        return Picture::from_columns(frame.as_chunks().0, shape, SCALE);
     }
+    let mut pixels = vec![0; shape.bytes()];
+    E::write_pixels(env.shared(), &env.scene(), &mut pixels);
+    Picture::from_columns(&colors(&pixels, shape), shape, SCALE)
+}
+
+/// Converts a frame in the default format to the original's `render()` in the mode `rgb_array`. One channel becomes a shade of grey,
+/// and a fourth one is left out.
+pub fn rgb_array(frame: &[u8], shape: FrameShape) -> Picture {
+    Picture::from_columns(&colors(frame, shape), shape, 1)
+}
+
+fn colors(frame: &[u8], shape: FrameShape) -> Vec<Rgb> {
+    let color = |pixel: &[u8]| if let [red, green, blue, ..] = *pixel { [red, green, blue] } else { [pixel[0]; 3] };
+    frame.chunks_exact(shape.channels).map(color).collect()
 }
 
 #[cfg(test)]
@@ -51,12 +62,15 @@ mod tests {
 
     #[test]
     fn columns_become_rows() {
-        let mut observation = [0; FRAME_BYTES];
-        let (x, y) = (5, 70);
-        observation[(x * SCREEN + y) * 3 + 1] = 9;
-        let mut picture = [1; FRAME_BYTES];
-        rgb_array(&observation, &mut picture);
-        assert_eq!(picture.iter().position(|byte| *byte == 9), Some((y * SCREEN + x) * 3 + 1));
-        assert_eq!(picture.iter().filter(|byte| **byte == 0).count(), FRAME_BYTES - 1);
+        for channels in [1, 3, 4] {
+            let shape = FrameShape { width: 7, height: 5, channels };
+            let mut observation = vec![0; shape.bytes()];
+            let (x, y) = (5, 2);
+            observation[(x * 5 + y) * channels..][..channels].fill(9);
+            let picture = rgb_array(&observation, shape);
+            assert_eq!((picture.width, picture.height, picture.pixels.len()), (7, 5, 7 * 5 * 3));
+            assert_eq!(picture.pixels.iter().position(|byte| *byte == 9), Some((y * 7 + x) * 3));
+            assert_eq!(picture.pixels.iter().filter(|byte| **byte == 9).count(), 3);
+        }
     }
 }

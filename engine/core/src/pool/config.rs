@@ -167,7 +167,7 @@ impl PoolConfig {
     ///
     /// [`PoolError`] if a reset parameter or a number is out of range.
     pub fn validate(&self, spec: &EnvSpec) -> Result<(), PoolError> {
-        self.check()?;
+        self.check(spec)?;
         batch_layout(spec, self.num_envs, self.contents())?;
         let check = |given: &OptionMap| ResetParameters::new(spec.id, spec.parameters, given).map(drop);
         match &self.options {
@@ -179,7 +179,7 @@ impl PoolConfig {
     }
 
     /// Checks everything except the id and the reset parameters.
-    pub(super) fn check(&self) -> Result<(), PoolError> {
+    pub(super) fn check(&self, spec: &EnvSpec) -> Result<(), PoolError> {
         if !(1..=MAX_ENVS).contains(&self.num_envs) {
             return Err(PoolError::NumEnvs { given: self.num_envs });
         }
@@ -187,6 +187,12 @@ impl PoolConfig {
             && !(1..=MAX_STACK).contains(&given)
         {
             return Err(PoolError::Stack { given });
+        }
+        if let (Some(frames), Some(frame)) = (self.frames, spec.frame)
+            && frames.format.grayscale
+            && frame.channels != 3
+        {
+            return Err(PoolError::Grayscale { id: spec.id, channels: frame.channels });
         }
         let end = self.first_env.checked_add(self.num_envs);
         if end.is_none_or(|end| end > self.total_envs) || self.total_envs > MAX_TOTAL_ENVS {

@@ -1,21 +1,47 @@
 //! Tracks the scene that was last drawn into each frame of a buffer, and updates the frame to another scene.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::envs::{Environment, SCREEN};
-use crate::raster::{Canvas, DirtySurface, PixelFormat};
+use super::config::PoolConfig;
+use crate::envs::{EnvSpec, Environment};
+use crate::raster::{Canvas, DirtySurface, FrameShape, PixelFormat};
 
 /// Settings for drawing frames.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct DrawSettings {
     /// Whether the buffer still holds the pool's last write, so that its frames show the drawn scenes.
     pub current: bool,
-    pub format: PixelFormat,
+    pub frame: FrameFormat,
     /// Whether to compare every frame with the same frame drawn in full.
     pub check: bool,
+}
+
+/// Size and format of the frames of a pool.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct FrameFormat {
+    pub shape: FrameShape,
+    pub format: PixelFormat,
+}
+
+impl FrameFormat {
+    /// The frames of a pool. Without frames, they are empty.
+    pub fn new(spec: &EnvSpec, config: &PoolConfig) -> Self {
+        let shape = spec.frame.unwrap_or(FrameShape::rgb(0, 0));
+        FrameFormat { shape, format: config.frames.unwrap_or_default().format }
+    }
+
+    /// Bytes of a frame.
+    pub fn bytes(self) -> usize {
+        self.format.shape(self.shape).iter().product()
+    }
+
+    /// Whether a frame can be changed without painting it in full.
+    fn can_repaint(self) -> bool {
+        self.shape.channels == 3 && (self.format.is_canvas() || self.shape.height <= DirtySurface::MAX_HEIGHT)
+    }
 }
 
 /// The scene that was last drawn into a frame, with its assets; `None` before the first.
@@ -40,18 +66,22 @@ impl<E: Environment> DrawnScene<E> {
         match &mut self.0 {
             Some((drawn_with, drawn)) if settings.current && Arc::ptr_eq(drawn_with, assets) => {
                 if *drawn != scene {
-                    paint_on(frame, settings.format, |canvas| E::repaint(assets, drawn, &scene, canvas));
+                    if settings.frame.can_repaint() {
+                        paint_on(frame, settings.frame, |canvas| E::repaint(assets, drawn, &scene, canvas));
+                    } else {
+                        draw_in_full::<E>(assets, &scene, settings.frame, frame);
+                    }
                 }
                 if settings.check {
-                    compare::<E>(assets, Some(drawn), &scene, settings.format, frame)?;
+                    compare::<E>(assets, Some(drawn), &scene, settings.frame, frame)?;
                 }
                 // Faster than an assignment, which calls memcpy for a large scene.
                 std::mem::swap(drawn, &mut scene);
             }
             drawn => {
-                draw_in_full::<E>(assets, &scene, settings.format, frame);
+                draw_in_full::<E>(assets, &scene, settings.frame, frame);
                 if settings.check {
-                    compare::<E>(assets, None, &scene, settings.format, frame)?;
+                    compare::<E>(assets, None, &scene, settings.frame, frame)?;
                 }
                 *drawn = Some((Arc::clone(assets), scene));
             }
@@ -64,23 +94,41 @@ impl<E: Environment> DrawnScene<E> {
 pub(super) fn draw_in_full<E: Environment>(
     assets: &E::Assets,
     scene: &E::Scene,
-    format: PixelFormat,
+    format: FrameFormat,
     frame: &mut [u8],
 ) {
-    paint_on(frame, format, |canvas| E::paint(assets, scene, canvas));
+    let FrameFormat { shape, format: order } = format;
+    if shape.channels == 3 {
+        return paint_on(frame, format, |canvas| E::paint(assets, scene, canvas));
+    }
+    if order.is_canvas() {
+        frame.fill(0);
+        return E::write_pixels(assets, scene, frame);
+    }
+    let mut pixels = PIXELS.take();
+    pixels.clear();
+    pixels.resize(shape.bytes(), 0);
+    E::write_pixels(assets, scene, &mut pixels);
+    order.copy(shape, &pixels, frame);
+    PIXELS.set(pixels);
 }
 
 thread_local! {
     /// The surface for frames in a format that a canvas cannot paint directly.
-    static SURFACE: RefCell<DirtySurface> = RefCell::new(DirtySurface::new(SCREEN, SCREEN));
+    static SURFACE: RefCell<DirtySurface> = RefCell::new(DirtySurface::new(0, 0));
+    /// The same for frames that are no canvas because of their channels.
+    static PIXELS: Cell<Vec<u8>> = const { Cell::new(Vec::new()) };
 }
 
 /// Calls `paint` with a canvas for `frame`. Only painted pixels change.
-fn paint_on(frame: &mut [u8], format: PixelFormat, paint: impl FnOnce(&mut Canvas<'_>)) {
+fn paint_on(frame: &mut [u8], FrameFormat { shape, format }: FrameFormat, paint: impl FnOnce(&mut Canvas<'_>)) {
     if format.is_canvas() {
-        return paint(&mut Canvas::new(frame, SCREEN, SCREEN));
+        return paint(&mut Canvas::new(frame, shape.width, shape.height));
     }
     SURFACE.with_borrow_mut(|surface| {
+        if (surface.width(), surface.height()) != (shape.width, shape.height) {
+            *surface = DirtySurface::new(shape.width, shape.height);
+        }
         paint(&mut surface.canvas());
         format.store(surface, frame);
     });
@@ -91,7 +139,7 @@ fn compare<E: Environment>(
     assets: &E::Assets,
     drawn: Option<&E::Scene>,
     scene: &E::Scene,
-    format: PixelFormat,
+    format: FrameFormat,
     frame: &[u8],
 ) -> Result<(), WrongFrame> {
     let mut expected = vec![0; frame.len()];
@@ -100,7 +148,7 @@ fn compare<E: Environment>(
         None => Ok(()),
         Some(byte) => Err(WrongFrame {
             env: 0,
-            pixel: format.pixel_of(byte, SCREEN, SCREEN),
+            pixel: format.format.pixel_of(byte, format.shape),
             expected: expected[byte],
             found: frame[byte],
             before: drawn.map_or_else(|| "unknown".to_owned(), |drawn| format!("{drawn:?}")),

@@ -4,13 +4,12 @@ use std::sync::Arc;
 
 use super::autoreset::Autoreset;
 use super::config::OptionMap;
-use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame, draw_in_full};
+use super::drawn_scene::{DrawSettings, DrawnScene, FrameFormat, WrongFrame, draw_in_full};
 use super::frame_stack::{FrameStack, StackedFrame};
 use super::seeding::Seeds;
 use crate::batch::BatchMut;
 use crate::envs::{Environment, Transition};
 use crate::random::Generator;
-use crate::raster::PixelFormat;
 
 /// An environment with its generator, its seeds, and the return and length of its episode.
 pub(super) struct EnvSlot<E: Environment> {
@@ -95,7 +94,7 @@ impl<E: Environment> EnvSlot<E> {
     }
 
     /// Writes a frame of the observation in full.
-    pub fn draw_stacked(&self, stacked: &StackedFrame<E::Scene>, format: PixelFormat, frame: &mut [u8]) {
+    pub fn draw_stacked(&self, stacked: &StackedFrame<E::Scene>, format: FrameFormat, frame: &mut [u8]) {
         match stacked {
             StackedFrame::Scene(scene) => draw_in_full::<E>(self.env.shared(), scene, format, frame),
             StackedFrame::Pixels(pixels) => frame.copy_from_slice(pixels),
@@ -183,7 +182,7 @@ impl<E: Environment> EnvSlot<E> {
     fn write_final_observation(&self, draw: DrawSettings, out: &mut BatchMut<'_>, row: usize) {
         write_if_present(out.final_observation.row(row), |r| {
             for (stacked, frame) in self.frames().zip(r.chunks_exact_mut(r.len() / self.frame_stack.length())) {
-                self.draw_stacked(&stacked, draw.format, frame);
+                self.draw_stacked(&stacked, draw.frame, frame);
             }
         });
         write_if_present(out.final_vector_observation.row(row), |r| self.env.vector_observation(r));

@@ -6,7 +6,6 @@ use super::drawn_scene::WrongFrame;
 use super::seeding::MAX_TOTAL_ENVS;
 use crate::batch::limits::{MAX_ENVS, MAX_THREADS};
 use crate::batch::{BLOCK_BYTES, LayoutError, MAX_STACK};
-use crate::envs::view::VIEW_BYTES;
 use crate::envs::{ActionError, ParameterError, UnknownEnvironment};
 use crate::random::EntropyError;
 
@@ -119,11 +118,19 @@ pub enum PoolError {
         /// Number of environments in the pool.
         num_envs: usize,
     },
-    /// Memory for a ground-truth view has the wrong size.
-    #[error("a ground-truth view must have {VIEW_BYTES} bytes, got {given}")]
-    ViewSize {
-        /// The number of bytes that was given.
-        given: usize,
+    /// The environment has only features, and no frame to show.
+    #[error("{id} has no frames to show, only features")]
+    NoFrame {
+        /// The environment id.
+        id: &'static str,
+    },
+    /// Only RGB frames have a luma.
+    #[error("grayscale frames are for environments with 3 channels, and {id} has {channels}")]
+    Grayscale {
+        /// The environment id.
+        id: &'static str,
+        /// Its number of channels.
+        channels: usize,
     },
     /// Only with [`check_drawing`](super::PoolConfig::check_drawing): an updated frame differs from the same frame drawn in
     /// full.

@@ -29,7 +29,7 @@ pub use episodes::{NextOptions, RunningEpisode};
 pub use error::PoolError;
 pub use experts::{Experts, ExpertsError};
 pub use pool::Pool;
-pub use registry::{DuplicateEnvironment, NoExpert, Registry};
+pub use registry::{NoExpert, Registry, RegistryError};
 pub use seeding::Seeding;
 pub use snapshot::{ResumeError, SNAPSHOT_VERSION, SavedEnv, SnapshotError};
 pub use threads::Threads;

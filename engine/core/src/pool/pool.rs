@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::autoreset::Autoreset;
 use super::buffers::Buffers;
 use super::config::{OptionMap, PoolConfig, ResetRequest};
-use super::drawn_scene::{DrawSettings, WrongFrame};
+use super::drawn_scene::{DrawSettings, FrameFormat, WrongFrame};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
 use super::registry::{Entry, Registry};
@@ -14,9 +14,8 @@ use super::snapshot::{ResumeError, SavedEnv, SnapshotError};
 use super::threads::Threads;
 use super::typed_envs::{AnyEnvs, WriteContext};
 use crate::batch::{BatchMut, Block, Layout, batch_layout};
-use crate::envs::view::VIEW_BYTES;
-use crate::envs::{EnvSpec, Progress, SCREEN};
-use crate::raster::PixelFormat;
+use crate::envs::view::Picture;
+use crate::envs::{EnvSpec, Progress};
 
 /// Environments of one id, stepped in lockstep.
 ///
@@ -46,7 +45,7 @@ pub struct Pool {
     layout: Layout,
     envs: Box<dyn AnyEnvs>,
     buffers: Buffers,
-    format: PixelFormat,
+    frame: FrameFormat,
     check_drawing: bool,
     autoreset: Autoreset,
     threads: Threads,
@@ -62,7 +61,7 @@ impl Pool {
     /// [`PoolError`] if the id is unknown, or if a reset parameter or a number in `config` is out of range.
     pub fn new(registry: &Registry, config: &PoolConfig, threads: &Threads) -> Result<Self, PoolError> {
         let entry = registry.entry(&config.id)?;
-        config.check()?;
+        config.check(&entry.spec)?;
         let layout = batch_layout(&entry.spec, config.num_envs, config.contents())?;
         let entropy = PoolEntropy::draw(&config.seeding)?;
         let envs = entry.envs(config, entropy)?;
@@ -71,7 +70,7 @@ impl Pool {
             layout,
             envs,
             buffers: Buffers::new(entropy.identity()),
-            format: config.frames.unwrap_or_default().format,
+            frame: FrameFormat::new(&entry.spec, config),
             check_drawing: config.check_drawing,
             autoreset: config.autoreset,
             threads: threads.clone(),
@@ -166,7 +165,7 @@ impl Pool {
     ) -> Result<(), PoolError> {
         self.check_batch(batch)?;
         let buffer = self.buffers.begin(&self.layout, batch);
-        let draw = DrawSettings { current: buffer.current, format: self.format, check: self.check_drawing };
+        let draw = DrawSettings { current: buffer.current, frame: self.frame, check: self.check_drawing };
         let context = WriteContext { threads: &self.threads, buffer: buffer.index, draw };
         let (given, needed) = (batch.len(), self.layout.blocks());
         let out = BatchMut::new(&self.layout, batch).ok_or(PoolError::BatchTooShort { given, needed })?;
@@ -296,7 +295,7 @@ impl Pool {
         }
         let save = |env| {
             let snapshot = self.envs.snapshot(env)?;
-            Ok(SavedEnv { snapshot, earlier_frames: self.envs.earlier_frames(env, self.format, self.frame_bytes()) })
+            Ok(SavedEnv { snapshot, earlier_frames: self.envs.earlier_frames(env, self.frame) })
         };
         (0..self.layout.num_envs()).map(save).collect::<Result<_, _>>().map(Some)
     }
@@ -313,7 +312,7 @@ impl Pool {
         if saved.len() != num_envs {
             return Err(ResumeError::Count { given: saved.len(), num_envs });
         }
-        let frame_bytes = self.frame_bytes();
+        let frame_bytes = self.frame.bytes();
         for (env, SavedEnv { snapshot, earlier_frames }) in saved.iter().enumerate() {
             let failed = |source| ResumeError::Environment { env, source };
             self.envs.restore(env, snapshot).map_err(failed)?;
@@ -321,11 +320,6 @@ impl Pool {
         }
         self.was_reset = true;
         Ok(())
-    }
-
-    /// Bytes of one frame.
-    fn frame_bytes(&self) -> usize {
-        self.format.shape(SCREEN, SCREEN).iter().product()
     }
 
     fn check_running(&self, env: usize) -> Result<(), PoolError> {
@@ -352,19 +346,16 @@ impl Pool {
         Ok(self.envs.progress(env))
     }
 
-    /// Draws the ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`,
-    /// indexed \[row\]\[column\]\[channel\]. `out` must have [`VIEW_BYTES`] bytes.
+    /// The ground-truth view of one environment: what the original's `render()` returns in the mode `debug_rgb_array`, with 4 times
+    /// the width and height of the frame.
     ///
     /// # Errors
     ///
-    /// [`PoolError::NotReset`], [`PoolError::NoSuchEnv`] or [`PoolError::ViewSize`].
-    pub fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) -> Result<(), PoolError> {
+    /// [`PoolError::NotReset`], [`PoolError::NoSuchEnv`] or [`PoolError::NoFrame`].
+    pub fn ground_truth_view(&mut self, env: usize) -> Result<Picture, PoolError> {
         self.check_running(env)?;
-        if out.len() != VIEW_BYTES {
-            return Err(PoolError::ViewSize { given: out.len() });
-        }
-        self.envs.ground_truth_view(env, out);
-        Ok(())
+        let shape = self.spec().frame.ok_or(PoolError::NoFrame { id: self.spec().id })?;
+        Ok(self.envs.ground_truth_view(env, shape))
     }
 
     /// Sets the animations of an environment's ground-truth view as if [`ground_truth_view`](Self::ground_truth_view) had been

@@ -9,7 +9,8 @@ use super::config::PoolConfig;
 use super::error::PoolError;
 use super::seeding::PoolEntropy;
 use super::typed_envs::{AnyEnvs, typed_envs};
-use crate::envs::{EnvSpec, Environment, Expert, Task, TaskEnv, UnknownEnvironment};
+use crate::envs::{EnvSpec, Environment, Expert, ObservationSpace, Task, TaskEnv, UnknownEnvironment};
+use crate::raster::FrameShape;
 
 /// Environment ids with their implementations. Pools, engines and commands look up ids in the registry that they are given.
 ///
@@ -29,14 +30,27 @@ impl Registry {
     ///
     /// # Errors
     ///
-    /// [`DuplicateEnvironment`] if the registry has the id already.
+    /// [`RegistryError`] if the registry has the id already, or if the specification contradicts itself.
     pub fn register<E: Environment + 'static>(
         &mut self,
         spec: EnvSpec,
         variant: E::Variant,
-    ) -> Result<(), DuplicateEnvironment> {
-        if self.specs().any(|known| known.id == spec.id) {
-            return Err(DuplicateEnvironment { id: spec.id.to_owned() });
+    ) -> Result<(), RegistryError> {
+        let id = spec.id;
+        if self.specs().any(|known| known.id == id) {
+            return Err(RegistryError::Duplicate { id });
+        }
+        if let Some(given) = spec.frame.filter(|frame| !frame.is_valid()) {
+            return Err(RegistryError::Frame { id, given });
+        }
+        if spec.frame.is_none() && spec.features.is_empty() {
+            return Err(RegistryError::NoObservation { id });
+        }
+        let features = spec.features.len();
+        if let Some(given) =
+            spec.observation_space.as_ref().map(ObservationSpace::width).filter(|width| *width != features)
+        {
+            return Err(RegistryError::ObservationSpace { id, given, features });
         }
         self.entries.push(Arc::new(Entry { spec, family: Box::new(Family::<E> { variant }) }));
         Ok(())
@@ -46,8 +60,8 @@ impl Registry {
     ///
     /// # Errors
     ///
-    /// [`DuplicateEnvironment`] if the registry has an id already.
-    pub fn with<T: Task>(mut self) -> Result<Self, DuplicateEnvironment> {
+    /// [`RegistryError`] if the registry has an id already, or if a specification contradicts itself.
+    pub fn with<T: Task>(mut self) -> Result<Self, RegistryError> {
         for spec in T::specs() {
             let id = spec.id;
             self.register::<TaskEnv<T>>(spec, id)?;
@@ -127,12 +141,39 @@ impl<E: Environment + 'static> AnyFamily for Family<E> {
     }
 }
 
-/// The registry already has this id.
+/// The registry refuses an environment.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("the registry has an environment `{id}` already")]
-pub struct DuplicateEnvironment {
-    /// The id.
-    pub id: String,
+pub enum RegistryError {
+    /// Two environments have the same id.
+    #[error("the registry already has an environment `{id}`")]
+    Duplicate {
+        /// The id.
+        id: &'static str,
+    },
+    /// The size of the frame is out of range.
+    #[error("frames must have a width and height of 1 to {max} and 1, 3 or 4 channels, got {given:?} for `{id}`", max = FrameShape::MAX_SIDE)]
+    Frame {
+        /// The id.
+        id: &'static str,
+        /// Its frame.
+        given: FrameShape,
+    },
+    /// The environment has neither a frame nor features.
+    #[error("an environment must have a frame or features, and `{id}` has neither")]
+    NoObservation {
+        /// The id.
+        id: &'static str,
+    },
+    /// The observation space does not fit the features.
+    #[error("the observation space of `{id}` must have as many numbers as there are features, {features}, got {given}")]
+    ObservationSpace {
+        /// The id.
+        id: &'static str,
+        /// Numbers of the space.
+        given: usize,
+        /// Number of features.
+        features: usize,
+    },
 }
 
 /// An id without a scripted expert.

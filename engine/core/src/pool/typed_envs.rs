@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use super::autoreset::Autoreset;
 use super::config::{OptionMap, PoolConfig, ResetOptions, ResetRequest};
 use super::division::EnvRange;
-use super::drawn_scene::{DrawSettings, DrawnScene, WrongFrame};
+use super::drawn_scene::{DrawSettings, DrawnScene, FrameFormat, WrongFrame};
 use super::env_slot::{EnvSlot, OptionSet};
 use super::episodes::{NextOptions, RunningEpisode};
 use super::error::PoolError;
@@ -17,8 +17,9 @@ use super::seeding::{PoolEntropy, Seeding, Seeds};
 use super::snapshot::{Saved, SnapshotError};
 use super::threads::Threads;
 use crate::batch::BatchMut;
-use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters, view};
-use crate::raster::PixelFormat;
+use crate::envs::view::{self, Picture};
+use crate::envs::{EnvSpec, Environment, ParameterError, Progress, ResetParameters};
+use crate::raster::FrameShape;
 
 /// Arguments for writing a batch.
 #[derive(Clone, Copy, Debug)]
@@ -65,7 +66,7 @@ pub(super) trait AnyEnvs: Send + Sync {
 
     /// All frames of one environment's observation except the newest, each of `frame_bytes` bytes; empty for an observation of
     /// one frame.
-    fn earlier_frames(&self, env: usize, format: PixelFormat, frame_bytes: usize) -> Vec<u8>;
+    fn earlier_frames(&self, env: usize, format: FrameFormat) -> Vec<u8>;
 
     /// Replaces all frames of one environment's observation except the newest.
     fn restore_earlier_frames(&mut self, env: usize, frames: &[u8], frame_bytes: usize) -> Result<(), SnapshotError>;
@@ -74,7 +75,7 @@ pub(super) trait AnyEnvs: Send + Sync {
     fn progress(&self, env: usize) -> Vec<Progress>;
 
     /// Draws one environment's ground-truth view.
-    fn ground_truth_view(&mut self, env: usize, out: &mut [u8]);
+    fn ground_truth_view(&mut self, env: usize, shape: FrameShape) -> Picture;
 
     /// Sets the animations of one environment's ground-truth view to the current step.
     fn align_ground_truth_view(&mut self, env: usize);
@@ -282,10 +283,11 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
         Ok(())
     }
 
-    fn earlier_frames(&self, env: usize, format: PixelFormat, frame_bytes: usize) -> Vec<u8> {
+    fn earlier_frames(&self, env: usize, format: FrameFormat) -> Vec<u8> {
         let slot = &self.slots[env];
-        let mut frames = vec![0; (self.stack - 1) * frame_bytes];
-        for (stacked, frame) in slot.frame_stack.earlier().zip(frames.chunks_exact_mut(frame_bytes.max(1))) {
+        let bytes = format.bytes();
+        let mut frames = vec![0; (self.stack - 1) * bytes];
+        for (stacked, frame) in slot.frame_stack.earlier().zip(frames.chunks_exact_mut(bytes.max(1))) {
             slot.draw_stacked(stacked, format, frame);
         }
         frames
@@ -304,8 +306,8 @@ impl<E: Environment> AnyEnvs for TypedEnvs<E> {
         self.slots[env].env.progress()
     }
 
-    fn ground_truth_view(&mut self, env: usize, out: &mut [u8]) {
-        view::ground_truth_view(&mut self.slots[env].env, out);
+    fn ground_truth_view(&mut self, env: usize, shape: FrameShape) -> Picture {
+        view::ground_truth_view(&mut self.slots[env].env, shape)
     }
 
     fn align_ground_truth_view(&mut self, env: usize) {

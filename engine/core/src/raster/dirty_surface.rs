@@ -18,13 +18,11 @@ pub struct DirtySurface {
 }
 
 impl DirtySurface {
-    /// A surface of at most 128 rows, with no dirty pixel.
-    ///
-    /// # Panics
-    ///
-    /// If `height` is more than 128.
+    /// Maximum height of a surface with a dirty mask.
+    pub const MAX_HEIGHT: usize = u128::BITS as usize;
+
+    /// A surface with no dirty pixel. Above [`MAX_HEIGHT`](DirtySurface::MAX_HEIGHT) it has no mask, and all pixels count as dirty.
     pub fn new(width: usize, height: usize) -> Self {
-        assert!(height <= u128::BITS as usize, "height must be 0 to 128, got {height}");
         DirtySurface { pixels: vec![0; width * height * 3], width, height, dirty: vec![0; width] }
     }
 
@@ -40,13 +38,20 @@ impl DirtySurface {
 
     /// Clears the dirty mask and returns a canvas that marks painted pixels.
     pub fn canvas(&mut self) -> Canvas<'_> {
+        let canvas = Canvas::new(&mut self.pixels, self.width, self.height);
+        if self.height > DirtySurface::MAX_HEIGHT {
+            return canvas;
+        }
         self.dirty.fill(0);
-        Canvas::new(&mut self.pixels, self.width, self.height).tracking_dirty(&mut self.dirty)
+        canvas.tracking_dirty(&mut self.dirty)
     }
 
     /// Calls `run` for each run of dirty pixels with its column, its rows, and its pixels.
     pub fn for_each_run(&self, mut run: impl FnMut(usize, Range<usize>, &[Rgb])) {
         let columns = self.pixels.as_chunks::<3>().0.chunks_exact(self.height.max(1));
+        if self.height > DirtySurface::MAX_HEIGHT {
+            return columns.enumerate().for_each(|(x, column)| run(x, 0..self.height, column));
+        }
         for (x, (bits, column)) in self.dirty.iter().zip(columns).enumerate() {
             let mut rest = *bits;
             while rest != 0 {

@@ -5,14 +5,46 @@ use serde::{Deserialize, Serialize};
 use super::dirty_surface::DirtySurface;
 use super::runs::Rgb;
 
+/// Size of a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameShape {
+    /// Pixels in a row, 1 to [`MAX_SIDE`](FrameShape::MAX_SIDE).
+    pub width: usize,
+    /// Pixels in a column, 1 to [`MAX_SIDE`](FrameShape::MAX_SIDE).
+    pub height: usize,
+    /// Bytes of a pixel: 1, 3 (RGB) or 4.
+    pub channels: usize,
+}
+
+impl FrameShape {
+    /// Maximum width and height.
+    pub const MAX_SIDE: usize = 4096;
+
+    /// An RGB frame.
+    pub const fn rgb(width: usize, height: usize) -> Self {
+        FrameShape { width, height, channels: 3 }
+    }
+
+    /// Bytes of a frame that is not in grayscale.
+    pub const fn bytes(self) -> usize {
+        self.width * self.height * self.channels
+    }
+
+    /// Whether the numbers are within their limits.
+    pub(crate) fn is_valid(self) -> bool {
+        let sides = 1..=FrameShape::MAX_SIDE;
+        sides.contains(&self.width) && sides.contains(&self.height) && [1, 3, 4].contains(&self.channels)
+    }
+}
+
 /// Order and kind of the numbers in a frame. The default is that of a [`Canvas`](super::Canvas) and of the original's
 /// observations: \[x\]\[y\]\[channel\].
 ///
 /// ```
-/// use endless_gym_core::raster::PixelFormat;
+/// use endless_gym_core::raster::{FrameShape, PixelFormat};
 ///
 /// let format = PixelFormat { channels_first: true, row_major: true, ..PixelFormat::default() };
-/// assert_eq!(format.shape(84, 84), [3, 84, 84]);
+/// assert_eq!(format.shape(FrameShape::rgb(84, 84)), [3, 84, 84]);
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -27,12 +59,12 @@ pub struct PixelFormat {
 
 impl PixelFormat {
     /// Shape of a frame's array.
-    pub fn shape(self, width: usize, height: usize) -> Vec<usize> {
+    pub fn shape(self, FrameShape { width, height, channels }: FrameShape) -> Vec<usize> {
         let (first, second) = if self.row_major { (height, width) } else { (width, height) };
         match self {
             PixelFormat { grayscale: true, .. } => vec![first, second],
-            PixelFormat { channels_first: true, .. } => vec![3, first, second],
-            _ => vec![first, second, 3],
+            PixelFormat { channels_first: true, .. } => vec![channels, first, second],
+            _ => vec![first, second, channels],
         }
     }
 
@@ -42,11 +74,11 @@ impl PixelFormat {
     }
 
     /// The pixel (x, y) that a byte of a frame belongs to.
-    pub(crate) fn pixel_of(self, byte: usize, width: usize, height: usize) -> (usize, usize) {
+    pub(crate) fn pixel_of(self, byte: usize, FrameShape { width, height, channels }: FrameShape) -> (usize, usize) {
         let pixel = match self {
             PixelFormat { grayscale: true, .. } => byte,
             PixelFormat { channels_first: true, .. } => byte % (width * height),
-            _ => byte / 3,
+            _ => byte / channels,
         };
         if self.row_major { (pixel % width, pixel / width) } else { (pixel / height, pixel % height) }
     }
@@ -79,6 +111,20 @@ impl PixelFormat {
             }
         });
     }
+
+    /// Copies `pixels`, in the order of a [`Canvas`](super::Canvas), into a frame in this format, which is not grayscale.
+    ///
+    /// # Panics
+    ///
+    /// If `pixels` or `frame` is too short.
+    pub(crate) fn copy(self, FrameShape { width, height, channels }: FrameShape, pixels: &[u8], frame: &mut [u8]) {
+        let (pixel, channel) = if self.channels_first { (1, width * height) } else { (channels, 1) };
+        let (across, down) = if self.row_major { (pixel, width * pixel) } else { (height * pixel, pixel) };
+        for (place, bytes) in pixels.chunks_exact(channels).enumerate() {
+            let at = place / height * across + place % height * down;
+            bytes.iter().enumerate().for_each(|(number, byte)| frame[at + number * channel] = *byte);
+        }
+    }
 }
 
 /// A colour's luma, truncated, as `GrayscaleObservation` of Gymnasium 1.x computes it.
@@ -99,12 +145,19 @@ mod tests {
         for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
             *canvas.pixel_mut(x, y) = color(x, y);
         }
+        let pixels: Vec<u8> = (0..width).flat_map(|x| (0..height).flat_map(move |y| color(x, y))).collect();
         for bits in 0..8 {
             let [grayscale, channels_first, row_major] = [1, 2, 4].map(|bit| bits & bit != 0);
             let format = PixelFormat { grayscale, channels_first, row_major };
-            let shape = format.shape(width, height);
+            let size = FrameShape::rgb(width, height);
+            let shape = format.shape(size);
             let mut frame = vec![255; shape.iter().product()];
             format.store(&surface, &mut frame);
+            if !grayscale {
+                let mut copied = vec![255; frame.len()];
+                format.copy(size, &pixels, &mut copied);
+                assert!(copied == frame, "{format:?}");
+            }
             for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
                 let (first, second) = if row_major { (y, x) } else { (x, y) };
                 for (channel, value) in color(x, y).into_iter().enumerate() {
@@ -118,7 +171,7 @@ mod tests {
                         _ => unreachable!("{shape:?}"),
                     };
                     assert_eq!(frame[place], expected, "{format:?} ({x}, {y})");
-                    assert_eq!(format.pixel_of(place, width, height), (x, y), "{format:?}");
+                    assert_eq!(format.pixel_of(place, size), (x, y), "{format:?}");
                 }
             }
         }

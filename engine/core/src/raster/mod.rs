@@ -42,7 +42,7 @@ pub use circle::circle_outline;
 pub use circle::{Disc, DiscColumn};
 pub use damage::Damage;
 pub use dirty_surface::DirtySurface;
-pub use format::PixelFormat;
+pub use format::{FrameShape, PixelFormat};
 pub use rect::{CornerRadii, Rect};
 pub use runs::Rgb;
 pub use runs::copy_run;

@@ -62,7 +62,7 @@ impl Recorder {
     pub fn step(&mut self, action: &[i32], pool: &Pool, blocks: &[Block]) {
         let Some(episode) = self.trace.episodes.last_mut() else { return };
         let batch = Batch::new(pool.layout(), blocks);
-        let done = batch.terminated()[0] | batch.truncated()[0] == 1;
+        let done = batch.has_ended(0);
         episode.steps.push(Step {
             action: action.to_vec(),
             reward: batch.reward()[0],

@@ -6,7 +6,6 @@ use serde_json::{Map, Value as Json};
 
 use super::format::{Trace, TraceError};
 use crate::batch::{Batch, Block, zeroed};
-use crate::envs::view::VIEW_BYTES;
 use crate::pool::{Autoreset, Pool, PoolConfig, Registry, ResetOptions, ResetRequest, Seeding, Threads};
 
 /// The outcome of a replay.
@@ -93,7 +92,6 @@ pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> 
     };
     let mut pool = Pool::new(registry, &config, &Threads::new(1)?)?;
     let mut blocks = zeroed(pool.layout().blocks());
-    let mut view = vec![0; VIEW_BYTES];
     let mut replay = Replay::default();
     for episode in &trace.episodes {
         match episode.seed {
@@ -109,11 +107,11 @@ pub fn replay(registry: &Registry, trace: &Trace) -> Result<Replay, TraceError> 
             let batch = Batch::new(pool.layout(), &blocks);
             replay.compare(step, "observation checksum", expected.crc, crc32fast::hash(batch.observation()));
             replay.compare(step, "reward", expected.reward, batch.reward()[0]);
-            replay.compare(step, "done", expected.done, batch.terminated()[0] | batch.truncated()[0] == 1);
+            replay.compare(step, "done", expected.done, batch.has_ended(0));
             compare_info(&mut replay, step, &expected.info, &info(&pool, &blocks, expected.done));
             if let Some(crc) = expected.render_crc {
-                pool.ground_truth_view(0, &mut view)?;
-                replay.compare(step, "ground-truth view checksum", crc, crc32fast::hash(&view));
+                let view = pool.ground_truth_view(0)?;
+                replay.compare(step, "ground-truth view checksum", crc, crc32fast::hash(&view.pixels));
                 replay.views += 1;
             }
             replay.steps += 1;

@@ -2,7 +2,7 @@
 
 use super::parameters::{Parameters, Variant};
 use crate::character::{Bounds, CharacterSize};
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 
 /// Side of a tile in pixels.
 pub const TILE: i32 = 14;

@@ -8,7 +8,7 @@ use super::parameters::{Parameters, Variant};
 use super::state::{DisplayedCharacter, State};
 use crate::character::Character;
 use crate::character_sprites::CharacterSprites;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 use endless_gym_core::raster::{Canvas, Damage, Rect, Rgb, Sprite, Surface};
 
 const TILE_BORDER: i32 = 1;

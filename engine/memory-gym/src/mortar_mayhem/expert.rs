@@ -5,8 +5,8 @@ use super::config::TILE;
 use super::features::{AGENT, ARENA_SIZE, BURNING, COMMAND, HEADING, LARGEST_ARENA};
 use super::parameters::{Locomotion, Variant};
 use crate::controls::turn_or_walk;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Expert;
-use endless_gym_core::envs::SCREEN;
 
 /// Distance in pixels from a tile's centre within which the agent stops.
 const DEAD_ZONE: i32 = 2;

@@ -3,8 +3,8 @@
 use super::commands::COMMANDS;
 use super::config::Config;
 use super::state::State;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Column;
-use endless_gym_core::envs::SCREEN;
 
 /// Indices of the columns in [`FEATURES`].
 pub(super) const AGENT: usize = 0;

@@ -7,6 +7,7 @@ use super::commands::{COMMANDS, MAX_VECTOR_COMMANDS};
 use super::features::FEATURES;
 use super::parameters::{Locomotion, MAX_AGENT_SCALE, MAX_COMMANDS, MAX_DURATION, Variant};
 use crate::controls::{MOVE, TURN_AND_WALK};
+use crate::screen::FRAME;
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::envs::Parameter;
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn};
@@ -165,6 +166,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "MortarMayhem-v0",
             summary: "Memorise a sequence of shown commands, then walk it tile by tile",
             action_space: ActionSpace::multi_discrete(&[3, 3]),
+            frame: Some(FRAME),
             actions: MOVE,
             vector_observation: 0,
             ground_truth: &[],
@@ -182,6 +184,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "MortarMayhem-Grid-v0",
             summary: "Mortar Mayhem with turning and walking from tile to tile",
             action_space: ActionSpace::Discrete(4),
+            frame: Some(FRAME),
             actions: TURN_AND_WALK,
             vector_observation: 0,
             ground_truth: &[],
@@ -199,6 +202,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "MortarMayhemB-v0",
             summary: "Mortar Mayhem without memory: the commands are always observed as a vector",
             action_space: ActionSpace::multi_discrete(&[3, 3]),
+            frame: Some(FRAME),
             actions: MOVE,
             vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
             ground_truth: &[],
@@ -216,6 +220,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "MortarMayhemB-Grid-v0",
             summary: "Mortar Mayhem without memory, on a grid",
             action_space: ActionSpace::Discrete(4),
+            frame: Some(FRAME),
             actions: TURN_AND_WALK,
             vector_observation: MAX_VECTOR_COMMANDS * COMMANDS,
             ground_truth: &[],
@@ -233,6 +238,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "Endless-MortarMayhem-v0",
             summary: "Each time the sequence is executed it grows by one shown command, until the agent fails",
             action_space: ActionSpace::multi_discrete(&[3, 3]),
+            frame: Some(FRAME),
             actions: MOVE,
             vector_observation: 0,
             ground_truth: GROUND_TRUTH,

@@ -3,7 +3,7 @@
 use super::parameters::{Parameters, Variant};
 use super::path::{GRID, Tile};
 use crate::character::CharacterSize;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 
 /// Side of a tile in pixels.
 pub const TILE: i32 = SCREEN as i32 / GRID;

@@ -6,7 +6,7 @@ use super::path::{GRID, Tile};
 use super::scene::Scene;
 use super::state::State;
 use crate::character_sprites::CharacterSprites;
-use endless_gym_core::envs::{FRAME_BYTES, SCREEN};
+use crate::screen::{FRAME, SCREEN};
 use endless_gym_core::raster::{Canvas, Damage, Rect, Rgb, Sprite, Surface};
 
 const BLACK: Rgb = [0, 0, 0];
@@ -201,7 +201,7 @@ impl Assets {
         if self.background.is_empty() {
             canvas.fill(BLACK);
         } else {
-            canvas.paste(&self.background[scrolled as usize * SCREEN * 3..][..FRAME_BYTES]);
+            canvas.paste(&self.background[scrolled as usize * SCREEN * 3..][..FRAME.bytes()]);
         }
     }
 

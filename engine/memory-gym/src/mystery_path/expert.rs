@@ -9,8 +9,8 @@ use super::parameters::Variant;
 use super::path::{GRID, Tile};
 use super::route::SEGMENT;
 use crate::controls::turn_or_walk;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Expert;
-use endless_gym_core::envs::SCREEN;
 
 /// Pixels that the endless agent moves in a step. The screen scrolls with the agent, so the frames do not show it.
 const ENDLESS_SPEED: i32 = 3;

@@ -5,8 +5,8 @@ use super::config::{Config, TILE};
 use super::parameters::Variant;
 use super::path::GRID;
 use super::state::State;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Column;
-use endless_gym_core::envs::SCREEN;
 
 /// Indices of the columns that all ids have.
 pub(super) const AGENT: usize = 0;

@@ -6,9 +6,10 @@
 use super::features::{ENDLESS_FEATURES, FINITE_FEATURES};
 use super::parameters::{DEFAULT_AGENT_SCALE, MAX_AGENT_SCALE, MAX_STAMINA, Variant};
 use crate::controls::{FOLLOW, MOVE, TURN_AND_WALK};
+use crate::screen::FRAME;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::envs::Parameter;
-use endless_gym_core::envs::SCREEN;
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn};
 
 const fn max_steps(default: i64) -> Parameter {
@@ -137,6 +138,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "MysteryPath-v0",
             summary: "Find an invisible path to the goal; the agent starts over after a fall and must remember the path",
             action_space: ActionSpace::multi_discrete(&[3, 3]),
+            frame: Some(FRAME),
             actions: MOVE,
             vector_observation: 0,
             ground_truth: &[],
@@ -154,6 +156,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "MysteryPath-Grid-v0",
             summary: "Mystery Path with turning and walking from tile to tile",
             action_space: ActionSpace::Discrete(4),
+            frame: Some(FRAME),
             actions: TURN_AND_WALK,
             vector_observation: 0,
             ground_truth: &[],
@@ -171,6 +174,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "Endless-MysteryPath-v0",
             summary: "Follow an endless invisible path; a fall before the farthest column, or twice at the same tile, ends the episode",
             action_space: ActionSpace::Discrete(4),
+            frame: Some(FRAME),
             actions: FOLLOW,
             vector_observation: 0,
             ground_truth: GROUND_TRUTH,

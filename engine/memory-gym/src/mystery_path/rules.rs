@@ -8,7 +8,7 @@ use super::parameters::Variant;
 use super::path::{GRID, draw_ends};
 use super::state::State;
 use crate::character::{Bounds, Character};
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Transition;
 use endless_gym_core::random::Generator;
 

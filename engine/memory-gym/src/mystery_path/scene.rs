@@ -5,7 +5,7 @@ use super::parameters::Variant;
 use super::path::{Tile, TileSet};
 use super::state::State;
 use crate::character::Character;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 
 /// What a frame shows.
 #[derive(Clone, Debug, PartialEq)]

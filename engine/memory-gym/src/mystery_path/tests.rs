@@ -7,8 +7,10 @@ use super::config::TILE;
 use super::features::{BACKGROUND, FALLEN, PAST_PATH, PAST_SHIFT, STAMINA};
 use super::path::{GRID, Tile};
 use super::{IDS, MysteryPath, State, Variant};
-use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, ResetParameters, SCREEN, Transition};
+use crate::screen::{FRAME, SCREEN};
+use endless_gym_core::envs::{EnvSpec, Environment, ResetParameters, Transition};
 use endless_gym_core::random::Generator;
+use endless_gym_core::raster::Canvas;
 
 /// Actions of the endless id.
 const RIGHT: i32 = 1;
@@ -53,8 +55,8 @@ impl Game {
 
     fn frame(&self) -> Vec<u8> {
         // The previous content must not matter.
-        let mut frame = vec![77; FRAME_BYTES];
-        self.env.draw(&mut frame);
+        let mut frame = vec![77; FRAME.bytes()];
+        MysteryPath::paint(self.env.shared(), &self.env.scene(), &mut Canvas::new(&mut frame, SCREEN, SCREEN));
         frame
     }
 
@@ -282,8 +284,7 @@ proptest! {
         }
         game.features();
         game.frame();
-        let mut view = vec![0; endless_gym_core::envs::view::VIEW_BYTES];
-        endless_gym_core::envs::view::ground_truth_view(&mut game.env, &mut view);
+        game.env.draw_ground_truth(&mut Canvas::new(&mut vec![0; FRAME.bytes()], SCREEN, SCREEN));
         prop_assert!(game.state().route.tiles().len() < 200 * 60);
     }
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 
 use super::config::BAR_HEIGHT;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 use endless_gym_core::raster::Rect;
 
 /// Longest move along each axis, in pixels, for which a circle's crescents are precomputed.

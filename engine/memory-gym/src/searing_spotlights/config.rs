@@ -2,7 +2,7 @@
 
 use super::parameters::{MAX_SPOTLIGHTS, Parameters, Variant};
 use crate::character::CharacterSize;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 
 /// Height in pixels of the bar at the top of the screen, which the agent cannot enter.
 pub const BAR_HEIGHT: usize = 4;

@@ -9,7 +9,7 @@ use super::light::{LightChange, Pixels, disc, outline};
 use super::pictures::{Assets, Pictures};
 use super::scene::Scene;
 use super::state::State;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 use endless_gym_core::raster::{Canvas, Damage, DiscColumn, Rect, Sprite, blend_keyed, copy_run};
 
 /// The area in which light and objects that are hidden in the dark are visible.

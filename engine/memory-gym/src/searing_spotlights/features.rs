@@ -2,8 +2,8 @@
 
 use super::config::{Config, HEALTH_WIDTH};
 use super::state::{Background, Exit, State};
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Column;
-use endless_gym_core::envs::SCREEN;
 
 /// Maximum number of coins and spotlights in the features. A frame may show more.
 pub(super) const COINS: usize = 8;

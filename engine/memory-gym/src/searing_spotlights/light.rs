@@ -12,7 +12,7 @@ use super::circles::{Circle, Circles, Edges, MAX_MOVED_RADIUS, Numbers, REACH, i
 use super::config::BAR_HEIGHT;
 use super::parameters::MAX_SPOT_RADIUS;
 use super::scene::Scene;
-use endless_gym_core::envs::{Frame, SCREEN};
+use crate::screen::{Frame, SCREEN};
 use endless_gym_core::raster::{Canvas, Disc, DiscColumn, Rect, Rgb, circle_outline, copy_run};
 
 /// The pixels of a background, column by column.

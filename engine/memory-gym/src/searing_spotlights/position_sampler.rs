@@ -3,7 +3,7 @@
 //! Source: `GridPositionSampler` of the original's `pygame_assets.py`, which searches an array of all pixels. Here a row of
 //! pixels is a bit set, so that 84 positions are counted at a time.
 
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 use endless_gym_core::random::Generator;
 
 /// All positions of one row.

@@ -6,6 +6,7 @@
 use super::features::FEATURES;
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Variant};
 use crate::controls::MOVE;
+use crate::screen::FRAME;
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::envs::Parameter;
 use endless_gym_core::envs::{Column, EnvSpec, InfoColumn};
@@ -237,6 +238,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "SearingSpotlights-v0",
             summary: "Collect coins and leave by the exit in the dark, without being hit by moving spotlights",
             action_space: ActionSpace::multi_discrete(&[3, 3]),
+            frame: Some(FRAME),
             actions: MOVE,
             vector_observation: 0,
             ground_truth: &[],
@@ -254,6 +256,7 @@ pub const IDS: &[(EnvSpec, Variant)] = &[
             id: "Endless-SearingSpotlights-v0",
             summary: "Collect one coin after the other in the dark, without being hit by moving spotlights",
             action_space: ActionSpace::multi_discrete(&[3, 3]),
+            frame: Some(FRAME),
             actions: MOVE,
             vector_observation: 0,
             ground_truth: GROUND_TRUTH,

@@ -9,8 +9,8 @@ use super::position_sampler::PositionSampler;
 use super::spotlight::Spotlight;
 use super::state::{Background, Exit, State};
 use crate::character::{Bounds, Character};
+use crate::screen::SCREEN;
 use crate::vector::distance;
-use endless_gym_core::envs::SCREEN;
 use endless_gym_core::envs::Transition;
 use endless_gym_core::random::Generator;
 

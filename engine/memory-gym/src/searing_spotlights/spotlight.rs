@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::circles::Circle;
 use super::config::MAX_COORDINATE;
 use super::parameters::{MAX_SPOT_RADIUS, Parameters};
+use crate::screen::SCREEN;
 use crate::vector::{lerp, rotate};
-use endless_gym_core::envs::SCREEN;
 use endless_gym_core::random::Generator;
 
 /// A spotlight that moves across the screen along a parabola, from one position off the screen to another.

@@ -7,8 +7,8 @@ use super::config::{Config, MAX_COORDINATE};
 use super::parameters::{MAX_COINS, MAX_SPOT_RADIUS, MAX_SPOTLIGHTS, Parameters};
 use super::spotlight::Spotlight;
 use crate::character::Character;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Progress;
-use endless_gym_core::envs::SCREEN;
 
 /// The background of the screen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

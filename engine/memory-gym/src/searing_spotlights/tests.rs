@@ -7,7 +7,8 @@ use serde_json::{Map, Value as Json, json};
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, HIT, LAST_ACTION, LIGHT, SPOTLIGHT};
 use super::{Assets, IDS, MAX_SPOTLIGHTS, SearingSpotlights, State, Variant};
-use endless_gym_core::envs::{EnvSpec, Environment, FRAME_BYTES, Parameter, ParameterKind, ResetParameters, SCREEN};
+use crate::screen::{FRAME, SCREEN};
+use endless_gym_core::envs::{EnvSpec, Environment, Parameter, ParameterKind, ResetParameters};
 use endless_gym_core::random::Generator;
 use endless_gym_core::raster::{Canvas, Surface};
 
@@ -36,8 +37,9 @@ fn features(environment: &SearingSpotlights) -> Vec<f32> {
 }
 
 fn frame(environment: &SearingSpotlights, before: u8) -> Vec<u8> {
-    let mut frame = vec![before; FRAME_BYTES];
-    environment.draw(&mut frame);
+    let mut frame = vec![before; FRAME.bytes()];
+    let canvas = &mut Canvas::new(&mut frame, SCREEN, SCREEN);
+    SearingSpotlights::paint(environment.shared(), &environment.scene(), canvas);
     frame
 }
 

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::config::{BAR_HEIGHT, HEALTH_WIDTH};
 use super::parameters::Variant;
 use super::scene::Bar;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 use endless_gym_core::raster::{Canvas, Rect, Rgb};
 
 /// A column of the bar, in one colour.

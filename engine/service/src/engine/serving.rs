@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_core::batch::{Block, LAYOUT_VERSION, action_layout};
+use endless_gym_core::batch::{BatchSection, Block, LAYOUT_VERSION, action_layout};
 use endless_gym_core::pool::{Pool, PoolError, Registry, ResetOptions, Threads};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -356,7 +356,9 @@ impl Engine {
 
 fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, PoolError> {
     let spec = pool.spec();
-    let features: &[_] = if config.pool.features { spec.features } else { &[] };
+    let has_features = pool.layout().section(BatchSection::Features).is_some();
+    let features: &[_] = if has_features { spec.features } else { &[] };
+    let frames = config.pool.frames.filter(|_| spec.frame.is_some());
     Ok(ServiceSpecification {
         service: config.service.clone(),
         layout_version: LAYOUT_VERSION,
@@ -370,7 +372,8 @@ fn specify(config: &EngineConfig, pool: &Pool) -> Result<ServiceSpecification, P
         first_env: config.pool.first_env,
         batch: pool.layout().clone(),
         action: action_layout(&spec.action_space, config.pool.num_envs)?,
-        frames: config.pool.frames,
+        frames,
+        frame: spec.frame.filter(|_| frames.is_some()),
         action_space: spec.action_space.clone(),
         info: spec.info.iter().map(|column| column.name.to_owned()).collect(),
         features: features.iter().map(|column| column.name.to_owned()).collect(),

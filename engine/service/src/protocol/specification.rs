@@ -3,6 +3,7 @@
 use endless_gym_core::batch::{ActionLayout, BatchSection, Frames, Layout, Section, action_layout};
 use endless_gym_core::envs::ActionSpace;
 use endless_gym_core::pool::{Autoreset, MAX_ENVS};
+use endless_gym_core::raster::FrameShape;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value as Json};
 
@@ -40,6 +41,9 @@ pub struct ServiceSpecification {
     pub action: ActionLayout,
     /// Format of the frames in a batch; `None` if batches have no frames.
     pub frames: Option<Frames>,
+    /// Size of a frame; `None` if batches have no frames.
+    #[serde(default)]
+    pub frame: Option<FrameShape>,
     /// The action space of one environment.
     pub action_space: ActionSpace,
     /// Names of the columns of the batch's section `info`.
@@ -88,6 +92,11 @@ impl ServiceSpecification {
         }
         if self.batch.num_envs() != self.num_envs {
             return Err(format!("batch must have {} environments, got {}", self.num_envs, self.batch.num_envs()));
+        }
+        let shape = self.frames.zip(self.frame).map(|(frames, frame)| frames.shape(frame));
+        let section = self.batch.section(BatchSection::Observation).map(Section::shape);
+        if shape.as_deref() != section {
+            return Err(format!("frames and frame must give the shape of an observation, {section:?}, got {shape:?}"));
         }
         let columns = [("info", &self.info, BatchSection::Info), ("features", &self.features, BatchSection::Features)];
         for (name, columns, section) in columns {

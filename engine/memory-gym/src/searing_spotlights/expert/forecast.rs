@@ -1,7 +1,7 @@
 //! Forecasts a spotlight's positions from its observed positions.
 
 use super::plan::Place;
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 
 /// Standard deviation of an observed centre in pixels, due to its truncation to whole pixels.
 const NOISE: f64 = 0.3;

@@ -5,8 +5,8 @@ mod plan;
 
 use super::features::{AGENT, COIN, EXIT, HEALTH, SPOTLIGHT};
 use super::parameters::Variant;
+use crate::screen::SCREEN;
 use endless_gym_core::envs::Expert;
-use endless_gym_core::envs::SCREEN;
 use forecast::Forecast;
 use plan::{Danger, Goal, HORIZON, NEUTRAL, Place, Plan, after, choose, dash};
 

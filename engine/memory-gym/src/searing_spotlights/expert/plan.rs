@@ -2,7 +2,7 @@
 //!
 //! Sets of places are bit sets, one for each row, so that one operation moves all places of a row.
 
-use endless_gym_core::envs::SCREEN;
+use crate::screen::SCREEN;
 
 /// A place in pixels: x, y.
 pub(super) type Place = [i32; 2];
