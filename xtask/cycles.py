@@ -8,7 +8,17 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 PACKAGES = ["bindings/python/endless_gym", "agents/endless_gym_agents"]
-CRATES = ["bindings/web", "engine/cli", "engine/core", "engine/memory-gym", "engine/service", "engine/view", "tests/faults", "xtask"]
+CRATES = [
+    "bindings/web",
+    "engine/cli",
+    "engine/core",
+    "engine/memory-gym",
+    "engine/popgym",
+    "engine/service",
+    "engine/view",
+    "tests/faults",
+    "xtask",
+]
 
 Module = tuple[str, ...]
 

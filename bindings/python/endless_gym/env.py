@@ -20,7 +20,7 @@ from endless_gym.window import Window, WindowClosed
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
-@documented(all_specs().values())
+@documented(spec for spec in all_specs().values() if spec.frame)
 class Env(gymnasium.Env[Any, Any]):
     """A Memory Gym environment: observations, rewards, flags and infos are bit-exact to the original.
 

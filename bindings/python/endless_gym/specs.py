@@ -174,7 +174,8 @@ class Spec:
         """The original's space of `info["ground_truth"]`."""
         if not self.ground_truth:
             return None
-        return spaces.Box(0, 1, (self.ground_truth,), np.float32)
+        # Memory Gym's numbers are in 0 to 1; POPGym's, which has no such space, also count.
+        return spaces.Box(0, 1 if self.frame else np.inf, (self.ground_truth,), np.float32)
 
 
 @cache

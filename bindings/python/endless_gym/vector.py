@@ -50,7 +50,7 @@ class Reconnection(NamedTuple):
     groups: list[GroupReconnection]
 
 
-@documented(all_specs().values())
+@documented(spec for spec in all_specs().values() if spec.frame)
 class EndlessVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """Environments of one id in lockstep.
 

@@ -2,8 +2,8 @@
 
 use std::sync::{Mutex, PoisonError};
 
+use endless_gym::environments;
 use endless_gym::envs::Expert;
-use endless_gym::memory_gym;
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -22,8 +22,8 @@ pub struct Experts {
 impl Experts {
     #[new]
     fn new(id: &str, num_envs: usize) -> PyResult<Self> {
-        let spec = memory_gym().spec(id).map_err(|error| PyValueError::new_err(error.to_string()))?;
-        let experts = (0..num_envs).map(|_| memory_gym().expert(id)).collect::<Result<_, _>>();
+        let spec = environments().spec(id).map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let experts = (0..num_envs).map(|_| environments().expert(id)).collect::<Result<_, _>>();
         Ok(Experts {
             experts: Mutex::new(experts.map_err(|error| PyValueError::new_err(error.to_string()))?),
             features: spec.features.len(),

@@ -17,7 +17,7 @@ mod single;
 use std::ffi::OsString;
 
 use endless_gym::pool::Autoreset;
-use endless_gym::{DEFAULT_ENV_ID, memory_gym};
+use endless_gym::{DEFAULT_ENV_ID, environments};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
@@ -25,14 +25,14 @@ use pyo3::types::PyTuple;
 /// The specifications of all environments, as JSON text.
 #[pyfunction]
 fn specs() -> PyResult<String> {
-    let specs: Vec<_> = memory_gym().specs().collect();
+    let specs: Vec<_> = environments().specs().collect();
     serde_json::to_string(&specs).map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }
 
 /// Runs the program `endless` and returns its exit status. `executable` is the command that starts it in a new process.
 #[pyfunction]
 fn endless(py: Python<'_>, arguments: Vec<OsString>, executable: Vec<OsString>) -> u8 {
-    py.detach(|| endless_gym_cli::main(memory_gym(), arguments, &executable))
+    py.detach(|| endless_gym_cli::main(environments(), arguments, &executable))
 }
 
 #[pymodule(name = "_native")]

@@ -5,7 +5,7 @@
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use endless_gym::batch::Block;
-use endless_gym::memory_gym;
+use endless_gym::environments;
 use endless_gym::pool::{NextOptions, OptionMap, Pool, PoolConfig, PoolError, Threads};
 use endless_gym::service::ServiceError;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
@@ -22,7 +22,7 @@ use crate::{arrays, errors};
 #[pyfunction]
 pub fn check_pool_config(config: &str) -> PyResult<()> {
     let config: PoolConfig = arguments::json(config)?;
-    let spec = memory_gym().spec(&config.id).map_err(|error| errors::pool(error.into()))?;
+    let spec = environments().spec(&config.id).map_err(|error| errors::pool(error.into()))?;
     config.validate(spec).map_err(errors::pool)
 }
 
@@ -74,7 +74,7 @@ impl Pools {
     fn new(py: Python<'_>, configs: Vec<String>, num_threads: usize) -> PyResult<Self> {
         let threads = Threads::new(num_threads).map_err(errors::pool)?;
         let group = |config: &String| {
-            let pool = Pool::new(memory_gym(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
+            let pool = Pool::new(environments(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
             Ok(Group { pool, buffers: Buffers::default(), actions: Vec::new() })
         };
         let pools: Vec<Group> = configs.iter().map(group).collect::<PyResult<_>>()?;

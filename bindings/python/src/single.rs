@@ -1,9 +1,9 @@
 //! One environment with the interface of the original. Every step returns newly allocated arrays.
 
 use endless_gym::batch::{Batch, BatchSection, Block, zeroed};
+use endless_gym::environments;
 use endless_gym::envs::ActionSpace;
 use endless_gym::envs::view::rgb_array;
-use endless_gym::memory_gym;
 use endless_gym::pool::{OptionMap, Pool, PoolError, ResetRequest, SavedEnv, Threads};
 use numpy::{Element, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -31,7 +31,7 @@ impl Single {
     #[new]
     fn new(config: &str) -> PyResult<Self> {
         let threads = Threads::new(1).map_err(errors::pool)?;
-        let pool = Pool::new(memory_gym(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
+        let pool = Pool::new(environments(), &arguments::json(config)?, &threads).map_err(errors::pool)?;
         let blocks = zeroed(pool.layout().blocks());
         let action_shape = ActionShape::single(&pool.spec().action_space);
         Ok(Single { pool, blocks, action_shape, action: Vec::new() })

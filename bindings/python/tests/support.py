@@ -16,6 +16,7 @@ import endless_gym
 from endless_gym import _native
 from endless_gym.program import program
 
+MEMORY_GYM = [id for id in endless_gym.all_specs() if not id.startswith("popgym-")]
 WHERE = [endless_gym.make_vec, endless_gym.serve]
 
 

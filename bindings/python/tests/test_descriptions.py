@@ -7,15 +7,15 @@ import sys
 
 import gymnasium
 import pytest
+from support import MEMORY_GYM
 
 import endless_gym
 from endless_gym.program import program
 
 SPECS = list(endless_gym.all_specs().values())
-IDS = [spec.id for spec in SPECS]
 
 
-@pytest.mark.parametrize("id", IDS)
+@pytest.mark.parametrize("id", MEMORY_GYM)
 def test_every_number_has_a_name_and_a_meaning(id: str) -> None:
     spec = endless_gym.spec(id)
     assert tuple(len(branch.choices) for branch in spec.actions) == spec.branches
@@ -37,16 +37,16 @@ def test_names_describe_what_the_original_does() -> None:
     assert endless_gym.Env("Endless-MysteryPath-v0").metadata["actions"] == {"move": ["nothing", "right", "up", "down"]}
 
 
-@pytest.mark.parametrize("shown", [endless_gym.Env, endless_gym.Env(IDS[0]), endless_gym.EndlessVectorEnv])
+@pytest.mark.parametrize("shown", [endless_gym.Env, endless_gym.Env(MEMORY_GYM[0]), endless_gym.EndlessVectorEnv])
 def test_help_shows_actions_and_ground_truth(shown: object) -> None:
     page = pydoc.plain(pydoc.render_doc(shown))
     assert "action[0], horizontal: 0 nothing, 1 left, 2 right" in page
     assert "action: 0 nothing, 1 left, 2 right, 3 ahead" in page
     assert 'info["ground_truth"][0], target_x: column of the tile' in page
-    assert all(id in page for id in IDS)
+    assert all(id in page for id in MEMORY_GYM)
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=IDS)
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
 def test_program_lists_actions_and_columns(spec) -> None:
     listed = subprocess.run(
         [*program(), "list", spec.id, "--picture", "never"], capture_output=True, text=True, check=True

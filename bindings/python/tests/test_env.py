@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from support import exact
+from support import MEMORY_GYM, exact
 
 import endless_gym
 
-IDS = list(endless_gym.all_specs())
+IDS = MEMORY_GYM
 #: Reset parameters with which random actions end several episodes.
 OPTIONS = {
     **{id: {"command_count": [2]} for id in IDS if id.startswith("MortarMayhem")},

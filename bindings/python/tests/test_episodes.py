@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import WHERE, exact
+from support import MEMORY_GYM, WHERE, exact
 
 import endless_gym
 
@@ -336,7 +336,7 @@ SHOWS_THE_LAST = ("Endless-MortarMayhem-v0",)
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("id", endless_gym.all_specs())
+@pytest.mark.parametrize("id", MEMORY_GYM)
 def test_replay_repeats_episodes(id: str, where: Callable[..., Envs]) -> None:
     short = {} if "Mortar" in id else {"max_steps": 25}
     short |= {"command_count": [2]} if id.startswith("Mortar") else {}

@@ -3,11 +3,11 @@
 import gymnasium
 import numpy as np
 import pytest
-from support import WHERE, engine_of_program, exact
+from support import MEMORY_GYM, WHERE, engine_of_program, exact
 
 import endless_gym
 
-IDS = list(endless_gym.all_specs())
+IDS = MEMORY_GYM
 #: Options of an episode that affect later episodes.
 LEFT = {
     "Endless-MortarMayhem-v0": {"agent_scale": 0.4},

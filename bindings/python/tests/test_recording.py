@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import rest_of_terminal
+from support import MEMORY_GYM, rest_of_terminal
 
 import endless_gym
 from endless_gym.cli import main as program_main
@@ -20,7 +20,7 @@ from endless_gym.recording.command import _parser
 
 pytestmark = [pytest.mark.libraries, pytest.mark.skipif(sys.version_info < (3, 11), reason="Minari needs Python 3.11")]
 
-IDS = list(endless_gym.all_specs())
+IDS = MEMORY_GYM
 
 
 def short(id: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 import pygame
 import pytest
 from gymnasium.utils.play import play
-from support import WHERE, same
+from support import MEMORY_GYM, WHERE, same
 from wrappers import SHORT, recorded
 
 import endless_gym
@@ -18,7 +18,7 @@ from endless_gym.window import Window
 
 __all__ = ["recorded"]
 
-IDS = list(endless_gym.all_specs())
+IDS = MEMORY_GYM
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ import pygame
 import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as vectors
+from support import MEMORY_GYM
 
 import endless_gym
 
@@ -28,7 +29,7 @@ SHORT: dict[str, dict[str, Any]] = {
     id: {"command_count": [1], "explosion_duration": [1], "explosion_delay": [2]}
     if id.startswith("MortarMayhem")
     else {"max_steps": 4}
-    for id in endless_gym.all_specs()
+    for id in MEMORY_GYM
 }
 for id in ("MortarMayhem-v0", "MortarMayhem-Grid-v0"):
     SHORT[id] |= {"command_show_duration": [1], "command_show_delay": [0]}

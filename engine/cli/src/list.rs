@@ -77,7 +77,7 @@ fn description(spec: &EnvSpec) -> String {
     let index = if spec.frame.is_some() { ", indexed [x][y][channel]" } else { "" };
     parts.push(format!("observation  {}{index}", observation(spec)));
     if !spec.ground_truth.is_empty() {
-        parts.push(format!("ground truth float64 ({},), in 0 to 1", spec.ground_truth.len()));
+        parts.push(format!("ground truth float64 ({},)", spec.ground_truth.len()));
     }
     let mut rows = table(["reset parameter", "default", "allowed", "description"]);
     for parameter in spec.parameters {

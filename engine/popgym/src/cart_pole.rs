@@ -99,7 +99,7 @@ impl Task for CartPole {
         const VELOCITIES: &[Column] = &[
             Column { name: "velocity", description: "velocity of the cart, m/s; at first its position, m" },
             Column {
-                name: "angular velocity",
+                name: "angular_velocity",
                 description: "angular velocity of the pole, rad/s; at first its angle, rad",
             },
         ];

@@ -10,6 +10,7 @@ warnings.filterwarnings("ignore")
 import gymnasium  # noqa: E402
 import numpy  # noqa: E402
 import popgym.envs  # noqa: E402
+from popgym.wrappers import Antialias, Flatten, PreviousAction  # noqa: E402
 
 IDS = [registered["id"] for registered in popgym.envs.ALL.values()]
 
@@ -69,6 +70,36 @@ def trace(env_id: str, seed: int, episodes: int, options: dict[str, float]) -> d
         "env": env_id,
         "options": options,
         "episodes": [original.episode(each, options, picker) for each in seeds],
+    }
+
+
+def spaces() -> dict[str, list[str]]:
+    """The action space and the observation space of each id, as text."""
+    made = {env_id: gymnasium.make(env_id, disable_env_checker=True) for env_id in IDS}
+    return {env_id: [str(env.action_space), str(env.observation_space)] for env_id, env in made.items()}
+
+
+def wrapped(env_id: str, seed: int) -> dict[str, Any]:
+    """Random steps with POPGym's wrappers. A step after the end of an episode starts the next, as in a vector environment."""
+    original, picker = Original(env_id), random.Random(seed)
+    env: Any = Antialias(PreviousAction(original.env))
+    flat: Any = Flatten(env)
+    observations = [env.reset(seed=seed)[0]]
+    actions: list[Any] = []
+    ended = False
+    for _ in range(250):
+        actions.append(original.random_action(picker))
+        observation, _, terminated, truncated, _ = (env.reset()[0], 0, 0, 0, {}) if ended else env.step(actions[-1])
+        ended = bool(terminated or truncated)
+        observations.append(observation)
+    flattened = [gymnasium.spaces.flatten(env.observation_space, each) for each in observations]
+    return {
+        "seed": seed,
+        "actions": [_flat(action) for action in actions],
+        "space": str(env.observation_space),
+        "observations": [_flat(observation) for observation in observations],
+        "flattened_space": str(flat.observation_space),
+        "flattened": [_flat(observation) for observation in flattened],
     }
 
 

@@ -10,12 +10,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from original import IDS, trace
+from original import IDS, spaces, trace, wrapped
 
 SEED = 20230501
 
 #: Options other than the defaults, which only some ids have.
 OPTIONS = {"Pole": {"low": -0.5, "high": 0.25}, "pole": {"low": -0.02}, "Pendulum": {"x_init": 0.5, "y_init": 4.0}}
+
+#: Ids with all kinds of spaces, which are also recorded with POPGym's wrappers.
+WRAPPED = [f"popgym-{name}Easy-v0" for name in ("Autoencode", "Battleship", "CountRecall", "PositionOnlyPendulum")]
 
 
 def record() -> dict[str, list[dict[str, Any]]]:
@@ -40,9 +43,10 @@ def main() -> None:
             answer = trace(request["env"], request["seed"], request["episodes"], request["options"])
             print(json.dumps(answer), flush=True)
         return
-    for family, traces in record().items():
-        text = json.dumps(traces, separators=(",", ":"))
-        path = Path(sys.argv[1]) / f"{family}.json.gz"
+    files: dict[str, Any] = {**record(), "spaces": spaces(), "wrapped": {id: wrapped(id, SEED) for id in WRAPPED}}
+    for name, content in files.items():
+        text = json.dumps(content, separators=(",", ":"))
+        path = Path(sys.argv[1]) / f"{name}.json.gz"
         path.write_bytes(gzip.compress(text.encode(), mtime=0))
 
 

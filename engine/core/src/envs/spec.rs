@@ -109,7 +109,7 @@ pub struct EnvSpec {
     pub actions: &'static [ActionBranch],
     /// Length of the vector observation (float32 in 0..=1); 0 if there is none.
     pub vector_observation: usize,
-    /// Columns of the ground truth (float64 in 0..=1); empty if there is none.
+    /// Columns of the ground truth (float64; in 0..=1 in Memory Gym); empty if there is none.
     pub ground_truth: &'static [Column],
     /// Whether the ground truth of a single environment has an integer dtype in the original.
     pub ground_truth_is_integer: bool,

@@ -1,0 +1,105 @@
+"""Tests of POPGym's ids, against spaces and episodes that were recorded from the original."""
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import endless_gym
+from endless_gym.popgym import PreviousAction
+
+REFERENCE = Path(__file__).parents[3] / "tests/reference/popgym"
+IDS = [id for id in endless_gym.all_specs() if id.startswith("popgym-")]
+FAMILIES = sorted({id.removeprefix("popgym-").replace("Easy", "").removesuffix("-v0") for id in IDS if "Easy" in id})
+
+
+def recorded(name: str) -> Any:
+    return json.loads(gzip.decompress((REFERENCE / f"{name}.json.gz").read_bytes()))
+
+
+def flat(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for part in value for number in flat(part)]
+    return [number.item() for number in np.ravel(value)]
+
+
+def action(env: gymnasium.Env[Any, Any], numbers: list[float]) -> Any:
+    space = env.action_space
+    return int(numbers[0]) if isinstance(space, gymnasium.spaces.Discrete) else np.array(numbers, space.dtype)
+
+
+def test_spaces_are_the_originals() -> None:
+    expected = recorded("spaces")
+    assert set(IDS) == set(expected)
+    for id, texts in expected.items():
+        env = gymnasium.make(f"EndlessGym/{id}")
+        assert [str(env.action_space), str(env.observation_space)] == texts
+        envs = gymnasium.make_vec(f"EndlessGym/{id}", num_envs=2)
+        assert [str(envs.single_action_space), str(envs.single_observation_space)] == texts
+        observation, _ = envs.reset(seed=1)
+        assert envs.observation_space.contains(observation), id
+        envs.close()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_single_environment_plays_recorded_episodes(family: str) -> None:
+    for trace in recorded(family)[:2]:
+        env = gymnasium.make(f"EndlessGym/{trace['env']}")
+        for episode in trace["episodes"]:
+            observation, _ = env.reset(seed=episode["seed"], options=trace["options"])
+            assert env.observation_space.contains(observation)
+            assert flat(observation) == episode["observation"]
+            for numbers, expected, *end, _ in episode["steps"]:
+                observation, reward, terminated, truncated, info = env.step(action(env, numbers))
+                assert env.observation_space.contains(observation)
+                assert (flat(observation), [reward, terminated, truncated]) == (expected, end)
+            assert info["length"] == len(episode["steps"])
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+@pytest.mark.parametrize("id", recorded("wrapped"))
+def test_previous_actions_and_first_steps_are_observed(id: str, flatten: bool) -> None:
+    record = recorded("wrapped")[id]
+    envs = PreviousAction(gymnasium.make_vec(f"EndlessGym/{id}", num_envs=1), flatten=flatten)
+    assert str(envs.single_observation_space) == record["flattened_space" if flatten else "space"]
+    expected = record["flattened" if flatten else "observations"]
+    observation, _ = envs.reset(seed=record["seed"])
+    assert flat(observation) == expected[0]
+    for numbers, row in zip(record["actions"], expected[1:], strict=True):
+        given = np.array(numbers, envs.action_space.dtype).reshape(envs.action_space.shape)
+        observation, *_ = envs.step(given)
+        is_allowed = envs.action_space.contains(given)
+        given.fill(0)
+        assert envs.observation_space.contains(observation) or not is_allowed
+        assert flat(observation) == row
+    assert sum(row[-1] == 1 for row in record["observations"]) > 1
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+def test_same_step_autoreset_keeps_the_last_action_in_the_final_observation(flatten: bool) -> None:
+    envs = endless_gym.make_vec("popgym-AutoencodeEasy-v0", 3, autoreset="same_step")
+    envs = PreviousAction(envs, flatten=flatten)
+    envs.reset(seed=4)
+    for _ in range(103):
+        observation, _, terminated, _, info = envs.step(np.array([3, 1, 2]))
+    assert terminated.all()
+    first, final = observation, list(info["final_obs"])
+    if flatten:
+        assert (first[:, 6:] == [1, 0, 0, 0, 0, 1]).all()
+        assert [row[6:].tolist() for row in final] == [[0, 0, 0, 1, 1, 0], [0, 1, 0, 0, 1, 0], [0, 0, 1, 0, 1, 0]]
+    else:
+        assert flat(first[2:]) == [0, 0, 0, 1, 1, 1]
+        assert [row[2:] for row in final] == [(3, 0), (1, 0), (2, 0)]
+        assert envs.single_observation_space.contains(final[0])
+
+
+def test_a_reset_of_some_environments_leaves_the_others_their_actions() -> None:
+    envs = PreviousAction(gymnasium.make_vec("EndlessGym/popgym-RepeatFirstEasy-v0", num_envs=2))
+    envs.reset(seed=1)
+    envs.step(np.array([3, 2]))
+    observation, _ = envs.reset(options={"reset_mask": np.array([False, True])})
+    assert (observation[1].tolist(), observation[2].tolist()) == ([3, 0], [0, 1])
