@@ -59,6 +59,14 @@ RUNS = [
         (f"pufferlib_rollout.py --backend {backend}", [SHORT_ID, GRID_ID], r"observations=\(8, 84, 84, 3\) uint8")
         for backend in ("PufferEnv", "Serial", "Multiprocessing")
     ),
+    *(
+        (
+            f"ppo_gru.py {ROLLOUT} --num-minibatches 2 --observation {kind} --autoreset {mode}",
+            [SHORT_ID, DICT_ID],
+            "loss=",
+        )
+        for kind, mode in (("rgb", "same_step"), ("features", "next_step"))
+    ),
     ("jax_service.py", [SHORT_ID, GRID_ID, DICT_ID], r"observation=\(8, 84, 84, 3\) uint8 shared=True"),
 ]
 
