@@ -276,3 +276,17 @@ def test_the_program_names_the_running_engines_if_there_is_none(trainer: Trainer
     assert len(ran.stderr.splitlines()) == 1
     assert "absent" in ran.stderr
     assert trainer.service in ran.stderr
+
+
+def test_without_a_name_the_program_watches_the_only_engine(trainer: Trainer) -> None:
+    trainer.step()
+    watching = watch_command("--json", "--interval", "0.1")
+    with subprocess.Popen(watching, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["service"] == trainer.service
+        process.send_signal(signal.SIGINT)
+    with endless_gym.serve(ID) as envs:
+        ran = subprocess.run(watch_command(), capture_output=True, text=True, timeout=60)
+        assert ran.returncode == 1
+        names = ", ".join(sorted((trainer.service, envs._engine.service)))
+        assert ran.stderr == f"endless: several engines run: {names}; give the name of one\n"

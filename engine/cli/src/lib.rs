@@ -110,6 +110,7 @@ pub fn main(registry: &Registry, arguments: impl IntoIterator<Item = OsString>, 
     let cli = parse(&arguments).and_then(|cli| match cli.command {
         Some(_) => Ok(cli),
         None => {
+            output::print("this is `endless demo`; `endless --help` lists all commands\n")?;
             arguments.push("demo".into());
             parse(&arguments)
         }

@@ -10,10 +10,7 @@ use endless_gym_view::ViewServer;
 use super::failure::Failure;
 use super::open;
 use super::output::{print, print_error};
-use super::{stop, terminal};
-
-/// The engine that is shown in the terminal by default.
-const DEFAULT_SERVICE: &str = "endless";
+use super::{stop, terminal, watch};
 
 /// Arguments of `endless view`.
 ///
@@ -21,7 +18,7 @@ const DEFAULT_SERVICE: &str = "endless";
 #[derive(clap::Args)]
 pub struct Args {
     /// Name of the engine; the page can be opened before it starts [default: the page lists the running engines; in the
-    /// terminal, `endless`].
+    /// terminal, the only running engine, or `endless`].
     service: Option<String>,
     #[command(flatten)]
     page: PageArgs,
@@ -48,7 +45,7 @@ pub struct PageArgs {
 /// Runs `endless view`, until a signal stops it.
 pub fn run(args: &Args) -> Result<(), Failure> {
     if args.terminal.terminal {
-        return terminal::view::run(args.service.as_deref().unwrap_or(DEFAULT_SERVICE), &args.terminal);
+        return terminal::view::run(&watch::named_or_only(args.service.as_deref())?, &args.terminal);
     }
     let stop = stop::on_signal()?;
     if let Some(parent) = args.child {

@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use endless_gym_service::{ConnectConfig, Observed, Observers, ServiceError};
+use endless_gym_service::{ConnectConfig, Namespace, Observed, Observers, ServiceError, running_engines};
 use endless_gym_view::RecentEpisodes;
 use serde_json::json;
 
@@ -23,9 +23,8 @@ const SLICE: Duration = Duration::from_millis(50);
 /// Arguments of `endless watch`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Name of the engine.
-    #[arg(default_value = "endless")]
-    service: String,
+    /// Name of the engine [default: the only running engine, or `endless`].
+    service: Option<String>,
     /// Watch this group only [default: all].
     #[arg(long)]
     group: Option<usize>,
@@ -88,7 +87,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let interval = seconds("--interval", args.interval.unwrap_or(if is_live { LIVE_INTERVAL } else { LINE_INTERVAL }))?;
     let timeout = seconds("--timeout", args.timeout)?;
     let stop = stop::on_signal()?;
-    let Some(mut observers) = connect(&args.service, args.group, timeout, stop)? else { return Ok(()) };
+    let service = named_or_only(args.service.as_deref())?;
+    let Some(mut observers) = connect(&service, args.group, timeout, stop)? else { return Ok(()) };
     let mut statistics = Statistics::new(observers.specification().num_envs);
     let id = observers.specification().id.clone();
     let mut shown = Instant::now();
@@ -108,12 +108,27 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let is_stopped = stop.load(Ordering::Relaxed);
         if is_over || is_stopped || shown.elapsed() >= interval {
             shown = Instant::now();
-            show(args, is_live, &id, &mut statistics, is_over)?;
+            show(args, &service, is_live, &id, &mut statistics, is_over)?;
         }
         if is_over || is_stopped {
             end_line(is_live)?;
             return if is_over && !args.json { print("the engine has ended") } else { Ok(()) };
         }
+    }
+}
+
+/// The name of an engine, by default of the only one that runs. `endless` is meant if it runs among others, or may start.
+pub fn named_or_only(service: Option<&str>) -> Result<String, Failure> {
+    const DEFAULT: &str = "endless";
+    if let Some(service) = service {
+        return Ok(service.to_owned());
+    }
+    let mut running = running_engines(&Namespace::default())?;
+    match running.len() {
+        1 => Ok(running.remove(0)),
+        0 => Ok(DEFAULT.to_owned()),
+        _ if running.iter().any(|name| name == DEFAULT) => Ok(DEFAULT.to_owned()),
+        _ => Err(format!("several engines run: {}; give the name of one", running.join(", ")).into()),
     }
 }
 
@@ -143,12 +158,19 @@ pub fn connect(
     }
 }
 
-fn show(args: &Args, is_live: bool, id: &str, statistics: &mut Statistics, is_over: bool) -> Result<(), Failure> {
+fn show(
+    args: &Args,
+    service: &str,
+    is_live: bool,
+    id: &str,
+    statistics: &mut Statistics,
+    is_over: bool,
+) -> Result<(), Failure> {
     let rate = statistics.rate();
     let (means, idle) = (statistics.episodes.means(), statistics.last.elapsed());
     if args.json {
         return print(json!({
-            "service": args.service,
+            "service": service,
             "environment": id,
             "steps_per_second": rate,
             "batches": statistics.batches,
@@ -160,7 +182,7 @@ fn show(args: &Args, is_live: bool, id: &str, statistics: &mut Statistics, is_ov
             "ended": is_over,
         }));
     }
-    let mut text = format!("{} {id}: {} steps/s", args.service, grouped(rate));
+    let mut text = format!("{service} {id}: {} steps/s", grouped(rate));
     text += &format!(", {} episodes", grouped(statistics.episodes.ended as f64));
     if let Some((mean_return, mean_length)) = means {
         text += &format!(", mean return {mean_return:.3}, mean length {mean_length:.1}");
