@@ -222,7 +222,15 @@ def draw_all(arguments: PlotArguments) -> list[Path]:
         if env in (arguments.env or (env,)):
             add(f"{env}-training", "Reward of training episodes", [curve for curve in trained if curve.env == env])
     for env in arguments.env or dict.fromkeys(curve.env for curve in measured) or (() if trained else known):
-        curves = [curve for curve in measured if curve.env == env] + published(env, arguments.published)
+        paper, mine = published(env, arguments.published), [curve for curve in measured if curve.env == env]
+        changed = [curve.label for curve in mine if ", " in curve.label]
+        if paper and changed:
+            print(
+                f"endless-plot: {env}: {'; '.join(changed)} is another task than the paper's, with which its score cannot be "
+                "compared; omit the paper's curves with --published",
+                file=sys.stderr,
+            )
+        curves = mine + paper
         add(env, metrics.metric(env)[1], curves)
     return plots
 

@@ -160,14 +160,17 @@ def evaluate_runs(arguments: EvalArguments, console: Console, failed: list[str] 
 def table(experiment: Experiment) -> Table:
     """A table with all metrics of the last checkpoint, and the paper's metric for the earlier ones.
 
-    Final infos that count failures as successes are marked, and the caption says which metric to trust.
+    The interval is the bootstrap interval of the interquartile mean (IQM), not of the mean. Final infos that count failures as
+    successes are marked, and the caption says which metric to trust.
     """
     options = "".join(f", {name}={value}" for name, value in experiment.options.items())
     first, _ = metrics.metric(experiment.env)
     rows = [(first, *row) for row in experiment.summaries(first)]
-    title = f"{experiment.env}, {experiment.label}, over {rows[0][-1]}{options}"
+    # The paper calls the agent without memory by its algorithm.
+    label = "none (ppo in the paper)" if experiment.label == "ppo" else experiment.label
+    title = f"{experiment.env}, {label}, over {rows[0][-1]}{options}"
     result = Table(title=title, title_justify="left", box=box.SIMPLE)
-    for name in ("steps", "metric", "mean", "std", "IQM", "95 % interval"):
+    for name in ("steps", "metric", "mean", "std", "IQM", "95 % of IQM"):
         result.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
     others = [name for name in experiment.runs[0].metrics if name != first]
     rows += [(name, *row) for name in others for row in experiment.summaries(name)[-1:]]

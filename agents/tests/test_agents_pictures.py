@@ -3,6 +3,7 @@
 import csv
 import json
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -154,6 +155,18 @@ def test_plots_contain_the_given_curves(tmp_path: Path) -> None:
     (trxl,) = published("MysteryPath-v0", ["trxl"])
     assert (theirs["source"], theirs["scores"]) == ("published", trxl.scores.tolist())
     assert sum(row["source"] == "published" for row in rows) == trxl.scores.shape[1] == 51
+
+
+def test_a_task_with_other_options_is_not_compared_silently(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paper = experiment("MysteryPath-v0", "task_progress", "gru", [[0.5]])
+    other = replace(paper, options={"max_steps": 60})
+    for number, (one, warned) in enumerate(((paper, False), (other, True))):
+        file = results(tmp_path / f"{number}.json", one)
+        draw_all(PlotArguments((file,), tmp_path / str(number), published=("trxl",)))
+        error = capsys.readouterr().err
+        assert ("gru, max_steps=60 is another task than the paper's" in error) == warned
+        draw_all(PlotArguments((file,), tmp_path / str(number), published=()))
+        assert not capsys.readouterr().err
 
 
 def test_spreads_runs_and_iqm(tmp_path: Path) -> None:
